@@ -1,0 +1,1 @@
+"""The framework: data, operator, pipeline, configuration, registry, random streams, execution. Knows no operator."""

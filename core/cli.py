@@ -1,0 +1,272 @@
+"""The command ``zonda``. Each command imports what it needs: ``zonda --help`` must stay quick."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from zonda import __version__
+
+from .errors import ZondaError
+
+if TYPE_CHECKING:
+    from .configuration.pipeline_file import PipelineFile
+
+USER_ERROR, INTERRUPTED = 2, 130
+
+_UNITS = {"": 1, "B": 1, **{f"{p}{i}B": b ** (k + 1) for k, p in enumerate("KMGT") for i, b in (("", 1000), ("I", 1024))}}
+
+
+class Bytes(click.ParamType[int]):
+    """A size such as 4GB or 500MiB, in bytes."""
+
+    name = "SIZE"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Bytes; fails with what was expected."""
+        if isinstance(value, int):
+            return value
+        text = str(value).strip()
+        number = text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ ")
+        try:
+            size = float(number) * _UNITS[text[len(number) :].strip().upper()]
+        except (ValueError, KeyError):
+            self.fail(f"{value!r} is not a size; write e.g. 4GB or 500MiB", param, ctx)
+        if not 1 <= size < 2**63:
+            self.fail(f"{value!r} is not a size a computer has", param, ctx)
+        return int(size)
+
+
+class Interrupted(Exception):
+    """Ctrl-C; click would print an empty line for a KeyboardInterrupt."""
+
+
+class Commands(click.Group):
+    """The built-in commands, and those of plugins: plugins are loaded only when a command is not built in, or for help."""
+
+    _extended = False
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """All names."""
+        self._extend()
+        return sorted(self.commands)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """One command."""
+        if name not in self.commands:
+            self._extend()
+        return super().get_command(ctx, name)
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click's, but an unknown command names the nearest one, and a pipeline file the command to use."""
+        name = args[0]
+        if self.get_command(ctx, name) is None and not name.startswith("-"):
+            from .configuration.diagnostics import nearest
+
+            hint = f"did you mean 'zonda run {name}'?" if name.endswith((".yaml", ".yml")) else nearest(name, self.commands)
+            ctx.fail(f"there is no command '{name}'; {hint or 'see zonda --help'}")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise Interrupted from None
+
+    def _extend(self) -> None:
+        if not self._extended:
+            self._extended = True
+            from .discovery import others_may_declare
+
+            if not others_may_declare("zonda.hooks"):
+                return
+            from .hooks import manager
+
+            built_in = dict(self.commands)
+            manager().hook.zonda_commands(group=self)
+            self.commands.update(built_in)  # a plugin adds commands, it does not replace any
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, "--version", prog_name="zonda", message="%(prog)s %(version)s")
+def zonda() -> None:
+    """Simulate what a ground-based (sub-)millimetre telescope records, and map it."""
+
+
+_pipeline = click.argument("pipeline", metavar="FILE_OR_NAME")
+_set = click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, e.g. PinkNoise.knee='0.5 Hz' or seed=8."
+)
+
+
+@zonda.command()
+@_pipeline
+@_set
+@click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
+@click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
+def run(pipeline: str, settings: tuple[str, ...], output: Path | None, threads: int | None, memory: int | None) -> None:
+    """Run a pipeline file, or a shipped pipeline by its name."""
+    from .files import write_text
+
+    file = _load(pipeline, settings)
+    folder = file.output if output is None else output
+    resolved = file.resolved_yaml()
+    data = file.pipeline().run(
+        file.scene(), output=folder, threads=threads, memory=memory, provenance={"resolved_yaml": resolved}
+    )
+    write_text(folder / "pipeline.yaml", resolved)
+    for who, what, value in data.tally:
+        if "/" not in who and value != "0":  # the companion runs' and what did not happen: in the report
+            click.echo(f"{who}: {what}: {value}", err=True)
+    click.echo(f"{folder}/")
+
+
+@zonda.command()
+@_pipeline
+@_set
+def check(pipeline: str, settings: tuple[str, ...]) -> None:
+    """Check a pipeline file: every mistake at once, each with its place."""
+    file = _load(pipeline, settings)
+    click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
+    for step in file.steps:
+        click.echo(f"  {step.key}")
+
+
+@zonda.command()
+@click.option("--check", is_flag=True, help="Import each one; exit status 1 where one fails.")
+def plugins(check: bool) -> None:
+    """List operators, instruments, sites, bands, noise models, mapmakers and hooks, and where each comes from."""
+    from . import hooks
+    from .discovery import discover
+    from .registry import registries
+
+    rows: list[tuple[str, ...]] = []
+    failures: list[Exception] = []
+    for registry in registries:
+        candidates = registry.candidates()
+        for found in candidates:
+            twice = sum(other.name == found.name for other in candidates) > 1
+            note = "provided twice" if twice else ""
+            if check:
+                try:
+                    registry.load(found) if registry.classes or twice else registry.create(found.name)
+                except ZondaError as err:
+                    failures.append(err)
+                    note = "FAILED"
+            rows.append((registry.kind, found.name, found.origin, found.reference, note))
+    rows += [("hook", found.name, found.origin, found.reference, "") for found in discover(hooks.GROUP)]
+    widths = [max((len(row[k]) for row in rows), default=0) for k in range(4)]
+    for row in rows:
+        click.echo("  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[4]]).rstrip())
+    if check:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            hooks.manager.cache_clear()
+            hooks.manager()
+        for warning in caught:
+            failures.append(ZondaError(str(warning.message)))
+        for failure in failures:
+            click.echo(f"\n{failure}", err=True)
+            if failure.__cause__ is not None:
+                import traceback
+
+                click.echo("".join(traceback.format_exception(failure.__cause__)).rstrip(), err=True)
+        click.echo(f"\n{len(rows)} components, {len(failures)} fault{'s' if len(failures) != 1 else ''}", err=True)
+        if failures:
+            raise click.exceptions.Exit(1)
+
+
+@zonda.command()
+def pipelines() -> None:
+    """List the shipped pipelines, which `zonda run` takes by name."""
+    from .configuration import locate, yaml_places
+
+    rows = []
+    for name, path in locate.shipped().items():
+        value = yaml_places.load(yaml_places.Source(str(path), locate.read(path))).value
+        rows.append((name, str(value.get("description", "")) if isinstance(value, dict) else ""))
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, description in rows:
+        click.echo(f"{name.ljust(width)}  {description}")
+
+
+@zonda.command()
+def schema() -> None:
+    """Print the JSON schema of pipeline files, for completion in editors."""
+    import json
+
+    from .configuration.schema import json_schema
+
+    click.echo(json.dumps(json_schema(), indent=2))
+
+
+def _load(pipeline: str, settings: tuple[str, ...]) -> PipelineFile:
+    from .configuration.pipeline_file import load
+
+    return load(pipeline, settings)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0, 1 (a fault of a plugin), 2 (a user's mistake), 130 (interrupted)."""
+    with _plain_warnings():
+        try:
+            result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)
+            return result if isinstance(result, int) else 0
+        except click.ClickException as err:
+            err.show()
+            return err.exit_code
+        except ZondaError as err:
+            _report(err)
+        except (Interrupted, KeyboardInterrupt, click.Abort):
+            _clear()
+            click.echo("interrupted: unfinished files were removed", err=True)
+            return INTERRUPTED
+        except OSError as err:
+            if err.filename is None and err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
+                raise
+            _report(ZondaError(err.strerror or str(err), place=str(err.filename or "")))
+        return USER_ERROR
+
+
+def _report(err: ZondaError) -> None:
+    colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+    _clear()
+    if render := getattr(err, "render", None):
+        click.echo(render(colour), err=True)
+    else:
+        click.echo(f"{click.style('error', fg='red', bold=True) if colour else 'error'}: {err}", err=True)
+
+
+def _clear() -> None:
+    """Clear the line that a progress plugin may have left."""
+    if sys.stderr.isatty():
+        click.echo("\r\033[K", nl=False, err=True)
+
+
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings as one line without the source that raised them."""
+    usual = warnings.formatwarning
+
+    def one_line(message: Any, category: Any, filename: str, lineno: int, line: str | None = None) -> str:
+        return f"warning: {message}\n"
+
+    warnings.formatwarning = one_line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
+
+
+if __name__ == "__main__":
+    sys.exit(main())

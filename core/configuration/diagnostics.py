@@ -1,0 +1,106 @@
+"""What is wrong, where, and what would mend it: printed with the source line and a caret."""
+
+from __future__ import annotations
+
+import difflib
+import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from ..errors import ZondaError
+from .yaml_places import Span
+
+WIDTH = 140
+"""Longer source lines are cut around the caret."""
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """One mistake.
+
+    Attributes
+    ----------
+    message
+        The cause: one sentence, lower case, no full stop.
+    span
+        Where.
+    label
+        A few words behind the caret.
+    help
+        What is expected, or what to do.
+    """
+
+    message: str
+    span: Span
+    label: str = ""
+    help: str = ""
+
+    @property
+    def place(self) -> str:
+        """``file:line:column``, counted from 1."""
+        return f"{self.span.source.name}:{self.span.line + 1}:{self.span.column + 1}"
+
+    def render(self, colour: bool = False) -> str:
+        """Several lines of text, the last with a line feed."""
+        red, blue, bold, off = ("\033[31;1m", "\033[34;1m", "\033[1m", "\033[0m") if colour else ("",) * 4
+        lines = self.span.source.text.splitlines() or [""]
+        row = min(self.span.line, len(lines) - 1)
+        line = lines[row]
+        start = min(self.span.column, len(line))
+        end = self.span.end_column if self.span.end_line == row else len(line.rstrip())
+        cut = max(0, start - WIDTH // 2) if len(line) > WIDTH else 0
+        shown = line[cut : cut + WIDTH]
+        before, under = line[cut:start], line[start : min(end, cut + WIDTH)]
+        indent = "".join(c if c == "\t" else " " * _columns(c) for c in before)
+        caret = "^" * max(1, _columns(under))
+        gutter = " " * len(str(row + 1))
+        parts = [
+            f"{red}error{off}{bold}: {self.message}{off}",
+            f"{gutter}{blue}-->{off} {self.place}",
+            f"{gutter} {blue}|{off}",
+            f"{blue}{row + 1} |{off} {shown}",
+            f"{gutter} {blue}|{off} {indent}{red}{caret}{' ' + self.label if self.label else ''}{off}",
+        ]
+        if self.help:
+            parts += [f"{gutter} {blue}={off} {text}" for text in self.help.splitlines()]
+        return "\n".join(parts) + "\n"
+
+
+class ConfigurationError(ZondaError):
+    """Everything that is wrong with a configuration, each with its place.
+
+    Attributes
+    ----------
+    diagnostics
+        In the order of the file; mistakes in overrides come last.
+    """
+
+    def __init__(self, diagnostics: Iterable[Diagnostic], place: str) -> None:
+        found = sorted(dict.fromkeys(diagnostics), key=lambda d: (d.span.source.name != place, d.span.line, d.span.column))
+        count = f"{len(found)} mistake{'s' if len(found) != 1 else ''}"
+        super().__init__(f"{count} in {place}", place="")
+        self.diagnostics, self.place = found, place
+
+    def __reduce__(self) -> tuple[type[ConfigurationError], tuple[list[Diagnostic], str]]:
+        return type(self), (self.diagnostics, self.place)
+
+    def render(self, colour: bool = False) -> str:
+        """All diagnostics and their number."""
+        return "\n".join([*(d.render(colour) for d in self.diagnostics), self.message])
+
+    def __str__(self) -> str:
+        return self.render()
+
+
+def nearest(word: object, options: Iterable[str], otherwise: str = "") -> str:
+    """``did you mean 'option'?``, or ``otherwise`` where no option is near."""
+    folded = {option.lower(): option for option in options}
+    near = difflib.get_close_matches(str(word).lower(), folded, n=1, cutoff=0.6)
+    return f"did you mean '{folded[near[0]]}'?" if near else otherwise
+
+
+def _columns(text: str) -> int:
+    """Columns that ``text`` takes on a terminal."""
+    wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
+    marks = sum(unicodedata.combining(c) > 0 for c in text)
+    return len(text) + wide - marks

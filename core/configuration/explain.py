@@ -1,0 +1,125 @@
+"""pydantic's errors as diagnostics with places in a document."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from .diagnostics import Diagnostic, nearest
+from .units import Unit
+from .yaml_places import Document, Path, Span
+
+_LIMITS = {
+    "greater_than": ("gt", "greater than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
+
+
+def explain(
+    error: ValidationError, model: type[BaseModel], document: Document, at: Path, who: str, keys: Iterable[str] = ()
+) -> list[Diagnostic]:
+    """One diagnostic per mistaken value.
+
+    Parameters
+    ----------
+    model
+        What was validated, from the value at path ``at`` of the document.
+    who
+        How messages call it.
+    keys
+        The keys it takes, where they are not just the model's fields.
+    """
+    found: list[Diagnostic] = []
+    branches: dict[Span, int] = {}
+    for e in error.errors():
+        new = _one(e, model, document, at, who, keys)
+        if new.span not in branches or e["type"] in ("missing", "extra_forbidden"):
+            branches[new.span] = len(found)
+            found.append(new)
+        else:  # another branch of a union
+            k = branches[new.span]
+            other = "or: " + new.message.removeprefix(found[k].message.split(": ")[0] + ": ")
+            found[k] = replace(found[k], help="\n".join(filter(None, (other, found[k].help))))
+    return found
+
+
+def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str, keys: Iterable[str]) -> Diagnostic:
+    path, loc = at, []
+    kind, context = e["type"], e.get("ctx", {})
+    for part in e["loc"][:-1] if kind == "missing" else e["loc"]:  # leaves out tags of unions
+        if (*path, part) in document.marks:
+            path = (*path, part)
+            loc.append(part)
+    mark = document.marks[path]
+    if kind == "extra_forbidden":
+        owner, _ = _field(model, loc[:-1])
+        options = list(keys if keys and len(loc) == 1 else (owner or model).model_fields)
+        inside = who if len(loc) == 1 else f"{who}, {'.'.join(map(str, loc[:-1]))}"
+        hint = nearest(e["loc"][-1], options, "not a known key")
+        return Diagnostic(f"unknown key '{e['loc'][-1]}' for {inside}", mark.start, hint, f"{inside} takes: {', '.join(options)}")
+    if kind == "missing":
+        name = str(e["loc"][-1])
+        _, field = _field(model, [*loc, name])
+        unit = _unit(field)
+        label = f"add '{name}: {unit.example}'" if unit else f"add '{name}:'"
+        inside = f"{who}, {'.'.join(map(str, loc))}" if loc else who
+        return Diagnostic(f"{inside} needs '{name}'", mark.start, label, _description(field))
+    _, field = _field(model, loc)
+    span, label = mark.value, context.get("label") or ""
+    if caret := context.get("caret"):
+        span = span.part(*caret)
+    message = str(context.get("error") or e["msg"])
+    if kind in _LIMITS:
+        message = _limit(e, _unit(field), document, path)
+    elif kind == "literal_error":
+        label = nearest(e["input"], re.findall(r"'([^']*)'", context.get("expected", "")))
+    message = message[:1].lower() + message[1:] if not message[:2].isupper() else message
+    where = f"{who}, {'.'.join(map(str, loc))}" if loc else who
+    text = "\n".join(filter(None, (context.get("help"), _description(field))))
+    return Diagnostic(f"{where}: {message}", span, label, text)
+
+
+def _limit(e: Any, unit: Unit | None, document: Document, path: Path) -> str:
+    """``must be at least 5 deg, got -1 deg``, in the unit that the user wrote."""
+    key, words = _LIMITS[e["type"]]
+    value: Any = document.value
+    for part in path:
+        value = value[part]
+    limit = e["ctx"][key]
+    shown = unit.write_in_unit_of(limit, value) if unit and unit.unit and isinstance(value, str) else f"{limit}"
+    return f"must be {words} {shown}, got {value}"
+
+
+def _field(model: type[BaseModel], loc: Iterable[Any]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
+    """The model and the field at ``loc``: what a value there is checked against."""
+    owner: type[BaseModel] | None = model
+    field: FieldInfo | None = None
+    for part in loc:
+        if owner is not None and part in owner.model_fields:
+            field = owner.model_fields[part]
+            owner = next((t for t in _types(field.annotation) if isinstance(t, type) and issubclass(t, BaseModel)), None)
+    return owner, field
+
+
+def _unit(field: FieldInfo | None) -> Unit | None:
+    if field is None:
+        return None
+    everything = [*field.metadata, *(m for t in _types(field.annotation) for m in getattr(t, "__metadata__", ()))]
+    return next((m for m in everything if isinstance(m, Unit)), None)
+
+
+def _types(annotation: Any) -> Iterator[Any]:
+    yield annotation
+    for argument in get_args(annotation):
+        yield from _types(argument)
+
+
+def _description(field: FieldInfo | None) -> str:
+    return " ".join((field.description or "").split()) if field is not None else ""

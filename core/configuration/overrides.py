@@ -1,0 +1,113 @@
+"""``--set Key.parameter=value``: changes to a pipeline file from the command line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from . import yaml_places
+from .diagnostics import Diagnostic, nearest
+from .yaml_places import Document, Mark, Path, Source, Span
+
+
+def apply(document: Document, text: str, keys: list[str]) -> list[Diagnostic]:
+    """Put one ``key=value`` into the document; returns what is wrong with it.
+
+    ``key`` is a key of the file (``seed``, ``site.altitude``), one of ``keys``; or a parameter of a step
+    (``PinkNoise.knee``), which goes by its operator's name or by its own; the second of two namesakes is
+    ``WhiteNoise.2.net``. The value is YAML.
+    """
+    source = Source("--set", text)
+    key, equals, value = text.partition("=")
+    place = Span(source, 0, 0, 0, max(1, len(key)))
+    if not equals or not key.strip():
+        cure = "write Key.parameter=value, e.g. --set PinkNoise.knee='0.5 Hz' or --set seed=8"
+        return [Diagnostic("a setting needs a key, '=' and a value", place, "", cure)]
+    new = yaml_places.load(source, column=len(key) + 1, text=value)
+    if new.faults:
+        return [Diagnostic(f.message, f.span, f.label, "the value is YAML; quote what YAML cannot read") for f in new.faults]
+    parts = key.strip().split(".")
+    try:
+        path = _header_path(document, parts) if parts[0] in keys else _step_path(document, key.strip(), keys)
+    except _Refused as why:
+        message, label, cure = why.args
+        return [Diagnostic(message, place, label, cure)]
+    document.put(path, new, place)
+    return []
+
+
+class _Refused(Exception):
+    """Arguments: message, label, help."""
+
+
+def _header_path(document: Document, parts: list[str]) -> Path:
+    if parts[0] == "operators":
+        raise _Refused("the list of operators cannot be set", "", "set one step's parameter: Operator.parameter=value")
+    here = document.value
+    for depth, part in enumerate(parts[:-1], 1):
+        if part not in here and depth == 1:
+            here[part] = {}
+            document.marks[(part,)] = document.marks[()]
+        here = here.get(part)
+        if not isinstance(here, dict):
+            where = ".".join(parts[:depth])
+            raise _Refused(f"'{where}' is not a mapping", "", f"set '{where}' itself, or write it as a mapping in the file")
+    return tuple(parts)
+
+
+def _step_path(document: Document, key: str, keys: list[str]) -> Path:
+    steps = _steps(document)
+    names = list(dict.fromkeys(name for _, labels in steps for name in labels))
+    name = max((n for n in names if key.startswith(f"{n}.") or key == n), key=len, default=None)
+    if name is None:
+        first = key.split(".")[0]
+        near = nearest(first, [*names, *keys])
+        cure = f"it has the steps {', '.join(names)} and the keys {', '.join(keys)}"
+        raise _Refused(f"nothing is called '{first}' in this pipeline", near, cure)
+    same = [path for path, labels in steps if name in labels]
+    parts = key[len(name) + 1 :].split(".")
+    number = int(parts.pop(0)) if parts[0].isdigit() else 0
+    ways = " or ".join(f"{name}.{k}" for k in range(1, len(same) + 1))
+    if not number and len(same) > 1:
+        raise _Refused(f"there are {len(same)} steps '{name}'", "", f"write {ways}")
+    if number > len(same):
+        raise _Refused(f"there is no step '{name}.{number}'", "", f"write {name if len(same) == 1 else ways}")
+    if not all(parts) or not parts:
+        raise _Refused(f"'{key}' is a step, not a parameter", "add a parameter", f"write {key.rstrip('.')}.parameter=value")
+    inner = _opened(document, same[max(number, 1) - 1])
+    here: Any = document.value["operators"][inner[1]][inner[2]]
+    for depth, part in enumerate(["", *parts[:-1]]):
+        here = here.get(part) if depth and isinstance(here, dict) else here
+        if not isinstance(here, dict):
+            where = ".".join([name, *parts[:depth]])
+            raise _Refused(f"'{where}' is not a mapping", "", f"set '{where}' itself, or write it as a mapping in the file")
+    return (*inner, *parts)
+
+
+def _steps(document: Document) -> list[tuple[Path, list[str]]]:
+    """Path of each step and the names it goes by."""
+    steps: list[tuple[Path, list[str]]] = []
+    items = document.value.get("operators")
+    for i, item in enumerate(items if isinstance(items, list) else []):
+        if isinstance(item, str):
+            steps.append((("operators", i), [item, item.rpartition(":")[2]]))
+        elif isinstance(item, dict) and len(item) == 1:
+            name, parameters = next(iter(item.items()))
+            labels = [str(name), str(name).rpartition(":")[2]]
+            if isinstance(parameters, dict) and isinstance(parameters.get("name"), str):
+                labels.append(parameters["name"])
+            steps.append((("operators", i), labels))
+    return steps
+
+
+def _opened(document: Document, path: Path) -> Path:
+    """Path of the parameters of a step, which become a mapping where there were none."""
+    item = document.value["operators"][path[1]]
+    if isinstance(item, str):
+        document.value["operators"][path[1]] = {item: {}}
+        mark = document.marks[path]
+        document.marks[(*path, item)] = Mark(mark.value, mark.value)
+        return (*path, item)
+    name = next(iter(item))
+    if item[name] is None:
+        item[name] = {}
+    return (*path, name)

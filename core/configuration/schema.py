@@ -1,0 +1,68 @@
+"""JSON schema of pipeline files, for completion in editors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.errors import PydanticInvalidForJsonSchema
+from pydantic.json_schema import JsonSchemaMode, models_json_schema
+
+from .. import registry
+from ..errors import ZondaError
+from ..operator import Operator
+from ..scene import Scene
+from .pipeline_file import KEYS, Header
+
+_MODE: JsonSchemaMode = "validation"
+
+
+def json_schema() -> dict[str, Any]:
+    """Schema (draft 2020-12) of pipeline files: one property per installed operator; broken plugins are left out."""
+    classes: dict[str, type[Operator]] = {}
+    for found in registry.steps.candidates():
+        twice = sum(other.name == found.name for other in registry.steps.candidates()) > 1
+        try:
+            operator = registry.steps.load(found)
+            operator.model_json_schema()
+        except (ZondaError, PydanticInvalidForJsonSchema):
+            continue
+        classes[found.qualified if twice else found.name] = operator
+    wanted: list[type[BaseModel]] = [Header, Scene, *dict.fromkeys(classes.values())]
+    models = [(model, _MODE) for model in wanted]
+    references, definitions = models_json_schema(models, ref_template="#/$defs/{model}")
+    defs = definitions.get("$defs", {})
+    header, scene = (defs.pop(references[model, _MODE]["$ref"].rpartition("/")[2]) for model in (Header, Scene))
+    properties = header["properties"] | scene["properties"]
+    for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
+        properties[kind] = _name_or(properties[kind], names)
+    for definition in defs.values():
+        if definition.get("title") == "Instrument":
+            definition["properties"]["band"] = _name_or(definition["properties"]["band"], registry.bands)
+    steps = _step(classes, references)
+    properties["operators"] = {"type": "array", "minItems": 1, "description": "Steps, in order.", "items": steps}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "zonda pipeline",
+        "type": "object",
+        "properties": {key: properties[key] for key in KEYS},
+        "patternProperties": {"^x-": {"description": "Anything: a place for anchors."}},
+        "additionalProperties": False,
+        "required": [*scene.get("required", []), "operators"],
+        "$defs": defs,
+    }
+
+
+def _step(classes: dict[str, type[Operator]], references: Any) -> dict[str, Any]:
+    properties = {
+        name: {"anyOf": [references[model, _MODE], {"type": "null"}], "description": (model.__doc__ or "").strip().split("\n")[0]}
+        for name, model in classes.items()
+    }
+    whole = {"type": "object", "properties": properties, "minProperties": 1, "maxProperties": 1, "additionalProperties": False}
+    return {"anyOf": [whole, {"enum": list(classes)}]}
+
+
+def _name_or(schema: dict[str, Any], names: registry.Registry) -> dict[str, Any]:
+    text = {"type": "string", "examples": list(names)}
+    described = {"description": schema["description"]} if "description" in schema else {}
+    return {"anyOf": [text, {k: v for k, v in schema.items() if k != "description"}], **described}

@@ -1,0 +1,145 @@
+"""Exact instants: integer nanoseconds since 1970-01-01T00:00 UTC, written and read as ISO 8601 text."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import PydanticCustomError, core_schema
+
+SECOND = 1_000_000_000
+"""Nanoseconds in a second."""
+
+_EXAMPLES = ["2024-11-25T07:00:00Z", "2024-11-25T02:00-05:00", "2024-11-25 07:00:00.5"]
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_ISO = re.compile(
+    r"(?P<date>\d{4}-\d{2}-\d{2})"
+    r"(?:[Tt ]\s*(?P<hour>\d{2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,](?P<fraction>\d+))?)?)?"
+    r"\s*(?P<zone>[Zz]|UTC|(?P<sign>[-+])(?P<zone_hour>\d{2}):?(?P<zone_minute>\d{2})?)?"
+)
+
+
+@dataclass(frozen=True, order=True, repr=False)
+class Instant:
+    """An instant of UTC, exact to the nanosecond. A pydantic field type; ordered and hashable.
+
+    POSIX time: every day has 86400 seconds, so differences across a leap second (the last one ended 2016) are one second
+    short, and the leap second itself (23:59:60) has no name.
+    """
+
+    nanoseconds: int
+    """Nanoseconds since 1970-01-01T00:00:00 UTC."""
+
+    @classmethod
+    def parse(cls, value: Any) -> Instant:
+        """From ISO 8601 text (UTC unless it carries Z or an offset), a datetime (naive: UTC), an astropy Time or an Instant.
+
+        Raises `pydantic_core.PydanticCustomError` (a ValueError) that says what was expected.
+        """
+        if isinstance(value, Instant):
+            return value
+        if isinstance(value, datetime):
+            return cls._from_datetime(value)
+        if isinstance(value, str):
+            return cls._from_text(value)
+        if hasattr(value, "utc") and hasattr(value, "jd1"):
+            return cls._from_astropy(value)
+        raise PydanticCustomError(
+            "time_type", "expected a time such as '{eg}', got {got}", {"eg": _EXAMPLES[0], "got": repr(value)}
+        )
+
+    @classmethod
+    def _from_datetime(cls, value: datetime) -> Instant:
+        aware = value.replace(tzinfo=UTC) if value.tzinfo is None else value
+        since = aware - _EPOCH
+        return cls((since.days * 86400 + since.seconds) * SECOND + since.microseconds * 1000)
+
+    @classmethod
+    def _from_text(cls, text: str) -> Instant:
+        match = _ISO.fullmatch(text.strip())
+        if match is None:
+            raise PydanticCustomError(
+                "time_text",
+                "cannot read {got} as a time; write ISO 8601 text such as '{eg}'",
+                {"got": repr(text), "eg": _EXAMPLES[0], "label": "expected YYYY-MM-DDThh:mm[:ss][Z or an offset such as -05:00]"},
+            )
+        part = match.groupdict()
+        seconds = int(part["second"] or 0)
+        if seconds == 60:
+            raise PydanticCustomError(
+                "time_leap",
+                "{got} is a leap second, which POSIX time cannot name",
+                {"got": repr(text), "label": "add one second"},
+            )
+        fraction = part["fraction"] or ""
+        if len(fraction.rstrip("0")) > 9:
+            raise PydanticCustomError(
+                "time_digits",
+                "{got} has more than nine decimals of a second",
+                {"got": repr(text), "label": "times are exact to 1 ns"},
+            )
+        try:
+            zone: timezone = UTC
+            if part["sign"]:
+                minutes = int(part["zone_hour"]) * 60 + int(part["zone_minute"] or 0)
+                zone = timezone(timedelta(minutes=-minutes if part["sign"] == "-" else minutes))
+            day = datetime.fromisoformat(part["date"])
+            local = day.replace(hour=int(part["hour"] or 0), minute=int(part["minute"] or 0), second=seconds, tzinfo=zone)
+        except ValueError as err:
+            raise PydanticCustomError(
+                "time_range", "{got} is no time: {why}", {"got": repr(text), "why": str(err), "eg": _EXAMPLES[0]}
+            ) from None
+        return cls(cls._from_datetime(local).nanoseconds + int(fraction[:9].ljust(9, "0")))
+
+    @classmethod
+    def _from_astropy(cls, value: Any) -> Instant:
+        utc = value.utc
+        if not getattr(utc, "isscalar", True):
+            raise PydanticCustomError("time_scalar", "expected one time, got an array of {n}", {"n": int(utc.size)})
+        utc.precision = 9
+        return cls._from_text(str(utc.isot))
+
+    @property
+    def datetime(self) -> datetime:
+        """Aware UTC datetime, rounded down to its microsecond."""
+        return _EPOCH + timedelta(microseconds=self.nanoseconds // 1000)
+
+    @property
+    def posix(self) -> float:
+        """Seconds since 1970-01-01T00:00:00 UTC: a float64, which resolves 0.24 us today."""
+        whole, rest = divmod(self.nanoseconds, SECOND)
+        return whole + rest / SECOND
+
+    def seconds_since(self, other: Instant) -> float:
+        """``self - other`` in s; the difference is taken exactly and rounded once."""
+        return (self.nanoseconds - other.nanoseconds) / SECOND
+
+    def shifted(self, seconds: float) -> Instant:
+        """The instant ``seconds`` later; the shift is rounded to the nearest nanosecond, the sum is exact."""
+        whole = int(seconds)
+        return Instant(self.nanoseconds + whole * SECOND + round((seconds - whole) * SECOND))
+
+    def isoformat(self) -> str:
+        """ISO 8601 text that parses back to the same nanosecond, e.g. ``2024-11-25T07:00:00Z``."""
+        whole, rest = divmod(self.nanoseconds, SECOND)
+        text = (_EPOCH + timedelta(seconds=whole)).replace(tzinfo=None).isoformat()
+        return text + (f".{rest:09d}".rstrip("0") if rest else "") + "Z"
+
+    def __str__(self) -> str:
+        return self.isoformat()
+
+    def __repr__(self) -> str:
+        return f"Instant.parse({self.isoformat()!r})"
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            cls.parse, serialization=core_schema.plain_serializer_function_ser_schema(cls.isoformat, when_used="json")
+        )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"type": "string", "pattern": r"^\d{4}-\d{2}-\d{2}", "examples": _EXAMPLES}

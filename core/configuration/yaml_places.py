@@ -1,0 +1,237 @@
+"""YAML with places, and without the traps of YAML 1.1.
+
+Stock PyYAML reads ``-11:45:09`` as an integer of base 60, ``1e3`` as text, ``on`` as true and keeps the last of two equal
+keys. Here scalars follow the YAML 1.2 core schema, equal keys are errors, and every value knows where it stands.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+Path = tuple[Any, ...]
+"""Keys and indices that lead to a value: ("operators", 2, "BinMap", "pixel")."""
+
+MAXIMUM_VALUES = 100_000
+"""More values than this (nested aliases multiply) are refused."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A text and what to call it: a file's path, or ``--set``."""
+
+    name: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of a source; lines and columns count from 0, the end is exclusive."""
+
+    source: Source
+    line: int = 0
+    column: int = 0
+    end_line: int = 0
+    end_column: int = 1
+
+    def part(self, offset: int, length: int) -> Span:
+        """``length`` characters from ``offset`` on, where the stretch lies on one line and is not quoted."""
+        rows = self.source.text.splitlines()
+        first = rows[self.line][self.column : self.column + 1] if self.line < len(rows) else ""
+        if self.line != self.end_line or first in ("'", '"'):
+            return self
+        return Span(self.source, self.line, self.column + offset, self.line, self.column + offset + length)
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Where a value and its key stand."""
+
+    value: Span
+    key: Span | None = None
+
+    @property
+    def start(self) -> Span:
+        """The key where there is one, else the value."""
+        return self.key or self.value
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that is not valid YAML, or not in this file format."""
+
+    message: str
+    span: Span
+    label: str = ""
+
+
+@dataclass
+class Document:
+    """Plain dictionaries, lists and scalars; a `Mark` for every path in them; and what is wrong with the text."""
+
+    value: Any
+    marks: dict[Path, Mark]
+    faults: list[Fault]
+
+    def mark(self, path: Path) -> Mark:
+        """Mark of the value at ``path``, or of the nearest one above it."""
+        while path and path not in self.marks:
+            path = path[:-1]
+        return self.marks[path]
+
+    def put(self, path: Path, value: Document, key: Span) -> None:
+        """Replace or add the value at ``path``, whose parent must be a mapping or a list."""
+        parent = self.value
+        for part in path[:-1]:
+            parent = parent[part]
+        parent[path[-1]] = value.value
+        self.marks = {p: m for p, m in self.marks.items() if p[: len(path)] != path}
+        self.marks |= {(*path, *p): m for p, m in value.marks.items()}
+        self.marks[path] = Mark(value.marks[()].value, key)
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012
+
+
+class _Dumper(yaml.SafeDumper):
+    yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        super().increase_indent(flow, False)
+
+
+_FLOAT = r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$"
+for _class in (_Loader, _Dumper):
+    for _tag, _pattern, _first in [
+        ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
+        ("merge", r"^<<$", "<"),
+        ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+        ("int", r"^(?:[-+]?[0-9]+|0x[0-9a-fA-F]+|0o[0-7]+)$", "-+0123456789"),
+        ("float", _FLOAT, "-+0123456789."),
+    ]:
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
+
+
+def _integer(loader: Any, node: Any) -> int:
+    text = loader.construct_scalar(node)
+    return int(text, {"0x": 16, "0o": 8}.get(text[:2].lower(), 10))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+
+
+def load(source: Source, *, column: int = 0, text: str | None = None) -> Document:
+    """Read a YAML document from ``text`` (default: all of the source), whose first line begins at ``column``.
+
+    Never raises for bad text: what is wrong is in `Document.faults`, and what could be read in its value.
+    """
+    reader = _Reader(source, column)
+    try:
+        loader = _Loader(source.text if text is None else text)
+    except yaml.YAMLError as err:  # a character that YAML does not allow
+        reader.fault(err)
+        return reader.document(None)
+    try:
+        node = loader.get_single_node()
+        value = reader.build(loader, node, (), None, ()) if node is not None else None
+    except yaml.YAMLError as err:
+        reader.fault(err)
+        value = None
+    finally:
+        loader.dispose()
+    return reader.document(value)
+
+
+def dump(value: Any) -> str:
+    """YAML text that `load` reads back to the same value."""
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10_000, default_flow_style=False)
+
+
+class _TooMany(yaml.YAMLError):
+    pass
+
+
+class _Reader:
+    def __init__(self, source: Source, column: int) -> None:
+        self.source, self.column = source, column
+        self.marks: dict[Path, Mark] = {}
+        self.faults: list[Fault] = []
+
+    def document(self, value: Any) -> Document:
+        self.marks.setdefault((), Mark(Span(self.source, 0, self.column, 0, max(self.column + 1, len(self.source.text)))))
+        return Document(value, self.marks, self.faults)
+
+    def span(self, node: Any) -> Span:
+        a, b = node.start_mark, node.end_mark
+        shift, end_shift = (self.column if a.line == 0 else 0), (self.column if b.line == 0 else 0)
+        return Span(self.source, a.line, a.column + shift, b.line, b.column + end_shift)
+
+    def fault(self, err: yaml.YAMLError) -> None:
+        if isinstance(err, _TooMany):
+            self.faults.append(Fault(str(err), Span(self.source)))
+        elif isinstance(err, yaml.MarkedYAMLError):
+            mark = err.problem_mark or err.context_mark
+            rows = self.source.text.splitlines() or [""]
+            line, column = (mark.line, mark.column) if mark else (0, 0)
+            column += self.column if line == 0 else 0
+            if line >= len(rows):  # past the end
+                line, column = len(rows) - 1, len(rows[-1])
+            message = f"not valid YAML: {err.problem or err.context}"
+            row = rows[line]
+            label = "indent with spaces, not tabs" if "\t" in row[: column + 1] else ""
+            self.faults.append(Fault(message, Span(self.source, line, column, line, column + 1), label))
+        else:
+            at = getattr(err, "position", 0)
+            line = self.source.text.count("\n", 0, at)
+            column = at - (self.source.text.rfind("\n", 0, at) + 1)
+            reason = f"not valid YAML: {getattr(err, 'reason', err)}"
+            self.faults.append(Fault(reason, Span(self.source, line, column, line, column + 1)))
+
+    def build(self, loader: Any, node: Any, path: Path, key: Span | None, above: tuple[int, ...]) -> Any:
+        span = self.span(node)
+        if id(node) in above:
+            self.faults.append(Fault("an alias may not stand inside what it names", span))
+            return None
+        if len(self.marks) > MAXIMUM_VALUES:
+            raise _TooMany(f"more than {MAXIMUM_VALUES} values")
+        self.marks[path] = Mark(span, key)
+        above = (*above, id(node))
+        if isinstance(node, yaml.SequenceNode):
+            return [self.build(loader, item, (*path, i), None, above) for i, item in enumerate(node.value)]
+        if isinstance(node, yaml.MappingNode):
+            return self.mapping(loader, node, path, above)
+        return self.scalar(loader, node)
+
+    def mapping(self, loader: Any, node: Any, path: Path, above: tuple[int, ...]) -> dict[Any, Any]:
+        first: dict[str, Any] = {}
+        for key, _ in node.value:  # before merging, where the same key is an override
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                if key.value in first:
+                    line = first[key.value].start_mark.line + 1
+                    self.faults.append(Fault(f"duplicate key '{key.value}'", self.span(key), f"first given on line {line}"))
+                first.setdefault(key.value, key)
+        loader.flatten_mapping(node)
+        result: dict[Any, Any] = {}
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                self.faults.append(Fault("a key must be plain text", self.span(key)))
+                continue
+            name = key.value if key.tag != "tag:yaml.org,2002:str" else self.scalar(loader, key)
+            result[name] = self.build(loader, value, (*path, name), self.span(key), above)
+        return result
+
+    def scalar(self, loader: Any, node: Any) -> Any:
+        try:
+            return loader.construct_object(node, deep=True)
+        except ValueError as err:  # e.g. an integer of more digits than Python reads
+            self.faults.append(Fault(f"cannot be read: {err}", self.span(node)))
+        except yaml.MarkedYAMLError as err:  # e.g. a tag !like_this
+            self.fault(err)
+        return None

@@ -1,0 +1,282 @@
+"""What flows: the scene, its observations, the blocks that operators work on, and the products."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .focalplane import Focalplane
+from .random import stream_key
+from .smooth import SmoothField
+
+if TYPE_CHECKING:
+    from .configuration.time import Instant
+    from .instrument import Instrument
+    from .scene import Scene
+    from .site import Site
+
+Floats = NDArray[np.floating]
+
+
+class Tally:
+    """Counts and figures that the user must know of: what was clipped, dropped, approximated. Thread-safe.
+
+    Keys are (who, what): the operator's label and a short phrase with its unit, e.g.
+    ``("SkyMap", "samples outside the input map")``.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: dict[tuple[str, str], int] = {}
+        self._figures: dict[tuple[str, str], str] = {}
+
+    def count(self, who: str, what: str, number: int) -> None:
+        """Add ``number`` to a count (a count of zero is kept: it says that nothing happened)."""
+        with self._lock:
+            self._counts[who, what] = self._counts.get((who, what), 0) + int(number)
+
+    def state(self, who: str, what: str, text: str) -> None:
+        """Record a figure or a choice as text; the last statement wins."""
+        with self._lock:
+            self._figures[who, what] = text
+
+    def update(self, other: Tally, prefix: str = "") -> None:
+        """Add another tally's counts and statements, ``prefix`` before their operators' labels."""
+        for (who, what), number in other._counts.items():
+            self.count(prefix + who, what, number)
+        for (who, what), text in other._figures.items():
+            self.state(prefix + who, what, text)
+
+    def __iter__(self) -> Iterator[tuple[str, str, str]]:
+        """Rows (who, what, value) in a fixed order."""
+        with self._lock:
+            rows = [(*k, f"{v}") for k, v in self._counts.items()] + [(*k, v) for k, v in self._figures.items()]
+        return iter(sorted(rows))
+
+    def get(self, who: str, what: str) -> int:
+        """A count, 0 where there is none."""
+        return self._counts.get((who, what), 0)
+
+
+@dataclass
+class Observation:
+    """One continuous scan.
+
+    Attributes
+    ----------
+    name, index
+        Unique name and position in `Data.observations`.
+    start
+        Exact start instant.
+    seconds
+        (n_samp,) float64, seconds since ``start``.
+    sample_rate
+        Hz.
+    boresight_azel, boresight_radec
+        (n_samp, 4) float64 quaternions (x, y, z, w), exactly TOAST's: Rz(lon) Ry(pi/2 - lat) Rz(psi), lon = -az for azel.
+    centre
+        ICRS (ra, dec) [rad] of the scan's target without its per-scan offset: the default map centre.
+    flags, detector_flags
+        (n_samp,) and (n_det,) uint8; nonzero means: do not use.
+    smooth
+        Slowly varying float64 fields: ``atmosphere`` (mean emission at the detector before efficiency, K_RJ) and
+        ``transmission`` (band-mean e^-tau at the mean PWV), each a `SmoothField`. Set by operators in ``prepare``.
+    detdata
+        (n_det, n_samp) arrays that an output asked to keep.
+    resolved
+        What operators resolved for one another (noise levels). It outlives the main run: companion runs use the same.
+    tally
+        What was counted or approximated.
+    output
+        Folder (Path) for files that are written while the scan runs (see `Data.output`).
+    """
+
+    name: str
+    index: int
+    site: Site
+    instrument: Instrument
+    focalplane: Focalplane
+    start: Instant
+    seconds: NDArray[np.float64]
+    sample_rate: float
+    boresight_azel: NDArray[np.float64]
+    boresight_radec: NDArray[np.float64]
+    centre: tuple[float, float]
+    seed: int
+    flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    detector_flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    smooth: dict[str, SmoothField] = field(default_factory=dict)
+    detdata: dict[str, Floats] = field(default_factory=dict)
+    resolved: dict[str, Any] = field(default_factory=dict)
+    tally: Tally = field(default_factory=Tally)
+    output: Any = None
+
+    def __post_init__(self) -> None:
+        if not self.flags.size:
+            self.flags = np.zeros(self.n_samples, np.uint8)
+        if not self.detector_flags.size:
+            self.detector_flags = np.zeros(self.n_detectors, np.uint8)
+
+    @property
+    def n_samples(self) -> int:
+        return len(self.seconds)
+
+    @property
+    def n_detectors(self) -> int:
+        return len(self.focalplane)
+
+    @property
+    def duration(self) -> float:
+        """n_samples / sample_rate, s."""
+        return self.n_samples / self.sample_rate
+
+    def key(self, *names: str | int) -> NDArray[np.uint32]:
+        """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""
+        return stream_key(self.seed, "observation", self.index, *names)
+
+    def derotate(self, which: str) -> tuple[Floats, Floats, Floats]:
+        """(lon, lat, psi) of ``boresight_azel`` or ``boresight_radec`` [rad]; for azel lon = -azimuth."""
+        x, y, z, w = getattr(self, which).T
+        lat = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
+        lon = np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
+        psi = np.arctan2(2 * (y * z + w * x), -2 * (x * z - w * y))
+        return lon % (2 * np.pi), lat, psi
+
+    @property
+    def azimuth(self) -> Floats:
+        """(n_samp,) rad, north through east, 0 to 2 pi."""
+        return (-self.derotate("boresight_azel")[0]) % (2 * np.pi)
+
+    @property
+    def elevation(self) -> Floats:
+        """(n_samp,) rad."""
+        return self.derotate("boresight_azel")[1]
+
+    @property
+    def ra(self) -> Floats:
+        """(n_samp,) rad, ICRS."""
+        return self.derotate("boresight_radec")[0]
+
+    @property
+    def dec(self) -> Floats:
+        """(n_samp,) rad, ICRS."""
+        return self.derotate("boresight_radec")[1]
+
+    def __repr__(self) -> str:
+        return f"<Observation {self.name}: {self.n_detectors} detectors x {self.n_samples} samples at {self.sample_rate:g} Hz>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("instrument", self.instrument.name),
+            ("site", self.site.name),
+            ("start", str(self.start)),
+            ("duration", f"{self.duration:.1f} s at {self.sample_rate:g} Hz"),
+            ("detectors", self.n_detectors),
+            ("elevation", f"{np.degrees(self.elevation.min()):.2f} to {np.degrees(self.elevation.max()):.2f} deg"),
+        ]
+        return html_table(f"Observation {self.name}", rows)
+
+
+@dataclass
+class Block:
+    """A rectangle of detectors x samples of one observation, on which `Operator.exec` works.
+
+    Attributes
+    ----------
+    observation
+        The scan it belongs to. Read only inside ``exec``.
+    detectors, samples
+        Absolute ranges (slices with start and stop, step None).
+    detdata
+        Named streams, each (n_det_block, n_samp_block) of `dtype`, C-contiguous. The signal components are `sky`
+        (main-beam sky signal above the atmosphere), `atmosphere` (fluctuation of the emission about its mean, before
+        efficiency), `transmission` (relative fluctuation of e^-tau about its mean), `white` and `pink` (at the detector),
+        all K_RJ but `transmission`; `signal` is the calibrated sum.
+    means
+        What must be added to a stream in float64 to have all of it, by stream name: the smooth mean emission.
+    dtype
+        float32 or float64: the type of every stream.
+    """
+
+    observation: Observation
+    detectors: slice
+    samples: slice
+    detdata: dict[str, Floats] = field(default_factory=dict)
+    means: dict[str, SmoothField] = field(default_factory=dict)
+    dtype: type[np.floating[Any]] = np.float32
+    buffers: dict[str, Floats] = field(default_factory=dict, repr=False)
+    """Memory reused from block to block; `exec` must not keep a stream beyond the call."""
+    places: dict[str, Floats] = field(default_factory=dict, repr=False)
+    """Where the executor wants a stream to be made, so that it need not be copied there."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.detectors.stop - self.detectors.start, self.samples.stop - self.samples.start
+
+    def new(self, name: str) -> Floats:
+        """Stream ``name``, made of zeros when it is not there yet."""
+        if name not in self.detdata:
+            self.detdata[name] = self.places[name] if name in self.places else self.buffer(name, self.shape)
+            self.detdata[name].fill(0)
+        return self.detdata[name]
+
+    def buffer(self, name: str, shape: tuple[int, int]) -> Floats:
+        """An uninitialized array of `dtype`, reused between blocks under this name."""
+        size = shape[0] * shape[1]
+        held = self.buffers.get(name)
+        if held is None or held.size < size or held.dtype != self.dtype:
+            held = self.buffers[name] = np.empty(size, self.dtype)
+        return held[:size].reshape(shape)
+
+    def total(self, name: str) -> NDArray[np.float64]:
+        """Stream plus its mean, float64: (n_det_block, n_samp_block). A copy."""
+        whole = self.detdata[name].astype(np.float64)
+        if name in self.means:
+            whole += self.means[name].evaluate(self.detectors, self.samples)
+        return whole
+
+
+@dataclass
+class Data:
+    """The scene, its observations, and what came out of them.
+
+    ``products`` maps names to whatever operators made (maps, spectra, file paths); products of a companion run (see
+    `Pipeline.runs`) carry its name and a slash: ``noiseless/map``.
+    """
+
+    scene: Scene
+    observations: list[Observation] = field(default_factory=list)
+    products: dict[str, Any] = field(default_factory=dict)
+    tally: Tally = field(default_factory=Tally)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    output: Any = None
+    """Folder (Path) that products are written to; None: nothing is written."""
+    run: str = ""
+    """Name of the companion run in progress; empty in the main run."""
+
+    def product(self, name: str) -> str:
+        """The key of a product of the run in progress."""
+        return f"{self.run}/{name}" if self.run else name
+
+    def __repr__(self) -> str:
+        return f"<Data: {len(self.observations)} observations, products {sorted(self.products)}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(
+            "Data",
+            [(o.name, f"{o.n_detectors} x {o.n_samples}") for o in self.observations]
+            + [("products", ", ".join(sorted(self.products)))],
+        )
+
+
+def html_table(title: str, rows: list[tuple[Any, Any]]) -> str:
+    """A two-column table for notebooks; everything is escaped."""
+    from html import escape
+
+    body = "".join(f"<tr><th style='text-align:left'>{escape(str(a))}</th><td>{escape(str(b))}</td></tr>" for a, b in rows)
+    return f"<table><caption>{escape(title)}</caption>{body}</table>"

@@ -1,0 +1,41 @@
+"""Errors that a user can mend. Each names the place, the cause and the cure; the CLI prints them without a traceback."""
+
+from __future__ import annotations
+
+
+class ZondaError(Exception):
+    """Base of every error that is the user's to mend (exit code 2 at the command line).
+
+    Parameters
+    ----------
+    message
+        The cause, one sentence, lower case, no full stop.
+    place
+        Where: a file, a key, an operator, an observation. May be empty.
+    cure
+        What to do about it. May be empty.
+    """
+
+    def __init__(self, message: str, *, place: str = "", cure: str = "") -> None:
+        super().__init__(message)
+        self.message, self.place, self.cure = message, place, cure
+
+    def __str__(self) -> str:
+        text = f"{self.place}: {self.message}" if self.place else self.message
+        return f"{text}\n  = {self.cure}" if self.cure else text
+
+
+class InputError(ZondaError):
+    """A file or array given by the user cannot be used (missing, unreadable, wrong unit, NaN, no WCS ...)."""
+
+
+class OutputError(ZondaError):
+    """A product cannot be written (folder not writable, disk full ...)."""
+
+
+class PointingError(ZondaError):
+    """The telescope cannot point there (target never up, outside the elevation limits ...)."""
+
+
+class PipelineError(ZondaError):
+    """The operators of a pipeline do not fit together (missing input, wrong order, too little memory ...)."""

@@ -1,0 +1,80 @@
+"""The table of detectors: where they look, how large their beams are, how noisy they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class Focalplane:
+    """Detectors of one instrument. Every array has shape (n_det,).
+
+    Attributes
+    ----------
+    names
+        Unique detector names.
+    xi, eta
+        Gnomonic tangent-plane offsets from the boresight [tan(rad)], xi towards increasing azimuth, eta towards
+        increasing elevation. In TOAST's boresight frame the direction is proportional to (-eta, -xi, 1).
+    polarization_angle
+        rad, COSMO convention, from the focal plane's +X (TOAST) axis.
+    fwhm
+        Main-beam full width at half maximum on the sky, rad.
+    main_beam_efficiency
+        zeta of the paper: the share of an astronomical signal that the main beam delivers.
+    illumination_efficiency
+        epsilon of the paper: the share of the atmosphere's emission that reaches the detector.
+    net
+        Noise-equivalent temperature on the sky, K_RJ sqrt(s): the rms of one second of integration.
+    band
+        Name of the band each detector observes in.
+    """
+
+    names: list[str]
+    xi: Floats
+    eta: Floats
+    fwhm: Floats
+    main_beam_efficiency: Floats
+    illumination_efficiency: Floats
+    net: Floats
+    polarization_angle: Floats = field(default_factory=lambda: np.zeros(0))
+    band: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if not self.polarization_angle.size:
+            self.polarization_angle = np.zeros(n)
+        if not self.band:
+            self.band = [""] * n
+        if len(set(self.names)) != n:
+            twice = sorted({d for d in self.names if self.names.count(d) > 1})
+            raise InputError(f"detector names must be unique; {twice[0]!r} is there twice", place="focal plane")
+        for f in fields(self):
+            value: Any = getattr(self, f.name)
+            if len(value) != n:
+                raise InputError(f"{f.name} has {len(value)} entries for {n} detectors", place="focal plane")
+            if isinstance(value, np.ndarray):
+                setattr(self, f.name, np.asarray(value, np.float64))
+                if not np.isfinite(value).all():
+                    bad = self.names[int(np.flatnonzero(~np.isfinite(value))[0])]
+                    raise InputError(f"{f.name} of detector {bad} is not finite", place="focal plane")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of a detector from the boresight, tan(rad)."""
+        return float(np.hypot(self.xi, self.eta).max()) if len(self) else 0.0
+
+    def copy(self) -> Focalplane:
+        """An independent copy (an observation may change its own, e.g. `Efficiency` sets the efficiencies)."""
+        return Focalplane(**{f.name: getattr(self, f.name).copy() for f in fields(self)})

@@ -1,0 +1,99 @@
+"""An operator: a checked set of parameters and the steps in which it acts on the data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import PrivateAttr
+
+from .configuration.parameters import Parameters
+
+if TYPE_CHECKING:
+    from .data import Block, Data, Observation
+    from .execution import Stream
+
+API_VERSION = 1
+"""Version of the contract below; a plugin written for another one is refused with a message that says so."""
+
+
+class Operator(Parameters):
+    """Base class of operators.
+
+    A pipeline calls, in this order:
+
+    1. ``observe(data)`` once, in order: pointing operators append `Observation`s.
+    2. For each observation, ``configure(observation)`` of every operator (resolve values that others need: efficiencies,
+       NET), then ``prepare(observation) -> state`` of every operator (draw turbulence, build coefficients).
+    3. ``exec(block, state)`` for every block. Called from several threads at once: the state is read only, or guarded.
+       Its result may depend on absolute detector and sample indices only, never on where the block begins or ends.
+    4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
+    5. ``finalize(data)`` once at the end of the run: turn sums into products, write files.
+
+    Class attributes
+    ----------------
+    requires, provides
+        Names of data read and written; checked before anything runs. ``boresight`` comes from a pointing operator; block
+        streams are ``sky, atmosphere, transmission, white, pink, signal``; products are named by their makers.
+    optional
+        Names it uses when an earlier or later operator provides them.
+    couples
+        What one output sample depends on: ``sample`` (itself alone, plus `halo` neighbours), ``detectors`` (all detectors
+        at that instant), ``time`` (one detector's whole scan), ``all``. An ``all`` operator implements
+        ``measure(stream, state)``, which reads the whole stream as often as it likes; its ``exec`` then works like that of
+        a ``sample`` operator.
+    main_run_only
+        True for operators left out of companion runs (spectra, saved time streams).
+    at_end
+        True for operators that only act in `finalize` (plots, reports): they run once, after all companion runs.
+    """
+
+    zonda_api: ClassVar[int] = API_VERSION
+    requires: ClassVar[frozenset[str]] = frozenset()
+    provides: ClassVar[frozenset[str]] = frozenset()
+    optional: ClassVar[frozenset[str]] = frozenset()
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
+    main_run_only: ClassVar[bool] = False
+    at_end: ClassVar[bool] = False
+
+    name: str | None = None
+    """Label of this step in messages, products and random streams; the class name where absent."""
+
+    _label: str = PrivateAttr("")
+
+    @property
+    def label(self) -> str:
+        """Unique name of this step in its pipeline (the pipeline numbers namesakes: ``WhiteNoise``, ``WhiteNoise.2``)."""
+        return self._label or self.name or type(self).__name__
+
+    def observe(self, data: Data) -> None:
+        """Append observations to ``data`` (pointing operators), or look at those that are there (map makers: a common grid)."""
+
+    def configure(self, observation: Observation) -> None:
+        """Resolve values that other operators read, e.g. the focal plane's efficiencies."""
+
+    def prepare(self, observation: Observation) -> Any:
+        """Return what `exec` needs for this observation. It may set ``observation.smooth`` fields."""
+        return None
+
+    def halo(self, observation: Observation) -> int:
+        """Samples on each side of a block that `exec` needs to be right inside it (a finite filter's half-length)."""
+        return 0
+
+    def measure(self, stream: Stream, state: Any) -> None:
+        """Read the whole stream (``couples = "all"`` only); leave the result in ``state``."""
+
+    def exec(self, block: Block, state: Any) -> None:
+        """Act on one block."""
+
+    def collect(self, data: Data, observation: Observation, state: Any) -> None:
+        """Add this observation's partial products to ``data.products``."""
+
+    def discard(self, observation: Observation, state: Any) -> None:
+        """Undo what `prepare` and `exec` began (temporary files): called instead of `collect` when the run fails."""
+
+    def finalize(self, data: Data) -> None:
+        """Finish products."""
+
+    def __repr__(self) -> str:
+        given = ", ".join(f"{k}={getattr(self, k)!r}" for k in sorted(self.model_fields_set))
+        return f"{type(self).__name__}({given})"

@@ -1,0 +1,283 @@
+"""An ordered list of operators: checked before it runs, then run over every observation."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from .configuration.parameters import Parameters
+from .data import Data, Tally, html_table
+from .errors import PipelineError
+from .execution import Execution, Settings, Timer, available_memory, available_threads
+from .operator import Operator
+
+if TYPE_CHECKING:
+    from .scene import Scene
+
+
+class Companion(Parameters):
+    """A companion run: the same pipeline and random numbers with some signal components absent."""
+
+    only: list[str] | None = Field(None, min_length=1)
+    """Components to keep (e.g. [sky]: the noiseless run); all others are left out."""
+    without: list[str] | None = Field(None, min_length=1)
+    """Components to leave out (e.g. [sky]: the source-free run)."""
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Companion:
+        if (self.only is None) == (self.without is None):
+            raise ValueError("give either only or without")
+        return self
+
+    def keeps(self, provides: frozenset[str]) -> bool:
+        """Whether an operator that provides these components takes part."""
+        if self.only is not None:
+            return bool(provides & set(self.only))
+        return not provides & set(self.without or ())
+
+
+@dataclass(frozen=True)
+class OrderProblem:
+    """A step that does not fit where it stands."""
+
+    index: int
+    message: str
+    label: str
+    cure: str = ""
+
+
+def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
+    """Every step whose inputs are not there yet, or whose output comes too late to be used."""
+    problems = []
+    have: set[str] = set()
+    for index, operator in enumerate(operators):
+        name = type(operator).__name__
+        later = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides}
+        for what in sorted(operator.requires - have):
+            if what in later:
+                problems.append(
+                    OrderProblem(
+                        index, f"{name} needs {what}, which {later[what]} provides only later", f"move it below {later[what]}"
+                    )
+                )
+            else:
+                problems.append(
+                    OrderProblem(index, f"{name} needs {what}, which no step provides", f"add a step that provides {what} above")
+                )
+        for what in sorted((operator.optional - operator.requires) & set(later)):
+            if not operator.at_end:
+                problems.append(
+                    OrderProblem(
+                        index, f"{later[what]} provides {what} only after {name} has used it", f"move {name} below {later[what]}"
+                    )
+                )
+        if operator.couples == "all" and len(operator.requires - {"boresight"}) != 1:
+            problems.append(
+                OrderProblem(
+                    index,
+                    f"{name} couples all samples but requires {len(operator.requires)} streams",
+                    "it must require exactly one",
+                )
+            )
+        have |= operator.provides
+    if operators and not any("boresight" in o.provides | o.requires for o in operators):
+        problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step, e.g. PointingDaisy"))
+    return problems
+
+
+class Pipeline:
+    """Operators in the order in which they act.
+
+    Parameters
+    ----------
+    operators
+        The steps. Namesakes are numbered (``WhiteNoise``, ``WhiteNoise.2``).
+    runs
+        Companion runs by name, e.g. ``{"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}``.
+    name, description
+        Shown in products.
+    precision
+        Type of the time streams. float32 carries fluctuations of some kelvin to 1e-7 K (the mean emission is kept apart in
+        float64); float64 is for common modes 1e6 times the signal.
+
+    Raises
+    ------
+    PipelineError
+        When a step's inputs are missing or come too late; the message names every such step.
+    """
+
+    def __init__(
+        self,
+        operators: Iterable[Operator],
+        *,
+        runs: Mapping[str, Companion | Mapping[str, Any]] | None = None,
+        name: str = "pipeline",
+        description: str = "",
+        precision: Literal["float32", "float64"] = "float32",
+    ) -> None:
+        self.operators = [o.model_copy() for o in operators]  # labels are this pipeline's own
+        self.runs = {k: v if isinstance(v, Companion) else Companion.model_validate(v) for k, v in (runs or {}).items()}
+        self.name, self.description, self.precision = name, description, precision
+        self._name_steps()
+        if problems := check_order(self.operators):
+            lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
+            raise PipelineError("\n".join(lines), place=self.name)
+        self._check_runs()
+
+    def _name_steps(self) -> None:
+        seen: dict[str, int] = {}
+        for operator in self.operators:
+            base = operator.name or type(operator).__name__
+            seen[base] = seen.get(base, 0) + 1
+            operator._label = base if seen[base] == 1 else f"{base}.{seen[base]}"
+
+    def _check_runs(self) -> None:
+        components = sorted(set().union(*(o.provides for o in self._generators())))
+        for name, companion in self.runs.items():
+            if not name.isidentifier():
+                raise PipelineError(f"{name!r} cannot name a run", place=self.name, cure="use letters, digits and underscores")
+            for what in [*(companion.only or ()), *(companion.without or ())]:
+                if what not in components:
+                    raise PipelineError(
+                        f"run {name} names {what!r}, which no step provides",
+                        place=self.name,
+                        cure=f"choose from: {', '.join(components)}",
+                    )
+
+    def _generators(self) -> list[Operator]:
+        """The operators that make signal components: those before `signal` is formed, pointing aside."""
+        found = []
+        for operator in self.operators:
+            if "signal" in operator.provides:
+                break
+            if operator.provides and "boresight" not in operator.provides:
+                found.append(operator)
+        return found
+
+    def _selected(self, run: str) -> list[Operator]:
+        steps = [o for o in self.operators if not o.at_end and "boresight" not in o.provides]
+        if not run:
+            return steps
+        dropped = {o.label for o in self._generators() if not self.runs[run].keeps(o.provides)}
+        return [o for o in steps if o.label not in dropped and not o.main_run_only]
+
+    def run(
+        self,
+        scene: Scene,
+        *,
+        output: str | Path | None = None,
+        threads: int | None = None,
+        memory: int | None = None,
+        keep: Sequence[str] = (),
+        provenance: Mapping[str, Any] | None = None,
+    ) -> Data:
+        """Observe the scene and return what came out.
+
+        Parameters
+        ----------
+        scene
+            What exists.
+        output
+            Folder for files; None: operators that write are refused (see `SaveMap`).
+        threads
+            Threads; default: the CPUs this process may use. Results do not depend on it.
+        memory
+            Budget for streams and blocks in bytes; default: half of the free memory. Results do not depend on it.
+        keep
+            Streams to keep in ``observation.detdata`` (float64, mean emission included) as they stand after the last step.
+        provenance
+            Entries added to ``data.provenance``.
+        """
+        from .files import check_output_folder
+        from .hooks import manager
+
+        hooks = manager().hook
+        data = Data(scene=scene, output=None if output is None else Path(output))
+        if data.output is not None:
+            check_output_folder(data.output)
+        data.provenance = {**self._provenance(scene), **(provenance or {})}
+        settings = Settings(
+            threads=threads or available_threads(),
+            memory=memory or available_memory() // 2,
+            dtype=np.float64 if self.precision == "float64" else np.float32,
+            progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
+        )
+        timer = Timer()
+        hooks.zonda_pipeline_start(pipeline=self, data=data)
+        for operator in self.operators:
+            start = time.thread_time()
+            operator.observe(data)  # pointing steps append observations; map makers lay out the grid of all of them
+            timer.add(operator.label, "observe", time.thread_time() - start)
+        if not data.observations:
+            raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
+        pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
+        for run in ["", *self.runs]:
+            data.run = run
+            steps = self._selected(run)
+            for observation, (focalplane, flags, detector_flags) in zip(data.observations, pristine, strict=True):
+                pointing_tally, observation.tally = observation.tally, Tally()
+                observation.focalplane, observation.smooth = focalplane.copy(), {}
+                observation.output = data.output
+                observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
+                execution = Execution(steps, observation, settings, timer, keep if not run else ())
+                execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator)
+                data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
+                if not run:
+                    data.tally.update(pointing_tally)
+            for operator in steps:
+                self._finalize(operator, data, timer, hooks)
+        data.run = ""
+        data.provenance["timings"] = [(label, stage, seconds) for (label, stage), seconds in timer.seconds.items()]
+        for operator in self.operators:
+            if operator.at_end:
+                self._finalize(operator, data, timer, hooks)
+        hooks.zonda_pipeline_end(pipeline=self, data=data)
+        return data
+
+    def _finalize(self, operator: Operator, data: Data, timer: Timer, hooks: Any) -> None:
+        hooks.zonda_before_operator(operator=operator, observation=None, stage="finalize")
+        start = time.thread_time()
+        operator.finalize(data)
+        used = time.thread_time() - start
+        timer.add(operator.label, "finalize", used)
+        hooks.zonda_after_operator(operator=operator, observation=None, stage="finalize", seconds=used)
+
+    def _provenance(self, scene: Scene) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "description": self.description,
+            "seed": scene.seed,
+            "precision": self.precision,
+            "runs": {k: v.model_dump(exclude_none=True) for k, v in self.runs.items()},
+            "versions": versions(),
+            "operators": [
+                (o.label, type(o).__name__, {k: str(v) for k, v in o.model_dump(mode="json", exclude_none=True).items()})
+                for o in self.operators
+            ],
+        }
+
+    def __repr__(self) -> str:
+        return f"<Pipeline {self.name}: {' > '.join(o.label for o in self.operators)}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(f"Pipeline {self.name}", [(o.label, repr(o)) for o in self.operators])
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that can change a number."""
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for package in ("zonda", "numpy", "scipy", "astropy", "astropy-iers-data", "numba", "healpy", "h5py"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

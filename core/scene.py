@@ -1,0 +1,46 @@
+"""What exists: the site, the instrument, the time, the target and the seed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field, field_validator
+
+from .configuration.parameters import Parameters
+from .configuration.target import Target
+from .configuration.time import Instant
+from .instrument import Instrument
+from .site import Site
+
+
+class Scene(Parameters):
+    """What exists while the pipeline observes. `site` and `instrument` take a registered name or an object."""
+
+    site: Site
+    """Where the telescope stands: a registered name (`zonda plugins`) or a Site."""
+    instrument: Instrument
+    """Telescope and camera: a registered name (`zonda plugins`) or an Instrument."""
+    time: Instant
+    """Start of the first scan, UTC unless it carries an offset, e.g. 2024-11-25T07:00 or 2024-11-25T02:00-05:00."""
+    target: Target | None = None
+    """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or {az: 180 deg, el: 60 deg}."""
+    seed: int = Field(0, ge=0, lt=2**63)
+    """Root of every random stream; the same seed gives the same bits."""
+
+    @field_validator("site", mode="before")
+    @classmethod
+    def _site_by_name(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            from .registry import sites
+
+            return sites.create(value)
+        return value
+
+    @field_validator("instrument", mode="before")
+    @classmethod
+    def _instrument_by_name(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            from .registry import instruments
+
+            return instruments.create(value)
+        return value

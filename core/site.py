@@ -1,0 +1,27 @@
+"""Where a telescope stands."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from .configuration.parameters import Parameters, quantity
+from .configuration.units import Angle, Metres
+
+
+class Site(Parameters):
+    """A place on the Earth (WGS84 geodetic) and the climatology that describes the air above it."""
+
+    name: str
+    """Registered name."""
+    description: str = ""
+    """One line for `zonda plugins`."""
+    latitude: Angle = Field(ge=-1.5707963267948966, le=1.5707963267948966)
+    """Geodetic latitude, north positive."""
+    longitude: Angle = Field(ge=-6.283185307179586, le=6.283185307179586)
+    """Longitude, east positive."""
+    altitude: Metres = quantity("0 m", ge=-500, le=9000)
+    """Height above the ellipsoid."""
+    climatology: str | None = None
+    """Name of the embedded climatology (see `zonda.operators.atmosphere.weather`), where there is one."""
+    provenance: str = ""
+    """Where these numbers come from."""

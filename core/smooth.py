@@ -1,0 +1,128 @@
+"""Fields that vary slowly over the focal plane and in time, kept at nodes and evaluated where they are wanted.
+
+A field is stored as cubic B-spline coefficients in time at ``n_node`` focal-plane nodes:
+
+    f(d, t) = sum_n weights[d, n] * sum_j coefficients[n, m + j] * B_j(r / step),   t = m * step + r,  j = 0..3     (1)
+
+with B_j the four cubic B-spline weights. Both the mean emission of the atmosphere (float64: microkelvin under tens of
+kelvin) and its turbulent part (float32) are such fields; see ``docs/atmosphere.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+
+PAD = 1
+"""Coefficients before the first sample's interval, so that every sample has its four neighbours."""
+
+
+def coarse_times(n_samples: int, step: int) -> NDArray[np.int64]:
+    """Sample indices (may be negative or past the end) of the coefficients that cover ``n_samples`` samples.
+
+    Shape (ceil(n_samples / step) + 3,): index k stands at sample (k - PAD) * step.
+    """
+    cells = -(-n_samples // step)
+    return (np.arange(cells + 3, dtype=np.int64) - PAD) * step
+
+
+def bspline_weights(step: int, dtype: type = np.float64) -> Floats:
+    """The four cubic B-spline weights at r = 0 .. step - 1. Shape (4, step)."""
+    u = np.arange(step) / step
+    v = 1.0 - u
+    return np.array([v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6]).astype(dtype)
+
+
+@dataclass(frozen=True)
+class SmoothField:
+    """Equation (1).
+
+    Attributes
+    ----------
+    weights
+        (n_det, n_node): interpolation from nodes to detectors (any per-detector gain is absorbed here).
+    coefficients
+        (n_node, ceil(n_samples / step) + 3): B-spline coefficients in time; index k stands at sample (k - 1) * step.
+    step
+        Samples between coefficients; a power of two, so that blocks never cut an interval (see `core.execution`).
+    n_samples
+        Samples covered.
+    """
+
+    weights: Floats
+    coefficients: Floats
+    step: int
+    n_samples: int
+
+    @classmethod
+    def from_values(cls, weights: Floats, values: Floats, step: int, n_samples: int, dtype: type = np.float64) -> SmoothField:
+        """From node values with a margin: ``values`` (n_node, n_coarse + 2 * margin) sampled every ``step`` samples.
+
+        The margin (equal on both sides, inferred from the width) is used by the spline prefilter and then dropped;
+        12 coefficients make the edge effect of the mirror boundary < 2e-7.
+        """
+        from scipy.ndimage import spline_filter1d
+
+        wanted = -(-n_samples // step) + 3
+        margin, odd = divmod(values.shape[1] - wanted, 2)
+        if margin < 0 or odd:
+            raise ValueError(f"values must have {wanted} + 2 * margin columns, got {values.shape[1]}")
+        filtered = spline_filter1d(np.asarray(values, np.float64), 3, axis=1, mode="mirror")
+        kept = np.ascontiguousarray(filtered[:, margin : margin + wanted])
+        return cls(np.ascontiguousarray(weights, dtype), kept.astype(dtype), step, n_samples)
+
+    @classmethod
+    def constant(cls, per_detector: Floats, n_samples: int, step: int = 2048) -> SmoothField:
+        """A field that does not vary in time: ``per_detector`` (n_det,)."""
+        ones = np.ones((1, -(-n_samples // step) + 3))
+        return cls(np.ascontiguousarray(np.asarray(per_detector, np.float64)[:, None]), ones, step, n_samples)
+
+    def scaled(self, per_detector: Floats) -> SmoothField:
+        """The field times a per-detector factor (n_det,)."""
+        return SmoothField(self.weights * np.asarray(per_detector)[:, None], self.coefficients, self.step, self.n_samples)
+
+    def evaluate(self, detectors: slice, samples: slice, out: Floats | None = None) -> Floats:
+        """f at the detectors and samples of a block: (n_det_block, n_samp_block), of ``out``'s dtype or float64.
+
+        Bits depend on the absolute detector and sample only. ``out`` is overwritten.
+        """
+        weights = self.weights[detectors]
+        start, stop = samples.start, samples.stop
+        if not 0 <= start <= stop <= self.n_samples:
+            raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
+        if out is None:
+            out = np.empty((weights.shape[0], stop - start))
+        basis = bspline_weights(self.step, out.dtype.type)
+        _evaluate(weights, self.coefficients, basis, start, out)
+        return out
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _evaluate(weights, coefficients, basis, start, out):  # type: ignore[no-untyped-def]
+    n_det, n = out.shape
+    n_node = weights.shape[1]
+    step = basis.shape[1]
+    stop = start + n
+    first, last = start // step, (stop + step - 1) // step
+    line = np.empty(last - first + 3, out.dtype)
+    b0, b1, b2, b3 = basis[0], basis[1], basis[2], basis[3]
+    for d in range(n_det):
+        for k in range(line.size):
+            total = 0.0
+            for node in range(n_node):
+                total += weights[d, node] * coefficients[node, first + k]
+            line[k] = total
+        row = out[d]
+        for m in range(first, last):
+            low, high = max(m * step, start), min((m + 1) * step, stop)
+            k, r = m - first, low - m * step
+            c0, c1, c2, c3 = line[k], line[k + 1], line[k + 2], line[k + 3]
+            into = row[low - start : high - start]
+            w0, w1, w2, w3 = b0[r : r + into.size], b1[r : r + into.size], b2[r : r + into.size], b3[r : r + into.size]
+            for t in range(into.size):
+                into[t] = c0 * w0[t] + c1 * w1[t] + c2 * w2[t] + c3 * w3[t]

@@ -1,0 +1,1 @@
+"""Everything that flows over the data, grouped by what it does."""

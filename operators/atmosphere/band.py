@@ -1,0 +1,257 @@
+"""A passband's view of the atmosphere: emission and transmission against water vapour and elevation, fast and smooth.
+
+The radiative transfer is run on Chebyshev nodes in u = ln(1 + pwv / p) and v = ln(1 / sin(elevation)); three functions,
+
+    emission               T = integral t(nu) T_RJ(nu) dnu / integral t(nu) dnu                                    (1)
+    log transmission       ln <e^-tau> = ln [integral t(nu) e^-tau(nu) dnu / integral t(nu) dnu]                   (2)
+    log background         ln <J(nu, 2.725 K) e^-tau>                                                              (3)
+
+are then polynomials in u and v. The transmission is averaged over the band, never the opacity.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.radiation import T_CMB, rayleigh_jeans
+
+from .absorption import absorption_table
+from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission
+from .weather import check_pwv
+
+if TYPE_CHECKING:
+    from zonda.core.instrument import Band
+
+    from .weather import Profile
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-5
+"""Aim of the interpolation: largest error of T relative to T, and of the logarithms relative to 1 + |logarithm|."""
+ERROR_MAX = 1e-4
+"""A band that cannot be interpolated to this error is refused."""
+GRIDS = ((14, 10, 1e2), (20, 12, 1e2), (32, 16, 1e4), (48, 24, 1e4))
+"""Numbers of nodes in u and v, and pwv_max / p; tried in this order until `TOLERANCE` is met. Only saturated lines
+(183, 557 GHz) need more than the first."""
+
+
+class BandAtmosphere:
+    """Emission and transmission of a band; all methods take floats or arrays that broadcast, and return float64.
+
+    Parameters
+    ----------
+    band
+        The passband.
+    profile
+        The air; its water is scaled to whatever PWV is asked for.
+    pwv_max
+        Largest PWV that will be asked for, m; three times the profile's own where absent.
+
+    Attributes
+    ----------
+    error
+        Largest interpolation error found against the radiative transfer, counted as `TOLERANCE` is.
+
+    Raises
+    ------
+    InputError
+        A band outside the absorption table, or too opaque to interpolate; later, a PWV or elevation outside the limits,
+        which the message names.
+    """
+
+    def __init__(self, band: Band, profile: Profile, pwv_max: float | None = None) -> None:
+        self.band = band
+        self.pwv_max = 3 * profile.pwv if pwv_max is None else pwv_max
+        check_pwv(self.pwv_max)
+        if self.pwv_max == 0:
+            raise InputError("the air is dry, so there is no water to vary", cure="give a PWV above 0 mm")
+        self._transfer = _BandTransfer(band, profile.layers)
+        self._v_max = -math.log(math.sin(ELEVATION_MIN))
+        for n_u, n_v, ratio in GRIDS:
+            self._scale, self._u_max = self.pwv_max / ratio, math.log1p(ratio)
+            self._coefficients = self._tabulate(n_u, n_v)
+            self.error = self._check()
+            if self.error < TOLERANCE:
+                break
+        if self.error > ERROR_MAX:
+            raise InputError(
+                f"its atmosphere cannot be interpolated to better than {self.error:.0e}, the limit is {ERROR_MAX:.0e}",
+                place=f"band '{band.name}'",
+                cure="choose a narrower band, or one off the saturated water lines",
+            )
+
+    def direct(self, pwv: float, elevation: float) -> tuple[float, float, float]:
+        """Equations (1) to (3) by radiative transfer, without interpolation: K_RJ, neper, ln K_RJ."""
+        return self._transfer(pwv, [elevation])[0]
+
+    def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+        """Equation (1): the atmosphere alone, background 0 K. PWV in m, elevation in rad -> K_RJ."""
+        return self._evaluate(0, pwv, elevation)
+
+    def log_transmission(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+        """Equation (2), <= 0."""
+        return self._evaluate(1, pwv, elevation)
+
+    def transmission(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+        """<e^-tau>."""
+        return np.exp(self.log_transmission(pwv, elevation))
+
+    def opacity(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+        """-ln <e^-tau> along the line of sight, neper."""
+        return -self.log_transmission(pwv, elevation)
+
+    def background(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+        """<J(nu, 2.725 K) e^-tau>: the microwave background behind the atmosphere, K_RJ."""
+        return np.exp(self._evaluate(2, pwv, elevation))
+
+    def emission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Array:
+        """emission(pwv + dpwv) - emission(pwv), K_RJ, to float64 precision of the difference however small it is."""
+        return self._difference(0, pwv, dpwv, elevation)
+
+    def log_transmission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Array:
+        """log_transmission(pwv + dpwv) - log_transmission(pwv), to float64 precision of the difference."""
+        return self._difference(1, pwv, dpwv, elevation)
+
+    def __repr__(self) -> str:
+        return f"BandAtmosphere({self.band.name}, PWV 0 to {self.pwv_max * 1e3:.3g} mm, error {self.error:.0e})"
+
+    def _tabulate(self, n_u: int, n_v: int) -> Array:
+        """Chebyshev coefficients (3, n_u, n_v) from values at the Chebyshev points."""
+        x_u, x_v = _chebyshev_points(n_u), _chebyshev_points(n_v)
+        values = np.array([self._transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u])  # (n_u, n_v, 3)
+        to_u, to_v = _chebyshev_transform(n_u), _chebyshev_transform(n_v)
+        return np.asarray(np.einsum("iu,uvf,jv->fij", to_u, values, to_v))
+
+    def _check(self) -> float:
+        """Largest error at 45 points: between the nodes, and the ends."""
+        points_u, points_v = np.array([-1.0, *_chebyshev_points(7), 1.0]), [-1.0, -0.61, 0.13, 0.87, 1.0]
+        worst = 0.0
+        for x in points_u:
+            elevations = [self._elevation(y) for y in points_v]
+            direct = np.array(self._transfer(self._pwv(x), elevations)).T
+            for k in range(3):
+                difference = np.abs(self._evaluate(k, self._pwv(x), elevations) - direct[k])
+                worst = max(worst, float(np.max(difference / (direct[k] if k == 0 else 1 + np.abs(direct[k])))))
+        return worst
+
+    def _pwv(self, x: float) -> float:
+        """PWV at x = -1 .. 1."""
+        return min(self._scale * math.expm1(self._u_max * (x + 1) / 2), self.pwv_max)
+
+    def _elevation(self, y: float) -> float:
+        """Elevation at y = -1 (zenith) .. 1 (5 deg)."""
+        return max(math.asin(math.exp(-self._v_max * (y + 1) / 2)), ELEVATION_MIN)
+
+    def _x(self, pwv: Array) -> Array:
+        if pwv.size and not (pwv.min() >= 0 and pwv.max() <= self.pwv_max * (1 + 1e-12)):
+            at = int(np.argmax((pwv < 0) | ~(pwv <= self.pwv_max)))
+            raise InputError(
+                f"PWV of {pwv.ravel()[at] * 1e3:.6g} mm (value {at} of {pwv.size}) is outside the table of band "
+                f"'{self.band.name}', 0 to {self.pwv_max * 1e3:.6g} mm",
+                cure="lower the PWV or its rms, or ask for a larger pwv_max",
+            )
+        return 2 * np.log1p(pwv / self._scale) / self._u_max - 1
+
+    def _y(self, elevation: Array) -> Array:
+        low, high = (float(elevation.min()), float(elevation.max())) if elevation.size else (ELEVATION_MIN, ELEVATION_MAX)
+        if not ELEVATION_MIN * (1 - 1e-9) <= low <= high <= ELEVATION_MAX * (1 + 1e-9):
+            raise InputError(
+                f"elevations of {math.degrees(low):.2f} to {math.degrees(high):.2f} deg leave the limits "
+                "of the radiative transfer, 5 to 90 deg",
+                cure="choose a target or a time with a higher elevation",
+            )
+        return -2 * np.log(np.sin(elevation)) / self._v_max - 1
+
+    def _evaluate(self, which: int, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+        pwv, elevation = np.broadcast_arrays(np.asarray(pwv, np.float64), np.asarray(elevation, np.float64))
+        basis = _chebyshev(self._x(pwv).ravel(), self._coefficients.shape[1])
+        return self._contract(which, basis, elevation).reshape(pwv.shape)
+
+    def _difference(self, which: int, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Array:
+        pwv, dpwv, elevation = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (pwv, dpwv, elevation)))
+        start, stop = self._x(pwv).ravel(), self._x(pwv + dpwv).ravel()
+        step = (2 * np.log1p(dpwv / (self._scale + pwv)) / self._u_max).ravel()
+        basis = _chebyshev_difference(start, stop, step, self._coefficients.shape[1])
+        return self._contract(which, basis, elevation).reshape(pwv.shape)
+
+    def _contract(self, which: int, basis: Array, elevation: Array) -> Array:
+        """sum_ij basis_i C_ij T_j(y), without BLAS: its sums may depend on the number of threads."""
+        other = _chebyshev(self._y(elevation).ravel(), self._coefficients.shape[2])
+        return np.asarray(np.sum(np.einsum("ij,in->jn", self._coefficients[which], basis) * other, axis=0))
+
+
+class _BandTransfer:
+    """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln transmission, ln background) each."""
+
+    def __init__(self, band: Band, layers: Layers) -> None:
+        weight, self._cells = _cell_weights(band)
+        frequency = absorption_table().frequency[self._cells]
+        self._weight = weight / weight.sum()
+        self._layers = layers
+        self._cross_sections = layers.cross_sections(self._cells)
+        self._source = rayleigh_jeans(frequency, layers.temperature[:, None])
+        self._cmb = rayleigh_jeans(frequency, T_CMB)
+
+    def __call__(self, pwv: float, elevations: list[float]) -> list[tuple[float, float, float]]:
+        layers = self._layers.scaled(pwv)
+        vertical = layers.opacity(self._cross_sections)
+        return [self._at(vertical * layers.airmass(elevation)[:, None]) for elevation in elevations]
+
+    def _at(self, slant: Array) -> tuple[float, float, float]:
+        emitted = float(np.sum(self._weight * emission(slant, self._source)))
+        opacity = slant.sum(axis=0)
+        least = float(opacity.min())  # factored out, so that opaque bands do not underflow
+        passed = self._weight * np.exp(least - opacity)
+        return emitted, math.log(passed.sum()) - least, math.log(np.sum(passed * self._cmb)) - least
+
+
+def _cell_weights(band: Band) -> tuple[Array, slice]:
+    """Integral of the (piecewise linear) transmission over each cell of the absorption table that it touches."""
+    open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
+    support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
+    nu, transmission = band.frequency[support], band.transmission[support]
+    table = absorption_table()
+    cells = table.cells(float(nu[0]), float(nu[-1]), place=f"band '{band.name}'")
+    edges = table.edges[cells.start : cells.stop + 1]
+    points = np.union1d(np.clip(edges, nu[0], nu[-1]), nu)
+    values = np.interp(points, nu, transmission)
+    integral = np.concatenate([[0.0], np.cumsum(np.diff(points) * (values[1:] + values[:-1]) / 2)])
+    return np.diff(np.interp(np.clip(edges, nu[0], nu[-1]), points, integral)), cells
+
+
+def _chebyshev_points(n: int) -> Array:
+    return np.cos(np.pi * (np.arange(n) + 0.5) / n)
+
+
+def _chebyshev_transform(n: int) -> Array:
+    """(n, n) matrix from values at `_chebyshev_points` to coefficients."""
+    transform = np.cos(np.pi * np.outer(np.arange(n), np.arange(n) + 0.5) / n) * 2 / n
+    transform[0] /= 2
+    return transform
+
+
+def _chebyshev(x: Array, n: int) -> Array:
+    """(n, len(x)) T_0 .. T_n-1."""
+    out = np.ones((n, x.size))
+    out[1] = x
+    for k in range(2, n):
+        out[k] = 2 * x * out[k - 1] - out[k - 2]
+    return out
+
+
+def _chebyshev_difference(x: Array, y: Array, step: Array, n: int) -> Array:
+    """(n, len(x)) T_k(y) - T_k(x) for y - x = step, by the recurrence of the differences, so nothing cancels:
+
+    D_k+1 = 2 y D_k + 2 step T_k(x) - D_k-1.
+    """
+    start = _chebyshev(x, n)
+    out = np.zeros((n, x.size))
+    out[1] = step
+    for k in range(2, n):
+        out[k] = 2 * y * out[k - 1] + 2 * step * start[k - 1] - out[k - 2]
+    return out

@@ -1,0 +1,225 @@
+"""Where the smooth atmosphere is evaluated: nodes over the focal plane and steps in time, chosen from an error bound.
+
+For a layer of covariance sum_k w_k exp(-r^2 / 4 e_k) (`covariance.mixture`) the expected squared error of a linear
+interpolation with weights W (summing to 1) is exact and separable on a grid:
+
+    E_d = sum_k w_k [1 - 2 (W_x . k_x)(W_y . k_y) + (W_x K_x W_x)(W_y K_y W_y)]                                  (1)
+
+In time, a cubic spline through samples a time dt apart makes, along a ray that crosses the layer at speed v and whose path
+is itself interpolated to within delta,
+
+    E_t = sum_k w_k G(v dt / sqrt(e_k)) + 2 S(delta)                                                             (2)
+    G(q) = int dw/2pi P_q(w) [(1 - A_0 b)^2 + sum_{m != 0} (A_m b)^2],   A_m = sinc^4((w + 2 pi m) / 2),  b = 3 / (2 + cos w)
+
+with P_q the spectrum of exp(-q^2 n^2 / 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .covariance import beam_structure, mixture
+
+Floats = NDArray[np.float64]
+
+LARGEST_STEP = 2048
+"""Samples; see `core.tiles`."""
+
+MARGIN = 12
+"""Coarse values beyond both ends that `SmoothField.from_values` wants."""
+
+_GRIDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 32, 40, 48, 64)
+_TRIED = 64
+
+
+@dataclass(frozen=True)
+class LayerModel:
+    """What the bounds need of one layer: share of the fluctuation, line-of-sight distance and height [m], r0, sigma [m]."""
+
+    amplitude: float
+    height: float
+    distance: float
+    outer_scale: float
+    sigma: float
+
+    def components(self) -> tuple[Floats, Floats]:
+        """(e, w) of equation (1)."""
+        return mixture(self.outer_scale, self.sigma, step=0.5, depth=1e-6)
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Points of the focal plane and the weights that interpolate from them: xi, eta (n_node,), weights (n_det, n_node)."""
+
+    xi: Floats
+    eta: Floats
+    weights: Floats
+    shape: tuple[int, int] | None
+    """(along xi, along eta), or None where the detectors are the nodes."""
+
+    def __str__(self) -> str:
+        return f"{self.shape[0]} x {self.shape[1]} Chebyshev" if self.shape else f"the {len(self.xi)} detectors"
+
+
+def chebyshev(low: float, high: float, n: int) -> Floats:
+    """The n Chebyshev nodes of [low, high], shape (n,)."""
+    return (low + high) / 2 + (high - low) / 2 * np.cos(np.pi * (np.arange(n) + 0.5) / n)
+
+
+def lagrange(nodes: Floats, x: Floats) -> Floats:
+    """Weights (len(x), n) of the polynomial through values at ``nodes`` (barycentric form, Berrut & Trefethen 2004)."""
+    n = len(nodes)
+    if n == 1:
+        return np.ones((len(x), 1))
+    k = np.arange(n)
+    barycentric = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / n)
+    gap = np.subtract.outer(x, nodes)
+    hit = gap == 0
+    ratio = barycentric / np.where(hit, 1.0, gap)
+    weights = ratio / ratio.sum(1, keepdims=True)
+    struck = hit.any(1)
+    weights[struck] = hit[struck]
+    return np.asarray(weights, np.float64)
+
+
+def grid(xi: Floats, eta: Floats, n: int) -> Nodes:
+    """n x n Chebyshev nodes over the rectangle that holds the detectors (one node across a rectangle of no width)."""
+    sides = []
+    for offsets in (xi, eta):
+        low, high = float(offsets.min()), float(offsets.max())
+        nodes = chebyshev(low, high, n if high > low else 1)
+        sides.append((nodes, lagrange(nodes, offsets)))
+    (x, wx), (y, wy) = sides
+    weights = (wx[:, :, None] * wy[:, None, :]).reshape(len(xi), -1)
+    return Nodes(np.repeat(x, len(y)), np.tile(y, len(x)), weights, (len(x), len(y)))
+
+
+def detectors_as_nodes(xi: Floats, eta: Floats) -> Nodes:
+    """Every detector its own node: no error in the focal plane."""
+    return Nodes(np.asarray(xi, np.float64), np.asarray(eta, np.float64), np.eye(len(xi)), None)
+
+
+def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float = 1.0) -> float:
+    """Expected rms error of the interpolation to detectors at (xi, eta), in units of the fluctuation before the beam.
+
+    Equation (1), mean over the detectors. ``stretch`` multiplies distances along eta (1 / sin(elevation) where the
+    turbulence lies in the horizontal plane). Accurate to 3e-8.
+    """
+    if nodes.shape is None:
+        return 0.0
+    ny = nodes.shape[1]
+    x, y = nodes.xi[::ny], nodes.eta[:ny]
+    wx, wy = lagrange(x, xi), lagrange(y, eta)
+    total = 0.0
+    for layer in layers:
+        e, w = layer.components()
+        one = _separable(x * layer.distance, xi * layer.distance, wx, e)
+        two = _separable(y * layer.distance * stretch, eta * layer.distance * stretch, wy, e)
+        error = 1 - 2 * one[0] * two[0] + one[1] * two[1]
+        total += layer.amplitude**2 * float(error.mean(0) @ w)
+    return float(np.sqrt(max(total, 0.0)))
+
+
+def _separable(nodes: Floats, points: Floats, weights: Floats, e: Floats) -> tuple[Floats, Floats]:
+    """(W . k, W K W) of one axis: each (n_points, len(e))."""
+    cross = np.exp(-(np.subtract.outer(points, nodes) ** 2)[..., None] / (4 * e))
+    among = np.exp(-(np.subtract.outer(nodes, nodes) ** 2)[..., None] / (4 * e))
+    return np.einsum("dn,dnk->dk", weights, cross), np.einsum("dn,nmk,dm->dk", weights, among, weights, optimize=True)
+
+
+def differential_rms(xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float = 1.0) -> float:
+    """Expected rms of the fluctuation minus its focal-plane mean, in units of the fluctuation before the beam."""
+    r = np.hypot(np.subtract.outer(xi, xi), stretch * np.subtract.outer(eta, eta)).ravel()
+    total = 0.0
+    for layer in layers:
+        e, w = layer.components()
+        total += layer.amplitude**2 * float((-np.expm1(-np.multiply.outer((r * layer.distance) ** 2, 1 / (4 * e)))).mean(0) @ w)
+    return float(np.sqrt(total))
+
+
+def some(xi: Floats, eta: Floats, number: int = _TRIED) -> tuple[Floats, Floats]:
+    """At most ``number`` detectors evenly taken from the list, the outermost four included."""
+    if len(xi) <= number:
+        return xi, eta
+    outer = [int(f(v)) for v in (xi, eta) for f in (np.argmin, np.argmax)]
+    index = np.unique(np.r_[np.linspace(0, len(xi) - 1, number - 4).astype(int), outer])
+    return xi[index], eta[index]
+
+
+def choose_nodes(
+    xi: Floats, eta: Floats, layers: Sequence[LayerModel], tolerance: float, stretch: float = 1.0, at_least: int = 1
+) -> tuple[Nodes, float]:
+    """The coarsest grid whose `focal_plane_error` is <= ``tolerance``, and that error.
+
+    Where a grid would need as many nodes as there are detectors, the detectors are the nodes. ``at_least`` nodes per axis.
+    """
+    some_xi, some_eta = some(xi, eta)
+    for n in _GRIDS:
+        if n < at_least:
+            continue
+        if n * n >= len(xi):
+            break
+        nodes = grid(xi, eta, n)
+        error = focal_plane_error(nodes, some_xi, some_eta, layers, stretch)
+        if error <= tolerance:
+            return nodes, error
+    return detectors_as_nodes(xi, eta), 0.0
+
+
+@lru_cache(maxsize=1)
+def _spline_table() -> tuple[Floats, Floats]:
+    """(ln q, ln G(q)) of equation (2) on 500 points of q, 0.01 to 1000."""
+    q = np.geomspace(1e-2, 1e3, 500)
+    u = np.linspace(-6, 6, 1201)  # w / q: the spectrum of exp(-q^2 n^2 / 4) is a Gaussian exp(-(w/q)^2)
+    density = np.exp(-u * u) / np.sqrt(np.pi) * (u[1] - u[0])
+    out = np.empty_like(q)
+    for n, ratio in enumerate(q):
+        w = u * ratio
+        b = 3 / (2 + np.cos(w))
+        # Images of frequencies far above Nyquist: fold w to (-pi, pi] and name its own image m.
+        own = np.round(w / (2 * np.pi))
+        folded = w - 2 * np.pi * own
+        error = np.zeros_like(w)
+        here = np.sinc(w / (2 * np.pi)) ** 4 * b
+        for m in range(-8, 9):
+            image = np.sinc((folded + 2 * np.pi * m) / (2 * np.pi)) ** 4 * b
+            error += np.where(m == own, 0.0, image**2)
+        out[n] = density @ (error + (1 - here) ** 2)
+    return np.log(q), np.log(out)
+
+
+def spline_error(q: Floats) -> Floats:
+    """G(q) of equation (2): squared error of the cubic spline for the covariance exp(-(q n)^2 / 4) of a unit-spaced series.
+
+    Falls as q^8 where q -> 0, and tends to 1.7 where the samples are independent.
+    """
+    log_q, log_g = _spline_table()
+    x = np.log(np.maximum(q, 1e-30))
+    below = log_g[0] + 8 * (x - log_q[0])
+    return np.asarray(np.exp(np.where(x < log_q[0], below, np.interp(x, log_q, log_g))), np.float64)
+
+
+def time_error(layers: Sequence[LayerModel], speeds: Sequence[Floats], deltas: Sequence[float], dt: float) -> float:
+    """Expected rms error of the spline in time, equation (2), in units of the fluctuation before the beam.
+
+    ``speeds``: per layer, speeds [m/s] that the rays have at times evenly spread over the scan (the mean of E_t is
+    taken); ``deltas``: per layer, rms error of the interpolated ray path, m.
+    """
+    total = 0.0
+    for layer, speed, delta in zip(layers, speeds, deltas, strict=True):
+        e, w = layer.components()
+        share = spline_error(np.multiply.outer(speed, dt / np.sqrt(e))).mean(0) @ w
+        share += 2 * beam_structure(delta, layer.outer_scale, layer.sigma)[0]
+        total += layer.amplitude**2 * float(share)
+    return float(np.sqrt(total))
+
+
+def candidate_steps(n_samples: int) -> list[int]:
+    """Powers of two from `LARGEST_STEP` down to 1 that put at least four cells into the scan (1 where it is shorter)."""
+    steps = [1 << k for k in range(LARGEST_STEP.bit_length() - 1, -1, -1)]
+    return [s for s in steps if 4 * s <= n_samples or s == 1]

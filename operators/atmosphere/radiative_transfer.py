@@ -1,0 +1,179 @@
+"""Radiative transfer through a clear atmosphere of layers, in numpy.
+
+Rays are straight and the layers are spherical shells, so a layer at height h is crossed at the airmass
+
+    m(h) = [1 - (cos(elevation) R / (R + h))^2]^(-1/2)                                                             (1)
+
+which is 1/sin(elevation) high in the sky and 2-7 % less at 5 deg. Refraction, clouds and scattering are left out: the
+results are as good as am's (see data/README.md), for clear sky.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.radiation import BOLTZMANN, T_CMB, rayleigh_jeans
+
+from .absorption import CrossSections, absorption_table
+
+Array = NDArray[np.float64]
+
+AVOGADRO = 6.02214076e23
+"""1 / mol (SI, exact)."""
+GRAVITY = 9.80665
+"""m / s2, standard gravity."""
+MOLAR_MASS_DRY_AIR = 28.964e-3
+"""kg / mol."""
+MOLAR_MASS_WATER = 18.015e-3
+"""kg / mol."""
+WATER_DENSITY = 1000.0
+"""kg / m3, of the liquid that precipitable water is measured in."""
+VAPOUR_GAS_CONSTANT = BOLTZMANN * AVOGADRO / MOLAR_MASS_WATER
+"""J / (kg K), of water vapour."""
+EARTH_RADIUS = 6.371e6
+"""m, mean."""
+ELEVATION_MIN, ELEVATION_MAX = math.radians(5.0), math.radians(90.0)
+"""rad: limits of equation (1) without refraction."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Layers of air, ground first.
+
+    Attributes
+    ----------
+    pressure, temperature
+        (n + 1,) Pa and K at the layers' boundaries. The topmost pressure may be 0.
+    h2o, o3
+        (n,) mean volume mixing ratio of each layer.
+    height
+        (n + 1,) m above sea level of the boundaries.
+    """
+
+    pressure: Array
+    temperature: Array
+    h2o: Array
+    o3: Array
+    height: Array
+
+    @property
+    def molecules(self) -> Array:
+        """(n,) molecules per m2 in hydrostatic balance."""
+        mass = MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o
+        return -np.diff(self.pressure) / GRAVITY / mass * AVOGADRO
+
+    @property
+    def pwv(self) -> float:
+        """Precipitable water vapour, m."""
+        return float(np.sum(self.molecules * self.h2o)) * MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY
+
+    def scaled(self, pwv: float) -> Layers:
+        """The same layers with all water multiplied so that it amounts to ``pwv`` [m]. The pressure stays as it is."""
+        if pwv == 0:
+            return replace(self, h2o=np.zeros_like(self.h2o))
+        layers = self
+        for _ in range(8):  # the number of molecules depends on the water by a few per mille: converges as 0.005^n
+            layers = replace(layers, h2o=layers.h2o * (pwv / layers.pwv))
+        return layers
+
+    def cross_sections(self, cells: slice = slice(None)) -> CrossSections:
+        """Of each layer at its mean pressure and temperature (they do not depend on the water)."""
+        pressure, temperature = (self.pressure[1:] + self.pressure[:-1]) / 2, (self.temperature[1:] + self.temperature[:-1]) / 2
+        return absorption_table().cross_sections(pressure, temperature, cells)
+
+    def opacity(self, cross_sections: CrossSections) -> Array:
+        """(n, n_frequency) vertical opacity of each layer, neper."""
+        k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
+        water_section = np.maximum(k.water + water * k.water_self, 0.0)
+        return self.molecules[:, None] * ((1 - water) * k.dry_air + water * water_section + ozone * k.ozone)
+
+    def airmass(self, elevation: float, *, plane_parallel: bool = False) -> Array:
+        """(n,) slant over vertical path of each layer, equation (1), or 1/sin(elevation) when ``plane_parallel``.
+
+        Raises
+        ------
+        InputError
+            Elevation outside 5 to 90 deg.
+        """
+        if not ELEVATION_MIN * (1 - 1e-9) <= elevation <= ELEVATION_MAX * (1 + 1e-9):
+            raise InputError(
+                f"an elevation of {math.degrees(elevation):.2f} deg is outside the limits of the radiative transfer, 5 to 90 deg",
+                cure="choose a target or a time with a higher elevation",
+            )
+        if plane_parallel:
+            return np.full(len(self.h2o), 1 / math.sin(elevation))
+        above_site = (self.height[1:] + self.height[:-1]) / 2 - self.height[0]
+        ratio = math.cos(elevation) * (EARTH_RADIUS + self.height[0]) / (EARTH_RADIUS + self.height[0] + above_site)
+        return np.asarray(1 / np.sqrt(1 - ratio**2))
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """What a ray sees, per frequency (n,).
+
+    Attributes
+    ----------
+    frequency
+        Hz, centres of cells of 0.5 GHz.
+    opacity
+        Zenith opacity, neper.
+    slant_opacity
+        Opacity along the ray, neper.
+    brightness
+        Rayleigh-Jeans brightness of the atmosphere alone along the ray (background 0 K), K.
+    """
+
+    frequency: Array
+    opacity: Array
+    slant_opacity: Array
+    brightness: Array
+
+    @property
+    def cmb(self) -> Array:
+        """Rayleigh-Jeans brightness of the cosmic microwave background behind the atmosphere, J(2.725 K) e^-tau, K."""
+        return rayleigh_jeans(self.frequency, T_CMB) * np.exp(-self.slant_opacity)
+
+
+def emission(slant_opacity: Array, source: Array) -> Array:
+    """Brightness at the ground of layers whose source function is linear in the opacity from boundary to boundary.
+
+        T = sum_i e^-tau_below,i [J_i (1 - e^-t_i) + (J_i+1 - J_i) ((1 - e^-t_i)/t_i - e^-t_i)]                    (2)
+
+    Parameters
+    ----------
+    slant_opacity
+        (n, ...) t_i, opacity of each layer along the ray, ground first.
+    source
+        (n + 1, ...) J at the boundaries, K.
+    """
+    absorbed = -np.expm1(-slant_opacity)
+    mean = np.divide(absorbed, slant_opacity, out=np.ones_like(absorbed), where=slant_opacity > 0)
+    total = np.cumsum(slant_opacity, axis=0)
+    below = np.ones_like(total)
+    np.exp(-total[:-1], out=below[1:])
+    return np.asarray(np.sum(below * (source[:-1] * absorbed + np.diff(source, axis=0) * (mean - 1 + absorbed)), axis=0))
+
+
+def spectrum(
+    layers: Layers, elevation: float, *, low: float | None = None, high: float | None = None, plane_parallel: bool = False
+) -> Spectrum:
+    """Opacity and brightness between two frequencies [Hz] (default: the whole table) at an elevation [rad].
+
+    Raises
+    ------
+    InputError
+        Elevation, frequency, pressure or temperature outside the limits, which the message names.
+    """
+    table = absorption_table()
+    edges = table.edges
+    cells = table.cells(edges[0] if low is None else low, edges[-1] if high is None else high)
+    frequency = table.frequency[cells]
+    vertical = layers.opacity(layers.cross_sections(cells))
+    slant = vertical * layers.airmass(elevation, plane_parallel=plane_parallel)[:, None]
+    source = rayleigh_jeans(frequency, layers.temperature[:, None])
+    return Spectrum(frequency, vertical.sum(axis=0), slant.sum(axis=0), emission(slant, source))

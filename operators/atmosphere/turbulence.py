@@ -1,0 +1,376 @@
+"""A turbulent layer at random access on an unlimited plane: a pyramid of Gaussian scale mixtures.
+
+The beam-convolved von Karman spectrum is a mixture of Gaussians exp(-e k^2) (`covariance`, equation 4). Level j of the
+pyramid takes those with e up to (2 d_j / c)^2 on a lattice of spacing d_j = 2^j metres: white noise, addressed by absolute
+lattice index, convolved with a compact kernel of radius R cells. Levels are summed from coarse to fine with x2 kriging
+interpolation of L taps:
+
+    f_j = noise_j * h_j + up2(f_(j+1)),            |FFT h_j|^2 = aliased spectrum of the level                     (1)
+
+Every sum runs over a fixed list of taps in a fixed order, so a lattice point has the same bits in whatever region it is
+asked for. The beam costs nothing and is exact; no matrix is inverted and nothing is periodic.
+
+Largest error of the implied covariance C, relative to the variance, and of the implied structure function S, relative to
+itself and from one cell up (computed exactly, not sampled), against r0 / sigma; `tests/.../test_turbulence.py`:
+
+=========================  ======  ======  ======  ======  ======  ======  ======  ==========
+R, L, c                    0.001   1       30      100     200     400     1000    4000
+=========================  ======  ======  ======  ======  ======  ======  ======  ==========
+default, 8, 10, 0.8: C     1.2e-4  6e-4    6e-4    1.0e-3  1.2e-3  1.4e-3  refused refused
+default, 8, 10, 0.8: S     1.7e-4  7e-4    8e-4    9e-4    1.2e-3  3.2e-3  (1e-2)  (1e-1)
+fine, 12, 12, 0.7: C       1.3e-5  3e-5    9e-5    1.5e-4  1.9e-4  2.2e-4  2.5e-4  3.1e-4
+fine, 12, 12, 0.7: S       1.3e-5  3e-5    8e-5    1.0e-4  1.1e-4  1.2e-4  2.7e-4  3.1e-3
+=========================  ======  ======  ======  ======  ======  ======  ======  ==========
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.random import lattice_normals, stream_key
+
+from .covariance import NU, beam_correlation, mixture_between
+
+Floats = NDArray[np.float64]
+Field = NDArray[np.float32]
+
+LARGEST_SCALE = 20.0
+"""The mixture is cut at s = 20 r0^2: 2e-9 of the variance lies beyond."""
+
+PREFILTER = 10
+"""Half-length of the finite cubic-spline prefilter: its truncation is 3e-6 at the shortest wavelength, less elsewhere."""
+
+_GRID = 96
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """Kernel radius R [cells], interpolation taps L, resolution c of the pyramid, and the range where its error was measured."""
+
+    name: str
+    radius: int
+    taps: int
+    resolution: float
+    error: float
+    """Largest error of the implied covariance, relative to the variance, inside the range below."""
+    structure_error: float
+    """Largest relative error of the implied structure function, from one cell up, inside the range below."""
+    scale_ratio: float
+    """Largest outer scale / sigma for which both hold."""
+
+
+FIDELITIES = {
+    "default": Fidelity("default", 8, 10, 0.8, 1.6e-3, 4e-3, 400.0),
+    "fine": Fidelity("fine", 12, 12, 0.7, 3.5e-4, 4e-3, 4000.0),
+}
+
+
+@dataclass(frozen=True)
+class Level:
+    """One lattice: spacing 2^exponent m; kernel (R + 1, R + 1), quadrant of the symmetric h_j; None: nothing at this scale."""
+
+    exponent: int
+    kernel: Field | None
+
+    @property
+    def spacing(self) -> float:
+        return math.ldexp(1.0, self.exponent)
+
+
+class Turbulence:
+    """One layer: a Gaussian field of covariance `covariance.beam_correlation`, on a lattice of `spacing` metres.
+
+    Parameters
+    ----------
+    seed, names
+        What the random stream belongs to (`core.random.stream_key`). Lattices are powers of two metres whatever the beam,
+        so two beams that look through the same stream see the same air.
+    outer_scale, sigma
+        r0 and the beam's standard deviation, m.
+    lattice
+        Largest spacing, in units of sigma.
+    fidelity
+        ``default`` or ``fine``, see the table above.
+
+    Raises
+    ------
+    InputError
+        Where the measured error of the pyramid does not cover the outer scale and beam.
+    """
+
+    def __init__(
+        self, seed: int, *names: str | int, outer_scale: float, sigma: float, lattice: float = 0.6, fidelity: str = "default"
+    ) -> None:
+        self.outer_scale, self.sigma, self.fidelity = outer_scale, sigma, FIDELITIES[fidelity]
+        if not (np.isfinite([outer_scale, sigma]).all() and outer_scale > 0 and sigma > 0):
+            raise InputError(
+                f"outer scale {outer_scale:g} m and beam {sigma:g} m must be finite and positive", place="turbulence"
+            )
+        ratio = outer_scale / sigma
+        if ratio > self.fidelity.scale_ratio or ratio < 1e-3:
+            finest = FIDELITIES["fine"].scale_ratio
+            raise InputError(
+                f"outer scale {outer_scale:g} m is {ratio:.3g} times the beam's sigma of {sigma:.3g} m; the error of the "
+                f"{fidelity!r} pyramid is known from 1e-3 to {self.fidelity.scale_ratio:g}",
+                place="turbulence",
+                cure="use fidelity: fine" if self.fidelity.scale_ratio < ratio <= finest else "choose another outer_scale",
+            )
+        self.levels = _levels(outer_scale, sigma, lattice, fidelity)
+        self.spacing = self.levels[0].spacing
+        self._keys = [stream_key(seed, *names, "level", level.exponent) for level in self.levels]
+        self._weights = _kriging(self.fidelity.taps, self.fidelity.resolution)
+
+    @property
+    def variance(self) -> float:
+        """Variance after the beam (1 before it)."""
+        return float(beam_correlation(0.0, self.outer_scale, self.sigma)[0])
+
+    def region(self, i0: int, i1: int, j0: int, j1: int) -> Field:
+        """The field at lattice points i0 <= i < i1, j0 <= j < j1 (any integers). Shape (i1 - i0, j1 - j0), float32."""
+        radius, pad = self.fidelity.radius, self.fidelity.taps // 2
+        boxes = [(i0, i1, j0, j1)]
+        for _ in self.levels[1:]:
+            a, b, c, d = boxes[-1]
+            boxes.append(((a >> 1) - pad + 1, ((b - 1) >> 1) + pad + 1, (c >> 1) - pad + 1, ((d - 1) >> 1) + pad + 1))
+        field: Field | None = None
+        for k in range(len(self.levels) - 1, -1, -1):
+            a, b, c, d = boxes[k]
+            here = np.zeros((b - a, d - c), np.float32)
+            if field is not None:
+                _upsample(field, boxes[k + 1][0], boxes[k + 1][2], self._weights, here, a, c)
+            kernel = self.levels[k].kernel
+            if kernel is not None:
+                noise = lattice_normals(self._keys[k], a - radius, b + radius, c - radius, d + radius)
+                _convolve(noise, kernel, here)
+            field = here
+        assert field is not None
+        return field
+
+    def coefficients(self, i0: int, i1: int, j0: int, j1: int) -> Field:
+        """Cubic B-spline coefficients at lattice points, so that `interpolate` passes through the field. As `region`."""
+        h = PREFILTER
+        out = np.empty((i1 - i0, j1 - j0), np.float32)
+        _prefilter(self.region(i0 - h, i1 + h, j0 - h, j1 + h), _prefilter_taps(), out)
+        return out
+
+    def implied_covariance(self, a: NDArray[np.integer], b: NDArray[np.integer]) -> Floats:
+        """Exact covariance of the float32-free algorithm between lattice points ``a`` and ``b``, each (n, 2). Shape (n,)."""
+        a, b = np.atleast_2d(a), np.atleast_2d(b)
+        out = np.zeros(len(a))
+        for k, level in enumerate(self.levels):
+            if level.kernel is None:
+                continue
+            r = self.fidelity.radius
+            h = np.zeros((4 * r + 2, 4 * r + 2))
+            index = np.arange(-r, r + 1)
+            h[np.ix_(index, index)] = level.kernel[np.ix_(abs(index), abs(index))]
+            auto = np.fft.irfft2(abs(np.fft.rfft2(h)) ** 2, h.shape)
+            known: dict[tuple[int, int], tuple[NDArray[np.int64], Floats]] = {}
+            for n in range(len(a)):
+                ends = [(int(a[n, axis]), int(b[n, axis])) for axis in (0, 1)]
+                for pair in set(ends) - set(known):
+                    known[pair] = self._lags(*pair, k)
+                lags = [known[pair] for pair in ends]
+                (u, wu), (v, wv) = ((lag[abs(lag) <= 2 * r], w[abs(lag) <= 2 * r]) for lag, w in lags)
+                out[n] += wu @ auto[np.ix_(u, v)] @ wv
+        return out
+
+    def _lags(self, a: int, b: int, k: int) -> tuple[NDArray[np.int64], Floats]:
+        """Lags on level k between the lattice points that a and b of level 0 are interpolated from (one axis), and weights."""
+        (xa, wa), (xb, wb) = self._sources(a, k), self._sources(b, k)
+        lag, inverse = np.unique(np.subtract.outer(xa, xb), return_inverse=True)
+        return np.asarray(lag, np.int64), np.bincount(inverse.ravel(), np.multiply.outer(wa, wb).ravel())
+
+    def _sources(self, index: int, k: int) -> tuple[NDArray[np.int64], Floats]:
+        weights, half = self._weights.astype(np.float64), self.fidelity.taps // 2
+        points = {index: 1.0}
+        for _ in range(k):
+            coarse: dict[int, float] = {}
+            for i, w in points.items():
+                if i & 1 == 0:
+                    coarse[i >> 1] = coarse.get(i >> 1, 0.0) + w
+                else:
+                    for tap in range(2 * half):
+                        at = (i >> 1) - half + 1 + tap
+                        coarse[at] = coarse.get(at, 0.0) + w * weights[tap]
+            points = coarse
+        return np.array(list(points), np.int64), np.array(list(points.values()))
+
+
+@lru_cache(maxsize=256)
+def _levels(outer_scale: float, sigma: float, lattice: float, fidelity: str) -> tuple[Level, ...]:
+    f = FIDELITIES[fidelity]
+    exponent = math.floor(math.log2(lattice * sigma))
+    low, top = sigma**2, LARGEST_SCALE * outer_scale**2 + sigma**2
+    levels = []
+    while low < top:
+        high = min((2 * math.ldexp(1.0, exponent) / f.resolution) ** 2, top)
+        kernel = None
+        if high > low:
+            kernel = _kernel(outer_scale, sigma, low, high, math.ldexp(1.0, exponent), f.radius)
+            low = high
+        levels.append(Level(exponent, kernel))
+        exponent += 1
+    return tuple(levels)
+
+
+def _kernel(outer_scale: float, sigma: float, low: float, high: float, spacing: float, radius: int) -> Field:
+    """Quadrant (R + 1, R + 1) of the kernel whose power is the aliased spectrum of low <= e < high, cut at R cells."""
+    e, w = mixture_between(outer_scale, sigma, low, high)
+    k = 2 * np.pi * np.fft.fftfreq(_GRID, spacing)
+    alias = 2 * np.pi / spacing * np.arange(-2, 3)
+    gauss = np.exp(-np.multiply.outer(e, np.add.outer(alias, k) ** 2)).sum(1)
+    power = (gauss.T * w) @ gauss / spacing**2
+    h = np.fft.irfft2(np.sqrt(power[:, : _GRID // 2 + 1]), (_GRID, _GRID))[: radius + 1, : radius + 1]
+    index = np.arange(radius + 1)
+    h = np.where(np.hypot(index[:, None], index) <= radius, h, 0.0)
+    times = np.where(index > 0, 2.0, 1.0)
+    total = times @ (h * h) @ times
+    variance = (w / (4 * np.pi * e)).sum()
+    return np.ascontiguousarray(h * math.sqrt(variance / total), np.float32)
+
+
+@lru_cache(maxsize=8)
+def _kriging(taps: int, resolution: float) -> Field:
+    """Weights that predict the middle of two lattice points from ``taps`` neighbours: best for the sum of coarser levels."""
+    x = np.arange(taps) - (taps - 1) / 2
+    octaves = np.arange(4)
+
+    def model(r: Floats) -> Floats:
+        scale, weight = 2 ** (-octaves / 2), 2 ** (NU * octaves)
+        return np.asarray((np.exp(-((np.multiply.outer(r, scale) * resolution / 2) ** 2)) * weight).sum(-1), np.float64)
+
+    between = model(x[:, None] - x)
+    between = between + 1e-12 * between[0, 0] * np.eye(taps)
+    return np.asarray(np.linalg.solve(between, model(x)), np.float32)
+
+
+@lru_cache(maxsize=1)
+def _prefilter_taps() -> Field:
+    """One-sided inverse of (1, 4, 1) / 6, cut at `PREFILTER` and normalized to unit sum. Shape (PREFILTER + 1,)."""
+    taps = np.sqrt(3.0) * (np.sqrt(3.0) - 2.0) ** np.arange(PREFILTER + 1)
+    return np.asarray(taps / (taps[0] + 2 * taps[1:].sum()), np.float32)
+
+
+# No fastmath in the kernels: a compiler that may fuse or reorder could give a point other bits at the end of a row.
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _convolve(noise, kernel, out):  # type: ignore[no-untyped-def]
+    """out += noise * kernel; ``noise`` has R more cells on every side, ``kernel`` is a symmetric quadrant (R + 1, R + 1)."""
+    radius = kernel.shape[0] - 1
+    n = nb.uint64(out.shape[1])
+    rows = np.empty(noise.shape[1], np.float32)
+    for i in range(out.shape[0]):
+        target = out[i]
+        for di in range(radius + 1):
+            above, below = noise[i + radius - di], noise[i + radius + di]
+            if di == 0:
+                for j in range(nb.uint64(rows.size)):
+                    rows[j] = above[j]
+            else:
+                for j in range(nb.uint64(rows.size)):
+                    rows[j] = above[j] + below[j]
+            weight = kernel[di, 0]
+            middle = rows[radius:]
+            for j in range(n):
+                target[j] += weight * middle[j]
+            for dj in range(1, radius + 1):
+                weight = kernel[di, dj]
+                if weight != 0:
+                    left, right = rows[radius - dj :], rows[radius + dj :]
+                    for j in range(n):
+                        target[j] += weight * (left[j] + right[j])
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _upsample(coarse, ci, cj, weights, out, fi, fj):  # type: ignore[no-untyped-def]
+    """out += x2 kriging interpolation; (ci, cj) and (fi, fj) are the absolute indices of the arrays' first points."""
+    half = weights.size // 2
+    n_i, n_j = out.shape
+    row = np.empty(coarse.shape[1], np.float32)
+    odd = np.empty(coarse.shape[1], np.float32)
+    span = nb.uint64(coarse.shape[1] - 2 * half + 1)
+    for i in range(n_i):
+        at = ((fi + i) >> 1) - ci
+        if (fi + i) & 1 == 0:
+            source = coarse[at]
+            for j in range(nb.uint64(row.size)):
+                row[j] = source[j]
+        else:
+            for j in range(nb.uint64(row.size)):
+                row[j] = 0
+            for tap in range(half):
+                weight = weights[tap]
+                one, two = coarse[at - half + 1 + tap], coarse[at + half - tap]
+                for j in range(nb.uint64(row.size)):
+                    row[j] += weight * (one[j] + two[j])
+        # odd[j] lies between row[j + half - 1] and row[j + half]
+        for j in range(span):
+            odd[j] = 0
+        for tap in range(half):
+            weight = weights[tap]
+            one, two = row[tap:], row[2 * half - 1 - tap :]
+            for j in range(span):
+                odd[j] += weight * (one[j] + two[j])
+        target = out[i]
+        first = fj & 1
+        start = ((fj + first) >> 1) - cj
+        for j in range((n_j - first + 1) // 2):
+            target[first + 2 * j] += row[start + j]
+        first = 1 - first
+        start = ((fj + first) >> 1) - cj - half + 1
+        for j in range((n_j - first + 1) // 2):
+            target[first + 2 * j] += odd[start + j]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _prefilter(field, taps, out):  # type: ignore[no-untyped-def]
+    """Separable symmetric filter; ``field`` has taps.size - 1 more cells on every side than ``out``."""
+    half = taps.size - 1
+    row = np.empty(field.shape[1], np.float32)
+    for i in range(out.shape[0]):
+        source = field[i + half]
+        for j in range(nb.uint64(row.size)):
+            row[j] = taps[0] * source[j]
+        for tap in range(1, half + 1):
+            weight = taps[tap]
+            one, two = field[i + half - tap], field[i + half + tap]
+            for j in range(nb.uint64(row.size)):
+                row[j] += weight * (one[j] + two[j])
+        target, middle = out[i], row[half:]
+        for j in range(nb.uint64(out.shape[1])):
+            target[j] = taps[0] * middle[j]
+        for tap in range(1, half + 1):
+            weight = taps[tap]
+            left, right = row[half - tap :], row[half + tap :]
+            for j in range(nb.uint64(out.shape[1])):
+                target[j] += weight * (left[j] + right[j])
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def interpolate(coefficients, i0, j0, x, y, amplitude, out):  # type: ignore[no-untyped-def]
+    """out += amplitude * field at the points (x, y) (lattice units, float64, any equal shapes), by cubic B-spline.
+
+    ``coefficients`` begin at lattice point (i0, j0) and must cover floor(x) - 1 .. floor(x) + 2, and y alike. out: float64.
+    """
+    for n in range(x.size):
+        px, py = x.flat[n], y.flat[n]
+        fx, fy = np.floor(px), np.floor(py)
+        u, v = px - fx, py - fy
+        i, j = np.int64(fx) - i0 - 1, np.int64(fy) - j0 - 1
+        um, vm = 1 - u, 1 - v
+        a = (um * um * um / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - um * um * (2 - um) / 2, u * u * u / 6)
+        b = (vm * vm * vm / 6, 2 / 3 - v * v * (2 - v) / 2, 2 / 3 - vm * vm * (2 - vm) / 2, v * v * v / 6)
+        total = 0.0
+        for k in range(4):
+            line = coefficients[i + k]
+            total += a[k] * (b[0] * line[j] + b[1] * line[j + 1] + b[2] * line[j + 2] + b[3] * line[j + 3])
+        out.flat[n] += amplitude * total

@@ -1,0 +1,1 @@
+"""Spectra, pictures and reports."""

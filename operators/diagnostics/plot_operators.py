@@ -1,0 +1,224 @@
+"""Pictures of a run: made once, written as PNG files and shown in the report."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Angle
+from zonda.core.data import Data
+from zonda.core.files import atomic_path, product_path
+from zonda.core.operator import Operator
+from zonda.operators.io.map_view import MapView, maps_of, noise_sources
+from zonda.operators.io.save_map import output_folder
+from zonda.operators.maps.image import Image
+from zonda.operators.maps.map_product import MapProduct
+
+from .plots import plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
+from .power_spectrum import Spectrum
+from .time_streams import TimeStream
+
+LARGEST = 1500
+"""Pixels of an image's longer side in a picture; larger images are thinned out."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG image: ``name`` without suffix, a title, what it shows, its bytes."""
+
+    name: str
+    title: str
+    caption: str
+    png: bytes
+
+
+class Plots(Operator):
+    """Draw what the run made and write it as PNG files to the output folder.
+
+    ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``, ``power_spectra.png``, ``tod.png``,
+    ``scan.png``, each where there is something to show. Acts after all runs; the report shows the same pictures.
+
+    Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
+    """
+
+    provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
+    at_end: ClassVar[bool] = True
+
+    smooth: Angle | Literal["beam", "none"] = "beam"
+    """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a Gaussian of this FWHM, or not."""
+    central_diameter: Angle = quantity("1 arcmin", gt=0)
+    """Diameter of the circle that noise maps show, in which their rms is taken."""
+    least_coverage: float = Field(0.1, ge=0, lt=1)
+    """Map pixels with fewer samples than this share of the 99th percentile are left grey in the pictures."""
+
+    def finalize(self, data: Data) -> None:
+        folder = output_folder(data, self.label)
+        made = pictures(data, self)
+        for picture in made:
+            with atomic_path(product_path(folder, picture.name, ".png")) as temporary:
+                temporary.write_bytes(picture.png)
+        data.products["pictures"] = made
+
+
+def pictures(data: Data, options: Plots) -> list[Picture]:
+    """Every picture that the products allow, in reading order."""
+    made: list[Picture] = []
+    maps = maps_of(data.products)
+    for name, image in data.products.items():
+        if isinstance(image, Image) and "/" not in name:
+            made.append(_input(name, image))
+    for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
+        if not name.startswith("source_free/"):
+            made.append(_map(name, maps[name], options))
+    for name, product in maps.items():
+        if "/" not in name:
+            made.append(_coverage(name, product))
+        if noise_sources(maps, name):
+            made.append(_noise(name, maps, options))
+    if data.observations:
+        ax = plot_scan(data.observations)
+        made.append(Picture("scan", "Boresight track", "The boresight about the target, one line per scan.", _png(ax)))
+    for name, product in data.products.items():
+        if isinstance(product, Spectrum):
+            made.append(_spectra(name, product))
+        elif isinstance(product, TimeStream):
+            made.extend(_streams(name, product))
+    return made
+
+
+def _png(ax: Any) -> bytes:
+    stream = io.BytesIO()
+    ax.figure.savefig(stream, format="png", metadata={"Software": "zonda"})
+    return stream.getvalue()
+
+
+def _input(name: str, image: Image) -> Picture:
+    step = -(-max(image.values.shape) // LARGEST)
+    values, wcs = image.values[::step, ::step], image.wcs
+    if step > 1:
+        wcs = wcs.slice((slice(None, None, step), slice(None, None, step)))
+    ax = plot_map(values, wcs, title="Input: the sky before the beam")
+    caption = "The input map, before beam, opacity and filters."
+    return Picture(product_path("", name).name, "Input", caption, _png(ax))
+
+
+def _shown(product: MapProduct, options: Plots) -> tuple[MapProduct, str]:
+    """The product as its picture shows it, and what was done to it."""
+    if product.header is None:
+        return product, "not smoothed"
+    if options.smooth == "none" or product.smoothed_by:
+        return product, f"smoothed by {_arcsec(product.smoothed_by)}" if product.smoothed_by else "not smoothed"
+    fwhm = product.fwhm if options.smooth == "beam" else float(options.smooth)
+    return (product.smoothed(fwhm), f"smoothed by {_arcsec(fwhm)} for this picture") if fwhm > 0 else (product, "not smoothed")
+
+
+def _arcsec(angle: float) -> str:
+    return f"{np.degrees(angle) * 3600:.3g}″"
+
+
+def _covered(product: MapProduct, options: Plots) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Pixels with enough samples to be shown."""
+    hits = product.hits
+    seen = hits[hits > 0]
+    return np.asarray(hits >= options.least_coverage * np.percentile(seen, 99)) if seen.size else hits > 0
+
+
+def _limit(values: Any, product: MapProduct) -> float | None:
+    """Brightness scale by what is well covered: the noisy rim must not set it."""
+    hits = product.hits
+    if not hits.any():
+        return None
+    good = np.abs(values[(hits > 0.25 * np.percentile(hits[hits > 0], 99)) & np.isfinite(values)])
+    return float(np.percentile(good, 99.7)) if good.size else None
+
+
+def _draw(name: str, product: MapProduct, planes: dict[str, Any], titles: dict[str, str], options: Plots, circle: bool) -> bytes:
+    """One panel per plane."""
+    from matplotlib.figure import Figure
+
+    covered = _covered(product, options)
+    view = MapView.of(name, product)
+    view.planes = {k: np.where(covered, v, np.nan) for k, v in planes.items()}
+    limits = [_limit(v, product) for v in planes.values()]
+    limit = max((x for x in limits if x), default=None)
+    flat = view.flat()
+    figure = Figure(figsize=(6.4 * len(planes), 5.2), dpi=110, layout="constrained")
+    for k, plane in enumerate(planes, 1):
+        ax = figure.add_subplot(1, len(planes), k, projection=flat.wcs)
+        width = options.central_diameter if circle else None
+        plot_map(flat.planes[plane], flat.wcs, ax=ax, title=titles[plane], fwhm=view.fwhm or None, limit=limit, circle=width)
+    return _png(ax)
+
+
+def _map(name: str, product: MapProduct, options: Plots) -> Picture:
+    run, _, _ = name.rpartition("/")
+    shown, how = _shown(product, options)
+    title = {"": "Map", "noiseless": "Map of the noiseless run"}.get(run, f"Map of run {run}")
+    meaning = {
+        "": "Everything: sky, atmosphere and noise, filtered and binned.",
+        "noiseless": "The sky alone through the same pointing, filters and binning: what the processing leaves of it.",
+    }.get(run, "A companion run.")
+    png = _draw(name, shown, {"signal": shown.signal}, {"signal": title}, options, circle=False)
+    return Picture(product_path("", name).name, title, f"{meaning} {how[0].upper()}{how[1:]}.", png)
+
+
+def _noise(name: str, maps: dict[str, MapProduct], options: Plots) -> Picture:
+    product = maps[name]
+    planes: dict[str, Any] = {}
+    titles: dict[str, str] = {}
+    figures = []
+    how = ""
+    words = {"half_difference": "even minus odd scans", "source_free": "run without the sky"}
+    for of, (source, plane) in noise_sources(maps, name).items():
+        shown, how = _shown(source, options)
+        planes[of], titles[of] = np.asarray(getattr(shown, plane)), f"Noise: {words[of]}"
+        rms = shown.rms(options.central_diameter / 2, of=plane)
+        if np.isfinite(rms):
+            figures.append(f"{words[of]} {rms * 1e6:.4g} µK_RJ")
+    resolution, _ = _shown(product, options)
+    png = _draw(name, resolution, planes, titles, options, circle=True)
+    text = "Noise maps on one scale, " + how + "."
+    if figures:
+        text += (
+            f" Weighted rms within the dotted circle of {np.degrees(options.central_diameter) * 60:.3g}′: {', '.join(figures)}."
+        )
+    return Picture(product_path("", f"noise_{name}").name, "Noise", text, png)
+
+
+def _coverage(name: str, product: MapProduct) -> Picture:
+    flat = MapView.of(name, product).flat()
+    ax = plot_coverage(flat.planes["hits"], flat.wcs)
+    suffix = "" if name == "map" else f"_{name}"
+    return Picture(
+        f"coverage{suffix}",
+        "Coverage",
+        f"{int(product.hits.sum()):,} samples in {int((product.hits > 0).sum()):,} pixels.",
+        _png(ax),
+    )
+
+
+def _spectra(name: str, spectrum: Spectrum) -> Picture:
+    ax = plot_spectra(spectrum)
+    many = f"{spectrum.detectors} detectors and {spectrum.observations} scan{'s' if spectrum.observations > 1 else ''}"
+    caption = (
+        f"Mean of {many} at step {spectrum.label}, referred to the calibrated sky: divided by ζe^-τ, the atmosphere times ε."
+    )
+    if "signal" in spectrum.psd:
+        caption += " The signal holds the mean emission too, which changes as the scan moves in elevation."
+    suffix = "" if name == "spectrum" else f"_{product_path('', name).name}"
+    return Picture(f"power_spectra{suffix}", "Power spectra", caption, _png(ax))
+
+
+def _streams(name: str, stream: TimeStream) -> list[Picture]:
+    suffix = "" if name == "time_streams" else f"_{product_path('', name).name}"
+    made = []
+    for which in stream.streams:
+        extra = "" if which == "signal" else f"_{which}"
+        caption = f"Stream {which} of {len(stream.names)} detectors at step {stream.label}."
+        made.append(Picture(f"tod{suffix}{extra}", "Time streams", caption, _png(plot_tod(stream, name=which))))
+    return made

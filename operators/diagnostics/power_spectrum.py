@@ -1,0 +1,222 @@
+"""Power spectra of the time streams, referred to the calibrated sky."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Seconds
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import PipelineError
+from zonda.core.operator import Operator
+from zonda.operators.io.streams import StreamsAsked
+
+Floats = NDArray[np.float64]
+StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
+
+ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
+
+
+@dataclass
+class Spectrum:
+    """Mean one-sided power spectral densities of time streams.
+
+    Attributes
+    ----------
+    frequency
+        (n,) Hz, without zero.
+    psd
+        (n,) per stream, K_RJ^2/Hz on the calibrated sky (`transmission`: relative, 1/Hz).
+    averages
+        Equivalent number of independent periodograms in each value: its relative standard error is averages^-1/2 where
+        detectors are independent.
+    white_level
+        2 <NET^2> of the detectors used, K_RJ^2/Hz: the level of white noise.
+    label
+        Of the step that measured it.
+    detectors, observations
+        How many were averaged.
+    """
+
+    frequency: Floats
+    psd: dict[str, Floats]
+    averages: float
+    white_level: float
+    label: str
+    detectors: int
+    observations: int = 1
+
+    def knee(self) -> float | None:
+        """Highest frequency at which the pink part exceeds the white one [Hz]; None where it never does or one is absent."""
+        if not {"pink", "white"} <= set(self.psd):
+            return None
+        edges = np.geomspace(self.frequency[0], self.frequency[-1], 31)
+        bins = np.clip(np.searchsorted(edges, self.frequency, "right") - 1, 0, 29)
+        sums = [np.bincount(bins, w, 30) for w in (np.log(self.frequency), self.psd["pink"], self.psd["white"])]
+        count = np.bincount(bins, minlength=30)
+        used = count > 0
+        log_f, pink, white = (s[used] / count[used] for s in sums)
+        if not (pink > 0).all() or not (white > 0).all():
+            return None
+        ratio = np.log(pink / white)
+        above = np.flatnonzero(ratio > 0)
+        if not above.size or above[-1] + 1 == ratio.size:
+            return None
+        k = above[-1]
+        return float(np.exp(np.interp(0.0, [-ratio[k], -ratio[k + 1]], [log_f[k], log_f[k + 1]])))
+
+
+def welch(values: Floats, sample_rate: float, length: int) -> tuple[Floats, Floats, float]:
+    """One-sided power spectral density by Welch's method (1967).
+
+    Segments of ``length`` samples overlap by half, each is freed of its straight line and weighted by a Hann window w once:
+
+        P_k = 2 |sum_t w_t x_t e^(-2 pi i k t / L)|^2 / (f_s sum_t w_t^2),    k > 0;  half of it at k = L/2        (1)
+
+    so that white noise of variance s^2 has P = 2 s^2 / f_s. Returns frequency (Hz, without zero), P, and the equivalent
+    number of independent segments.
+    """
+    from scipy.fft import rfft
+
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length) if length > 2 else np.ones(length)
+    line = np.arange(length) - (length - 1) / 2
+    starts = range(0, len(values) - length + 1, max(1, length // 2))
+    power = np.zeros(length // 2 + 1)
+    for start in starts:
+        segment = values[start : start + length] - values[start : start + length].mean()
+        segment -= line * ((segment * line).sum() / (line**2).sum())
+        segment *= window
+        found = rfft(segment)
+        power += found.real**2 + found.imag**2
+    power *= 2 / (len(starts) * sample_rate * (window**2).sum())
+    if length % 2 == 0:
+        power[-1] /= 2
+    overlap = ((window[: length - length // 2] * window[length // 2 :]).sum() / (window**2).sum()) ** 2
+    independent = len(starts) / (1 + 2 * overlap * (1 - 1 / len(starts)))
+    return np.arange(1, length // 2 + 1) * sample_rate / length, power[1:], independent
+
+
+@dataclass
+class _State:
+    detectors: NDArray[np.int64]
+    length: int
+    frequency: Floats | None = None
+    independent: float = 0.0
+    found: dict[int, dict[str, Floats]] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+class PowerSpectrum(Operator):
+    """Mean one-sided power spectra of the streams as they stand at this step, in K_RJ^2/Hz on the calibrated sky.
+
+    Components are divided as the calibration divides them: `atmosphere` times epsilon, `white` and `pink`, by zeta e^-tau.
+    Each segment is freed of a straight line, which takes the slow drift of the mean emission with elevation out.
+    Makes the product ``spectrum`` (a `Spectrum`), or one under this step's own name where it has one.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
+    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
+    main_run_only: ClassVar[bool] = True
+
+    streams: list[StreamName] | None = Field(None, min_length=1)
+    """Streams to measure; where absent, `signal` and every component but `transmission` that reaches this step."""
+    detectors: int = Field(16, ge=1)
+    """Number of detectors averaged, chosen evenly among those not flagged."""
+    segment: Seconds = quantity("128 s", gt=0)
+    """Length of Welch's segments (at most the scan): the inverse of the frequency resolution."""
+
+    def prepare(self, observation: Observation) -> _State:
+        usable = np.flatnonzero(observation.detector_flags == 0)
+        chosen = (
+            np.unique(np.linspace(0, usable.size - 1, min(usable.size, self.detectors)).round().astype(np.int64))
+            if usable.size
+            else []
+        )
+        length = min(observation.n_samples, max(2, round(self.segment * observation.sample_rate)))
+        if flagged := int(np.count_nonzero(observation.flags)):
+            observation.tally.count(self.label, "flagged samples that the power spectra include", flagged)
+        return _State(usable[chosen], length)
+
+    def exec(self, block: Block, state: _State) -> None:
+        observation = block.observation
+        if block.shape[1] != observation.n_samples:
+            raise PipelineError(
+                "got a part of a scan, not a whole one", place=self.label, cure="this is a fault of the executor: report it"
+            )
+        if state.length < 4:
+            return
+        for d in state.detectors[(state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)]:
+            found: dict[str, Floats] = {}
+            divisor = _divisor(block, int(d))
+            names: Sequence[str] = self.streams or [s for s in ORDER if s in block.detdata and s != "transmission"]
+            for name in names:
+                if name not in block.detdata:
+                    have = ", ".join(sorted(block.detdata))
+                    raise PipelineError(
+                        f"there is no stream {name!r} at this step", place=self.label, cure=f"choose from: {have}"
+                    )
+                values = _on_sky(block, int(d), name, divisor)
+                if np.isfinite(values).all():
+                    state.frequency, found[name], state.independent = welch(values, observation.sample_rate, state.length)
+                else:
+                    observation.tally.count(self.label, f"detectors left out for non-finite samples of {name}", 1)
+            with state.lock:
+                state.found[int(d)] = found
+
+    def collect(self, data: Data, observation: Observation, state: _State) -> None:
+        key = data.product(self.name or ("spectrum" if self.label == type(self).__name__ else self.label))
+        if state.frequency is None:
+            observation.tally.count(self.label, "scans too short for a power spectrum", 1)
+            return
+        names = [s for s in ORDER if any(s in f for f in state.found.values())]
+        psd = {}
+        for name in names:
+            rows = [state.found[d][name] for d in sorted(state.found) if name in state.found[d]]
+            psd[name] = np.mean(rows, axis=0)
+        count = len(state.found)
+        white = 2 * float(np.mean(observation.focalplane.net[sorted(state.found)] ** 2))
+        new = Spectrum(state.frequency, psd, state.independent * count, white, self.label, count)
+        old = data.products.get(key)
+        if old is None:
+            data.products[key] = new
+        elif (
+            old.frequency.shape == new.frequency.shape
+            and np.allclose(old.frequency, new.frequency, rtol=1e-12)
+            and old.psd.keys() == psd.keys()
+        ):
+            n = old.observations
+            merged = {k: (old.psd[k] * n + new.psd[k]) / (n + 1) for k in psd}
+            level = (old.white_level * n + white) / (n + 1)
+            data.products[key] = Spectrum(old.frequency, merged, old.averages + new.averages, level, self.label, count, n + 1)
+        else:
+            observation.tally.count(self.label, "scans of another length left out of the mean spectrum", 1)
+
+
+def _divisor(block: Block, detector: int) -> Floats:
+    """zeta e^-tau of one detector: (n_samp,), or (1,) where no step gave a transmission."""
+    zeta = block.observation.focalplane.main_beam_efficiency[detector]
+    transmission = block.observation.smooth.get("transmission")
+    if transmission is None:
+        return np.array([zeta])
+    return np.asarray(zeta * transmission.evaluate(slice(detector, detector + 1), block.samples)[0], np.float64)
+
+
+def _on_sky(block: Block, detector: int, name: str, divisor: Floats) -> Floats:
+    """One detector's whole stream, mean included, as it enters the calibrated sum, float64 (n_samp,)."""
+    values = block.detdata[name][detector - block.detectors.start].astype(np.float64)
+    if name in block.means:
+        values += block.means[name].evaluate(slice(detector, detector + 1), block.samples)[0]
+    if name == "atmosphere":
+        values *= block.observation.focalplane.illumination_efficiency[detector]
+    if name in ("atmosphere", "white", "pink"):
+        values /= divisor
+    return np.asarray(values, np.float64)

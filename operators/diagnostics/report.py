@@ -1,0 +1,377 @@
+"""One self-contained page that shows what a run made and says how."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from html import escape
+from importlib import resources
+from typing import Any, ClassVar
+
+import numpy as np
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Angle
+from zonda.core.data import Data
+from zonda.core.errors import ZondaError
+from zonda.core.files import write_text
+from zonda.core.operator import Operator
+from zonda.operators.io.map_view import maps_of, noise_figures
+from zonda.operators.io.save_map import output_folder
+
+from .plot_operators import Picture, Plots, pictures
+
+_WIDE = 1000
+"""Pictures wider than this many pixels take a whole row."""
+
+
+class Report(Operator):
+    """Write ``report.html``: the pictures, what was simulated, with which seed and versions, what was counted and approximated.
+
+    The page needs no other file and no network. ``resolved.yaml``, the configuration with every default filled in, is written
+    beside it when the run came from a file. Acts after all runs: put it last, so that it knows of the files before it.
+
+    Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
+    """
+
+    optional: ClassVar[frozenset[str]] = frozenset({"pictures", "map_file", "tod_file"})
+    provides: ClassVar[frozenset[str]] = frozenset({"report"})
+    at_end: ClassVar[bool] = True
+
+    central_diameter: Angle = quantity("1 arcmin", gt=0)
+    """Diameter of the circle about the map's centre in which the noise is stated."""
+
+    def finalize(self, data: Data) -> None:
+        folder = output_folder(data, self.label)
+        if text := str(data.provenance.get("resolved_yaml", "")):
+            write_text(folder / "resolved.yaml", text)
+        shown = data.products.get("pictures")
+        if shown is None:
+            shown = pictures(data, Plots(central_diameter=f"{self.central_diameter!r} rad"))
+        data.products["report"] = write_text(folder / "report.html", page(data, shown, self.central_diameter))
+
+
+def page(data: Data, shown: Sequence[Picture], central_diameter: float) -> str:
+    """The whole page. Everything that is not markup of this module is escaped."""
+    style = resources.files(__package__).joinpath("data/report.css").read_text(encoding="utf-8")
+    provenance = data.provenance
+    name = str(provenance.get("name") or "zonda run")
+    parts = [
+        ("results", "Results", _results(data, central_diameter)),
+        ("pictures", "Pictures", _pictures(shown)),
+        ("scene", "Scene", _scene(data)),
+        ("scans", "Scans", _scans(data)),
+        ("steps", "Steps", _steps(data)),
+        ("tally", "Counted and approximated", _tally(data)),
+        ("time", "Computing time", _timings(data)),
+        ("provenance", "Provenance", _provenance(data)),
+    ]
+    parts = [p for p in parts if p[2]]
+    links = "".join(f'<a href="#{key}">{title}</a>' for key, title, _ in parts)
+    sections = "\n".join(f'<section id="{key}"><h2>{title}</h2>{body}</section>' for key, title, body in parts)
+    scene = data.scene
+    line = f"{scene.instrument.name} on {scene.instrument.telescope.name} at {scene.site.name}, {scene.time}, seed {scene.seed}"
+    description = f"<p>{escape(str(provenance['description']))}</p>" if provenance.get("description") else ""
+    version = provenance.get("versions", {}).get("zonda", "")
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(name)} · zonda</title>
+<style>
+{style}</style>
+</head>
+<body>
+<header><h1>{escape(name)}</h1>{description}<p>{escape(line)}</p></header>
+<nav>{links}</nav>
+<main>
+{sections}
+</main>
+<footer>Simulated, not observed, by zonda {escape(str(version))}.</footer>
+</body>
+</html>
+"""
+
+
+def _table(rows: Iterable[Sequence[Any]], head: Sequence[str] = (), numbers: Sequence[int] = ()) -> str:
+    """A table; the first column is a header. Cells are escaped unless they are `_Html`; ``numbers``: right-aligned columns."""
+
+    def cell(k: int, value: Any) -> str:
+        text = value.text if isinstance(value, _Html) else escape(str(value))
+        tag, style = ("th" if k == 0 else "td"), (' class="number"' if k in numbers else "")
+        return f"<{tag}{style}>{text}</{tag}>"
+
+    body = "".join("<tr>" + "".join(cell(k, v) for k, v in enumerate(row)) + "</tr>" for row in rows)
+    top = ""
+    if head:
+        cells = (f"<th{' class=number' if k in numbers else ''}>{escape(h)}</th>" for k, h in enumerate(head))
+        top = "<thead><tr>" + "".join(cells) + "</tr></thead>"
+    style = "" if head else ' class="pairs"'
+    return f'<div class="scroll"><table{style}>{top}<tbody>{body}</tbody></table></div>' if body else ""
+
+
+class _Html:
+    """Text that is markup already."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+
+def _brightness(kelvin: float) -> str:
+    """A brightness with three figures, in the unit that reads best."""
+    if not math.isfinite(kelvin):
+        return "unknown"
+    for factor, unit in ((1e6, "µK_RJ"), (1e3, "mK_RJ")):
+        if abs(kelvin) * factor < 1e3:
+            return f"{kelvin * factor:.3g}\u00a0{unit}".replace("-", "−")
+    return f"{kelvin:.3g}\u00a0K_RJ".replace("-", "−")
+
+
+def _results(data: Data, diameter: float) -> str:
+    maps = maps_of(data.products)
+    seconds = sum(o.duration for o in data.observations)
+    samples = sum(o.n_samples * o.n_detectors for o in data.observations)
+    cards = [
+        (str(len(data.observations)), "scan" if len(data.observations) == 1 else "scans"),
+        (f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s", "on the sky"),
+        (f"{samples:,}".replace(",", "\u202f"), "samples of all detectors"),
+    ]
+    words = {"half_difference": "even − odd scans", "source_free": "run without the sky"}
+    where = f"central {np.degrees(diameter) * 60:.3g}′"
+    for figure in noise_figures(maps, diameter):
+        label = "" if figure.product == "map" else f", {figure.product}"
+        smoothed = math.isfinite(figure.smoothed)
+        cards.append(
+            (
+                _brightness(figure.smoothed if smoothed else figure.rms),
+                f"rms, {where}, {words[figure.of]}{', beam-smoothed' * smoothed}{label}",
+            )
+        )
+        if smoothed:
+            cards.append((_brightness(figure.rms), f"the same per {_angle(maps[figure.product].pixel)} pixel"))
+    if (image := data.products.get("input")) is not None and hasattr(image, "values") and np.isfinite(image.values).any():
+        cards.append((_brightness(_extreme(image.values)), "strongest pixel of the input"))
+    if (product := maps.get("noiseless/map")) is not None and np.isfinite(product.signal).any():
+        cards.append((_brightness(_extreme(product.signal)), "strongest pixel of the noiseless map"))
+    return (
+        '<div class="cards">'
+        + "".join(f"<div class=card><b>{escape(b)}</b><span>{escape(s)}</span></div>" for b, s in cards)
+        + "</div>"
+    )
+
+
+def _extreme(values: Any) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite[np.abs(finite).argmax()])
+
+
+def _pictures(shown: Sequence[Picture]) -> str:
+    figures = []
+    for picture in shown:
+        width = int.from_bytes(picture.png[16:20], "big")
+        image = base64.b64encode(picture.png).decode()
+        style = ' class="wide"' if width > _WIDE else ""
+        alt = escape(f"{picture.title}: {picture.caption}", quote=True)
+        caption = f"<figcaption><b>{escape(picture.title)}.</b> {escape(picture.caption)}</figcaption>"
+        figures.append(f'<figure{style}><img alt="{alt}" src="data:image/png;base64,{image}">{caption}</figure>')
+    return f'<div class="pictures">{"".join(figures)}</div>' if figures else ""
+
+
+def _angle(value: float) -> str:
+    for factor, unit in ((180 / math.pi, "°"), (10800 / math.pi, "′")):
+        if abs(value) * factor >= 1:
+            return f"{value * factor:.4g}{unit}"
+    return f"{value * 648000 / math.pi:.4g}″"
+
+
+def _scene(data: Data) -> str:
+    scene = data.scene
+    instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
+    band = instrument.band
+    rows: list[tuple[str, Any]] = [
+        ("Site", f"{site.name}: {np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°, {site.altitude:.0f} m"),
+        ("Telescope", f"{telescope.name}, {telescope.diameter:.4g} m"),
+        ("Instrument", f"{instrument.name}: {instrument.detectors} detectors in a field of {_angle(instrument.field_of_view)}"),
+        (
+            "Band",
+            f"{band.name}: {band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz, centre {band.centre / 1e9:.4g} GHz",
+        ),
+        ("Target", scene.target if scene.target is not None else "given by the pointing step"),
+        ("Start", scene.time),
+        ("Seed", scene.seed),
+    ]
+    if data.observations:
+        plane, rate = data.observations[0].focalplane, data.observations[0].sample_rate
+        rows[4:4] = [
+            ("Beam (FWHM)", _spread(plane.fwhm * 648000 / np.pi, "″")),
+            ("Main-beam efficiency ζ", _spread(plane.main_beam_efficiency)),
+            ("Illumination efficiency ε", _spread(plane.illumination_efficiency)),
+            ("NET on the sky", _spread(plane.net * 1e3, " mK_RJ √s")),
+            ("Read-out", f"{rate:.6g} Hz"),
+        ]
+    for kind, text in (("Site", site.provenance), ("Instrument", instrument.provenance), ("Band", band.provenance)):
+        if text:
+            rows.append((f"{kind}: source of the numbers", text))
+    return _table(rows)
+
+
+def _spread(values: Any, unit: str = "") -> str:
+    low, high = float(np.min(values)), float(np.max(values))
+    same = math.isclose(low, high, rel_tol=1e-9)
+    return f"{low:.4g}{unit}" if same else f"{low:.4g} to {high:.4g}{unit}, mean {float(np.mean(values)):.4g}"
+
+
+def _scans(data: Data) -> str:
+    rows = []
+    for o in data.observations:
+        elevation = np.degrees(o.elevation)
+        azimuth = np.degrees(np.unwrap(o.azimuth))
+        flagged = f"{np.count_nonzero(o.flags)} / {np.count_nonzero(o.detector_flags)}"
+        centre = f"{np.degrees(o.centre[0]):.5f}°, {np.degrees(o.centre[1]):+.5f}°"
+        rows.append(
+            (
+                o.name,
+                str(o.start).replace("T", " "),
+                f"{o.duration:.1f} s",
+                f"{o.n_detectors} × {o.n_samples}",
+                centre,
+                f"{elevation.min():.2f}° – {elevation.max():.2f}°",
+                f"{azimuth.min():.2f}° – {azimuth.max():.2f}°",
+                flagged,
+            )
+        )
+    head = (
+        "scan",
+        "start",
+        "duration",
+        "detectors × samples",
+        "target (RA, Dec)",
+        "elevation",
+        "azimuth",
+        "flagged samples / detectors",
+    )
+    return f'<div class="compact">{_table(rows, head)}</div>'
+
+
+_NUMBER = re.compile(r"([-+]?\d+\.?\d*(?:e[-+]?\d+)?) ([A-Za-z][A-Za-z0-9 /()]*)", re.IGNORECASE)
+
+
+def readable(text: str) -> str:
+    """``0.0011635528346628863 rad`` as ``4 arcmin``; other text as it is."""
+    match = _NUMBER.fullmatch(text.strip())
+    if match is None:
+        return text
+    value, unit = float(match[1]), match[2].strip()
+    choices: dict[str, list[tuple[float, str]]] = {
+        "rad": [(180 / math.pi, "deg"), (10800 / math.pi, "arcmin"), (648000 / math.pi, "arcsec")],
+        "rad / s": [(180 / math.pi, "deg/s"), (10800 / math.pi, "arcmin/s"), (648000 / math.pi, "arcsec/s")],
+        "s": [(1 / 60, "min"), (1, "s"), (1e3, "ms")],
+        "Hz": [(1e-9, "GHz"), (1e-3, "kHz"), (1, "Hz")],
+        "m": [(1e-3, "km"), (1, "m"), (1e3, "mm")],
+        "K": [(1, "K"), (1e3, "mK"), (1e6, "uK")],
+        "K s(1/2)": [(1, "K s(1/2)"), (1e3, "mK s(1/2)"), (1e6, "uK s(1/2)")],
+    }
+    scales = choices.get(unit)
+    if not scales:
+        return text
+    if value == 0:
+        return f"0 {unit.replace(' / ', '/')}"
+    factor, name = next(((f, n) for f, n in scales if abs(value) * f >= 0.9999995), scales[-1])
+    return f"{value * factor:.6g} {name}"
+
+
+def _steps(data: Data) -> str:
+    made = []
+    for label, kind, parameters in data.provenance.get("operators", []):
+        described = _class(kind)
+        doc = (described.__doc__ or "").strip().split("\n\n")[0] if described is not None else ""
+        fields = described.model_fields if described is not None else {}
+        rows = []
+        for key, text in parameters.items():
+            about = (fields[key].description or "") if key in fields else ""
+            value = _Html(f'<span title="{escape(str(text), quote=True)}">{escape(readable(str(text)))}</span>')
+            rows.append((key, value, _Html(f"<small>{_prose(about)}</small>")))
+        plain = label if label == kind else f"{label} ({kind})"
+        brief = " ".join(doc.split())
+        body = _table(rows) or '<p class="note">No parameters.</p>'
+        made.append(f"<details><summary>{escape(str(plain))}<small>{_prose(brief)}</small></summary>{body}</details>")
+    if not made:
+        return ""
+    return '<p class="note">In the order in which they acted; a step opens to its parameters.</p>' + "".join(made)
+
+
+def _prose(text: str) -> str:
+    """Docstring text: escaped, with single and double backquotes as code."""
+    return re.sub(r"``(.+?)``|`(.+?)`", lambda m: f"<code>{m[1] or m[2]}</code>", escape(" ".join(text.split())))
+
+
+def _class(kind: str) -> type[Operator] | None:
+    """The operator class of that name; None where its plugin cannot be had any more."""
+    from zonda.core.registry import mapmakers, operators
+
+    for registry in (operators, mapmakers):
+        with suppress(ZondaError, KeyError):
+            if kind in registry:
+                found = registry.get(kind)
+                if isinstance(found, type) and issubclass(found, Operator):
+                    return found
+    return None
+
+
+def _tally(data: Data) -> str:
+    """The main run's rows; those of companion runs (``noiseless/BinMap``) folded below."""
+    by_run: dict[str, list[tuple[str, str, str]]] = {"": []}
+    previous = ""
+    for who, what, value in data.tally:
+        run, _, step = who.rpartition("/")
+        number = f"{int(value):,}".replace(",", "\u202f") if re.fullmatch(r"\d+", value) else value
+        by_run.setdefault(run, []).append((step if who != previous else "", what, number))
+        previous = who
+    head = ("step", "what", "value")
+    parts = [_table(by_run.pop(""), head)]
+    for run, rows in by_run.items():
+        parts.append(f"<details><summary>Run {escape(run)}</summary>{_table(rows, head)}</details>")
+    return f'<div class="steps">{"".join(parts)}</div>' if any(parts) else ""
+
+
+def _timings(data: Data) -> str:
+    timings = data.provenance.get("timings", [])
+    if not timings:
+        return ""
+    by_step: dict[str, dict[str, float]] = {}
+    for label, stage, seconds in timings:
+        stages = by_step.setdefault(str(label), {})
+        stages[str(stage)] = stages.get(str(stage), 0.0) + float(seconds)
+    total = sum(sum(s.values()) for s in by_step.values())
+    longest = max((sum(s.values()) for s in by_step.values()), default=0.0) or 1.0
+    rows: list[tuple[Any, ...]] = []
+    for label, stages in by_step.items():
+        used = sum(stages.values())
+        detail = ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005)
+        bar = f'<span class="bar" style="width:{100 * used / longest:.1f}%"></span>'
+        rows.append((label, f"{used:.3f} s", _Html(bar), _Html(f"<small>{escape(detail)}</small>")))
+    note = f'<p class="note">CPU seconds of all runs, added up over threads: {total:.2f} s (first use includes compilation).</p>'
+    return note + _table(rows, ("step", "CPU", "", "stages"), numbers=(1,))
+
+
+def _provenance(data: Data) -> str:
+    provenance = data.provenance
+    rows: list[tuple[str, Any]] = [("seed", data.scene.seed)]
+    if provenance.get("command"):
+        rows.append(("command", provenance["command"]))
+    rows += [(k, v) for k, v in provenance.get("versions", {}).items()]
+    rows += [(k, str(provenance[k])) for k in ("precision", "runs") if provenance.get(k)]
+    files = [str(p.name) for key in ("map_file", "tod_file") for p in data.products.get(key, [])]
+    if files:
+        rows.append(("files", ", ".join(files)))
+    text = str(provenance.get("resolved_yaml", ""))
+    folded = (
+        f"<details><summary>Configuration with every default filled in</summary><pre>{escape(text)}</pre></details>"
+        if text
+        else ""
+    )
+    return _table(rows) + folded

@@ -1,0 +1,96 @@
+"""Keep a few detectors' time streams for a picture."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from zonda.core.data import Block, Data, Observation
+from zonda.core.operator import Operator
+from zonda.operators.io.streams import StreamsAsked
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class TimeStream:
+    """Streams of a few detectors of one scan.
+
+    Attributes
+    ----------
+    seconds
+        (n_samp,) s since the scan's start.
+    streams
+        (n_det, n_samp) K_RJ each, mean included.
+    names
+        (n_det) detector names.
+    observation, label
+        Name of the scan; the step at which they were taken.
+    """
+
+    seconds: Floats
+    streams: dict[str, Floats]
+    names: list[str]
+    observation: str
+    label: str
+    lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
+
+
+class TimeStreams(Operator):
+    """Keep the streams of a few detectors of one scan as they stand at this step, for a picture: product ``time_streams``.
+
+    Components (`sky`, `white` ...) are at the detector, before the calibration; `signal` is the calibrated sum.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
+    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
+    main_run_only: ClassVar[bool] = True
+
+    streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
+    """Streams to keep; those absent at this step are left out and counted."""
+    detectors: int = Field(3, ge=1, le=64)
+    """Number of detectors, chosen evenly."""
+    observation: int = Field(0, ge=0)
+    """Which scan, counted from 0."""
+
+    def prepare(self, observation: Observation) -> TimeStream | None:
+        if observation.index != self.observation:
+            return None
+        n = observation.n_detectors
+        chosen = np.unique(np.linspace(0, n - 1, min(n, self.detectors)).round().astype(int))
+        names = [observation.focalplane.names[d] for d in chosen]
+        streams: dict[str, Floats] = {
+            s: np.full((len(names), observation.n_samples), np.nan) for s in dict.fromkeys(self.streams)
+        }
+        return TimeStream(observation.seconds, streams, names, observation.name, self.label)
+
+    def exec(self, block: Block, state: TimeStream | None) -> None:
+        if state is None:
+            return
+        order = {name: k for k, name in enumerate(state.names)}
+        for d in range(block.detectors.start, block.detectors.stop):
+            k = order.get(block.observation.focalplane.names[d])
+            if k is None:
+                continue
+            row = slice(d, d + 1)
+            for name, kept in state.streams.items():
+                if name in block.detdata:
+                    values = block.detdata[name][d - block.detectors.start].astype(np.float64)
+                    if name in block.means:
+                        values += block.means[name].evaluate(row, block.samples)[0]
+                    kept[k, block.samples] = values
+
+    def collect(self, data: Data, observation: Observation, state: TimeStream | None) -> None:
+        if state is None:
+            return
+        for name in [s for s, values in state.streams.items() if np.isnan(values).all()]:
+            del state.streams[name]
+            observation.tally.count(self.label, f"stream {name} is absent at this step", 1)
+        key = self.name or ("time_streams" if self.label == type(self).__name__ else self.label)
+        data.products[data.product(key)] = state

@@ -1,0 +1,408 @@
+"""Removes what all detectors see alike: the first singular modes of the signal.
+
+With A the stream (detectors x samples) and u_i the leading eigenvectors of G = A A^T, eigenvalues sigma_i^2,
+
+    A <- A - sum_i u_i v_i^T,   v_i = A^T u_i.                                                            (1)
+
+G is never formed: one step of the Lanczos iteration (full reorthogonalization, float64) reads the stream once and gives
+A^T q and A A^T q together. It starts from the detector mean and stops when
+
+    |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is removed.                        (2)
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from zonda.core.data import Block, Observation
+from zonda.core.errors import PipelineError
+from zonda.core.operator import Operator
+from zonda.core.random import normals, stream_key
+from zonda.core.tiles import TILE_SAMPLES
+
+if TYPE_CHECKING:
+    from zonda.core.execution import Stream
+
+Floats = NDArray[np.float64]
+
+FLAG_DEAD = 8
+"""Bit set in ``detector_flags`` of detectors whose signal is constant or not finite."""
+
+ROUNDING = 2.0**-24 / np.sqrt(3.0)
+"""rms of float32's relative rounding error."""
+
+EMPTY = 1e-13
+"""Share of the stream's energy, per detector, that G cannot tell from rounding."""
+
+NOTHING = 1e-26
+"""Share of the stream's energy below which what is left after subtraction is float64 rounding: there is no further mode."""
+
+
+class CommonModeFilter(Operator):
+    """Remove the first singular modes of each scan: equation (1). Flagged samples and detectors take no part."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+
+    modes: int = Field(1, ge=1, le=100)
+    """How many modes to remove."""
+    method: Literal["svd", "mean"] = "svd"
+    """Singular modes, or the plain mean of all detectors at each instant (one mode)."""
+    residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
+    """Largest residual of a removed mode, equation (2)."""
+    gap: float = Field(0.9, gt=0, lt=1)
+    """A mode is determined by the data while the next singular value is at most this times its own."""
+    on_undetermined: Literal["mean", "skip", "remove"] = "mean"
+    """What to do with a mode that is not determined: remove the detectors' mean (in place of the first), skip or remove it."""
+
+    @model_validator(mode="after")
+    def _one_mean(self) -> CommonModeFilter:
+        if self.method == "mean" and self.modes != 1:
+            raise ValueError("method: mean removes one mode; leave modes at 1 or choose method: svd")
+        return self
+
+    def prepare(self, observation: Observation) -> Modes:
+        """Empty modes, filled by `measure`."""
+        return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
+
+    def measure(self, stream: Stream, state: Modes) -> None:
+        """Find the modes. Raises PipelineError where float32 cannot carry the remainder."""
+        observation, tally, who = stream.observation, stream.observation.tally, self.label
+        place = f"{who}, {observation.name}"
+        if stream.means.get("signal") is not None and stream.array.dtype != np.float64:
+            raise PipelineError(
+                "the mean emission, tens of kelvin, is still part of the signal and float32 cannot carry it",
+                place=place,
+                cure="put a HighpassFilter before, or set precision: float64",
+            )
+        with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+            gram = Gram(stream, pool)
+            for name, dead in (("not finite", gram.not_finite), ("constant", gram.constant)):
+                tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
+                observation.detector_flags[dead] |= FLAG_DEAD
+            found = Ritz.of_mean(gram) if self.method == "mean" else lanczos(gram, self)
+            count = self._choose(found, gram, observation)
+        state.detectors, state.times = found.detectors[:count], found.times[:count]
+        sizes = np.sqrt(np.maximum(found.values[: self.modes + 1], 0.0) / max(1, gram.n_good * gram.n_used))
+        values = ", ".join(f"{s:.4g}" for s in sizes)
+        worst = found.residuals[:count].max(initial=0.0)
+        tally.state(who, f"{observation.name}: singular values / sqrt(detectors x samples)", f"{values or 'none'} K")
+        tally.state(who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps")
+        tally.state(who, f"{observation.name}: modes removed", f"{count} ({found.what})")
+        self._check_precision(found, count, gram, stream, place)
+
+    def _choose(self, found: Ritz, gram: Gram, observation: Observation) -> int:
+        """Number of modes to remove; may replace the modes by the detectors' mean."""
+        tally = observation.tally
+        wanted = min(self.modes, max(0, found.rank - 1))
+        tally.count(self.label, "modes kept because the data do not determine them (rank)", self.modes - wanted)
+        if self.method == "mean":
+            return wanted
+        size = np.sqrt(np.maximum(found.values, 0.0))
+        following = np.append(size, 0.0)[1:]
+        open_gaps = [i + 1 for i in range(wanted) if following[i] <= self.gap * size[i]]
+        determined = max(open_gaps, default=0)
+        tally.count(self.label, "modes not determined (gap closed)", wanted - determined)
+        if determined == wanted or self.on_undetermined == "remove":
+            return wanted
+        if self.on_undetermined == "mean" and determined == 0:
+            mean = Ritz.of_mean(gram)
+            found.detectors, found.times, found.residuals = mean.detectors, mean.times, mean.residuals
+            found.what = "detector mean, because the gap is closed"
+            return 1
+        return determined
+
+    def _check_precision(self, found: Ritz, count: int, gram: Gram, stream: Stream, place: str) -> None:
+        if stream.array.dtype != np.float32 or not count or gram.energy <= 0:
+            return
+        left = max(gram.energy - float(found.energies[:count].sum()), 0.0) / gram.energy
+        if 0.01 * np.sqrt(left) < ROUNDING:
+            rms, ratio = np.sqrt(gram.energy / (gram.n_good * gram.n_used)), 1 / max(np.sqrt(left), 1e-30)
+            raise PipelineError(
+                f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than float32 can carry",
+                place=place,
+                cure="set precision: float64",
+            )
+
+    def exec(self, block: Block, state: Modes) -> None:
+        """Equation (1) on one block."""
+        signal = block.detdata["signal"]
+        mean = block.means.get("signal")
+        if mean is not None and len(state.detectors):
+            signal += mean.evaluate(block.detectors, block.samples)
+            del block.means["signal"]
+        for u, v in zip(state.detectors, state.times, strict=True):
+            _remove(signal, u[block.detectors], v[block.samples])
+
+
+@dataclass
+class Modes:
+    """Modes to remove: u (k, n_det), unit vectors, and v (k, n_samp), K_RJ."""
+
+    detectors: Floats
+    times: Floats
+
+
+class Gram:
+    """G = A A^T as an operator on vectors over detectors, without flagged samples, flagged and dead detectors.
+
+    Work is cut into absolute tiles of `TILE_SAMPLES` samples, whose parts are added in order: the bits do not depend on the
+    number of threads.
+    """
+
+    def __init__(self, stream: Stream, pool: ThreadPoolExecutor) -> None:
+        self.stream, self.pool = stream, pool
+        self.n_samples = stream.shape[1]
+        self.good_samples = stream.observation.flags == 0
+        self.n_used = int(self.good_samples.sum())
+        use = stream.observation.detector_flags == 0
+        total, square = self._moments()
+        finite = np.isfinite(square)
+        spread = square - total**2 / max(1, self.n_used)
+        steady = ~(spread > 1e-12 * square)
+        self.not_finite = use & ~finite
+        self.constant = use & finite & steady
+        self.use = use & finite & ~steady
+        self.n_good = int(self.use.sum())
+        self.squares = np.where(self.use, square, 0.0)
+        self.energy = float(self.squares.sum())
+
+    def _tiles(self) -> list[slice]:
+        return [slice(a, min(a + TILE_SAMPLES, self.n_samples)) for a in range(0, self.n_samples, TILE_SAMPLES)]
+
+    def _tile(self, samples: slice) -> tuple[NDArray[Any], int, int]:
+        """An array that holds these samples (mean emission included, zero where flagged), and where in it they are."""
+        array, mean, good = np.asarray(self.stream.array), self.stream.means.get("signal"), self.good_samples[samples]
+        if mean is None and good.all():
+            return array, samples.start, samples.stop
+        copy = np.array(array[:, samples], order="C")
+        if mean is not None:
+            copy += mean.evaluate(slice(0, copy.shape[0]), samples)
+        copy[:, ~good] = 0
+        return copy, 0, copy.shape[1]
+
+    def _moments(self) -> tuple[Floats, Floats]:
+        """Sum and sum of squares of each detector's good samples, (n_det,) each."""
+
+        def work(samples: slice) -> Floats:
+            out = np.zeros((2, self.stream.shape[0]))
+            _moments(*self._tile(samples), out)
+            return out
+
+        parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, 2, self.stream.shape[0])
+        with np.errstate(invalid="ignore"):
+            total, square = parts.sum(axis=0)
+        return total, square
+
+    def apply(self, q: Floats) -> tuple[Floats, Floats]:
+        """(G q, A^T q): shapes (n_det,) and (n_samp,); A^T q is 0 at flagged samples."""
+        times, rows = np.zeros(self.n_samples), np.flatnonzero(self.use)
+
+        def work(samples: slice) -> Floats:
+            out = np.zeros(q.size)
+            _product(*self._tile(samples), q, rows, times[samples], out)
+            return out
+
+        parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, q.size)
+        return parts.sum(axis=0), times
+
+    def left(self, detectors: Floats, times: Floats) -> float:
+        """Energy of A - sum u v^T, formed without cancellation."""
+
+        def work(samples: slice) -> float:
+            array, start, stop = self._tile(samples)
+            rest = array[self.use, start:stop].astype(np.float64)
+            for u, v in zip(detectors, times, strict=True):
+                rest -= np.outer(u[self.use], v[samples])
+            return float(np.einsum("dt,dt->", rest, rest))
+
+        return sum(self.pool.map(work, self._tiles()))
+
+
+@dataclass
+class Ritz:
+    """Approximate leading eigenpairs of G, largest first.
+
+    Attributes
+    ----------
+    values
+        sigma_i^2; may be longer than ``detectors``. `energies`: |v_i|^2 of the modes at hand.
+    detectors, times
+        u_i (k, n_det) and v_i = A^T u_i (k, n_samp).
+    residuals
+        Left side of (2) over sigma_i^2.
+    rank
+        Rank of A as far as it matters here (a lower bound).
+    """
+
+    values: Floats
+    detectors: Floats
+    times: Floats
+    residuals: Floats
+    rank: int
+    steps: int
+    what: str = "singular modes"
+    energies: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.energies = np.einsum("kt,kt->k", self.times, self.times)
+
+    @classmethod
+    def of_mean(cls, gram: Gram) -> Ritz:
+        """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
+        if gram.n_good == 0:
+            return cls.nothing(gram)
+        u = gram.use / np.sqrt(gram.n_good)
+        _, v = gram.apply(u)
+        rank = 1 + (gram.left(u[None], v[None]) > NOTHING * gram.energy)
+        return cls(np.array([v @ v]), u[None], v[None], np.zeros(1), rank, 1, "detector mean")
+
+    @classmethod
+    def nothing(cls, gram: Gram) -> Ritz:
+        """No mode at all: no detector is left."""
+        n_det = gram.use.size
+        return cls(np.zeros(0), np.zeros((0, n_det)), np.zeros((0, gram.n_samples)), np.zeros(0), 0, 0, "no good detector")
+
+
+def lanczos(gram: Gram, how: CommonModeFilter) -> Ritz:
+    """Leading modes of ``gram`` to ``how.residual``, or to a tenth where the gap is closed and the modes are not removed."""
+    n, wanted = gram.n_good, how.modes
+    if n == 0:
+        return Ritz.nothing(gram)
+    start = gram.use * (1.0 + 0.01 * _directions(0, gram))
+    basis: list[Floats] = [start / np.linalg.norm(start)]
+    times: list[Floats] = []
+    projected = np.zeros((n, n)) if n <= 4096 else np.zeros((512, 512))
+    while True:
+        m = len(basis)
+        image, time = gram.apply(basis[-1])
+        times.append(time)
+        space = np.array(basis)
+        column = space @ image
+        projected[:m, m - 1] = projected[m - 1, :m] = column
+        rest = image - column @ space
+        again = space @ rest
+        rest -= again @ space
+        rest[~gram.use] = 0.0
+        beta = float(np.linalg.norm(rest))
+        values, vectors = np.linalg.eigh(projected[:m, :m])
+        values, vectors = values[::-1], vectors[:, ::-1]
+        floor = EMPTY * n * gram.energy
+        residuals = beta * np.abs(vectors[-1]) / np.maximum(values, floor)
+        exhausted = m == min(n, len(projected)) or gram.energy - float(values.sum()) <= floor
+        enough = m > wanted
+        converged = bool((residuals[:wanted] <= how.residual).all())
+        closed = False
+        if enough and how.on_undetermined != "remove" and m >= wanted + 3:
+            size = np.sqrt(np.maximum(values, 0.0))
+            rough = bool((residuals[: wanted + 1] <= 0.1).all())
+            closed = rough and all(size[i + 1] > how.gap * size[i] for i in range(wanted))
+        if exhausted or closed or (enough and converged):
+            k = min(wanted, m)
+            detectors = np.array(vectors[:, :k].T @ space)
+            series = np.array(vectors[:, :k].T @ np.array(times))
+            rank = int(np.count_nonzero(values > floor))
+            if not exhausted:
+                rank += 1
+            elif rank < n:  # G squares what is small: look at the remainder itself
+                seen = vectors[:, :rank].T
+                rank += gram.left(seen @ space, seen @ np.array(times)) > NOTHING * gram.energy
+            return Ritz(values, detectors, series, residuals[:k], rank, m)
+        if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
+            rest = gram.use * _directions(m, gram)
+            for _ in range(2):
+                rest = rest - (space @ rest) @ space
+            beta = float(np.linalg.norm(rest))
+        basis.append(rest / beta)
+
+
+def _directions(step: int, gram: Gram) -> Floats:
+    """Fixed pseudo-random numbers over detectors (n_det,)."""
+    return normals(stream_key(0, "CommonModeFilter", step), 0, gram.use.size).astype(np.float64)
+
+
+LANES = 32
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _moments(array, start, stop, out):  # type: ignore[no-untyped-def]
+    """Adds each row's sum and sum of squares over samples start .. stop - 1 to out (2, n_det)."""
+    n_det, n = array.shape[0], stop - start
+    whole = n // LANES * LANES
+    first, second = np.empty(LANES), np.empty(LANES)
+    for d in range(n_det):
+        row = array[d, start:stop]
+        first[:] = 0.0
+        second[:] = 0.0
+        for base in range(0, whole, LANES):
+            x = row[base : base + LANES]
+            for i in range(LANES):
+                y = np.float64(x[i])
+                first[i] += y
+                second[i] += y * y
+        for t in range(whole, n):
+            first[0] += row[t]
+            second[0] += np.float64(row[t]) ** 2
+        for i in range(LANES):
+            out[0, d] += first[i]
+            out[1, d] += second[i]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _product(array, start, stop, q, rows, v, out):  # type: ignore[no-untyped-def]
+    """v = A^T q at samples start .. stop - 1 and out = A v, over the detectors ``rows``, four at a time."""
+    n = stop - start
+    v[:] = 0.0
+    fours = rows.size // 4 * 4
+    for k in range(0, fours, 4):
+        q0, q1, q2, q3 = q[rows[k]], q[rows[k + 1]], q[rows[k + 2]], q[rows[k + 3]]
+        a, b = array[rows[k], start:stop], array[rows[k + 1], start:stop]
+        c, d = array[rows[k + 2], start:stop], array[rows[k + 3], start:stop]
+        for t in range(n):
+            v[t] += (q0 * np.float64(a[t]) + q1 * np.float64(b[t])) + (q2 * np.float64(c[t]) + q3 * np.float64(d[t]))
+    for k in range(fours, rows.size):
+        q0, a = q[rows[k]], array[rows[k], start:stop]
+        for t in range(n):
+            v[t] += q0 * np.float64(a[t])
+    whole = n // LANES * LANES
+    lanes = np.empty((4, LANES))
+    l0, l1, l2, l3 = lanes[0], lanes[1], lanes[2], lanes[3]
+    for k in range(0, rows.size, 4):
+        last = rows.size - 1
+        r0, r1, r2, r3 = rows[k], rows[min(k + 1, last)], rows[min(k + 2, last)], rows[min(k + 3, last)]
+        lanes[:] = 0.0
+        for base in range(0, whole, LANES):
+            w, at = v[base : base + LANES], start + base
+            a, b = array[r0, at : at + LANES], array[r1, at : at + LANES]
+            c, d = array[r2, at : at + LANES], array[r3, at : at + LANES]
+            for i in range(LANES):
+                l0[i] += np.float64(a[i]) * w[i]
+                l1[i] += np.float64(b[i]) * w[i]
+                l2[i] += np.float64(c[i]) * w[i]
+                l3[i] += np.float64(d[i]) * w[i]
+        for j in range(min(4, rows.size - k)):
+            r = rows[k + j]
+            total = 0.0
+            for i in range(LANES):
+                total += lanes[j, i]
+            for t in range(whole, n):
+                total += np.float64(array[r, start + t]) * v[t]
+            out[r] = total
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _remove(signal, u, v):  # type: ignore[no-untyped-def]
+    """signal -= u v^T in float64, rounded once."""
+    n_det, n = signal.shape
+    for d in range(n_det):
+        row, factor = signal[d], u[d]
+        for t in range(n):
+            row[t] = np.float64(row[t]) - factor * v[t]

@@ -1,0 +1,217 @@
+"""Time-ordered data as FITS binary tables: ``TOD`` (one row per detector), ``SAMPLES``, ``DETECTORS``, ``PROVENANCE``."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zonda.core.errors import InputError
+from zonda.core.files import writing
+
+from .save_map import ascii_text
+from .time_ordered_data import UNITS, Floats, TimeOrderedData
+from .toast_hdf5 import azimuth_elevation
+
+SUFFIX = ".fits"
+
+_DETECTOR_UNITS = {
+    "fwhm": "rad",
+    "polarization_angle": "rad",
+    "band_centre": "Hz",
+    "band_width": "Hz",
+    "net": "K s(1/2)",
+    "knee": "Hz",
+    "minimum_frequency": "Hz",
+}
+
+
+class Writer:
+    """Writes one observation, streams in rectangles and in any order; same interface as `toast_hdf5.Writer`.
+
+    The table ``TOD`` comes first, at a place known beforehand, so that rectangles go straight to their bytes; the tables
+    ``SAMPLES``, ``DETECTORS`` (with the flags as they are at the end) and ``PROVENANCE`` are appended by `finish`.
+    """
+
+    def __init__(self, path: Path, tod: TimeOrderedData, streams: list[str], dtype: str) -> None:
+        from astropy.io import fits
+
+        self.path, self._tod = path, tod
+        self._dtype = np.dtype(dtype).newbyteorder(">")
+        self._streams = list(streams)
+        self._name_bytes = max(len(d.encode()) for d in tod.names)
+        n, code = tod.n_samples, {"float64": "D", "float32": "E"}[dtype]
+        columns = [fits.Column("DETECTOR", f"{self._name_bytes}A")]
+        columns += [fits.Column(s.upper(), f"{n}{code}", unit=UNITS.get(s, "K") or None) for s in streams]
+        table = fits.BinTableHDU.from_columns(columns, nrows=0, name="TOD")
+        table.header["NAXIS2"] = tod.n_detectors
+        primary = fits.PrimaryHDU(header=_primary_header(tod)).header
+        head = (primary.tostring() + table.header.tostring()).encode("ascii")
+        self._data_start = len(head)
+        self._row = self._name_bytes + len(streams) * n * self._dtype.itemsize
+        size = tod.n_detectors * self._row
+        with writing(path):
+            self._file = path.open("w+b")
+            self._file.write(head)
+            self._file.truncate(self._data_start + -(-size // 2880) * 2880)
+            for d, name in enumerate(tod.names):
+                self._file.seek(self._data_start + d * self._row)
+                self._file.write(name.encode().ljust(self._name_bytes, b"\0"))
+
+    def write(self, stream: str, detectors: slice, samples: slice, values: Floats) -> None:
+        """A rectangle of a stream."""
+        column = self._name_bytes + (self._streams.index(stream) * self._tod.n_samples + samples.start) * self._dtype.itemsize
+        rows = np.ascontiguousarray(values, self._dtype)
+        with writing(self.path):
+            for d, row in zip(range(detectors.start, detectors.stop), rows, strict=True):
+                self._file.seek(self._data_start + d * self._row + column)
+                self._file.write(row.tobytes())
+
+    def finish(self) -> None:
+        """Append the other tables and close the file."""
+        with writing(self.path):
+            try:
+                self._file.seek(0, os.SEEK_END)
+                for table in (_samples_table(self._tod), _detectors_table(self._tod), _provenance_table(self._tod)):
+                    self._file.write(_bytes_of(table))
+            finally:
+                self._file.close()
+
+    def close(self) -> None:
+        """Close an unfinished file."""
+        with contextlib.suppress(OSError):  # nothing is lost: the caller removes the file
+            self._file.close()
+
+
+def _primary_header(tod: TimeOrderedData) -> Any:
+    from astropy.io import fits
+
+    header = fits.Header()
+    site, latitude, longitude, altitude = tod.site
+    header["OBJECT"] = (ascii_text(tod.name), "observation")
+    header["TELESCOP"] = ascii_text(tod.telescope)
+    header["SITE"] = ascii_text(site)
+    header["SITELAT"] = (float(np.degrees(latitude)), "[deg] geodetic latitude")
+    header["SITELON"] = (float(np.degrees(longitude)), "[deg] longitude, east positive")
+    header["SITEALT"] = (float(altitude), "[m] height above the ellipsoid")
+    header["DATE-OBS"] = (tod.start, "UTC, start of the scan")
+    header["TIMESYS"] = "UTC"
+    header["SAMPRATE"] = (float(tod.sample_rate), "[Hz]")
+    header["FOV"] = (float(np.degrees(tod.field_of_view)), "[deg] diameter")
+    header["TEMPSCAL"] = ("K_RJ", "temperature scale of the streams")
+    return header
+
+
+def _samples_table(tod: TimeOrderedData) -> Any:
+    from astropy.io import fits
+
+    azimuth, elevation = azimuth_elevation(tod.boresight_azel)
+    column = fits.Column
+    columns = [
+        column("SECONDS", "D", unit="s", array=tod.seconds),
+        column("TIME", "D", unit="s", array=tod.times),
+        column("AZ", "D", unit="rad", array=azimuth),
+        column("EL", "D", unit="rad", array=elevation),
+        column("BORESIGHT_AZEL", "4D", array=tod.boresight_azel),
+        column("BORESIGHT_RADEC", "4D", array=tod.boresight_radec),
+        column("FLAGS", "B", array=tod.flags),
+    ]
+    table = fits.BinTableHDU.from_columns(columns, name="SAMPLES")
+    table.header.add_comment(
+        "SECONDS counts from DATE-OBS of the primary header; TIME is POSIX. Quaternions are x, y, z, w as TOAST's."
+    )
+    return table
+
+
+def _detectors_table(tod: TimeOrderedData) -> Any:
+    from astropy.io import fits
+
+    column = fits.Column
+    columns = [
+        column("NAME", f"{max(len(d.encode()) for d in tod.names)}A", array=tod.names),
+        column("QUAT", "4D", array=tod.quats),
+        column("XI", "D", array=tod.xi),
+        column("ETA", "D", array=tod.eta),
+        column("FLAGS", "B", array=tod.detector_flags),
+    ]
+    columns += [column(k.upper(), "D", unit=_DETECTOR_UNITS.get(k), array=v) for k, v in tod.columns.items()]
+    return fits.BinTableHDU.from_columns(columns, name="DETECTORS")
+
+
+def _provenance_table(tod: TimeOrderedData) -> Any:
+    from astropy.io import fits
+
+    keys, values = list(tod.metadata), [json.dumps(v) for v in tod.metadata.values()]
+    columns = [
+        fits.Column(name, f"{max(map(len, [*texts, ' ']))}A", array=texts) for name, texts in (("KEY", keys), ("VALUE", values))
+    ]
+    return fits.BinTableHDU.from_columns(columns, name="PROVENANCE")
+
+
+def _bytes_of(table: Any) -> bytes:
+    import io
+
+    from astropy.io import fits
+
+    stream = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(stream)
+    return stream.getvalue()[2880:]  # without the primary header, which the file has already
+
+
+def read(path: str | os.PathLike[str]) -> TimeOrderedData:
+    """Read what `Writer` writes.
+
+    Raises
+    ------
+    InputError
+        No such file, not FITS, or one of the tables is missing.
+    """
+    from astropy.io import fits
+
+    place = f"time-ordered data {path}"
+    try:
+        file = fits.open(path)
+    except FileNotFoundError:
+        raise InputError("no such file", place=place, cure="check the path") from None
+    except OSError as error:
+        raise InputError(f"cannot be read as FITS: {error}", place=place, cure="give a file that SaveTOD wrote") from None
+    with file:
+        try:
+            return _read(file)
+        except KeyError as error:
+            raise InputError(f"is incomplete: {error.args[0]}", place=place, cure="give a file that SaveTOD wrote") from None
+
+
+def _read(file: Any) -> TimeOrderedData:
+    header, tod = file[0].header, file["TOD"]
+    samples, detectors, provenance = (file[name].data for name in ("SAMPLES", "DETECTORS", "PROVENANCE"))
+    fixed = {"NAME", "QUAT", "XI", "ETA", "FLAGS"}
+
+    def native(values: Any) -> Any:
+        array = np.asarray(values)
+        return array.astype(array.dtype.newbyteorder("="))
+
+    shape = len(detectors), len(samples)
+    return TimeOrderedData(
+        name=header["OBJECT"],
+        start=header["DATE-OBS"],
+        seconds=native(samples["SECONDS"]),
+        times=native(samples["TIME"]),
+        sample_rate=header["SAMPRATE"],
+        telescope=header["TELESCOP"],
+        field_of_view=float(np.radians(header["FOV"])),
+        site=(header["SITE"], float(np.radians(header["SITELAT"])), float(np.radians(header["SITELON"])), header["SITEALT"]),
+        boresight_azel=native(samples["BORESIGHT_AZEL"]),
+        boresight_radec=native(samples["BORESIGHT_RADEC"]),
+        flags=native(samples["FLAGS"]),
+        detector_flags=native(detectors["FLAGS"]),
+        names=[str(d) for d in detectors["NAME"]],
+        quats=native(detectors["QUAT"]),
+        columns={c.lower(): native(detectors[c]) for c in detectors.names if c not in fixed},
+        streams={c.lower(): native(tod.data[c]).reshape(shape) for c in tod.columns.names if c != "DETECTOR"},
+        metadata={str(key): json.loads(value) for key, value in zip(provenance["KEY"], provenance["VALUE"], strict=True)},
+    )

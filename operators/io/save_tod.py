@@ -1,0 +1,153 @@
+"""Write the time-ordered data of every scan, block by block, as TOAST's HDF5 or FITS binary tables."""
+
+from __future__ import annotations
+
+import os
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+from pydantic import Field
+
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import OutputError
+from zonda.core.files import atomic_path, check_output_folder, discard, product_path, publish, temporary_sibling
+from zonda.core.operator import Operator
+
+from . import fits_table, toast_hdf5
+from .streams import StreamsAsked
+from .time_ordered_data import TimeOrderedData
+
+_FORMATS: dict[str, Any] = {"hdf5": toast_hdf5, "fits": fits_table}
+
+
+@dataclass
+class _State:
+    """An open file. ``largest``: greatest magnitude written, K, for the statement about rounding."""
+
+    path: Path
+    temporary: Path
+    tod: TimeOrderedData
+    writer: Any
+    largest: float = 0.0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+class SaveTOD(Operator):
+    """Write the streams as they stand at this step, one file per scan: ``tod_<observation>.h5`` or ``.fits``.
+
+    The smooth mean emission is added in float64, so `signal` is the whole T_scan (or what the filters left of it). HDF5
+    files have TOAST 3's layout (version 2), which TOAST and sotodlib read; the noise model in them is the instrument's
+    nominal one. A file gets its name when its scan is complete: a failed or interrupted run leaves no half file.
+
+    Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
+    provides: ClassVar[frozenset[str]] = frozenset({"tod_file"})
+    main_run_only: ClassVar[bool] = True
+
+    format: Literal["hdf5", "fits"] = "hdf5"
+    """File format: hdf5 (TOAST's layout) or fits (binary tables)."""
+    streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
+    """Streams to write; components (sky, atmosphere ...) are as they entered the calibrated sum."""
+    dtype: Literal["float64", "float32"] = "float64"
+    """Number type in the file. TOAST wants float64; float32 rounds a mean of 30 K to 2 uK."""
+
+    def prepare(self, observation: Observation) -> _State:
+        if observation.output is None:
+            raise OutputError(
+                "there is no output folder",
+                place=self.label,
+                cure="give one: zonda run --output FOLDER, or run(scene, output=...)",
+            )
+        module = _FORMATS[self.format]
+        folder = check_output_folder(observation.output)
+        stem = f"tod_{observation.name}" if self.label == "SaveTOD" else f"tod_{self.label}_{observation.name}"
+        path = product_path(folder, stem, module.SUFFIX)
+        if path.is_dir():
+            raise OutputError(
+                "cannot be written: there is a folder of that name",
+                place=str(path),
+                cure="remove it or choose another output folder",
+            )
+        temporary = temporary_sibling(path)
+        tod = TimeOrderedData.of(observation)
+        try:
+            writer = module.Writer(temporary, tod, list(dict.fromkeys(self.streams)), self.dtype)
+        except BaseException:
+            discard(temporary)
+            raise
+        return _State(path, temporary, tod, writer)
+
+    def exec(self, block: Block, state: _State) -> None:
+        for name in dict.fromkeys(self.streams):
+            if name not in block.detdata:
+                have = ", ".join(sorted(block.detdata))
+                raise OutputError(f"there is no stream {name!r} at this step", place=self.label, cure=f"choose from: {have}")
+            values = block.total(name)
+            largest = float(np.abs(values).max(initial=0.0)) if name != "transmission" else 0.0
+            with state.lock:
+                state.largest = max(state.largest, largest)
+                state.writer.write(name, block.detectors, block.samples, values)
+
+    def collect(self, data: Data, observation: Observation, state: _State) -> None:
+        state.tod.flags, state.tod.detector_flags = observation.flags, observation.detector_flags
+        state.tod.metadata.update(_provenance(data))
+        state.writer.finish()
+        publish(state.temporary, state.path)
+        data.products.setdefault(data.product("tod_file"), []).append(state.path)
+        if self.dtype == "float32":
+            observation.tally.state(self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}")
+
+    def discard(self, observation: Observation, state: _State) -> None:
+        state.writer.close()
+        discard(state.temporary)
+
+
+def _provenance(data: Data) -> dict[str, str | int | float]:
+    versions = data.provenance.get("versions", {})
+    found: dict[str, str | int | float] = {"pipeline": str(data.provenance.get("name", ""))}
+    if "zonda" in versions:
+        found["version"] = str(versions["zonda"])
+    if text := data.provenance.get("resolved_yaml"):
+        found["resolved_yaml"] = str(text)
+    return found
+
+
+def load_tod(path: str | os.PathLike[str]) -> TimeOrderedData:
+    """Read a file that `SaveTOD` wrote, or another TOAST layout-2 HDF5 file.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read as such.
+    """
+    return _module(path).read(path)  # type: ignore[no-any-return]
+
+
+def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
+    """Write a whole scan, ``tod.streams`` included; the format follows the suffix (.h5, .hdf5, .fits). Returns the path.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written.
+    """
+    types = {s.dtype.name for s in tod.streams.values()}
+    with atomic_path(path) as temporary:
+        writer = _module(path).Writer(temporary, tod, list(tod.streams), "float64" if types != {"float32"} else "float32")
+        try:
+            for name, values in tod.streams.items():
+                writer.write(name, slice(0, tod.n_detectors), slice(0, tod.n_samples), values)
+            writer.finish()
+        finally:
+            writer.close()
+    return Path(path)
+
+
+def _module(path: str | os.PathLike[str]) -> Any:
+    return fits_table if Path(path).suffix.lower() in (".fits", ".fit") else toast_hdf5

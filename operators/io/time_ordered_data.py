@@ -1,0 +1,140 @@
+"""One scan as it goes to and comes from a file: pointing, detectors, flags and streams."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Observation
+
+Floats = NDArray[np.floating]
+
+UNITS = {"transmission": "", "flags": ""}
+"""Units of streams that are not in K."""
+
+
+@dataclass
+class TimeOrderedData:
+    """What a time-ordered data file holds.
+
+    Attributes
+    ----------
+    name
+        Of the observation.
+    start
+        Exact start, UTC, ISO 8601 with a fraction of a second.
+    seconds
+        (n_samp,) float64, s since ``start``.
+    times
+        (n_samp,) float64, POSIX seconds (0.24 us resolution).
+    sample_rate
+        Hz.
+    telescope, field_of_view
+        Name; diameter of the circle that holds all detectors, rad.
+    site
+        name, latitude [rad], longitude [rad], altitude [m].
+    boresight_azel, boresight_radec
+        (n_samp, 4) quaternions (x, y, z, w), see `Observation`.
+    flags, detector_flags
+        (n_samp,) and (n_det,) uint8; nonzero: do not use.
+    names, quats
+        Detector names; (n_det, 4) rotations from the boresight's frame to the detectors'.
+    columns
+        Further detector columns, (n_det,) each, SI: fwhm [rad], net [K_RJ sqrt(s)], knee, minimum_frequency [Hz], slope,
+        band_centre, band_width [Hz], main_beam_efficiency, illumination_efficiency, polarization_angle [rad].
+    streams
+        (n_det, n_samp) arrays; K_RJ but for `transmission`, which is relative.
+    metadata
+        Text and numbers that say where the data come from.
+    """
+
+    name: str
+    start: str
+    seconds: NDArray[np.float64]
+    times: NDArray[np.float64]
+    sample_rate: float
+    telescope: str
+    field_of_view: float
+    site: tuple[str, float, float, float]
+    boresight_azel: NDArray[np.float64]
+    boresight_radec: NDArray[np.float64]
+    flags: NDArray[np.uint8]
+    detector_flags: NDArray[np.uint8]
+    names: list[str]
+    quats: NDArray[np.float64]
+    columns: dict[str, NDArray[np.float64]]
+    streams: dict[str, Floats] = field(default_factory=dict)
+    metadata: dict[str, str | int | float] = field(default_factory=dict)
+
+    @property
+    def n_samples(self) -> int:
+        return len(self.seconds)
+
+    @property
+    def n_detectors(self) -> int:
+        return len(self.names)
+
+    @property
+    def xi(self) -> NDArray[np.float64]:
+        """(n_det,) gnomonic offset towards increasing azimuth."""
+        return np.asarray(-self._directions[1] / self._directions[2])
+
+    @property
+    def eta(self) -> NDArray[np.float64]:
+        """(n_det,) gnomonic offset towards increasing elevation."""
+        return np.asarray(-self._directions[0] / self._directions[2])
+
+    @property
+    def _directions(self) -> NDArray[np.float64]:
+        """Detector directions in the boresight's frame, (3, n_det)."""
+        x, y, z, w = self.quats.T
+        return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+
+    @classmethod
+    def of(cls, observation: Observation, metadata: Mapping[str, str | int | float] | None = None) -> TimeOrderedData:
+        """Everything but the streams of an observation."""
+        o, f, instrument = observation, observation.focalplane, observation.instrument
+        n = len(f)
+        return cls(
+            name=o.name,
+            start=o.start.isoformat(),
+            seconds=o.seconds,
+            times=o.start.posix + o.seconds,
+            sample_rate=o.sample_rate,
+            telescope=instrument.name,
+            field_of_view=2 * float(np.arctan(f.radius)),
+            site=(o.site.name, o.site.latitude, o.site.longitude, o.site.altitude),
+            boresight_azel=o.boresight_azel,
+            boresight_radec=o.boresight_radec,
+            flags=o.flags,
+            detector_flags=o.detector_flags,
+            names=list(f.names),
+            quats=detector_quaternions(f.xi, f.eta, f.polarization_angle),
+            columns={
+                "fwhm": f.fwhm,
+                "polarization_angle": f.polarization_angle,
+                "main_beam_efficiency": f.main_beam_efficiency,
+                "illumination_efficiency": f.illumination_efficiency,
+                "band_centre": np.full(n, instrument.band.centre),
+                "band_width": np.full(n, instrument.band.width),
+                "net": f.net,
+                "knee": np.full(n, instrument.knee),
+                "minimum_frequency": np.full(n, instrument.pink_minimum_frequency),
+                "slope": np.full(n, instrument.slope),
+            },
+            metadata={"seed": o.seed, "observation_index": o.index, **(metadata or {})},
+        )
+
+
+def detector_quaternions(xi: Floats, eta: Floats, angle: Floats) -> NDArray[np.float64]:
+    """Rotations (n, 4) that take the boresight frame's Z axis to (-eta, -xi, 1) and its X axis to the polarization angle.
+
+    q = Rz(phi) Ry(theta) Rz(angle - phi), theta = atan |(xi, eta)|, phi = atan2(-xi, -eta); see `Focalplane`.
+    """
+    half, phi = np.arctan(np.hypot(xi, eta)) / 2, np.arctan2(-np.asarray(xi), -np.asarray(eta))
+    roll = np.asarray(angle) / 2
+    x, y = -np.sin(half) * np.sin(phi - roll), np.sin(half) * np.cos(phi - roll)
+    return np.stack([x, y, np.cos(half) * np.sin(roll), np.cos(half) * np.cos(roll)], 1)

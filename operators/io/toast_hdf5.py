@@ -1,0 +1,292 @@
+"""TOAST 3's HDF5 observation file, layout version 2, written and read with h5py alone.
+
+What TOAST requires of a file is in its `toast.io.observation_hdf_utils`; sotodlib's ``load_toast_h5_file`` reads the same
+file. TOAST wants float64 signals, and an uncompressed ``detdata/signal``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zonda.core.configuration.time import Instant
+from zonda.core.errors import InputError
+from zonda.core.files import writing
+
+from .time_ordered_data import UNITS, Floats, TimeOrderedData
+
+SUFFIX = ".h5"
+
+_COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
+    "fwhm": ("fwhm", "arcmin", "rad"),
+    "polarization_angle": ("gamma", "rad", "rad"),
+    "band_centre": ("bandcenter", "GHz", "Hz"),
+    "band_width": ("bandwidth", "GHz", "Hz"),
+    "net": ("psd_net", "K s(1/2)", "K s(1/2)"),
+    "knee": ("psd_fknee", "Hz", "Hz"),
+    "minimum_frequency": ("psd_fmin", "Hz", "Hz"),
+    "slope": ("psd_alpha", "", ""),
+    "main_beam_efficiency": ("main_beam_efficiency", "", ""),
+    "illumination_efficiency": ("illumination_efficiency", "", ""),
+}
+
+
+def name_uid(name: str) -> int:
+    """TOAST's number of a name (toast.utils.name_UID)."""
+    return int.from_bytes(hashlib.md5(name.encode()).digest(), "little") & 0x7FFFFFFF
+
+
+class Writer:
+    """Writes one observation, streams in rectangles and in any order. Not thread-safe: guard it.
+
+    Parameters
+    ----------
+    path
+        File to create.
+    tod
+        Everything but the streams.
+    streams
+        Their names; `signal` is what TOAST expects.
+    dtype
+        Type of the streams.
+    """
+
+    def __init__(self, path: Path, tod: TimeOrderedData, streams: list[str], dtype: str) -> None:
+        import h5py
+
+        self.path, self._tod = path, tod
+        with writing(path):
+            self._file = h5py.File(path, "w")
+        group = self._file.create_group("detdata")
+        for name in streams:
+            data = group.create_dataset(name, (tod.n_detectors, tod.n_samples), dtype)
+            data.attrs["units"] = UNITS.get(name, "K")
+
+    def write(self, stream: str, detectors: slice, samples: slice, values: Floats) -> None:
+        """A rectangle of a stream."""
+        with writing(self.path):
+            self._file["detdata"][stream][detectors, samples] = values
+
+    def finish(self) -> None:
+        """Write everything else and close the file."""
+        with writing(self.path):
+            try:
+                _write_root(self._file, self._tod)
+                _write_instrument(self._file.create_group("instrument"), self._tod)
+                _write_metadata(self._file, self._tod)
+                _write_shared(self._file, self._tod)
+                flags = self._file["detdata"].create_dataset("flags", (self._tod.n_detectors, self._tod.n_samples), "u1")
+                flags.attrs["units"] = ""
+                for d in np.flatnonzero(self._tod.detector_flags):  # rows never written are zeros and take no room
+                    flags[int(d)] = self._tod.detector_flags[d]
+            finally:
+                self._file.close()
+
+    def close(self) -> None:
+        """Close an unfinished file."""
+        with contextlib.suppress(OSError):  # nothing is lost: the caller removes the file
+            self._file.close()
+
+
+def _write_root(file: Any, tod: TimeOrderedData) -> None:
+    file.attrs["toast_format_version"] = 2
+    file.attrs["observation_name"] = tod.name
+    file.attrs["observation_uid"] = name_uid(tod.name)
+    file.attrs["observation_samples"] = tod.n_samples
+    file.attrs["observation_detector_sets"] = "NONE"
+    file.attrs["observation_sample_sets"] = "NONE"
+    _long_attribute(file, "observation_detectors", json.dumps(tod.names))
+    flags = dict(zip(tod.names, tod.detector_flags.tolist(), strict=True))
+    _long_attribute(file, "observation_detector_flags", json.dumps(flags))
+
+
+def _long_attribute(group: Any, name: str, text: str) -> None:
+    """An attribute beyond HDF5's 64 KiB for compact ones (a few thousand detectors) as a variable-length string."""
+    import h5py
+
+    group.attrs.create(name, text, dtype=h5py.string_dtype())
+
+
+def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
+    import astropy.units as u
+    from astropy.io.misc.hdf5 import write_table_hdf5
+    from astropy.table import QTable
+
+    site, latitude, longitude, altitude = tod.site
+    group.attrs.update(
+        toast_format_version=2,
+        telescope_class="toast.instrument.Telescope",
+        telescope_name=tod.telescope,
+        telescope_uid=name_uid(tod.telescope),
+        focalplane_class="toast.instrument.Focalplane",
+        site_class="toast.instrument.GroundSite",
+        site_name=site,
+        site_uid=name_uid(site),
+        site_lat_deg=float(np.degrees(latitude)),
+        site_lon_deg=float(np.degrees(longitude)),
+        site_alt_m=float(altitude),
+        session_class="toast.instrument.Session",
+        session_name=tod.name,
+        session_uid=name_uid(tod.name),
+        session_start=float(tod.times[0]),
+        session_end=float(tod.times[-1]),
+    )
+    table = QTable()
+    table["name"] = np.array(tod.names).astype("S")
+    table["quat"] = tod.quats
+    for ours, values in tod.columns.items():
+        theirs, unit, si = _COLUMNS[ours]
+        table[theirs] = u.Quantity(values, si).to(unit) if unit else values
+    if "polarization_angle" in tod.columns:
+        table["psi_pol"] = table["gamma"]
+        table["pol_leakage"] = np.zeros(tod.n_detectors)
+    table["pixel"] = table["name"]
+    table["uid"] = np.array([name_uid(d) for d in tod.names], np.uint32)
+    table.meta["sample_rate"] = tod.sample_rate * u.Hz
+    table.meta["field_of_view"] = u.Quantity(tod.field_of_view, u.rad).to(u.deg)
+    write_table_hdf5(table, group, path="focalplane", serialize_meta=True)
+
+
+def _write_metadata(file: Any, tod: TimeOrderedData) -> None:
+    metadata = file.create_group("metadata")
+    other = metadata.create_group("other")
+    other.attrs["python_data_type"] = "dict"
+    other.attrs["zonda_start_utc"] = tod.start
+    for key, value in tod.metadata.items():
+        other.attrs[f"zonda_{key}"] = value
+    file.create_group("attr")
+    if {"net", "knee", "slope", "minimum_frequency"} <= set(tod.columns) and (tod.columns["net"] > 0).all():
+        _write_noise(metadata.create_group("noise_model"), tod)
+
+
+def _write_noise(group: Any, tod: TimeOrderedData) -> None:
+    """The nominal noise, in TOAST's two-sided convention: NET^2 (1 + (knee / max(f, f_min))^slope)."""
+    c, rate = tod.columns, tod.sample_rate
+    lowest = min(1e-5, rate / max(2 * tod.n_samples, 1))
+    frequency = np.geomspace(lowest, rate / 2, 100)
+    f = np.maximum(frequency, c["minimum_frequency"][:, None])
+    psd = c["net"][:, None] ** 2 * (1 + (c["knee"][:, None] / f) ** c["slope"][:, None])
+    names = [d.encode() for d in tod.names]
+    width = max(len(d) for d in names) + 1
+    group.attrs["class"] = "toast.noise.Noise"
+    group.attrs["psd_units"] = "K2 s"
+    weights = list(zip(names, 1 / (c["net"] ** 2 * rate), strict=True))
+    group.create_dataset("detector_weights", data=np.array(weights, f"S{width}, f4")).attrs["unit"] = "1 / K2"
+    group.create_dataset("mixing_matrix", data=np.array([(d, d, 1.0) for d in names], f"S{width}, S{width}, f4"))
+    group.create_dataset("psds", data=np.vstack([frequency, psd]).astype("f4"))
+    group.create_dataset("psds_indices", data=np.array([name_uid(d) for d in tod.names], np.uint32))
+    group.create_dataset("psds_keys", data=np.array(names, f"S{width}"))
+
+
+def _write_shared(file: Any, tod: TimeOrderedData) -> None:
+    azimuth, elevation = azimuth_elevation(tod.boresight_azel)
+    shared = {
+        "times": tod.times,
+        "seconds": tod.seconds,
+        "azimuth": azimuth,
+        "elevation": elevation,
+        "boresight_azel": tod.boresight_azel,
+        "boresight_radec": tod.boresight_radec,
+        "flags": tod.flags,
+    }
+    group = file.create_group("shared")
+    for name, values in shared.items():
+        group.create_dataset(name, data=values).attrs["comm_type"] = "column"
+    intervals = file.create_group("intervals")
+    intervals.attrs["times"] = "times"
+    for name in ("scanning", "throw"):
+        intervals.create_dataset(name, data=np.array([[tod.times[0]], [tod.times[-1]]]))
+
+
+def azimuth_elevation(boresight_azel: Floats) -> tuple[Floats, Floats]:
+    """Azimuth (0 to 2 pi, north through east) and elevation of quaternions (n, 4), rad."""
+    x, y, z, w = boresight_azel.T
+    azimuth = -np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
+    elevation = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
+    return azimuth % (2 * np.pi), elevation
+
+
+def read(path: str | os.PathLike[str]) -> TimeOrderedData:
+    """Read what `Writer` writes, and the same items of any TOAST layout-2 file.
+
+    Raises
+    ------
+    InputError
+        No such file, not HDF5, another layout, or an item that TOAST requires is missing.
+    """
+    import h5py
+
+    place = f"time-ordered data {path}"
+    try:
+        file = h5py.File(path, "r")
+    except FileNotFoundError:
+        raise InputError("no such file", place=place, cure="check the path") from None
+    except OSError as error:
+        raise InputError(f"cannot be read as HDF5: {error}", place=place, cure="give an HDF5 file in TOAST's layout") from None
+    with file:
+        version = file.attrs.get("toast_format_version")
+        if version != 2:
+            raise InputError(
+                f"toast_format_version is {version}, not 2", place=place, cure="save it again with TOAST 3.0 or later"
+            )
+        try:
+            return _read(file)
+        except KeyError as error:
+            raise InputError(f"is incomplete: {error.args[0]}", place=place, cure="save it again") from None
+
+
+def _read(file: Any) -> TimeOrderedData:
+    import astropy.units as u
+    from astropy.io.misc.hdf5 import read_table_hdf5
+    from astropy.table import QTable
+
+    instrument, shared, detdata = file["instrument"], file["shared"], file["detdata"]
+    table = QTable(read_table_hdf5(instrument, path="focalplane", character_as_bytes=False))
+    order = {name: k for k, name in enumerate(np.asarray(table["name"]).astype(str))}
+    names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]
+    rows = np.array([order[d] for d in names], int)
+    flags = json.loads(file.attrs["observation_detector_flags"])
+    columns = {}
+    for ours, (theirs, unit, si) in _COLUMNS.items():
+        if theirs in table.colnames:
+            values = table[theirs][rows]
+            columns[ours] = np.array(u.Quantity(values, unit).to_value(si) if unit else values, np.float64)
+    other = file["metadata/other"].attrs
+    times = shared["times"][:]
+    seconds = shared["seconds"][:] if "seconds" in shared else times - times[0]
+    start = other.get("zonda_start_utc")
+    if start is None:
+        start = Instant(round(float(times[0]) * 1e9)).isoformat()
+    own = {k.removeprefix("zonda_"): v for k, v in other.items() if k.startswith("zonda_") and k != "zonda_start_utc"}
+    a = instrument.attrs
+    n = len(times)
+    return TimeOrderedData(
+        name=str(file.attrs["observation_name"]),
+        start=str(start),
+        seconds=seconds,
+        times=times,
+        sample_rate=float(table.meta["sample_rate"].to_value(u.Hz)),
+        telescope=str(a["telescope_name"]),
+        field_of_view=float(table.meta["field_of_view"].to_value(u.rad)),
+        site=(
+            str(a["site_name"]),
+            float(np.radians(a["site_lat_deg"])),
+            float(np.radians(a["site_lon_deg"])),
+            float(a["site_alt_m"]),
+        ),
+        boresight_azel=shared["boresight_azel"][:],
+        boresight_radec=shared["boresight_radec"][:],
+        flags=shared["flags"][:] if "flags" in shared else np.zeros(n, np.uint8),
+        detector_flags=np.array([flags[d] for d in names], np.uint8),
+        names=names,
+        quats=np.asarray(table["quat"][rows], np.float64),
+        columns=columns,
+        streams={name: detdata[name][:] for name in detdata if name != "flags"},
+        metadata={k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()},
+    )

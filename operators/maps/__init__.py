@@ -1,0 +1,1 @@
+"""From time streams to maps."""

@@ -1,0 +1,405 @@
+"""Averages samples into pixels.
+
+    m_p = sum_i w_i d_i / sum_i w_i over the samples i in pixel p                                        (1)
+
+The sums are kept in fixed point (int64), so that they are exact and their bits depend neither on the order of blocks nor on
+the number of threads; each sample is rounded to `VALUE` = 2^-36 K (1.5e-11 K).
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, field_validator, model_validator
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.target import Target
+from zonda.core.configuration.units import Angle
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import InputError, PipelineError
+from zonda.core.operator import Operator
+from zonda.core.tiles import TILE_SAMPLES
+
+from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
+from .map_product import MapProduct
+
+Sums = NDArray[np.int64]
+
+VALUE = 2.0**36
+"""Fixed-point units per K in the sum of w d."""
+WEIGHT = 2.0**30
+"""Fixed-point units per reference weight in the sums of w and of the noise terms."""
+LARGEST = 2.0**50
+"""Largest w d that is accepted, in fixed-point units: 2^14 K at the reference weight."""
+MAGIC = 1.5 * 2.0**52
+"""A float64 q + MAGIC has the integer q in its low bits."""
+MAGIC_BITS = 0x4338000000000000
+
+DATA, HITS, WEIGHTS, NOISE = range(4)
+OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
+
+
+class BinMap(Operator):
+    """Average the samples in each pixel, equation (1), into a FITS image (TAN) or a HEALPix map."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal", "boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({"map"})
+
+    pixel: Angle = quantity("2 arcsec", gt=0)
+    """Side of a pixel."""
+    width: Angle | None = Field(None, gt=0)
+    """Width of the map; where absent, it covers the scans."""
+    height: Angle | None = Field(None, gt=0)
+    """Height of the map; where absent, the width if that is given, else it covers the scans."""
+    centre: Target | None = None
+    """Centre of the map; where absent, the first scan's target."""
+    projection: Literal["TAN"] = "TAN"
+    """Projection of the image."""
+    frame: Literal["icrs", "galactic"] = "icrs"
+    """Celestial frame of the map."""
+    nside: int | None = Field(None, ge=1, le=2**20)
+    """Make a HEALPix map of this resolution (a power of two) instead of an image."""
+    ordering: Literal["ring", "nested"] = "ring"
+    """HEALPix pixel order."""
+    weights: Literal["uniform", "inverse_variance"] = "inverse_variance"
+    """Weigh samples alike, or by the inverse variance that follows from each detector's NET."""
+    noise: Literal["net", "scatter"] = "net"
+    """Noise of each pixel: from the detectors' NET, or from the scatter of its samples."""
+    half_difference: bool = True
+    """Keep even and odd scans apart and make a noise map of their difference (needs two scans)."""
+    smooth: Angle | Literal["beam"] | None = None
+    """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam."""
+    product: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
+    """Name of the map among the products."""
+
+    _grid: Grid | None = PrivateAttr(None)
+    _variance: float = PrivateAttr(1.0)
+    _fwhm: float = PrivateAttr(0.0)
+    _middle: tuple[float, float] = PrivateAttr((0.0, 0.0))
+
+    @field_validator("nside")
+    @classmethod
+    def _power_of_two(cls, value: int | None) -> int | None:
+        if value is not None and value & (value - 1):
+            raise ValueError(f"nside must be a power of two, got {value}")
+        return value
+
+    @field_validator("centre")
+    @classmethod
+    def _on_the_sky(cls, value: Target | None) -> Target | None:
+        if value is not None and value.frame == "horizontal":
+            raise ValueError("the centre of a map must be fixed on the sky; give ICRS or galactic coordinates")
+        return value
+
+    @field_validator("smooth")
+    @classmethod
+    def _positive(cls, value: float | str | None) -> float | str | None:
+        if isinstance(value, float) and value <= 0:
+            raise ValueError("smooth must be positive; leave it out for no smoothing")
+        return value
+
+    @model_validator(mode="after")
+    def _one_grid(self) -> BinMap:
+        image_only = {"pixel", "width", "height", "centre", "projection"} & self.model_fields_set
+        if self.nside is not None and image_only:
+            raise ValueError(f"{sorted(image_only)[0]} belongs to an image, nside to a HEALPix map; give one of them")
+        if self.nside is None and "ordering" in self.model_fields_set:
+            raise ValueError("ordering belongs to a HEALPix map; give nside too")
+        return self
+
+    def observe(self, data: Data) -> None:
+        """Lay out one grid for all observations."""
+        if not data.observations:
+            return
+        first = data.observations[0]
+        instrument = first.instrument
+        self._variance = 2.0 ** round(math.log2(instrument.net**2 * first.sample_rate)) if instrument.net > 0 else 2.0**-12
+        self._fwhm = instrument.beam_fwhm
+        self._middle = in_frame(self.centre.icrs() if self.centre else first.centre, self.frame)
+        self._grid = self._healpix(data) if self.nside else self._image(data)
+
+    def _healpix(self, data: Data) -> HealpixGrid:
+        assert self.nside is not None
+        nest = self.ordering == "nested"
+        return HealpixGrid(self.nside, nest, covered_healpix(data.observations, self.nside, nest, self.frame), self.frame)
+
+    def _image(self, data: Data) -> TangentGrid:
+        width, height = self.width, self.height if self.height is not None else self.width
+        if width is None or height is None:
+            half_x, half_y = covering_extent(data.observations, self._middle, self.frame)
+            width = width if width is not None else 2 * half_x + 2 * self.pixel
+            height = height if height is not None else 2 * half_y + 2 * self.pixel
+        nx, ny = (max(1, math.ceil(side / self.pixel - 1e-6)) for side in (width, height))
+        if nx * ny > MOST_PIXELS:
+            raise InputError(
+                f"a map of {nx} x {ny} pixels is too large", place=self.label, cure="choose larger pixels or a smaller width"
+            )
+        return TangentGrid(self._middle, self.pixel, (ny, nx), self.frame)
+
+    def prepare(self, observation: Observation) -> Binning:
+        """Pointing, weights and empty sums for one observation."""
+        if self._grid is None:
+            raise PipelineError("no grid: observe() was not called", place=self.label, cure="run it in a Pipeline")
+        net = observation.focalplane.net
+        variance = net**2 * observation.sample_rate / self._variance  # of one sample, in reference units
+        weight = np.ones(len(net))
+        if self.weights == "inverse_variance":
+            if (net > 0).all():
+                weight = 1 / variance
+            elif (net != net[0]).any():
+                bad = observation.focalplane.names[int(np.flatnonzero(net <= 0)[0])]
+                raise PipelineError(
+                    f"detector {bad} has NET 0, which has no inverse variance", place=self.label, cure="set weights: uniform"
+                )
+        weight = np.rint(weight * WEIGHT) / WEIGHT  # so that the sums of w d and of w use the same w
+        if weight.max(initial=0.0) > 2.0**20 or weight.min(initial=1.0) < 2.0**-20:
+            raise PipelineError(
+                "the detectors' NETs differ by more than a factor of 1000", place=self.label, cure="set weights: uniform"
+            )
+        noise = weight**2 * variance
+        alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
+        return Binning(
+            self._grid, self._grid.pointing(observation), (observation.flags == 0).astype(np.uint8), weight, noise, alike
+        )
+
+    def exec(self, block: Block, state: Binning) -> None:
+        """Add one block to this thread's sums."""
+        sums, dropped, largest = state.of_thread()
+        plane, observation = block.observation.focalplane, block.observation
+        signal = block.total("signal") if "signal" in block.means else block.detdata["signal"]
+        begin, rows = block.samples.start, block.detectors
+        xi, eta, use = plane.xi[rows], plane.eta[rows], observation.detector_flags[rows] == 0
+        for start in range(begin, block.samples.stop, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, block.samples.stop)
+            index = np.empty((len(xi), stop - start), np.int32)
+            state.grid.pixels(state.pointing, start, stop, xi, eta, index)
+            _add(
+                signal, start - begin, index, use, state.good[start:stop], state.weight[rows], state.noise[rows],
+                self.noise == "scatter", state.alike, 1 / self._variance, sums, dropped, largest,
+            )  # fmt: skip
+
+    def collect(self, data: Data, observation: Observation, state: Binning) -> None:
+        """Add this observation to the even or the odd scans' sums."""
+        sums, dropped, largest = state.merged()
+        tally = observation.tally
+        tally.count(self.label, "samples binned", int(sums[:, HITS].sum()))
+        tally.count(self.label, "samples dropped: outside the map", int(dropped[OUTSIDE]))
+        tally.count(self.label, "samples dropped: flagged", int(dropped[FLAGGED]))
+        tally.count(self.label, "samples dropped: not finite", int(dropped[NOT_FINITE]))
+        if dropped[TOO_LARGE]:
+            raise PipelineError(
+                f"{int(dropped[TOO_LARGE])} samples are too large for the map's fixed-point sums",
+                place=f"{self.label}, {observation.name}",
+                cure="look for the operator that makes them; a signal is below 1e4 K",
+            )
+        key = data.product(f"{self.label} sums")
+        if key not in data.products:
+            data.products[key] = Halves(self._n_pixels())
+        data.products[key].add(observation, sums, largest, self.label)
+
+    def _n_pixels(self) -> int:
+        assert self._grid is not None
+        return self._grid.n_pixels
+
+    def finalize(self, data: Data) -> None:
+        """Turn the sums into ``data.products[data.product(product)]``, a `MapProduct`."""
+        halves = data.products.pop(data.product(f"{self.label} sums"), None)
+        if halves is None:
+            return
+        key = data.product(self.product)
+        if key in data.products:
+            raise PipelineError(
+                f"two steps make the product {self.product!r}", place=self.label, cure="give one of them another product name"
+            )
+        product = self._product_of(halves)
+        if self.smooth is not None:
+            product = product.smoothed(self._fwhm if self.smooth == "beam" else float(self.smooth))
+        data.products[key] = product
+        data.tally.state(self.label, "fixed-point step of the sums", f"{1 / VALUE:.1e} K per sample")
+        if self.half_difference and len(halves.scans) < 2:
+            data.tally.state(self.label, "half-difference", "not made: it needs two scans")
+
+    def _product_of(self, halves: Halves) -> MapProduct:
+        grid = self._grid
+        assert grid is not None
+        total = halves.sums[0] + halves.sums[1]
+        signal, weight = _mean(total)
+        hits = total[:, HITS]
+        noise = self._noise_of(total, signal, weight)
+        half = None
+        if self.half_difference and len(halves.scans) >= 2:
+            (even, w_even), (odd, w_odd) = _mean(halves.sums[0]), _mean(halves.sums[1])
+            with np.errstate(invalid="ignore", divide="ignore"):
+                half = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
+        unit = self._variance if self.weights == "inverse_variance" else 1.0
+        shape = grid.shape if isinstance(grid, TangentGrid) else (grid.n_pixels,)
+        arrays = [signal, hits, weight / unit, noise] + ([half] if half is not None else [])
+        keep = slice(None) if isinstance(grid, TangentGrid) else hits > 0
+        arrays = [a[keep].reshape(shape if isinstance(grid, TangentGrid) else -1) for a in arrays]
+        common: dict[str, Any] = {
+            "frame": self.frame, "weighting": self.weights, "noise_from": self.noise, "fwhm": self._fwhm, "scans": halves.scans,
+            "centre": self._middle, "half_difference": arrays[4] if half is not None else None,
+        }  # fmt: skip
+        if isinstance(grid, TangentGrid):
+            header = grid.wcs.to_header(relax=True)
+            return MapProduct(arrays[0], arrays[1], arrays[2], arrays[3], header=header, pixel=grid.pixel, **common)
+        size = math.sqrt(4 * math.pi / (12 * grid.nside**2))
+        return MapProduct(
+            arrays[0], arrays[1], arrays[2], arrays[3], header=None, pixel=size, nside=grid.nside, nest=grid.nest,
+            pixels=grid.pixels_covered[keep], **common,
+        )  # fmt: skip
+
+    def _noise_of(self, total: Sums, signal: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviation of each pixel's mean."""
+        term = total[:, NOISE] / WEIGHT * self._variance
+        hits = total[:, HITS]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            if self.noise == "net":
+                return np.where(hits > 0, np.sqrt(term) / weight, np.nan)
+            scatter = np.maximum(term / weight - signal**2, 0.0)
+            return np.where(hits > 1, np.sqrt(scatter / (hits - 1)), np.nan)
+
+
+def _mean(sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(signal, weight) of fixed-point sums (n_pixel, 4); NaN where there are no hits."""
+    weight = sums[:, WEIGHTS] / WEIGHT
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(sums[:, HITS] > 0, sums[:, DATA] / VALUE / weight, np.nan), weight
+
+
+@dataclass
+class Binning:
+    """One observation's pointing and weights, and the sums of each thread.
+
+    Attributes
+    ----------
+    good
+        (n_samp,) uint8: 1 where not flagged.
+    weight, noise
+        (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
+    alike
+        All detectors weigh the same: the sums of weights and noise follow from the hits.
+    """
+
+    grid: Grid
+    pointing: NDArray[np.float64]
+    good: NDArray[np.uint8]
+    weight: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    alike: bool
+    parts: dict[int, tuple[Sums, Sums, NDArray[np.float64]]] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def of_thread(self) -> tuple[Sums, Sums, NDArray[np.float64]]:
+        """(sums (n_pixel + 1, 4), dropped (4,), largest (4,)) of the calling thread; the last row is for what is dropped."""
+        mine = threading.get_ident()
+        with self.lock:
+            if mine not in self.parts:
+                self.parts[mine] = np.zeros((self.grid.n_pixels + 1, 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
+            return self.parts[mine]
+
+    def merged(self) -> tuple[Sums, Sums, NDArray[np.float64]]:
+        """All threads' sums together."""
+        sums, dropped, largest = np.zeros((self.grid.n_pixels, 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
+        for part_sums, part_dropped, part_largest in self.parts.values():
+            sums += part_sums[:-1]
+            dropped += part_dropped
+            largest = np.maximum(largest, part_largest)
+        self.parts.clear()
+        if self.alike:
+            sums[:, WEIGHTS] = sums[:, HITS] * np.int64(np.rint(self.weight[0] * WEIGHT))
+            sums[:, NOISE] = sums[:, HITS] * np.int64(np.rint(self.noise[0] * WEIGHT))
+        return sums, dropped, largest
+
+
+class Halves:
+    """Sums of the even and of the odd observations, in their order."""
+
+    def __init__(self, n_pixels: int) -> None:
+        self.sums = np.zeros((2, n_pixels, 4), np.int64)
+        self.scans: list[str] = []
+        self._largest = np.zeros(4)
+
+    def add(self, observation: Observation, sums: Sums, largest: NDArray[np.float64], label: str) -> None:
+        """Add one observation. Raises PipelineError where a sum may have overflowed."""
+        self.sums[len(self.scans) % 2] += sums
+        self.scans.append(observation.name)
+        self._largest = np.maximum(self._largest, largest)
+        deepest = float(self.sums[:, :, HITS].sum(axis=0).max(initial=0))
+        if deepest * self._largest.max() >= 2.0**62:
+            raise PipelineError(
+                f"{deepest:.0f} samples in one pixel, each up to {self._largest[DATA] / VALUE:.3g} K, overflow the map's fixed-point sums",
+                place=f"{label}, {observation.name}",
+                cure="make smaller pixels, or put a HighpassFilter before",
+            )
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
+    """Add samples to the fixed-point sums of their pixels; count what is dropped; note the largest terms.
+
+    The last row of ``sums`` takes what is dropped. ``index`` (n_det, n): pixels of the samples first .. first + n - 1 of the
+    block. ``alike``: all detectors weigh the same; the sums of weights and noise follow from the hits.
+    """
+    n_det, n = index.shape
+    flat = sums.reshape(-1)
+    trash = np.int32(sums.shape[0] - 1)
+    shifted, cells = np.empty(n), np.empty(n, np.int32)
+    bits = shifted.view(np.int64)
+    columns, one, two, three = np.uintp(4), np.uintp(HITS), np.uintp(WEIGHTS), np.uintp(NOISE)
+    trash_hits = np.uintp(trash) * columns + one
+    for d in range(n_det):
+        if not use[d]:
+            dropped[FLAGGED] += n
+            continue
+        row = signal[d, first : first + n]
+        limit = LARGEST / VALUE / max(weight[d], 1.0)
+        w = np.int64(np.rint(weight[d] * WEIGHT))
+        term = np.int64(np.rint(noise[d] * WEIGHT))
+        factor, square = weight[d] * VALUE, weight[d] * per_variance * WEIGHT
+        if scatter:
+            limit = min(limit, math.sqrt(2.0**60 / square))
+        place = index[d]
+        for t in range(n):  # what is not wanted goes to the last row; adding `MAGIC` rounds to an integer in the low bits
+            x = np.float64(row[t])
+            wanted = (abs(x) < limit) & (place[t] >= 0) & (good[t] != 0)
+            shifted[t] = (x if wanted else 0.0) * factor + MAGIC
+            cells[t] = place[t] if wanted else trash
+        high = np.int64(0)
+        for t in range(n):
+            q = bits[t] - MAGIC_BITS
+            bits[t] = q
+            high = max(high, abs(q))
+        lost = flat[trash_hits]
+        for t in range(n):
+            cell = np.uintp(cells[t]) * columns
+            flat[cell] += bits[t]
+            flat[cell + one] += 1
+        if not alike:
+            for t in range(n):
+                if scatter:
+                    y = np.float64(bits[t]) / factor
+                    term = np.int64(np.rint(square * y * y))
+                cell = np.uintp(cells[t]) * columns
+                flat[cell + two] += w
+                flat[cell + three] += term
+        if flat[trash_hits] != lost:
+            for t in range(n):
+                size = abs(np.float64(row[t]))
+                if not good[t]:
+                    dropped[FLAGGED] += 1
+                elif not size < np.inf:
+                    dropped[NOT_FINITE] += 1
+                elif place[t] < 0:
+                    dropped[OUTSIDE] += 1
+                elif not size < limit:
+                    dropped[TOO_LARGE] += 1
+        largest[DATA] = max(largest[DATA], float(high))
+        largest[WEIGHTS] = max(largest[WEIGHTS], float(w))
+        largest[NOISE] = max(largest[NOISE], square * (high / factor) ** 2 if scatter else float(term))

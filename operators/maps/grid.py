@@ -1,0 +1,178 @@
+"""Pixel grids: tangent-plane (TAN) images and HEALPix, and which of their pixels a sample falls in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.projection import directions, frame_rotation, homographies
+
+if TYPE_CHECKING:
+    from zonda.core.data import Observation
+
+Floats = NDArray[np.float64]
+
+MOST_PIXELS = 1 << 28
+"""Largest grid that is made."""
+
+
+@dataclass(frozen=True)
+class TangentGrid:
+    """A TAN image: ``shape`` (ny, nx), centre [rad] in ``frame``, square pixels of side ``pixel`` [rad], east to the left."""
+
+    centre: tuple[float, float]
+    pixel: float
+    shape: tuple[int, int]
+    frame: str = "icrs"
+
+    @property
+    def n_pixels(self) -> int:
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def wcs(self) -> Any:
+        """`astropy.wcs.WCS` whose reference point is the middle of the image, for odd and even sizes alike."""
+        return tangent_wcs(self.centre, self.pixel, self.shape, self.frame)
+
+    def pointing(self, observation: Observation) -> Floats:
+        """Homographies (9, n_samp), see `core.projection`."""
+        return np.ascontiguousarray(homographies(observation.boresight_radec, self.wcs).T)
+
+    def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
+        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into ``out``."""
+        tangent_pixels(pointing, first, stop, xi, eta, *self.shape, out)
+
+
+@dataclass(frozen=True)
+class HealpixGrid:
+    """The pixels ``pixels`` (sorted) of a HEALPix map; a sample's index is its place among them."""
+
+    nside: int
+    nest: bool
+    pixels_covered: NDArray[np.int64]
+    frame: str = "icrs"
+
+    @property
+    def n_pixels(self) -> int:
+        return len(self.pixels_covered)
+
+    def pointing(self, observation: Observation) -> Floats:
+        """Boresight quaternions (n_samp, 4); the frame is applied in `pixels`."""
+        return observation.boresight_radec
+
+    def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
+        """Indices (n_det, stop - first) into ``pixels_covered`` of detectors at (xi, eta), -1 elsewhere. Into ``out``."""
+        import healpy
+
+        where = directions(pointing[first:stop], xi, eta) @ frame_rotation(self.frame).T
+        pixel = healpy.vec2pix(self.nside, where[..., 0], where[..., 1], where[..., 2], nest=self.nest)
+        place = np.minimum(np.searchsorted(self.pixels_covered, pixel), self.n_pixels - 1)
+        out[:] = np.where(self.pixels_covered[place] == pixel, place, -1)
+
+
+Grid = TangentGrid | HealpixGrid
+
+
+def tangent_wcs(centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs") -> Any:
+    """`astropy.wcs.WCS` of a TAN image: (ny, nx) pixels of side ``pixel`` [rad] around ``centre`` [rad, in ``frame``]."""
+    from astropy.wcs import WCS
+
+    names = {"icrs": ("RA---TAN", "DEC--TAN"), "galactic": ("GLON-TAN", "GLAT-TAN")}
+    if frame not in names:
+        raise InputError(f"unknown frame {frame!r}", place="map grid", cure="use icrs or galactic")
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = names[frame]
+    wcs.wcs.cunit = ["deg", "deg"]
+    wcs.wcs.crval = [math.degrees(centre[0]) % 360.0, math.degrees(centre[1])]
+    wcs.wcs.cdelt = [-math.degrees(pixel), math.degrees(pixel)]
+    wcs.wcs.crpix = [(shape[1] + 1) / 2, (shape[0] + 1) / 2]
+    if frame == "icrs":
+        wcs.wcs.radesys = "ICRS"
+    wcs.wcs.set()
+    return wcs
+
+
+def in_frame(icrs: tuple[float, float], frame: str) -> tuple[float, float]:
+    """(lon, lat) [rad] in ``frame`` of an ICRS position [rad]."""
+    ra, dec = icrs
+    if frame == "icrs":
+        return ra, dec
+    x, y, z = frame_rotation(frame) @ [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+    return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
+
+
+def covering_extent(observations: Sequence[Observation], centre: tuple[float, float], frame: str) -> tuple[float, float]:
+    """Half-width and half-height [rad, on the tangent plane] of the TAN image around ``centre`` that holds every sample."""
+    wcs = tangent_wcs(centre, 1.0, (1, 1), frame)
+    half = np.zeros(2)
+    for observation in observations:
+        h = homographies(observation.boresight_radec, wcs)
+        h8 = h[:, 8] if h.size else np.ones(1)
+        if (h8 < math.cos(math.radians(75.0))).any():
+            raise InputError(
+                f"{observation.name} reaches more than 75 deg from the map centre, too far for a tangent plane",
+                place="map grid",
+                cure="give width and height, or nside for a HEALPix map",
+            )
+        offset = h[:, [2, 5]] / h8[:, None]
+        reach = observation.focalplane.radius
+        far = np.hypot(*offset.T) * reach
+        # a circle of radius r around a point at tangent distance s appears at most r (1 + s^2) / (1 - r s) wide
+        if (far > 0.5).any():
+            raise InputError(
+                "the field of view is too wide for a tangent plane", place="map grid", cure="give nside for a HEALPix map"
+            )
+        grown = reach * (1 + (offset**2).sum(axis=1)) / (1 - far)
+        half = np.maximum(half, (np.abs(offset) + grown[:, None]).max(axis=0))
+    return float(half[0]), float(half[1])
+
+
+def covered_healpix(observations: Sequence[Observation], nside: int, nest: bool, frame: str) -> NDArray[np.int64]:
+    """Pixels that any sample may hit: discs of the field of view's radius around the boresights. Sorted."""
+    import healpy
+
+    size = float(healpy.nside2resol(nside))
+    pieces = []
+    for observation in observations:
+        radius = math.atan(observation.focalplane.radius)
+        spacing = max(radius, size) / 4
+        boresight = directions(observation.boresight_radec, np.zeros(1), np.zeros(1))[0] @ frame_rotation(frame).T
+        fine = 1
+        while fine < nside and healpy.nside2resol(fine) > spacing:
+            fine *= 2
+        cells, first = np.unique(healpy.vec2pix(fine, *boresight.T), return_index=True)
+        del cells
+        margin = radius + float(healpy.max_pixrad(fine)) * 2
+        pieces += [healpy.query_disc(nside, boresight[k], min(margin, math.pi), inclusive=True, nest=nest) for k in first]
+        pieces = [np.unique(np.concatenate(pieces))]
+    return np.asarray(pieces[0], np.int64)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def tangent_pixels(h, first, stop, xi, eta, ny, nx, out):  # type: ignore[no-untyped-def]
+    """Flat index y nx + x of the pixel that holds each sample, -1 outside the image or behind it. ``h`` (9, n_samp)."""
+    wide, high, row_length = np.float64(nx), np.float64(ny), np.int32(nx)
+    for low in range(first, stop, 256):  # these coefficients stay in the first cache for all detectors
+        end = min(low + 256, stop)
+        h0, h1, h2 = h[0, low:end], h[1, low:end], h[2, low:end]
+        h3, h4, h5 = h[3, low:end], h[4, low:end], h[5, low:end]
+        h6, h7, h8 = h[6, low:end], h[7, low:end], h[8, low:end]
+        for d in range(xi.size):
+            a, b, pixel = xi[d], eta[d], out[d, low - first : end - first]
+            for t in range(pixel.size):
+                w = h6[t] * a + h7[t] * b + h8[t]
+                scale = 1.0 / w
+                x = (h0[t] * a + h1[t] * b + h2[t]) * scale + 0.5
+                y = (h3[t] * a + h4[t] * b + h5[t]) * scale + 0.5
+                inside = (w > 0.0) & (x >= 0.0) & (x < wide) & (y >= 0.0) & (y < high)
+                x = x if inside else 0.0
+                y = y if inside else 0.0
+                p = np.int32(np.int32(y) * row_length + np.int32(x))
+                pixel[t] = p if inside else np.int32(-1)

@@ -1,0 +1,38 @@
+"""An image of the sky in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+
+@dataclass
+class Image:
+    """A pixelized brightness with its world coordinates.
+
+    Attributes
+    ----------
+    values
+        (ny, nx) float64, NaN where nothing is known; row 0 is the FITS file's first row.
+    header
+        FITS header with a two-dimensional celestial WCS.
+    unit
+        Unit of ``values``, e.g. ``K_RJ``.
+    """
+
+    values: NDArray[np.float64]
+    header: Header
+    unit: str = "K_RJ"
+
+    @property
+    def wcs(self) -> Any:
+        """The `astropy.wcs.WCS` of the header."""
+        from astropy.wcs import WCS
+
+        return WCS(self.header, naxis=2)

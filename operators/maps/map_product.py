@@ -1,0 +1,204 @@
+"""A map: what was measured in each pixel, how often, and how well."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import html_table
+from zonda.core.errors import InputError
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+Floats = NDArray[np.float64]
+
+ARCMIN = math.pi / 180 / 60
+FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
+
+
+@dataclass
+class MapProduct:
+    """A map in the TAN projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the pixels ``pixels``.
+
+    Attributes
+    ----------
+    signal
+        Weighted mean of the samples, `unit`; NaN where hits == 0.
+    hits
+        Number of samples, int64.
+    weights
+        Sum of the samples' weights: K^-2 (inverse variance), or a plain count (uniform).
+    noise
+        Standard deviation of ``signal`` (after smoothing, where it is smoothed), `unit`; NaN where unknown.
+    half_difference
+        Noise map from the difference of the even and odd scans,
+        (m_e - m_o) sqrt(w_e w_o) / (w_e + w_o): its variance is that of ``signal`` where both have hits; NaN elsewhere.
+    header
+        FITS header with the WCS (TAN maps), else None.
+    centre
+        (lon, lat) [rad] of the map's centre in ``frame``.
+    pixel
+        Side of a pixel [rad]; for HEALPix the square root of its area.
+    nside, nest, pixels
+        HEALPix parameters and sorted pixel numbers, else 0, False, None.
+    fwhm
+        Main-beam FWHM of the instrument [rad]. ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
+    scans
+        Names of the observations in it.
+    """
+
+    signal: Floats
+    hits: NDArray[np.int64]
+    weights: Floats
+    noise: Floats
+    half_difference: Floats | None
+    header: Header | None
+    centre: tuple[float, float]
+    pixel: float
+    frame: str = "icrs"
+    unit: str = "K_RJ"
+    weighting: Literal["uniform", "inverse_variance"] = "uniform"
+    noise_from: Literal["net", "scatter"] = "net"
+    nside: int = 0
+    nest: bool = False
+    pixels: NDArray[np.int64] | None = None
+    fwhm: float = 0.0
+    smoothed_by: float = 0.0
+    scans: list[str] = field(default_factory=list)
+
+    @property
+    def wcs(self) -> Any:
+        """The `astropy.wcs.WCS` of a TAN map."""
+        from astropy.wcs import WCS
+
+        if self.header is None:
+            raise InputError("a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy")
+        return WCS(self.header)
+
+    def distance(self) -> Floats:
+        """Angle [rad] of every pixel from the centre, shape of ``signal``."""
+        lon, lat = self.centre
+        if self.header is not None:
+            y, x = np.indices(self.signal.shape)
+            wcs = self.wcs
+            there = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0)))
+            phi, theta = there.reshape(2, *self.signal.shape)
+        else:
+            import healpy
+
+            colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
+            theta = np.pi / 2 - colatitude
+        half = np.sin((theta - lat) / 2) ** 2 + np.cos(theta) * np.cos(lat) * np.sin((phi - lon) / 2) ** 2
+        return np.asarray(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1))))
+
+    def rms(self, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal") -> float:
+        """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre (the central arcmin).
+
+        NaN where no pixel there has a value.
+        """
+        values = getattr(self, of)
+        if values is None:
+            raise InputError("the map has no half-difference", place="map", cure="set BinMap.half_difference and make two scans")
+        use = (self.distance() <= radius) & np.isfinite(values)
+        w = self.weights[use]
+        return float(np.sqrt((w * values[use] ** 2).sum() / w.sum())) if use.any() and w.sum() > 0 else math.nan
+
+    def smoothed(self, fwhm: float) -> MapProduct:
+        """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w over pixels with hits.
+
+        Empty pixels neither contribute nor are filled. Noise: pixels are independent before, so its variance becomes
+        sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel itself.
+        """
+        convolve = self._convolver(fwhm)
+        known = self.hits > 0
+        weights = np.where(known, self.weights, 0.0)
+        total = convolve(weights, 1.0)
+
+        def mean(values: Floats, use: NDArray[np.bool_]) -> Floats:
+            w = np.where(use, weights, 0.0)
+            below = total if use is known else convolve(w, 1.0)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                return np.where(use, convolve(w * np.where(use, values, 0.0), 1.0) / below, np.nan)
+
+        quiet = known & np.isfinite(self.noise)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = convolve((weights * np.where(quiet, self.noise, 0.0)) ** 2, 2.0) / total**2
+        noise = np.where(quiet, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        half = self.half_difference
+        if half is not None:
+            half = mean(half, np.isfinite(half))
+        return replace(
+            self,
+            signal=mean(self.signal, known),
+            noise=noise,
+            half_difference=half,
+            smoothed_by=math.hypot(self.smoothed_by, fwhm),
+        )
+
+    def _convolver(self, fwhm: float) -> Any:
+        """f(values, power): values convolved with the power-th power of the Gaussian kernel, whose sum is 1."""
+        sigma = fwhm / FWHM_PER_SIGMA / self.pixel
+        if self.header is not None:
+            from scipy.ndimage import convolve1d
+
+            reach = np.arange(-math.ceil(5 * sigma), math.ceil(5 * sigma) + 1)
+            kernel = np.exp(-(reach**2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
+            kernel /= kernel.sum()
+
+            def flat(values: Floats, power: float) -> Floats:
+                once = convolve1d(values, kernel**power, axis=0, mode="constant")
+                return np.asarray(convolve1d(once, kernel**power, axis=1, mode="constant"))
+
+            return flat
+
+        def sphere(values: Floats, power: float) -> Floats:
+            import healpy
+
+            whole = np.zeros(healpy.nside2npix(self.nside))
+            whole[self.pixels] = values
+            if self.nest:
+                whole = healpy.reorder(whole, n2r=True)
+            whole = healpy.smoothing(whole, fwhm=fwhm / math.sqrt(power), iter=3)
+            if self.nest:
+                whole = healpy.reorder(whole, r2n=True)
+            return np.asarray(whole[self.pixels]) * (4 * math.pi * sigma**2) ** (1 - power)
+
+        return sphere
+
+    @property
+    def healpix_full(self) -> Floats:
+        """The whole-sphere signal (12 nside^2,), healpy's UNSEEN where there is none (HEALPix maps)."""
+        import healpy
+
+        if self.pixels is None:
+            raise InputError("not a HEALPix map", place="map", cure="set BinMap.nside")
+        whole = np.full(healpy.nside2npix(self.nside), healpy.UNSEEN)
+        known = self.hits > 0
+        whole[self.pixels[known]] = self.signal[known]
+        return whole
+
+    def __repr__(self) -> str:
+        size = (
+            f"nside {self.nside}, {len(self.hits)} pixels"
+            if self.header is None
+            else f"{self.hits.shape[1]} x {self.hits.shape[0]}"
+        )
+        return f"<MapProduct {size}, {int(self.hits.sum())} samples of {len(self.scans)} scans, {self.unit}>"
+
+    def _repr_html_(self) -> str:
+        hit = self.hits > 0
+        rows: list[tuple[Any, Any]] = [
+            ("size", repr(self)),
+            ("pixel", f"{math.degrees(self.pixel) * 3600:.3g} arcsec"),
+            ("pixels hit", int(hit.sum())),
+            ("smoothed by", f"{math.degrees(self.smoothed_by) * 3600:.3g} arcsec" if self.smoothed_by else "nothing"),
+            ("rms in the central arcmin", f"{self.rms():.3g} {self.unit}"),
+        ]
+        if self.half_difference is not None:
+            rows.append(("half-difference rms there", f"{self.rms(of='half_difference'):.3g} {self.unit}"))
+        return html_table("Map", rows)

@@ -1,0 +1,212 @@
+"""A short recursive filter whose power response is f^-slope from f_min to the Nyquist frequency.
+
+White noise through a cascade of ``poles`` real one-pole sections (z = e^{2 pi i f / f_s})
+
+    H(z) = prod_k (1 - (1 - z_k) / z) / (1 - (1 - q_k) / z),     g |H(f)|^2 = (f_min / f)^slope  for f >= f_min       (1)
+
+has a power-law spectrum of any length, without periodicity. The poles q_k and zeros z_k (distances from 1, in (0, 2)) and the
+gain g are fitted to (1) in discrete time by least squares of the log response. Each section keeps 1 - pole, which float32
+resolves however slow the pole is:
+
+    y = x + (z_k - q_k) s_k,     s_k <- s_k + (x - q_k s_k)                                                              (2)
+
+A cascade has no cancelling residues, so poles may coincide. Largest error of the PSD from f_min to Nyquist for slope 1:
+
+=====  =======================  =======================
+poles  f_min / f_s = 1e-5       f_min / f_s = 1e-7
+=====  =======================  =======================
+4      18 %                     37 %
+6      5.1 %                    15 %
+8      1.8 %                    5.8 %
+10     0.7 %                    2.5 %
+12     0.25 %                   1.2 %
+=====  =======================  =======================
+
+(the rms error is a third of that; the fit in use states its own). Below f_min the response levels off, at `plateau` times its
+value at f_min: a sharp corner is beyond real poles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zonda.core.errors import InputError
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 0.25
+"""A fit whose PSD errs by more is refused."""
+
+_N_BAND, _N_NYQUIST, _N_BELOW = 200, 50, 12
+_WEIGHTS = np.repeat([1.0, 0.5, 3e-3], [_N_BAND, _N_NYQUIST, _N_BELOW])
+_SLOWEST = 0.02
+"""Lower bound of 2 pi f of a pole, in units of 2 pi f_min."""
+_FASTEST = 2.0 - 1e-5
+_GOOD = 0.02
+"""A fit as good as this is not tried again from another first guess."""
+_RIDGE = 1e-4
+"""Weight that keeps poles without influence near where they began."""
+
+
+@dataclass(frozen=True)
+class PowerLawFilter:
+    """Equation (1) for given f_min / f_s, slope and number of poles; make one with `power_law_filter`.
+
+    Attributes
+    ----------
+    poles, zeros
+        (K,) 1 - pole and 1 - zero, by falling pole frequency.
+    gain
+        g of (1).
+    error
+        Largest relative error of the power response from f_min to the Nyquist frequency.
+    plateau
+        Response at f -> 0 over its value at f_min.
+    variance
+        Of the output for unit white input and unit g.
+    """
+
+    poles: Array
+    zeros: Array
+    gain: float
+    error: float
+    plateau: float
+    variance: float
+    start: Array
+    """(K, K): stationary states are ``start @ n`` with n (K,) standard normal."""
+
+    def response(self, frequency: ArrayLike) -> Array:
+        """g |H|^2 at frequencies in units of the sampling rate (0 to 1/2)."""
+        sine = 4 * np.sin(np.pi * np.asarray(frequency, np.float64)) ** 2
+        return np.asarray(self.gain * np.exp(_log_power(self.zeros, sine).sum(0) - _log_power(self.poles, sine).sum(0)))
+
+
+@lru_cache(maxsize=64)
+def power_law_filter(f_min: float, slope: float, poles: int) -> PowerLawFilter:
+    """Fit equation (1); about 0.05 s, kept for later calls.
+
+    Parameters
+    ----------
+    f_min
+        In units of the sampling rate, below 1/2.
+    slope
+        0 < slope <= 3.
+    poles
+        Number of sections, at least 2.
+
+    Raises
+    ------
+    InputError
+        When ``f_min`` is not below the Nyquist frequency, or the fit errs by more than `TOLERANCE`.
+    """
+    if not 0 < f_min < 0.5:
+        text = f"minimum_frequency is {2 * f_min:.3g} times the Nyquist frequency"
+        raise InputError(text, place="pink noise", cure="choose a lower minimum_frequency")
+    fits: list[PowerLawFilter] = []
+    for ends in (1, 0, 2):
+        fits.append(_fit(f_min, slope, poles, min(ends, poles - 2)))
+        if fits[-1].error < _GOOD:
+            break
+    best = min(fits, key=lambda fit: fit.error)
+    if best.error > TOLERANCE:
+        raise InputError(
+            f"{poles} poles fit f^-{slope:g} from {f_min:.2g} of the sampling rate up only to {100 * best.error:.0f} %",
+            place="pink noise",
+            cure="raise poles or minimum_frequency",
+        )
+    return best
+
+
+def _log_power(root: Array, sine: Array) -> Array:
+    """ln |1 - (1 - r) / z|^2 = ln(r^2 + (1 - r) 4 sin^2(pi f)) for each r: (K, n)."""
+    return np.log(root[:, None] ** 2 + (1 - root[:, None]) * sine)
+
+
+def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
+    """Levenberg-Marquardt from poles in geometric progression, ``ends`` of them at the Nyquist end (its cusp needs some)."""
+    from scipy.optimize import least_squares
+
+    band = np.geomspace(f_min, 0.5, _N_BAND)
+    nyquist = 0.5 - np.geomspace(1e-4, 0.4 * (0.5 - f_min), _N_NYQUIST)
+    below = f_min * np.geomspace(1e-3, 0.3, _N_BELOW)
+    frequency = np.r_[band, nyquist, below]
+    sine = 4 * np.sin(np.pi * frequency) ** 2
+    target = -slope * np.log(np.maximum(frequency / f_min, 1.0))
+    slowest = 2 * np.pi * f_min * _SLOWEST
+    span = _FASTEST - slowest
+
+    def roots(x: Array) -> tuple[Array, Array]:
+        """Roots within their bounds, and their derivatives."""
+        s = 1 / (1 + np.exp(-np.clip(x, -40, 40)))
+        return slowest + span * s, span * s * (1 - s)
+
+    first = _first_guess(f_min, slope, n, ends)
+    share = np.clip((first - slowest) / span, 1e-9, 1 - 1e-9)
+    x0 = np.r_[np.log(share / (1 - share)), 0.0]
+
+    def misfit(x: Array) -> Array:
+        poles, zeros = roots(x[:n])[0], roots(x[n:-1])[0]
+        log_response = _log_power(zeros, sine).sum(0) - _log_power(poles, sine).sum(0) + x[-1]
+        return np.asarray(np.r_[(log_response - target) * _WEIGHTS, _RIDGE * (x - x0)])
+
+    def jacobian(x: Array) -> Array:
+        blocks: list[Any] = []
+        for sign, part in ((-1, x[:n]), (1, x[n:-1])):
+            root, slope_of_root = roots(part)
+            r = root[:, None]
+            blocks.append(sign * ((2 * r - sine) / (r**2 + (1 - r) * sine) * slope_of_root[:, None]).T)
+        blocks.append(np.ones((frequency.size, 1)))
+        return np.vstack([np.hstack(blocks) * _WEIGHTS[:, None], _RIDGE * np.eye(2 * n + 1)])
+
+    x0[-1] = -np.mean(misfit(x0)[:_N_BAND])
+    found = least_squares(misfit, x0, jac=jacobian, method="lm", max_nfev=120, xtol=1e-6, ftol=1e-5).x
+    error = np.abs(np.expm1((misfit(found)[: frequency.size] / _WEIGHTS)[: _N_BAND + _N_NYQUIST])).max()
+    poles, zeros = np.sort(roots(found[:n])[0])[::-1], np.sort(roots(found[n:-1])[0])[::-1]
+    covariance = _state_covariance(poles, zeros)
+    tap = zeros - poles
+    scale = np.sqrt(np.diag(covariance))
+    value, vector = np.linalg.eigh(covariance / np.outer(scale, scale))
+    gain = float(np.exp(found[-1]))
+    return PowerLawFilter(
+        poles=poles,
+        zeros=zeros,
+        gain=gain,
+        error=float(error),
+        plateau=float(gain * np.prod((zeros / poles) ** 2)),
+        variance=float(1 + tap @ covariance @ tap),
+        start=scale[:, None] * vector * np.sqrt(np.maximum(value, 0)),
+    )
+
+
+def _first_guess(f_min: float, slope: float, n: int, ends: int) -> Array:
+    """Poles then zeros (2 n,): above slope 2 one pole stands alone, the others alternate with zeros."""
+    alone = int(slope > 2)
+    rest = slope - 2 * alone
+    chain = n - ends - alone
+    bottom = np.pi * f_min
+    step = np.log(max(0.75 / bottom, 2.0)) / max(chain, 1)
+    pole = bottom * np.exp(step * (np.arange(chain) + 0.5 - rest / 4))
+    zero = pole * np.exp(step * rest / 2)
+    end = 0.5 * 0.15 ** np.arange(ends)
+    lone = np.full(alone, bottom)
+    return np.concatenate([lone, -np.expm1(-pole), 2 - end, np.ones(alone), np.minimum(-np.expm1(-zero), 1.1), 2 - 1.2 * end])
+
+
+def _state_covariance(poles: Array, zeros: Array) -> Array:
+    """Stationary covariance S (K, K) of the states of (2) for unit white input: S = (1 + D) S (1 + D)^T + b b^T.
+
+    Written with D = A - 1, so that nothing cancels for slow poles.
+    """
+    from scipy.linalg import solve_triangular
+
+    n = poles.size
+    drift = np.diag(-poles) + np.tril(np.broadcast_to(zeros - poles, (n, n)), -1)
+    eye = np.eye(n)
+    system = -(np.kron(drift, eye) + np.kron(eye, drift) + np.kron(drift, drift))  # lower triangular, like drift
+    covariance = solve_triangular(system, np.ones(n * n), lower=True).reshape(n, n)
+    return np.asarray((covariance + covariance.T) / 2)

@@ -1,0 +1,266 @@
+"""From brightness on the sky to the calibrated scan: telescope efficiencies, opacity and calibration.
+
+    T_scan = (epsilon T_atm + zeta e^-tau T_astro + T_white + T_pink) / (zeta <e^-tau>)            (1)
+
+(van Marrewijk, Morris et al. 2024). With t = <e^-tau> the smooth band transmission, e^-tau = t (1 + x) and
+T_atm = E + A, mean emission and fluctuation, equation (1) reads
+
+    T_scan = T_astro (1 + x) + (epsilon A + T_white + T_pink) / (zeta t) + M,   M = epsilon E / (zeta t).     (2)
+
+M, tens of kelvin, stays beside the stream as a float64 `SmoothField`; everything else is the stream ``signal``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Fraction
+from zonda.core.data import Block, Observation
+from zonda.core.operator import Operator
+from zonda.core.random import normals
+from zonda.core.smooth import SmoothField
+
+Floats = NDArray[np.float64]
+
+OPAQUE = 1e-6
+"""Band transmission below which nothing can be calibrated: such samples and detectors are flagged."""
+
+FLAG_OPAQUE = 4
+"""Bit set in ``flags`` and ``detector_flags`` where the band transmission is below `OPAQUE`."""
+
+MEAN_ERROR = 1e-7
+"""Largest error allowed in the smooth mean M, relative to its largest value."""
+
+
+class Efficiency(Operator):
+    """Telescope efficiencies, opacity and calibration: equation (1). Writes ``signal``; the components stay as they are."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
+
+    main_beam: Fraction | None = Field(None, gt=0, le=1)
+    """zeta, the share of an astronomical signal that the main beam delivers; where absent, the instrument's."""
+    illumination: Fraction | None = Field(None, gt=0, le=1)
+    """epsilon, the share of the atmosphere's emission that reaches a detector; where absent, the instrument's."""
+    scatter: Fraction = quantity("0 %", ge=0, le=0.5)
+    """Relative rms of zeta between detectors (normal; known to the calibration, so it changes noise, not gain)."""
+    calibration: Literal["mean", "instantaneous"] = "mean"
+    """Divide by e^-tau at the mean PWV and current elevation, or by the fluctuating e^-tau."""
+    calibration_error: Fraction = quantity("0 %", ge=0, le=0.5)
+    """Relative rms of an unknown gain error per detector (normal), constant over a scan."""
+
+    def configure(self, observation: Observation) -> None:
+        """Write ``main_beam_efficiency`` and ``illumination_efficiency`` of the focal plane."""
+        plane = observation.focalplane
+        n = len(plane)
+        if self.illumination is not None:
+            plane.illumination_efficiency = np.full(n, self.illumination)
+        if self.main_beam is not None:
+            plane.main_beam_efficiency = np.full(n, self.main_beam)
+        if self.scatter > 0:
+            nominal = plane.main_beam_efficiency
+            if self.main_beam is None:  # from the instrument, so that configuring twice scatters once
+                own = observation.instrument.focalplane()
+                known = dict(zip(own.names, own.main_beam_efficiency, strict=True))
+                nominal = np.array([known.get(d, z) for d, z in zip(plane.names, nominal, strict=True)])
+            drawn = nominal * (1 + self.scatter * _normals(observation, self.label, "zeta"))
+            plane.main_beam_efficiency = np.clip(drawn, 0.01 * nominal, 1.0)
+            clipped = int(np.count_nonzero(plane.main_beam_efficiency != drawn))
+            observation.tally.count(self.label, "detectors whose scattered zeta was clipped", clipped)
+
+    def prepare(self, observation: Observation) -> Calibration:
+        """Coefficients of equation (2); flags what is opaque."""
+        plane, tally = observation.focalplane, observation.tally
+        gain = np.ones(len(plane))
+        if self.calibration_error > 0:
+            gain += self.calibration_error * _normals(observation, self.label, "gain")
+        transmission = observation.smooth.get("transmission")
+        if transmission is not None:
+            _flag_opaque(self.label, observation, transmission)
+        emission, mean = observation.smooth.get("atmosphere"), None
+        if emission is not None:
+            share = gain * plane.illumination_efficiency / plane.main_beam_efficiency
+            ratio, error = emission, 0.0
+            if transmission is not None:
+                ratio, error = quotient(emission, transmission, np.flatnonzero(observation.detector_flags == 0))
+            mean = ratio.scaled(share)
+            tally.state(self.label, "largest error of the smooth mean emission", f"{error * np.abs(share).max():.1e} K_RJ")
+        zeta, epsilon = plane.main_beam_efficiency, plane.illumination_efficiency
+        tally.state(self.label, "zeta and epsilon (mean)", f"{zeta.mean():.4g}, {epsilon.mean():.4g}")
+        tally.state(self.label, "calibrated by", f"zeta e^-tau, {self.calibration}")
+        return Calibration(zeta, epsilon, gain, transmission, mean)
+
+    def exec(self, block: Block, state: Calibration) -> None:
+        """Equation (2) on one block."""
+        rows, shape = block.detectors, block.shape
+        have = block.detdata
+        signal = block.buffer("signal", shape)
+        absent = np.empty((0, 0), block.dtype)
+        divisor = absent
+        noisy = any(name in have for name in ("atmosphere", "white", "pink"))
+        if state.transmission is not None and noisy:
+            divisor = state.transmission.evaluate(rows, block.samples, block.buffer("Efficiency t", shape))
+        instantaneous = self.calibration == "instantaneous" and "transmission" in have
+        mean = absent
+        if instantaneous and state.mean is not None:
+            mean = state.mean.evaluate(rows, block.samples, block.buffer("Efficiency M", shape))
+        streams = [have.get(name, absent) for name in ("sky", "transmission", "atmosphere", "white", "pink")]
+        per_detector = [a[rows].astype(block.dtype) for a in (state.gain, state.epsilon, state.zeta)]
+        _calibrate(*streams, divisor, mean, *per_detector, instantaneous, block.dtype(OPAQUE), signal)
+        have["signal"] = signal
+        block.means.pop("signal", None)
+        if state.mean is not None:
+            block.means["signal"] = state.mean
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What `Efficiency` knows of one observation: per-detector factors (n_det,), t and M of equation (2)."""
+
+    zeta: Floats
+    epsilon: Floats
+    gain: Floats
+    transmission: SmoothField | None
+    mean: SmoothField | None
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, instantaneous, opaque, out):  # type: ignore[no-untyped-def]
+    """Equation (2); absent streams have no rows. ``wet`` is x, ``divisor`` t, ``mean`` M (instantaneous only)."""
+    n_det, n = out.shape
+    one = out.dtype.type(1)
+    piece = 2048
+    noise, scale = np.empty(piece, out.dtype), np.empty(piece, out.dtype)
+    for d in range(n_det):
+        for begin in range(0, n, piece):
+            m = min(piece, n - begin)
+            row = out[d, begin : begin + m]
+            row[:] = 0
+            if sky.shape[0]:
+                row[:] = gain[d] * sky[d, begin : begin + m]
+                if wet.shape[0] and not instantaneous:
+                    x = wet[d, begin : begin + m]
+                    for t in range(m):
+                        row[t] *= one + x[t]
+            noise[:] = 0
+            if air.shape[0]:
+                a = air[d, begin : begin + m]
+                for t in range(m):
+                    noise[t] = epsilon[d] * a[t]
+            if white.shape[0]:
+                a = white[d, begin : begin + m]
+                for t in range(m):
+                    noise[t] += a[t]
+            if pink.shape[0]:
+                a = pink[d, begin : begin + m]
+                for t in range(m):
+                    noise[t] += a[t]
+            if air.shape[0] or white.shape[0] or pink.shape[0]:
+                factor = gain[d] / zeta[d]
+                scale[:] = factor
+                if divisor.shape[0]:
+                    a = divisor[d, begin : begin + m]
+                    for t in range(m):
+                        scale[t] = factor / max(a[t], opaque)
+                if instantaneous:
+                    x = wet[d, begin : begin + m]
+                    for t in range(m):
+                        scale[t] /= max(one + x[t], opaque)
+                for t in range(m):
+                    row[t] += noise[t] * scale[t]
+            if instantaneous and mean.shape[0]:
+                x, a = wet[d, begin : begin + m], mean[d, begin : begin + m]
+                for t in range(m):
+                    row[t] -= a[t] * x[t] / max(one + x[t], opaque)
+
+
+def _normals(observation: Observation, *names: str) -> Floats:
+    """(n_det,) standard normals that belong to this observation and ``names``."""
+    return normals(observation.key(*names), 0, observation.n_detectors).astype(np.float64)
+
+
+def _flag_opaque(label: str, observation: Observation, transmission: SmoothField) -> None:
+    """Flag detectors that are opaque most of the time, and the samples at which one of the others is."""
+    knots = transmission.weights @ _knots(transmission, transmission.step)[0]
+    opaque = ~(knots >= OPAQUE)
+    dead = opaque.mean(axis=1) > 0.5
+    observation.detector_flags[dead] |= FLAG_OPAQUE
+    cell = opaque[~dead].any(axis=0)
+    bad = np.repeat(cell[:-1] | cell[1:], transmission.step)[: observation.n_samples]
+    observation.flags[bad] |= FLAG_OPAQUE
+    observation.tally.count(label, f"detectors flagged: band transmission below {OPAQUE:g}", int(dead.sum()))
+    observation.tally.count(label, f"samples flagged: band transmission below {OPAQUE:g}", int(bad.sum()))
+
+
+def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> tuple[SmoothField, float]:
+    """The smooth field above / max(below, `OPAQUE`), and its largest error over the detectors ``use``.
+
+    The ratio is taken at the coarse times (with its derivative at the two ends) and refitted by an interpolating spline
+    in time and by least squares over the nodes of ``above``; where the nodes do not carry it, over its own leading
+    singular vectors. The step is halved until the error at the cells' midpoints is below `MEAN_ERROR`.
+    """
+    n_samples, step = above.n_samples, min(above.step, below.step)
+    while True:
+        (high, high_slope), (low, low_slope) = _knots(above, step), _knots(below, step)
+        top, bottom = above.weights @ high, below.weights @ low
+        clear = bottom > OPAQUE
+        bottom = np.maximum(bottom, OPAQUE)
+        ratio = top / bottom
+        ends = [0, -1]
+        slope = above.weights @ high_slope[:, ends] - ratio[:, ends] * (below.weights @ low_slope[:, ends]) * clear[:, ends]
+        known = np.hstack([slope[:, :1] / bottom[:, :1], ratio, slope[:, 1:] / bottom[:, -1:]])
+        half_top, half_bottom = (f.weights @ _knots(f, step, 0.5)[0] for f in (above, below))
+        exact = half_top / np.maximum(half_bottom, OPAQUE)
+        tolerance = MEAN_ERROR * max(float(np.abs(ratio[use]).max(initial=0.0)), 1e-30)
+        error = np.inf
+        for basis in (above.weights.astype(np.float64), None):
+            if basis is None:
+                left, size, _ = np.linalg.svd(known, full_matrices=False)
+                basis = left[:, : max(1, int(np.count_nonzero(size > 1e-13 * size[0])))]
+            fit: Floats = np.linalg.lstsq(basis, known, rcond=1e-12)[0]
+            field = SmoothField(basis, _spline(fit), step, n_samples)
+            fitted = field.weights @ _knots(field, step, 0.5)[0]
+            error = float(np.abs(fitted - exact)[use].max(initial=0.0))
+            if error <= tolerance:
+                break
+        if error <= tolerance or step == 1:
+            return field, error
+        step //= 2
+
+
+def _knots(field: SmoothField, step: int, offset: float = 0.0) -> tuple[Floats, Floats]:
+    """Node values and their derivatives per ``step``, at samples (j + offset) * step. Each (n_node, n_cell + 1 or n_cell).
+
+    ``step`` divides the field's own; all cells' edges (offset 0), or one point inside each (0 < offset < 1).
+    """
+    cells = -(-field.n_samples // step)
+    position = (np.arange(cells + (offset == 0)) + offset) * step / field.step
+    m = np.minimum(position.astype(np.int64), field.coefficients.shape[1] - 4)
+    u = position - m
+    v = 1.0 - u
+    value = (v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6)
+    slope = (-v * v / 2, u * (3 * u - 4) / 2, -v * (3 * v - 4) / 2, u * u / 2)
+    c = field.coefficients.astype(np.float64)
+    values: Any = sum(w * c[:, m + j] for j, w in enumerate(value))
+    slopes: Any = sum(w * c[:, m + j] for j, w in enumerate(slope))
+    return values, slopes * (step / field.step)
+
+
+def _spline(known: Floats) -> Floats:
+    """B-spline coefficients (n_node, k) from (first slope, k - 2 values, last slope) per node: the complete cubic spline."""
+    from scipy.linalg import solve_banded
+
+    k = known.shape[1]
+    band = np.zeros((5, k))  # rows: offsets +2, +1, 0, -1, -2
+    band[2, 1:-1], band[1, 2:], band[3, :-2] = 4 / 6, 1 / 6, 1 / 6
+    band[2, 0], band[1, 1], band[0, 2] = -0.5, 0.0, 0.5
+    band[2, -1], band[3, -2], band[4, -3] = 0.5, 0.0, -0.5
+    coefficients: Floats = solve_banded((2, 2), band, known.T).T
+    return np.ascontiguousarray(coefficients)

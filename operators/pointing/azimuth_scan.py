@@ -1,0 +1,108 @@
+"""Back and forth in azimuth at constant elevation."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
+from zonda.core.errors import PointingError
+
+from .base import Pointing
+from .transform import CelestialTransform, unit_vectors
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.target import Target
+    from zonda.core.data import Data, Observation
+
+Floats = NDArray[np.float64]
+
+TURNAROUND = 2
+"""Flag bit of a sample taken in a turnaround."""
+
+
+class PointingBackAndForth(Pointing):
+    """Constant-elevation scan back and forth in azimuth, with smooth turnarounds.
+
+    It is centred on an az/el target, or on where a celestial target stands in the middle of the scan. Each leg crosses
+    `throw` at constant `speed`, both measured on the sky (azimuth angle times the cosine of the elevation); then the
+    telescope turns round outside `throw` within T = 4 speed / acceleration. With u the fraction of T that has passed
+
+        x'' = -acceleration sin^2(pi u),   x - throw/2 = speed T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)]      (1)
+
+    so position, speed, acceleration and jerk are continuous. The turnaround reaches 1.41 speed^2 / acceleration beyond.
+    """
+
+    throw: Angle = quantity("30 arcmin", gt=0, le=2 * math.pi)
+    """Length on the sky of the part at constant speed."""
+    speed: AngularSpeed = quantity("1 arcmin/s", gt=0)
+    """Constant speed on the sky."""
+    acceleration: AngularAcceleration = quantity("1 arcmin/s2", gt=0)
+    """Largest acceleration on the sky in a turnaround."""
+    flag_turnarounds: bool = False
+    """Flag the samples in turnarounds (bit value 2), so that no map uses them; without it they are used like all others."""
+
+    @property
+    def turnaround(self) -> float:
+        """Duration T of a turnaround, s."""
+        return 4 * self.speed / self.acceleration
+
+    def path(self, seconds: Floats) -> tuple[Floats, Floats]:
+        leg, turn = self.throw / self.speed, self.turnaround
+        count, within = np.divmod(seconds, leg + turn)
+        u = np.clip((within - leg) / turn, 0.0, 1.0)
+        beyond = self.speed * turn * (u - u * u + (1 - np.cos(2 * np.pi * u)) / (2 * np.pi**2))
+        x = self.speed * np.minimum(within, leg) - self.throw / 2 + beyond
+        return np.where(count % 2 == 0, x, -x), np.zeros(len(seconds))
+
+    def in_turnaround(self, seconds: Floats) -> NDArray[np.bool_]:
+        """(n,) True in turnarounds."""
+        leg = self.throw / self.speed
+        late: NDArray[np.bool_] = np.mod(seconds, leg + self.turnaround) > leg
+        return late
+
+    def directions(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
+        longitude, elevation = -target.longitude, target.latitude
+        if target.frame != "horizontal":
+            middle = np.array([(seconds[0] + seconds[-1]) / 2])
+            north, west, up = transform.horizontal(unit_vectors(*target.icrs()), middle)[0]
+            longitude, elevation = math.atan2(west, north), math.atan2(up, math.hypot(north, west))
+        elevation += offset[1]
+        widest = self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2)
+        if elevation >= math.pi / 2 or widest > math.pi * math.cos(elevation):
+            raise PointingError(
+                f"the scan spans more than a whole turn of azimuth at elevation {math.degrees(elevation):.2f} deg",
+                place=self.label,
+                cure="lower throw, or choose a lower elevation",
+            )
+        x, _ = self.path(seconds)
+        return unit_vectors(longitude - (x + offset[0]) / math.cos(elevation), np.full(len(seconds), elevation))
+
+    def flag(self, seconds: Floats) -> NDArray[np.uint8]:
+        if not self.flag_turnarounds:
+            return np.zeros(len(seconds), np.uint8)
+        return np.where(self.in_turnaround(seconds), TURNAROUND, 0).astype(np.uint8)
+
+    def state(self, observation: Observation) -> None:
+        what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
+        observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()))
+
+    def observe(self, data: Data) -> None:
+        telescope = data.scene.instrument.telescope
+        for name, limit, unit in (
+            ("speed", telescope.speed_max, "arcsec/s"),
+            ("acceleration", telescope.acceleration_max, "arcsec/s2"),
+        ):
+            asked = getattr(self, name)
+            if limit is not None and asked > limit:
+                raise PointingError(
+                    f"{name} is {np.degrees(asked) * 3600:.4g} {unit}; "
+                    f"{telescope.name}'s largest is {np.degrees(limit) * 3600:.4g} {unit}",
+                    place=self.label,
+                    cure=f"lower {name}",
+                )
+        super().observe(data)

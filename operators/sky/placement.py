@@ -1,0 +1,88 @@
+"""Where an image lies on the sky, and what its pixels are worth in K_RJ."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.projection import pixel_matrix
+from zonda.core.radiation import to_kelvin_rj
+
+from .read import HealpixMap, WcsMap, is_plain_tan, linear
+from .resample import pixel_areas
+
+if TYPE_CHECKING:
+    from zonda.core.instrument import Band
+
+Floats = NDArray[np.float64]
+
+
+def placed(image: WcsMap, centre: tuple[float, float] | None, place: str = "") -> Any:
+    """The TAN `WCS` of an image, or None where it must be resampled (another projection, distortions).
+
+    Parameters
+    ----------
+    centre
+        ICRS (ra, dec) [rad]: the image's centre, pixel ((nx + 1) / 2, (ny + 1) / 2) counted from 1, is put there and becomes
+        the tangent point; scale and orientation with respect to north are kept. None: where the header puts it.
+
+    Raises InputError for a ``centre`` with another projection than TAN.
+    """
+    from astropy.wcs import WCS
+
+    if centre is None:
+        return image.wcs if image.wcs is not None and is_plain_tan(image.wcs) else None
+    if image.wcs is not None and not is_plain_tan(image.wcs):
+        raise InputError(
+            f"centre cannot move a map in projection {', '.join(image.wcs.wcs.ctype)}",
+            place=place,
+            cure="remove centre, or give a TAN map",
+        )
+    rows, columns = image.values.shape
+    if image.wcs is not None:
+        matrix, swapped = np.asarray(image.wcs.pixel_scale_matrix), image.wcs.wcs.lng == 1
+    else:
+        assert image.scale is not None  # the reader gives one or the other
+        matrix, swapped = np.degrees(image.scale), False
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["DEC--TAN", "RA---TAN"] if swapped else ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval = np.degrees(centre)[::-1] if swapped else np.degrees(centre)
+    wcs.wcs.crpix = [(columns + 1) / 2, (rows + 1) / 2]
+    wcs.wcs.radesys = "ICRS"
+    return linear(wcs, matrix)
+
+
+def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
+    """Solid angles (ny, nx) [sr] of the pixels of a TAN grid with `pixel_matrix` ``matrix``.
+
+    With H its inverse, a pixel p = (x, y, 1) looks along H p, and dOmega = |det H| / |H p|^3 dx dy.
+    """
+    inverse = np.linalg.inv(matrix)
+    y, x = np.mgrid[0.0 : shape[0], 0.0 : shape[1]]
+    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ inverse.T
+    return np.asarray(abs(np.linalg.det(inverse)) / np.linalg.norm(rays, axis=2) ** 3)
+
+
+def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: Any) -> tuple[Floats, str]:
+    """The map's values in K_RJ averaged over ``band``, and the conversion as text. ``wcs``: the TAN WCS, None where resampled.
+
+    Jy/pixel is divided by each pixel's own solid angle. Raises InputError as `core.radiation.to_kelvin_rj`.
+    """
+    beam = source.beam_solid_angle if isinstance(source, WcsMap) else None
+    factor = to_kelvin_rj(source.unit, band, 1.0, spectral_index, beam)
+    if source.unit != "Jy/pixel":
+        return source.values * factor, f"{factor:.6g} K_RJ per {source.unit}"
+    areas: Floats
+    if isinstance(source, HealpixMap):
+        areas = np.full(source.values.shape, np.pi / (3 * source.nside**2))
+    elif wcs is not None:
+        areas = tangent_areas(pixel_matrix(wcs), (source.values.shape[0], source.values.shape[1]))
+    else:
+        areas = pixel_areas(source.wcs, (source.values.shape[0], source.values.shape[1]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.where(np.isfinite(areas) & (areas > 0), source.values * (factor / areas), 0.0)
+    typical = factor / float(np.nanmedian(areas))
+    return values, f"{typical:.6g} K_RJ per Jy/pixel at the median pixel, {float(np.nanmedian(areas)):.6g} sr"

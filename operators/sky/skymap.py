@@ -1,0 +1,309 @@
+"""The sky: a map convolved with each detector's beam and sampled where each detector looks."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
+
+from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.target import Target
+from zonda.core.configuration.units import Angle, Kelvin
+from zonda.core.data import Block, Data, Observation
+from zonda.core.operator import Operator
+from zonda.core.projection import pixel_matrix, rotation_matrices
+
+from ..maps.image import Image
+from .beam import REACH, SIGMA, Convolved, convolve, distinct
+from .placement import kelvin, placed
+from .read import HealpixMap, WcsMap, read_map
+from .resample import resample_healpix, resample_image, tangent_wcs
+from .sampling import sample
+
+Floats = NDArray[np.float64]
+
+
+class SkyMap(Operator):
+    """Sky signal of a FITS or HEALPix map, averaged over the band and convolved with the beam, above the atmosphere (K_RJ).
+
+    A TAN image is used on its own pixels; other projections and HEALPix maps are first interpolated (third order) onto a
+    TAN grid about the observation. The smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at
+    least 4 pixels per FWHM: within 0.3 % of the peak of a point source.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+
+    file: InputPath
+    """FITS image (with or without a celestial WCS) or HEALPix table. A relative path starts at the pipeline file's folder."""
+    unit: str | None = None
+    """Unit of the map: Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y), with a prefix (mK_CMB). Default: its header's."""
+    pixel_size: Angle | None = Field(None, gt=0)
+    """Side of a pixel; replaces the header's scale (its orientation is kept). Default: the header's."""
+    centre: Target | Literal["target"] | None = None
+    """Put the map's centre here: a position fixed on the sky, or `target` for the scan's. Default: where its header says."""
+    beam: Literal["gaussian", "none"] = "gaussian"
+    """Shape of the main beam; `none` for a map that is convolved already."""
+    fwhm: Angle | None = Field(None, gt=0)
+    """Full width at half maximum of the beam. Default: each detector's own."""
+    outside: Kelvin = quantity("0 K")
+    """Brightness of the sky beyond the map's edge, K_RJ; samples there are counted."""
+    missing: Literal["error", "zero"] = "error"
+    """What NaN or infinite pixels do: stop with an error, or count as 0 in the map's unit (and be counted)."""
+    scale: float = 1.0
+    """Factor on the whole map (not on `outside`)."""
+    spectral_index: float = 0.0
+    """Slope of the flux density, S ~ frequency^index, within the band; for maps in Jy/pixel, Jy/beam and MJy/sr."""
+
+    _memory: Memory = PrivateAttr(default_factory=lambda: Memory())
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SkyMap:
+        if self.beam == "none" and self.fwhm is not None:
+            raise ValueError("beam: none has no width; remove fwhm, or set beam: gaussian")
+        if isinstance(self.centre, Target) and self.centre.frame == "horizontal":
+            raise ValueError("centre must be fixed on the sky (ICRS or galactic), not horizontal")
+        return self
+
+    def prepare(self, observation: Observation) -> State:
+        fwhm = np.full(observation.n_detectors, self.fwhm) if self.fwhm is not None else observation.focalplane.fwhm
+        widths, index = (np.zeros(1), np.zeros(len(fwhm), np.int64)) if self.beam == "none" else distinct(fwhm)
+        widest = float(widths.max(initial=0.0))
+        finest = float(widths.min(initial=np.inf))
+        sky = self._sky(observation, widest, finest)
+        beams = [self._memory.get((*sky.key, "beam", w), lambda w=w: self._beam(sky, float(w))) for w in widths]  # type: ignore[misc]
+        tally = observation.tally
+        for what, text in sky.notes.items():
+            tally.state(self.label, what, text)
+        if sky.zeroed:
+            tally.count(self.label, "pixels of the input map that are NaN or infinite, taken as zero", sky.zeroed)
+        for width, beam in zip(widths, beams, strict=True):
+            _state_beam(tally, self.label, float(width), beam.convolved)
+        return State(sky, beams, index)
+
+    def exec(self, block: Block, state: State) -> None:
+        observation, plane = block.observation, block.observation.focalplane
+        stream = block.new("sky")
+        index = state.index[block.detectors]
+        xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
+        quaternions = np.ascontiguousarray(observation.boresight_radec[block.samples], np.float64)
+        beyond = behind = 0
+        for number, beam in enumerate(state.beams):
+            rows = np.flatnonzero(index == number)
+            if rows.size:
+                coefficients = beam.convolved.coefficients[stream.dtype.name]
+                found = sample(
+                    quaternions, beam.matrix, xi[rows], eta[rows], rows, coefficients, beam.convolved.bounds, beam.covered, stream
+                )
+                beyond, behind = beyond + found[0], behind + found[1]
+        if self.outside:
+            stream += stream.dtype.type(self.outside)
+        state.record(block, beyond, behind)
+
+    def collect(self, data: Data, observation: Observation, state: State) -> None:
+        beyond, behind = state.totals()
+        observation.tally.count(self.label, "samples outside the input map", beyond)
+        if behind:
+            observation.tally.count(self.label, "samples more than 90 deg from the input map's centre", behind)
+        first = data.products.get("input")  # of the first observation, and of the first SkyMap in the pipeline
+        key = "input" if first is None or first.header.get("OPERATOR") == self.label else f"input.{self.label}"
+        if key not in data.products:
+            data.products[key] = state.sky.image(self.label)
+
+    def _sky(self, observation: Observation, widest: float, finest: float) -> Sky:
+        """The map in K_RJ on a TAN grid, from memory where it is there."""
+        place, band = f"{self.label}, sky map {self.file}", observation.instrument.band
+        stamp = self.file.stat() if self.file.exists() else None
+        identity = ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
+        source: WcsMap | HealpixMap = self._memory.get(identity, self._read)
+        bandwise = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
+        if isinstance(source, WcsMap):
+            centre = self._centre(observation, source)
+            wcs = placed(source, centre, place)
+            if wcs is not None:
+                there = (*bandwise, "image", tuple(wcs.wcs.crval))
+                return cast(Sky, self._memory.get(there, lambda: self._direct(source, wcs, band, there)))
+        ra, dec = observation.centre
+        radius = _reach(observation) + REACH * SIGMA * widest
+        pixel = _pixel(source)
+        step = float(np.clip(finest / 4, pixel / 4, pixel if isinstance(source, WcsMap) else pixel / 1.5))
+        radius = float(step * 1.1 ** np.ceil(np.log(radius / step + 8) / np.log(1.1)))  # scans of nearly one size share a grid
+        key = (*bandwise, "grid", ra, dec, radius, step)
+        wcs = tangent_wcs(ra, dec, radius, step, place)
+        return cast(Sky, self._memory.get(key, lambda: self._resampled(source, wcs, band, key)))
+
+    def _read(self) -> WcsMap | HealpixMap:
+        return read_map(
+            self.file, unit=self.unit, pixel_size=self.pixel_size, centred=self.centre is not None, missing=self.missing
+        )
+
+    def _centre(self, observation: Observation, source: WcsMap) -> tuple[float, float] | None:
+        if isinstance(self.centre, Target):
+            return self.centre.icrs()
+        return observation.centre if self.centre == "target" or source.wcs is None else None
+
+    def _direct(self, source: WcsMap, wcs: Any, band: Any, key: tuple[Hashable, ...]) -> Sky:
+        values, factor = kelvin(source, band, self.spectral_index, wcs)
+        pixel = np.linalg.norm(np.asarray(wcs.pixel_scale_matrix), axis=0) * 3600
+        notes = {
+            **source.notes,
+            "input map": f"TAN, {values.shape[1]} x {values.shape[0]} pixels of {pixel[0]:.6g} x {pixel[1]:.6g} arcsec",
+            "conversion": factor,
+        }
+        return Sky(key, values * self.scale, np.zeros((0, 0), bool), wcs, notes, source.zeroed)
+
+    def _resampled(self, source: WcsMap | HealpixMap, wcs: Any, band: Any, key: tuple[Hashable, ...]) -> Sky:
+        values, factor = kelvin(source, band, self.spectral_index, None)
+        if isinstance(source, HealpixMap):
+            kind = f"HEALPix of nside {source.nside}"
+            scaled: WcsMap | HealpixMap = HealpixMap(values, source.pixels, source.nside, source.nest, source.frame, "K_RJ")
+            grid, covered = resample_healpix(cast(HealpixMap, scaled), wcs)
+        else:
+            kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
+            grid, covered = resample_image(WcsMap(values, "K_RJ", source.wcs, None), wcs)
+        step = abs(float(wcs.wcs.cdelt[1])) * 3600
+        notes = {
+            **source.notes,
+            "input map": f"{kind}, interpolated (third order) onto a TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of "
+            f"{step:.6g} arcsec about the observation; its error falls with the third power of the input's pixel size",
+            "conversion": factor,
+        }
+        mask = np.zeros((0, 0), bool) if covered.all() else covered
+        return Sky(key, np.where(covered, grid * self.scale, self.outside), mask, wcs, notes, source.zeroed)
+
+    def _beam(self, sky: Sky, fwhm: float) -> Beam:
+        """The map convolved with one beam; the Jacobian is that at the tangent point."""
+        jacobian = np.radians(np.asarray(sky.wcs.pixel_scale_matrix, np.float64))
+        convolved = convolve(sky.values, jacobian, fwhm, self.outside)
+        return Beam(convolved, convolved.to_grid @ pixel_matrix(sky.wcs), _on_grid(sky.covered, convolved))
+
+
+class Memory:
+    """What an operator has computed, kept for its next observation. Thread-safe; copies and pickles are empty."""
+
+    LIMIT = 2**30
+    """Bytes kept; the values least recently used go first (an observation that needs them holds them itself)."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """The value of ``key``, made where it is not there. Values have ``nbytes``."""
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = make()
+                while len(self._kept) > 1 and sum(v.nbytes for v in self._kept.values()) > self.LIMIT:
+                    self._kept.popitem(last=False)
+            value = self._kept[key]
+            self._kept.move_to_end(key)
+            return value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Memory)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[type[Memory], tuple[()]]:
+        return Memory, ()
+
+
+@dataclass(frozen=True)
+class Sky:
+    """A map in K_RJ, ``values`` (ny, nx), on the TAN grid ``wcs``; ``covered`` (ny, nx), or (0, 0): everywhere."""
+
+    key: tuple[Hashable, ...]
+    values: Floats
+    covered: NDArray[np.bool_]
+    wcs: Any
+    notes: dict[str, str]
+    zeroed: int
+
+    @property
+    def nbytes(self) -> int:
+        return self.values.nbytes + self.covered.nbytes
+
+    def image(self, label: str) -> Image:
+        """As a product for pictures and comparisons; NaN where nothing is known. ``label``: the operator's."""
+        header = self.wcs.to_header(relax=True)
+        header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
+        values = np.where(self.covered, self.values, np.nan) if self.covered.size else self.values
+        return Image(values, header, "K_RJ")
+
+
+@dataclass(frozen=True)
+class Beam:
+    """A convolved map with the matrix from ICRS directions to its grid."""
+
+    convolved: Convolved
+    matrix: Floats
+    covered: NDArray[np.uint8]
+
+    @property
+    def nbytes(self) -> int:
+        return self.covered.nbytes + sum(c.nbytes for c in self.convolved.coefficients.values())
+
+
+@dataclass
+class State:
+    """What `SkyMap.exec` needs; ``index`` (n_det,) numbers each detector's beam."""
+
+    sky: Sky
+    beams: list[Beam]
+    index: NDArray[np.int64]
+    _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+
+    def record(self, block: Block, beyond: int, behind: int) -> None:
+        """Keep a block's counts under its place: a block that is made twice is counted once."""
+        self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
+
+    def totals(self) -> tuple[int, int]:
+        counts = list(self._counts.values())
+        return sum(c[0] for c in counts), sum(c[1] for c in counts)
+
+
+def _state_beam(tally: Any, label: str, width: float, convolved: Convolved) -> None:
+    if width == 0.0:
+        tally.state(label, "beam", "none")
+        return
+    arcsec = np.degrees(width) * 3600
+    grid = " x ".join(str(q) for q in convolved.steps)
+    text = f"Gaussian, {grid} grid steps per input pixel"
+    if convolved.coarse:
+        text += "; the input has fewer than 2 pixels per FWHM: it is taken as smooth between its pixels"
+    tally.state(label, f"beam of {arcsec:.6g} arcsec", text)
+
+
+def _on_grid(covered: NDArray[np.bool_], convolved: Convolved) -> NDArray[np.uint8]:
+    """`Sky.covered` on the points of the convolved grid."""
+    if not covered.size:
+        return np.zeros((0, 0), np.uint8)
+    shape = convolved.coefficients["float64"].shape
+    whole = np.zeros(shape, np.uint8)
+    (qx, qy), (x0, _, y0, _) = convolved.steps, convolved.bounds
+    x, y = np.floor((np.arange(shape[1]) - x0) / qx).astype(int), np.floor((np.arange(shape[0]) - y0) / qy).astype(int)
+    in_x, in_y = (x >= 0) & (x < covered.shape[1]), (y >= 0) & (y < covered.shape[0])
+    whole[np.ix_(in_y, in_x)] = covered[np.ix_(y[in_y], x[in_x])]
+    return whole
+
+
+def _reach(observation: Observation) -> float:
+    """Largest distance [rad] of a detector's direction from the observation's centre."""
+    ra, dec = observation.centre
+    centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    cosine = float((rotation_matrices(observation.boresight_radec)[:, :, 2] @ centre).min())
+    return float(np.arccos(np.clip(cosine, -1, 1)) + np.arctan(observation.focalplane.radius))
+
+
+def _pixel(source: WcsMap | HealpixMap) -> float:
+    """Side of a pixel, rad."""
+    if isinstance(source, HealpixMap):
+        return float(np.sqrt(np.pi / 3) / source.nside)
+    return float(np.radians(np.sqrt(abs(np.linalg.det(source.wcs.pixel_scale_matrix)))))

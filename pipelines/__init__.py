@@ -1,0 +1,1 @@
+"""Shipped pipelines, each runnable by name."""

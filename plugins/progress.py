@@ -1,0 +1,57 @@
+"""A progress line on the terminal: a plugin of zonda's own hooks, and a pattern for others."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from typing import Any
+
+from zonda.core.hooks import hookimpl
+
+INTERVAL = 0.1
+"""Seconds between two updates."""
+
+
+class Progress:
+    """Writes to stderr, and only where that is a terminal."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._what, self._began, self._shown, self._visible = "", 0.0, 0.0, False
+
+    @hookimpl
+    def zonda_progress(self, done: int, total: int, what: str) -> None:
+        """One line: ``what [#####.....] 50 %, 12 s left``."""
+        if not sys.stderr.isatty():
+            return
+        now = time.monotonic()
+        with self._lock:
+            if what != self._what:
+                self._what, self._began, self._shown = what, now, 0.0
+            if done < total and now - self._shown < INTERVAL:
+                return
+            self._shown, self._visible = now, True
+            sys.stderr.write("\r\033[K" + line(done, total, what, now - self._began))
+            sys.stderr.flush()
+
+    @hookimpl
+    def zonda_pipeline_end(self, pipeline: Any) -> None:
+        """Clear the line."""
+        with self._lock:
+            if self._visible:
+                sys.stderr.write("\r\033[K")
+                sys.stderr.flush()
+            self._what, self._visible = "", False
+
+
+def line(done: int, total: int, what: str, seconds: float, width: int = 20) -> str:
+    """The text of the progress line after ``seconds``; ``width`` characters of bar."""
+    share = min(1.0, done / total) if total > 0 else 1.0
+    bar = "#" * int(width * share)
+    left = f", {seconds * (1 - share) / share:.0f} s left" if 0 < share < 1 and seconds >= 1 else ""
+    return f"{what[:60]} [{bar:.<{width}}] {100 * share:.0f} %{left}"
+
+
+progress = Progress()
+"""What the entry point names."""

@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from zonda.core.configuration.parameters import Parameters, quantity
+from zonda.core.configuration.units import (
+    KINDS,
+    UNITS,
+    Angle,
+    AngularAcceleration,
+    AngularSpeed,
+    Fraction,
+    Hertz,
+    Kelvin,
+    KelvinRootSecond,
+    Metres,
+    MetresPerSecond,
+    Seconds,
+    Unit,
+    read_unit,
+)
+
+
+class All(Parameters):
+    angle: Angle = quantity("4 arcmin", gt=0)
+    speed: AngularSpeed = quantity("51 arcsec/s")
+    acceleration: AngularAcceleration = quantity("0.05 deg/s2")
+    time: Seconds = quantity("45 min")
+    frequency: Hertz = quantity("78 GHz")
+    length: Metres = quantity("7.7 mm")
+    wind: MetresPerSecond = quantity("36 km/h")
+    temperature: Kelvin | None = quantity("270 K")
+    net: KelvinRootSecond = quantity("1.7 mK s(1/2)")
+    share: Fraction = quantity("30 %")
+
+
+def test_defaults_are_si() -> None:
+    a = All()
+    arcmin = np.pi / 180 / 60
+    assert a.angle == pytest.approx(4 * arcmin, rel=1e-15)
+    assert a.speed == pytest.approx(51 * arcmin / 60, rel=1e-15)
+    assert a.acceleration == pytest.approx(np.radians(0.05), rel=1e-15)
+    assert (a.time, a.frequency, a.length, a.wind, a.temperature, a.net, a.share) == (2700, 78e9, 7.7e-3, 10, 270, 1.7e-3, 0.3)
+
+
+@pytest.mark.parametrize("name", sorted(UNITS))
+def test_table_agrees_with_astropy(name: str) -> None:
+    import astropy.units as u
+
+    factor, (rad, s, m, kelvin) = UNITS[name]
+    unit = u.Unit(name)
+    base = u.rad**rad * u.s**s * u.m**m * u.K**kelvin
+    # both are products of a few correctly rounded factors
+    assert unit.to(base) == pytest.approx(factor, rel=4 * np.finfo(float).eps)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "mK s(1/2)",
+        "mK sqrt(s)",
+        "mK * s(1/2)",
+        "uK s**(1/2)",
+        "deg / s2",
+        "deg/s^2",
+        "deg s-2",
+        "arcmin/s**2",
+        "km / h",
+        "m s-1",
+        "km.h-1",
+    ],
+)
+def test_compound_units_agree_with_astropy(text: str) -> None:
+    import astropy.units as u
+
+    own = read_unit(text)
+    assert own is not None
+    base = u.rad ** own.powers[0] * u.s ** own.powers[1] * u.m ** own.powers[2] * u.K ** own.powers[3]
+    assert u.Unit(text).to(base) == pytest.approx(own.factor, rel=4 * np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("text", ["m / s / K", "K / s m", "furlong", "1 / s", "K_RJ", "m / (s K)", "s(1/2"])
+def test_other_texts_are_left_to_astropy(text: str) -> None:
+    assert read_unit(text) is None
+
+
+def test_rarer_units_go_through_astropy() -> None:
+    assert All(length="1 pc").length == pytest.approx(3.0856775814913674e16)
+    assert All(time="1 yr").time == pytest.approx(365.25 * 86400)
+
+
+def test_astropy_quantities() -> None:
+    import astropy.units as u
+
+    assert All(angle=2 * u.deg).angle == pytest.approx(np.radians(2))
+    assert All(net=2 * u.mK * u.s**0.5).net == pytest.approx(2e-3)
+    with pytest.raises(ValidationError, match="'s' is a unit of time"):
+        All(angle=2 * u.s)
+    with pytest.raises(ValidationError, match="an array of shape"):
+        All(angle=[1, 2] * u.deg)
+
+
+def test_numpy_pure_numbers() -> None:
+    assert All(share=np.float32(0.5)).share == 0.5
+    assert All(share="0.25").share == 0.25
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"angle": "4"}, "4 has no unit; write an angle such as '4 arcmin'"),
+        ({"angle": 4}, "4 has no unit"),
+        ({"angle": np.float64(4)}, "4.0 has no unit"),
+        ({"angle": "4 s"}, "expected an angle such as '4 arcmin', but 's' is a unit of time"),
+        ({"speed": "51 arcsec"}, "'arcsec' is a unit of angle"),
+        ({"length": "7.7 mms"}, "unknown unit 'mms'"),
+        ({"frequency": "fast"}, "cannot read 'fast' as a frequency"),
+        ({"time": "1e999 s"}, "expected a finite number"),
+        ({"time": "nan s"}, "cannot read 'nan s'"),
+        ({"share": float("nan")}, "expected a finite number"),
+        ({"share": float("inf")}, "expected a finite number"),
+        ({"share": "3 m"}, "'m' is a unit of length"),
+        ({"angle": True}, "expected an angle such as '4 arcmin', got True"),
+        ({"angle": None}, "got None"),
+        ({"angle": ["4 arcmin"]}, "expected an angle"),
+        ({"angle": "-4 arcmin"}, "greater than 0"),
+        ({"net": "1 mK/sqrt(Hz)"}, "differ by sqrt\\(2\\)"),
+        ({"net": "1 mK Hz(-1/2)"}, "differ by sqrt\\(2\\)"),
+    ],
+)
+def test_refusals(given: dict[str, object], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        All(**given)
+
+
+def test_dump_is_readable_and_loads_again() -> None:
+    a = All()
+    assert a.model_dump(mode="json") == {
+        "angle": "4 arcmin",
+        "speed": "51 arcsec/s",
+        "acceleration": "180 arcsec/s2",
+        "time": "45 min",
+        "frequency": "78 GHz",
+        "length": "7.7 mm",
+        "wind": "10 m/s",
+        "temperature": "270 K",
+        "net": "1.7 mK s(1/2)",
+        "share": 0.3,
+    }
+    assert All.model_validate_json(a.model_dump_json()) == a
+    assert All(temperature=None).model_dump(mode="json")["temperature"] is None
+
+
+def test_si_text_is_exact() -> None:
+    assert All(angle="0.001 rad").angle == 0.001
+
+
+@pytest.mark.parametrize("unit", sorted(KINDS))
+@given(value=st.floats(allow_nan=False, allow_infinity=False))
+def test_written_values_read_back_to_the_same_bits(unit: str, value: float) -> None:
+    kind = Unit(unit)
+    assert kind.parse(kind.write(value)) == value
+
+
+def test_a_unit_of_ones_own() -> None:
+    flux = Unit("Jy")
+    assert flux.parse("3 mJy") == pytest.approx(3e-3)
+    assert flux.parse(flux.write(0.1)) == 0.1
+    with pytest.raises(ValueError, match="expected a quantity in Jy such as '1 Jy', but 'K' is a unit of temperature"):
+        flux.parse("3 K")
+
+
+def test_common_units_do_not_import_astropy() -> None:
+    code = (
+        "import sys; from zonda.core.configuration.units import Unit; "
+        "Unit('rad').parse('4 arcmin'); Unit('K s(1/2)').parse('1.7 mK s(1/2)'); Unit('').parse('5 %'); "
+        "print('astropy' in sys.modules, 'numpy' in sys.modules)"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["False", "False"]
+
+
+def test_schema_shows_unit_and_examples() -> None:
+    angle = All.model_json_schema()["properties"]["angle"]
+    assert angle["x-unit"] == "rad"
+    assert "4 arcmin" in angle["examples"]

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zonda.core.configuration.yaml_places import Document, Source, dump, load
+
+
+def read(text: str) -> Document:
+    return load(Source("t.yaml", text))
+
+
+def test_scalars_are_yaml_1_2() -> None:
+    text = "ra: 13:47:30.6\ndec: -11:45:09\nk: 1e-3\nsw: on\nd: 2020-01-01\nn: 0o17\nz: 007\nu: 1_000\ne: \nt: true\nf: 1.\n"
+    expected = {"ra": "13:47:30.6", "dec": "-11:45:09", "k": 1e-3, "sw": "on", "d": "2020-01-01", "n": 15, "z": 7}
+    assert read(text).value == expected | {"u": "1_000", "e": None, "t": True, "f": 1.0}
+    assert yaml.safe_load(text)["dec"] == -42309  # what plain PyYAML makes of a declination
+
+
+def test_places() -> None:
+    document = read("a:\n  - b: {c: 4 arcmin}\n")
+    mark = document.marks["a", 0, "b", "c"]
+    assert (mark.key.line, mark.key.column) == (1, 8)
+    assert (mark.value.column, mark.value.end_column) == (11, 19)
+    assert mark.value.part(2, 6).column == 13
+    assert document.mark(("a", 0, "x", "y")) == document.marks["a", 0]
+
+
+def test_parts_of_quoted_values_are_not_pointed_at() -> None:
+    span = read("a: '4 amin'").marks["a",].value
+    assert span.part(2, 4) == span
+
+
+def test_duplicate_keys_are_all_reported() -> None:
+    faults = read("a: 1\nb: {c: 1, c: 2}\na: 2\n").faults
+    assert sorted((f.message, f.span.line, f.span.column, f.label) for f in faults) == [
+        ("duplicate key 'a'", 2, 0, "first given on line 1"),
+        ("duplicate key 'c'", 1, 10, "first given on line 2"),
+    ]
+
+
+def test_merged_keys_may_be_overridden() -> None:
+    document = read("x-a: &a {r: 1, s: 2}\nb:\n  <<: *a\n  r: 3\n")
+    assert document.faults == []
+    assert document.value["b"] == {"r": 3, "s": 2}
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "line", "column"),
+    [
+        ("a: [1, 2\nb: 3\n", "not valid YAML", 1, 1),
+        ("a: 1\n\tb: 2\n", "not valid YAML", 1, 0),
+        ("a: !point 3\n", "not valid YAML", 0, 3),
+        ("a: *nowhere\n", "not valid YAML", 0, 3),
+        ("a: 1\n---\nb: 2\n", "not valid YAML", 1, 0),
+        ("a: b\x07\n", "not valid YAML", 0, 4),
+        ("? [1, 2]\n: 3\n", "a key must be plain text", 0, 2),
+        ("a: &a [*a]\n", "an alias may not stand inside what it names", 0, 3),
+        (f"a: {'9' * 5000}\n", "cannot be read", 0, 3),
+    ],
+)
+def test_bad_text(text: str, message: str, line: int, column: int) -> None:
+    (fault,) = read(text).faults
+    assert fault.message.startswith(message)
+    assert (fault.span.line, fault.span.column) == (line, column)
+
+
+def test_exploding_aliases_are_refused() -> None:
+    text = "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    text += "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12))
+    assert "more than 100000 values" in read(text).faults[0].message
+
+
+def test_empty() -> None:
+    for text in ("", "\n", "# nothing\n"):
+        document = read(text)
+        assert document.value is None
+        assert document.faults == []
+
+
+plain = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"])),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text("abcxyz-_09", min_size=1), inner),
+    max_leaves=20,
+)
+
+
+@given(plain)
+def test_dump_loads_again(value: Any) -> None:
+    document = read(dump({"v": value}))
+    assert document.faults == []
+    assert _keys_as_text(document.value["v"]) == _keys_as_text(value)
+
+
+def test_texts_that_look_like_numbers_stay_texts() -> None:
+    values = ["1e3", "on", "13:47:30", "0x1f", "1_0", ".5", "null", "~", "", "- a", "a: b", "#c", ".inf"]
+    assert read(dump(values)).value == values
+    assert math.isinf(read(dump(math.inf)).value)
+
+
+def _keys_as_text(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _keys_as_text(v) for k, v in value.items()}
+    return [_keys_as_text(v) for v in value] if isinstance(value, list) else value

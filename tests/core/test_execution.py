@@ -1,0 +1,258 @@
+"""Blocks, segments, halos and spilling never change a bit."""
+
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import PipelineError
+from zonda.core.execution import Execution, Settings, Timer, cut
+from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.operator import Operator
+from zonda.core.smooth import SmoothField
+from zonda.core.tiles import TILE_SAMPLES
+
+
+def observation(n_det=101, n_samp=9 * TILE_SAMPLES + 123):
+    instrument = Instrument(
+        name="test",
+        telescope=Telescope(name="t", diameter="6 m"),
+        band=Band(name="b", low="140 GHz", high="160 GHz"),
+        detectors=n_det,
+        field_of_view="1 deg",
+        main_beam_efficiency=1,
+        illumination_efficiency=1,
+        net="1 mK s(1/2)",
+        sample_rate="100 Hz",
+    )
+    pointing = np.tile([0.0, 0, 0, 1], (n_samp, 1))
+    return Observation(
+        "scan",
+        0,
+        None,
+        instrument,
+        instrument.focalplane(),
+        None,
+        np.arange(n_samp) / 100.0,
+        100.0,
+        pointing,
+        pointing,
+        (0, 0),
+        1,
+    )
+
+
+class Source(Operator):
+    """A value that depends on the absolute detector and sample only."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        d = np.arange(block.detectors.start, block.detectors.stop)[:, None]
+        t = np.arange(block.samples.start, block.samples.stop)
+        block.new("signal")[...] += np.sin(0.37 * d + 0.01 * t) + np.cos(1.3 * d * t)
+        block.means["signal"] = SmoothField.constant(np.full(block.observation.n_detectors, 5.0), block.observation.n_samples)
+
+
+class Smooth(Operator):
+    """The mean of the samples at t - width, t and t + width (those that exist)."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    width: int = 5
+
+    def halo(self, observation):
+        return self.width
+
+    def exec(self, block, state):
+        signal = block.detdata["signal"].astype(np.float64)
+        out, hits = np.zeros_like(signal), np.zeros(signal.shape[1])
+        n = signal.shape[1]
+        for k in (-self.width, 0, self.width):
+            to, of = slice(max(0, -k), max(0, min(n, n - k))), slice(max(0, k), max(0, min(n, n + k)))
+            out[:, to] += signal[:, of]
+            hits[to] += 1
+        block.detdata["signal"][...] = out / hits
+
+
+class Demean(Operator):
+    """Subtract each detector's mean over the scan."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "time"
+
+    def exec(self, block, state):
+        assert block.shape[1] == block.observation.n_samples
+        for row in block.detdata["signal"]:
+            row -= row.mean(dtype=np.float64)
+
+
+class FocalPlaneMean(Operator):
+    """Subtract the focal-plane mean at each sample."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "detectors"
+
+    def exec(self, block, state):
+        assert block.shape[0] == block.observation.n_detectors
+        signal = block.detdata["signal"]
+        total = np.zeros(signal.shape[1])
+        for row in signal:
+            total += row
+        signal -= total / len(signal)
+
+
+class Scale(Operator):
+    """Divide by the rms of the whole stream."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "all"
+
+    def prepare(self, observation):
+        return {}
+
+    def measure(self, stream, state):
+        assert stream.means["signal"].weights[0, 0] == 5.0
+        state["rms"] = np.sqrt(sum(float(np.sum(row.astype(float) ** 2)) for row in stream.array) / stream.array.size)
+
+    def exec(self, block, state):
+        block.detdata["signal"] /= block.dtype(state["rms"])
+
+
+class Sink(Operator):
+    """Count every sample once."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def prepare(self, observation):
+        return np.zeros((observation.n_detectors, observation.n_samples), int)
+
+    def exec(self, block, state):
+        state[block.detectors, block.samples] += 1
+
+    def collect(self, data, observation, state):
+        data.products["seen"] = state
+
+
+CHAIN = [Source(), Smooth(width=3), Demean(), Smooth(width=700), FocalPlaneMean(), Smooth(width=2500), Scale(), Sink()]
+
+
+def run(operators, obs, **settings):
+    operators = [o.model_copy() for o in operators]
+    for i, o in enumerate(operators):
+        o._label = f"{type(o).__name__}.{i}"
+    data = Data(scene=None)
+    nothing = lambda **k: None  # noqa: E731
+    Execution(operators, obs, Settings(**settings), Timer(), ["signal"]).run(data, nothing, nothing)
+    return obs.detdata["signal"], data
+
+
+def reference(obs):
+    block = Block(obs, slice(0, obs.n_detectors), slice(0, obs.n_samples))
+    state = {}
+    for operator in CHAIN[:-1]:
+        if operator.couples == "all":
+            operator.measure(type("S", (), {"array": block.detdata["signal"], "means": block.means})(), state)
+        operator.exec(block, state)
+    return block.total("signal")
+
+
+def test_blocks_halos_threads_and_spilling_change_no_bit():
+    want = reference(observation())
+    size = want.size * 4
+    for memory, threads in ((1 << 30, 1), (3 * size, 3), (int(1.9 * size), 1), (int(1.9 * size), 3)):
+        obs = observation()
+        got, data = run(CHAIN, obs, memory=memory * threads, threads=threads)
+        assert np.array_equal(got, want)
+        assert (data.products["seen"] == 1).all()
+
+
+def test_spilling_is_stated():
+    obs = observation()
+    got, _ = run(CHAIN, obs, memory=int(1.9 * obs.n_detectors * obs.n_samples * 4))
+    assert any("spilled" in what for _, what, _ in obs.tally)
+    assert np.array_equal(got, reference(observation()))
+
+
+def test_budget_too_small_says_what_is_needed():
+    with pytest.raises(PipelineError, match=r"(?s)one block of 16 detectors needs .* raise --memory"):
+        run(CHAIN, observation(), memory=100_000)
+
+
+def test_one_detector_one_sample():
+    got, data = run(CHAIN[:1] + CHAIN[-1:], observation(1, 1))
+    assert got.shape == (1, 1)
+    assert data.products["seen"].sum() == 1
+
+
+def test_segments():
+    spans = [(len(s.operators), s.span, s.halo) for s in cut(CHAIN, observation())]
+    assert spans == [
+        (1, "sample", 0),
+        (1, "sample", 3),
+        (2, "time", 0),
+        (1, "detectors", 0),
+        (1, "sample", 2500),
+        (2, "sample", 0),
+    ]
+    assert [s.operators[0].couples for s in cut([Source(), Demean(), Scale(), Sink()], observation())] == ["sample", "all"]
+    assert [len(s.operators) for s in cut([Source(), Demean(), Smooth(), Sink()], observation())] == [
+        4
+    ]  # whole scans need no halo
+
+
+def test_failure_discards_what_was_begun():
+    gone = []
+
+    class Fails(Operator):
+        """Fails in the second block."""
+
+        def exec(self, block, state):
+            if block.detectors.start:
+                raise ValueError("no")
+
+    class Begun(Operator):
+        """Has something to undo."""
+
+        def discard(self, observation, state):
+            gone.append(True)
+
+    for threads in (1, 2):
+        with pytest.raises(ValueError, match="no"):
+            run([Source(), Begun(), Fails()], observation(), threads=threads)
+    assert gone == [True, True]
+
+
+def test_kept_stream_must_exist():
+    class Nothing(Operator):
+        """Makes nothing."""
+
+    with pytest.raises(PipelineError, match="'signal' was asked to be kept"):
+        run([Nothing()], observation())
+
+
+def test_smooth_field_matches_spline_and_any_cut():
+    rng = np.random.default_rng(1)
+    n, step = 5000, 64
+    weights = rng.standard_normal((5, 3))
+    k = np.arange(-(-n // step) + 3 + 24) - 13
+    values = np.array([np.sin(0.01 * step * k), np.cos(0.004 * step * k), 0.1 + 0 * k])
+    field = SmoothField.from_values(weights, values, step, n)
+    t = np.arange(n)
+    exact = weights @ np.array([np.sin(0.01 * t), np.cos(0.004 * t), 0.1 + 0 * t])
+    got = field.evaluate(slice(0, 5), slice(0, n))
+    # cubic splines err by (omega * step)^4 / 384 = 4e-4 of the fastest sine
+    assert np.abs(got - exact).max() < 5e-4 * np.abs(weights).max() * 2
+    part = field.evaluate(slice(2, 4), slice(2048, 4000))
+    assert np.array_equal(part, got[2:4, 2048:4000])
+
+
+@pytest.mark.parametrize("samples", [slice(-1, 5), slice(0, 5001)])
+def test_smooth_field_refuses_samples_outside(samples):
+    field = SmoothField.constant(np.ones(2), 5000)
+    with pytest.raises(ValueError, match="outside"):
+        field.evaluate(slice(0, 2), samples)

@@ -1,0 +1,103 @@
+"""Focal planes, passbands, telescopes, sites."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+import zonda
+from zonda.core.errors import InputError
+from zonda.core.instrument import hexagonal_packing
+from zonda.core.registry import instruments, sites
+
+ARCMIN = np.radians(1 / 60)
+
+
+def test_mustang2_is_the_papers():
+    m2 = instruments.create("mustang2")
+    plane = m2.focalplane()
+    assert len(plane) == m2.detectors == 223
+    assert np.isclose(2 * np.arctan(plane.radius), 4.2 * ARCMIN, rtol=1e-12)
+    assert np.isclose(m2.beam_fwhm, np.radians(8.5 / 3600))
+    assert np.isclose(m2.band.centre, 93e9, rtol=1e-12)
+    assert (m2.net, m2.sample_rate, m2.telescope.diameter) == (1.7e-3, 100.0, 100.0)
+    gaps = np.hypot(plane.xi[:, None] - plane.xi, plane.eta[:, None] - plane.eta) + 10 * np.eye(223)
+    assert 15 < np.degrees(gaps.min()) * 3600 < 17  # the pitch that fills the field, see the docstring
+
+
+def test_diffraction_limit_where_no_beam_is_given():
+    m2 = instruments.create("mustang2").model_copy(update={"fwhm": None})
+    assert np.isclose(np.degrees(m2.beam_fwhm) * 3600, 8.11, atol=0.01)  # 1.22 lambda / D at 93 GHz
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 19, 61, 223, 1000])
+def test_hexagonal_packing(n):
+    x, y = hexagonal_packing(n)
+    assert len(x) == n
+    if n > 1:
+        d = np.hypot(x[:, None] - x, y[:, None] - y) + 10 * np.eye(n)
+        assert np.isclose(d.min(), 1, rtol=1e-12)
+    if n in (7, 19, 61):  # whole hexagons: the centre of gravity is the centre
+        assert abs(x.mean()) < 1e-12
+        assert abs(y.mean()) < 1e-12
+
+
+def test_passband_from_a_file(tmp_path):
+    table = tmp_path / "band.txt"
+    table.write_text("# GHz transmission\n80 0\n85 0.5\n95 1\n105 0\n")
+    band = zonda.Band(name="mine", file=table)
+    assert band.frequency[0] == 80e9
+    assert np.isclose(band.width, (5 * 0.25 + 10 * 0.75 + 10 * 0.5) * 1e9)
+    assert 85e9 < band.centre < 97e9
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("80 1\n", "has 1 rows"),
+        ("80 1 3\n90 1 3\n", "3 columns"),
+        ("80 one\n", "cannot be read as numbers"),
+        ("80 1\n80 1\n", "increase"),
+        ("80 nan\n90 1\n", "NaN"),
+        ("80 -1\n90 1\n", ">= 0"),
+        ("80 0\n90 0\n", "somewhere > 0"),
+    ],
+)
+def test_bad_passband_files(tmp_path, text, words):
+    table = tmp_path / "band.txt"
+    table.write_text(text)
+    with pytest.raises(InputError, match=words):
+        zonda.Band(name="mine", file=table)
+
+
+def test_missing_passband_file(tmp_path):
+    with pytest.raises(ValidationError, match="no such file"):
+        zonda.Band(name="mine", file=tmp_path / "none.txt")
+
+
+@pytest.mark.parametrize(
+    "edges", [{}, {"low": "90 GHz"}, {"low": "90 GHz", "high": "80 GHz"}, {"low": "0 GHz", "high": "80 GHz"}]
+)
+def test_band_edges(edges):
+    with pytest.raises(ValidationError, match="0 < low < high"):
+        zonda.Band(name="mine", **edges)
+
+
+def test_green_bank():
+    site = sites.create("green_bank")
+    assert np.isclose(np.degrees(site.latitude), 38.4331)
+    assert site.altitude == 825
+
+
+def test_focalplane_refuses_nonsense():
+    plane = instruments.create("mustang2").focalplane()
+    plane.names[1] = plane.names[0]
+    with pytest.raises(InputError, match="there twice"):
+        plane.copy()
+    plane = instruments.create("mustang2").focalplane()
+    plane.xi[3] = np.nan
+    with pytest.raises(InputError, match="xi of detector d003 is not finite"):
+        plane.copy()
+    plane = instruments.create("mustang2").focalplane()
+    plane.eta = plane.eta[:-1]
+    with pytest.raises(InputError, match="eta has 222 entries for 223 detectors"):
+        plane.copy()

@@ -1,0 +1,182 @@
+"""Order is checked before anything runs; companion runs leave out what they should."""
+
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import zonda
+from zonda.core.data import Observation
+from zonda.core.errors import PipelineError
+from zonda.core.operator import Operator
+from zonda.core.pipeline import Pipeline, check_order
+from zonda.core.random import normals
+
+
+class Point(Operator):
+    """Stares."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    scans: int = 2
+
+    def observe(self, data):
+        q = np.tile([0.0, 0, 0, 1], (3000, 1))
+        for k in range(self.scans):
+            scene = data.scene
+            data.observations.append(
+                Observation(
+                    f"scan-{k}",
+                    k,
+                    scene.site,
+                    scene.instrument,
+                    scene.instrument.focalplane(),
+                    scene.time,
+                    np.arange(3000.0),
+                    1.0,
+                    q,
+                    q,
+                    (0, 0),
+                    scene.seed,
+                )
+            )
+
+
+class Component(Operator):
+    """Draws noise."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+
+    def exec(self, block, state):
+        (name,) = self.provides
+        for d in range(block.detectors.start, block.detectors.stop):
+            key = block.observation.key(self.label, d)
+            block.new(name)[d - block.detectors.start] += normals(key, block.samples.start, block.samples.stop)
+
+
+class Sky(Component):
+    """The sky."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+
+
+class White(Component):
+    """The noise."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"white"})
+
+
+class Sum(Operator):
+    """Adds up."""
+
+    optional: ClassVar[frozenset[str]] = frozenset({"sky", "white"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        for name in ("sky", "white"):
+            if name in block.detdata:
+                block.new("signal")[...] += block.detdata[name]
+
+
+class Total(Operator):
+    """Keeps a sum."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"total"})
+
+    def prepare(self, observation):
+        return np.zeros((observation.n_detectors, observation.n_samples), np.float32)
+
+    def exec(self, block, state):
+        state[block.detectors, block.samples] = block.detdata["signal"]
+
+    def collect(self, data, observation, state):
+        data.products.setdefault(data.product("total"), []).append(state)
+
+
+class Late(Operator):
+    """Looks at everything at the end."""
+
+    at_end: ClassVar[bool] = True
+    requires: ClassVar[frozenset[str]] = frozenset({"total"})
+
+    def finalize(self, data):
+        data.products["seen"] = sorted(data.products)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return zonda.Scene(site="green_bank", instrument="hexagonal_array", time="2024-11-25T07:00", seed=3)
+
+
+RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
+
+
+def test_companion_runs_use_the_same_random_numbers(scene):
+    data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs=RUNS).run(scene, threads=1)
+    assert data.products["seen"] == ["noiseless/total", "source_free/total", "total"]
+    for k in range(2):
+        whole, sky, noise = (data.products[n][k] for n in ("total", "noiseless/total", "source_free/total"))
+        assert np.array_equal(whole, sky + noise)
+        assert 0.9 < sky.std() < 1.1
+
+
+def test_same_seed_same_bits_two_seeds_incoherent(scene):
+    def total(seed, **settings):
+        out = Pipeline([Point(scans=1), White(), Sum(), Total()]).run(scene.model_copy(update={"seed": seed}), **settings)
+        return out.products["total"][0]
+
+    one = total(1, threads=1)
+    assert np.array_equal(one, total(1, threads=2, memory=4_000_000))
+    other = total(2, threads=1)
+    # correlation of independent normals: 0 +- 1 / sqrt(n)
+    assert abs(np.mean(one.astype(float) * other)) < 5 / np.sqrt(one.size)
+
+
+def test_namesakes_draw_different_numbers(scene):
+    pipeline = Pipeline([Point(scans=1), White(), White(), Sum(), Total()])
+    assert [o.label for o in pipeline.operators] == ["Point", "White", "White.2", "Sum", "Total"]
+    out = pipeline.run(scene, threads=1).products["total"][0]
+    assert abs(out.var() - 2) < 5 * 2 * np.sqrt(2 / out.size)  # 4 if both were the same
+
+
+def test_streams_are_kept_when_asked(scene):
+    data = Pipeline([Point(scans=1), Sky(), Sum()]).run(scene, keep=["signal"])
+    assert data.observations[0].detdata["signal"].shape == (61, 3000)
+    assert "sky" not in data.observations[0].detdata
+    assert "signal" in repr(data.observations[0].detdata.keys())
+    assert "<table>" in data._repr_html_()
+    assert "scan-0" in data.observations[0]._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [
+        ([Sky()], "Sky needs boresight, which no step provides"),
+        ([White(), Point()], "White needs boresight, which Point provides only later"),
+        ([Point(), Total()], "Total needs signal, which no step provides"),
+        ([Point(), Sum(), Sky()], "Sky provides sky only after Sum has used it"),
+        ([Sum()], "no step points the telescope"),
+    ],
+)
+def test_misordered_steps(steps, words):
+    with pytest.raises(PipelineError) as err:
+        Pipeline(steps, name="mine")
+    assert words in str(err.value)
+    assert "mine" in str(err.value)
+    assert any(words == p.message for p in check_order(steps))
+
+
+def test_all_mistakes_of_order_at_once():
+    with pytest.raises(PipelineError) as err:
+        Pipeline([Total(), Sum(), Sky()])
+    assert str(err.value).count("step ") >= 3
+
+
+def test_unknown_component_of_a_run():
+    with pytest.raises(PipelineError, match=r"(?s)run quiet names 'noise'.*choose from: sky, white"):
+        Pipeline([Point(), Sky(), White(), Sum()], runs={"quiet": {"without": ["noise"]}})
+
+
+def test_no_observation(scene):
+    with pytest.raises(PipelineError, match="made no observation"):
+        Pipeline([Point(scans=0), Sky(), Sum()]).run(scene)

@@ -1,0 +1,470 @@
+"""`AtmosphereLayers` as a whole: rms, structure function, evaluation at nodes, invariances, corners."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from zonda.core.configuration.time import Instant
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import ZondaError
+from zonda.core.focalplane import Focalplane
+from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.scene import Scene
+from zonda.core.site import Site
+from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
+from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
+from zonda.operators.atmosphere.layers import AtmosphereLayers, Fluctuations, Wind, _model, _turbulence, beam_sigma, sample
+
+Floats = NDArray[np.float64]
+PWV = 7.7e-3
+SITE = Site(name="here", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="825 m", climatology="green_bank")
+START = "2024-11-25T07:00:00Z"
+
+
+def instrument(detectors: int = 223, field: str = "4.2 arcmin", diameter: str = "100 m") -> Instrument:
+    return Instrument(
+        name="camera",
+        telescope=Telescope(name="dish", diameter=diameter),
+        band=Band(name="90 GHz", low="78 GHz", high="108 GHz"),
+        detectors=detectors,
+        field_of_view=field,
+        main_beam_efficiency=0.3,
+        illumination_efficiency=0.8,
+        net="1 mK s(1/2)",
+        sample_rate="100 Hz",
+    )
+
+
+def quaternions(azimuth: Floats, elevation: Floats) -> Floats:
+    """Rz(-az) Ry(pi/2 - el), multiplied out: (n, 4)."""
+    a, b = -azimuth / 2, (np.pi / 2 - elevation) / 2
+    return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
+
+
+def observe(
+    seconds: float = 60.0,
+    rate: float = 100.0,
+    elevation: float = 57.0,
+    azimuth: float = 150.0,
+    *,
+    scan: float = 0.0,
+    camera: Instrument | None = None,
+    offsets: tuple[Any, Any] | None = None,
+    seed: int = 1,
+    index: int = 0,
+    start: str = START,
+) -> Observation:
+    """A stare, or a circle of radius ``scan`` arcmin in 20 s."""
+    t = np.arange(max(1, round(seconds * rate))) / rate
+    turn = 2 * np.pi * t / 20
+    el = np.radians(elevation + scan / 60 * np.sin(turn))
+    az = np.radians(azimuth + scan / 60 * np.cos(turn) / np.cos(np.radians(elevation)))
+    q = quaternions(az, el)
+    camera = camera or instrument()
+    plane = camera.focalplane()
+    if offsets is not None:
+        xi, eta = (np.asarray(v, np.float64) for v in offsets)
+        one = np.ones(len(xi))
+        plane = Focalplane([f"d{k}" for k in range(len(xi))], xi, eta, one * 4e-5, one, one, one)
+    return Observation(f"scan{index}", index, SITE, camera, plane, Instant.parse(start), t, rate, q, q, (0.0, 0.0), seed)
+
+
+def operator(**parameters: Any) -> AtmosphereLayers:
+    return AtmosphereLayers(**{"pwv": "7.7 mm", **parameters})
+
+
+def whole(observation: Observation, state: Fluctuations, name: str = "emission", dtype: type = np.float64) -> Floats:
+    """(n_det, n_samp)."""
+    n_det, n = observation.n_detectors, observation.n_samples
+    return getattr(state, name).evaluate(slice(0, n_det), slice(0, n), np.empty((n_det, n), dtype))
+
+
+def water(op: AtmosphereLayers, observation: Observation) -> Floats:
+    """y of every detector and sample: relative fluctuation of the water, from the emission and its slope (y << 1)."""
+    emission = whole(observation, op.prepare(observation))
+    _, band = op._weather(observation)
+    u = rays(axes(observation.boresight_azel), observation.focalplane.xi, observation.focalplane.eta)
+    slope = (band.emission(PWV * 1.001, np.arcsin(u[2])) - band.emission(PWV * 0.999, np.arcsin(u[2]))) / 0.002
+    return emission / slope
+
+
+def layers_of(op: AtmosphereLayers, observation: Observation) -> list[Any]:
+    profile, _ = op._weather(observation)
+    track = tracks([observation])[0]
+    return [_model(layer, track, observation, op.outer_scale) for layer in op._layers(profile)]
+
+
+def expected_variance(op: AtmosphereLayers, observation: Observation) -> float:
+    """Variance of y after the beam."""
+    return sum(
+        (op.pwv_rms * m.amplitude) ** 2 * beam_correlation(0.0, op.outer_scale, m.sigma)[0] for m in layers_of(op, observation)
+    )
+
+
+# ------------------------------------------------------------------------------------------------------- statistics
+
+
+@pytest.mark.parametrize("seconds", [30.0, 120.0, 2700.0])
+def test_mean_and_rms_are_ensemble_properties_whatever_the_duration(seconds: float) -> None:
+    # 25 seeds x 16 lines of sight >= 2 km = 4 r0 apart at the layer. The scan mean of y^2 varies by at most 2 v^2 and that of
+    # y by at most v, whatever the duration, so the standard errors are at most sqrt(2 k2 / n) v = 8 % v and sqrt(k1 v / n),
+    # n = 400, with k_m = sum of rho^m over the 16 lines of sight, rho(separation) their correlation. 4 of each are allowed.
+    op = operator(layers=1, lowest="4000 m", pwv_rms="1 %", wind={"speed": "20 m/s", "direction": "250 deg"})
+    xi, eta = (v.ravel() * 0.5 for v in np.mgrid[-1.5:2, -1.5:2])
+    observations = [observe(seconds, 0.2, 75.0, seed=seed, offsets=(xi, eta)) for seed in range(25)]
+    y = np.array([water(op, o) for o in observations])
+    v = expected_variance(op, observations[0])
+    separation = 4000 / np.sin(np.radians(75.0)) * np.hypot(np.subtract.outer(xi, xi), np.subtract.outer(eta, eta))
+    rho = beam_correlation(separation, 500.0, 42.5)
+    k1, k2 = (float((rho**m).sum(1).mean()) for m in (1, 2))
+    n = 25 * 16
+    assert np.mean(y**2) == pytest.approx(v, rel=4 * np.sqrt(2 * k2 / n))
+    assert np.mean(y) == pytest.approx(0, abs=4 * np.sqrt(k1 * v / n))
+
+
+@pytest.mark.parametrize("direction", ["along", "across"])
+def test_structure_function_between_detectors_through_the_whole_operator(direction: str) -> None:
+    # Two lines of sight r = 12 m apart in one layer seen through a 42.5 m beam. D = <(y1 - y2)^2> = 2 p^2 S(r). The estimate
+    # averages d^2 over 30 seeds of 2700 s at 30 m/s; its relative variance is 2 / n_eff with
+    # 1 / n_eff = mean over lags of rho(lag)^2, rho the correlation of d from the analytic covariance.
+    r, height, elevation, speed, seeds, seconds = 12.0, 2000.0, 50.0, 30.0, 30, 2700.0
+    distance = height / np.sin(np.radians(elevation))
+    half = r / distance / 2
+    op = operator(layers=1, lowest="2000 m", wind={"speed": f"{speed} m/s", "direction": "270 deg"})
+    # Looking north with a west wind: xi is along the wind, eta across it.
+    offsets = ([-half, half], [0.0, 0.0]) if direction == "along" else ([0.0, 0.0], [-half, half])
+    squares = []
+    for seed in range(seeds):
+        o = observe(seconds, 1.0, elevation, 0.0, seed=seed, offsets=offsets)
+        y = water(op, o)
+        squares.append(np.mean((y[0] - y[1]) ** 2))
+    sigma = layers_of(op, o)[0].sigma
+    s = beam_structure(r, 500.0, sigma)[0]
+    lag = speed * np.arange(0, int(seconds))
+    near = lag < 3000
+    far = [np.hypot(lag[near] + r * a, r * b) for a, b in (((1, 0), (-1, 0)) if direction == "along" else ((0, 1), (0, -1)))]
+    rho = np.zeros(len(lag))
+    rho[near] = (2 * beam_correlation(lag[near], 500.0, sigma) - sum(beam_correlation(v, 500.0, sigma) for v in far)) / (2 * s)
+    per_scan = (2 * (rho**2 * (1 - lag / seconds / speed)).sum() - 1) / len(lag)
+    error = np.sqrt(2 * per_scan / seeds)
+    assert error < 0.02
+    assert np.mean(squares) == pytest.approx(2 * op.pwv_rms**2 * s, rel=4 * error)
+
+
+def test_rms_after_the_beam_is_the_option() -> None:
+    before, after = operator(pwv_rms="2 %"), operator(pwv_rms="2 %", pwv_rms_after_beam=True)
+    camera = instrument(detectors=1, field="0 deg")
+    a, b = water(before, observe(camera=camera)), water(after, observe(camera=camera))
+    ratio = 0.02 / np.sqrt(expected_variance(before, observe(camera=camera)))
+    assert 1.01 < ratio < 1.2
+    np.testing.assert_allclose(b / a, ratio, rtol=2e-3)  # the slope of the emission changes with y
+
+
+def test_large_rms_takes_the_log_normal_map_and_keeps_mean_and_rms() -> None:
+    # Single lines of sight of n = 1500 seeds, through the map itself: y = exp(s g - s^2 v / 2) - 1 with g normal.
+    op = operator(pwv_rms="40 %", pwv_rms_after_beam=True)
+    g = np.random.default_rng(0).standard_normal(400_000) * np.sqrt(0.9)
+    y = op._water(g, 0.4 / np.sqrt(0.9), 0.9)
+    assert y.min() > -1
+    assert y.mean() == pytest.approx(0, abs=4 * 0.4 / np.sqrt(len(g)))
+    assert y.std() == pytest.approx(0.4, rel=0.02)
+    o = observe(5.0)
+    op.prepare(o)
+    assert ("AtmosphereLayers", "distribution of the water", "log-normal") in list(o.tally)
+    assert o.tally.get("AtmosphereLayers", "node values of the water clipped to the table") == 0
+    covariance = np.mean(op._water(g, 1.0, 0.9) * op._water(g, 1.0, 0.9))  # exp(s^2 v) - 1 = p^2
+    assert covariance == pytest.approx(0.16, rel=0.03)
+
+
+# --------------------------------------------------------------------------------------------- evaluation at nodes
+
+
+@pytest.mark.parametrize(
+    ("diameter", "field", "tolerance"),
+    [("100 m", "4.2 arcmin", 3e-5), ("100 m", "4.2 arcmin", 1e-2), ("12 m", "30 arcmin", 1e-3)],
+)
+def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: str, field: str, tolerance: float) -> None:
+    # Every detector and sample evaluated directly in the same realization. The bound is an ensemble rms; one realization of
+    # 80 s has some tens of independent errors, hence the factor 3. The lattice's own interpolation is common to both.
+    camera = instrument(detectors=61, field=field, diameter=diameter)
+    op = operator(layers=3, tolerance=tolerance)
+    o = observe(80.0, 50.0, scan=4.0, camera=camera)
+    state = op.prepare(o)
+    profile, band = op._weather(o)
+    track = tracks([o])[0]
+    u = rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)
+    g = np.zeros(u.shape[1:])
+    for number, layer in enumerate(op._layers(profile)):
+        beam = _turbulence(op, o, number, _model(layer, track, o, op.outer_scale))
+        across, along = track.positions(crossing(u), o.seconds, layer.height, layer.wind)
+        sample(beam, across, along, layer.amplitude, g)
+    elevation = np.arcsin(u[2])
+    direct = band.emission_difference(PWV, PWV * op.pwv_rms * g, elevation)
+    rms = np.sqrt(expected_variance(op, o)) * np.mean(band.emission_difference(PWV, 0.01 * PWV, elevation)) / 0.01
+    error = whole(o, state) - direct
+    assert state.emission.step > 1
+    assert state.emission.weights.shape[1] < 61
+    assert np.sqrt(np.mean(error**2)) < 3 * np.sqrt(2) * tolerance * rms
+    relative = np.expm1(band.log_transmission_difference(PWV, PWV * op.pwv_rms * g, elevation))
+    assert np.sqrt(np.mean((whole(o, state, "transmission") - relative) ** 2)) < 10 * tolerance * relative.std() + 1e-7
+    # The mean, in float64: within the same share of the fluctuation.
+    mean = o.smooth["atmosphere"].evaluate(slice(0, 61), slice(0, o.n_samples))
+    assert mean.dtype == np.float64
+    assert abs(mean - band.emission(PWV, elevation)).max() < 10 * tolerance * rms
+    opaque = o.smooth["transmission"].evaluate(slice(0, 61), slice(0, o.n_samples))
+    assert abs(opaque - band.transmission(PWV, elevation)).max() < tolerance * 1e-2
+
+
+def test_the_default_job_is_compressed_by_nodes_and_steps() -> None:
+    o = observe(120.0, scan=4.0)
+    state = operator().prepare(o)
+    assert state.emission.weights.shape[1] <= 9
+    assert state.emission.step >= 64
+    said = {what: text for who, what, text in o.tally if who == "AtmosphereLayers"}
+    assert "Chebyshev" in said["nodes"]
+    assert "samples" in said["step in time"]
+    assert "0.500% of the mean before the beam" in said["PWV rms"]
+    assert said["PWV rms after the beam, per layer"].count("m:") == 10
+
+
+# ------------------------------------------------------------------------------------------ bits, seeds, invariances
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_bits_do_not_depend_on_the_block(dtype: type) -> None:
+    o = observe(90.0, scan=3.0)
+    op = operator(layers=3)
+    state = op.prepare(o)
+
+    def run(detectors: slice, samples: slice) -> dict[str, Any]:
+        block = Block(o, detectors, samples, dtype=dtype)
+        op.exec(block, state)
+        return block.detdata
+
+    everything = run(slice(0, 223), slice(0, o.n_samples))
+    for detectors, samples in ((slice(16, 48), slice(2048, 6144)), (slice(208, 223), slice(8192, o.n_samples))):
+        part = run(detectors, samples)
+        for name in ("atmosphere", "transmission"):
+            assert part[name].dtype == dtype
+            np.testing.assert_array_equal(part[name], everything[name][detectors, samples])
+
+
+def test_exec_adds_to_what_is_there() -> None:
+    o = observe(10.0)
+    op = operator(layers=2)
+    state = op.prepare(o)
+    block = Block(o, slice(0, 16), slice(0, 500))
+    block.new("atmosphere")[:] = 2.0
+    op.exec(block, state)
+    np.testing.assert_allclose(block.detdata["atmosphere"] - 2, whole(o, state)[:16, :500], atol=1e-6)
+
+
+def test_same_seed_same_bits_and_two_seeds_are_incoherent() -> None:
+    op = operator(layers=4, outer_scale="100 m")
+    camera = instrument(detectors=1, field="0 deg")
+
+    def series(seed: int) -> Floats:
+        return whole(o := observe(2000.0, 1.0, camera=camera, seed=seed), op.prepare(o))[0]
+
+    a, b = series(1), series(2)
+    np.testing.assert_array_equal(a, series(1))
+    # At > 5 m/s past r0 = 100 m, 2000 s hold > 50 independent pieces: |correlation| < 4 / sqrt(50).
+    assert abs(np.corrcoef(a, b)[0, 1]) < 0.57
+    assert not np.array_equal(a, b)
+
+
+def test_two_operators_have_independent_air() -> None:
+    a, b = operator(), operator(name="other")
+    o = observe(5.0)
+    assert not np.allclose(whole(o, a.prepare(o)), whole(o, b.prepare(o)), rtol=0.1)
+
+
+@pytest.mark.parametrize("angle", [37.0, 180.0, 271.0])
+def test_turning_telescope_and_wind_together_changes_nothing(angle: float) -> None:
+    wind = {"speed": "12 m/s", "direction": "200 deg"}
+    turned = {"speed": "12 m/s", "direction": f"{200 + angle} deg"}
+    one, two = observe(20.0, azimuth=40.0, scan=4.0), observe(20.0, azimuth=40.0 + angle, scan=4.0)
+    a, b = (whole(o, operator(layers=3, wind=w).prepare(o)) for o, w in ((one, wind), (two, turned)))
+    np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_zero_wind_and_a_stare_give_identical_samples() -> None:
+    o = observe(30.0)
+    op = operator(wind={"speed": "0 m/s"})
+    state = op.prepare(o)
+    for name in ("emission", "transmission"):
+        values = whole(o, state, name)
+        assert np.isfinite(values).all()
+        assert values.std(axis=0).max() > 0
+        assert np.ptp(values, axis=1).max() <= 1e-12 * abs(values).max()
+
+
+def test_frozen_flow_carries_the_air_to_the_next_detector() -> None:
+    # A detector downwind sees the same air r / v later (one layer; the shift along eta = 0 is level with the boresight).
+    distance = 2000.0 / np.sin(np.radians(50.0))
+    r = 60.0
+    op = operator(layers=1, lowest="2000 m", wind={"speed": "10 m/s", "direction": "270 deg"}, tolerance=1e-5)
+    o = observe(60.0, 10.0, 50.0, 0.0, offsets=([0.0, r / distance], [0.0, 0.0]))
+    west, east = water(op, o)
+    np.testing.assert_allclose(east[60:], west[:-60], atol=2e-3 * op.pwv_rms)
+
+
+def test_consecutive_scans_see_the_same_air_continuously() -> None:
+    # The second scan starts where the first one ends, 0.3 deg away; at 60 s the pointing jumps, the air does not.
+    op = operator(tolerance=1e-5)
+    whole_scan = observe(120.0, 10.0)
+    first = observe(60.0, 10.0, index=0)
+    second = observe(60.0, 10.0, index=1, start="2024-11-25T07:01:00Z")
+    scene = Scene(site=SITE, instrument=instrument(), time=START)
+    op.observe(Data(scene, [first, second]))
+    parts = [whole(o, op.prepare(o))[:20] for o in (first, second)]
+    alone = operator(tolerance=1e-5)
+    alone.observe(Data(scene, [whole_scan]))
+    expected = whole(whole_scan, alone.prepare(whole_scan))[:20]
+    np.testing.assert_allclose(np.concatenate(parts, axis=1), expected, atol=1e-4 * expected.std() + 5e-6)
+    moved = observe(60.0, 10.0, azimuth=153.0, elevation=57.2, index=1, start="2024-11-25T07:01:00Z")
+    op.observe(Data(scene, [first, moved]))
+    values = whole(moved, op.prepare(moved))[:20]
+    # 3 deg at 3 km is 150 m of other air, far less than r0: the values stay correlated, and no realization is redrawn.
+    assert abs(values[:, 0] - parts[0][:, -1]).max() < 2 * 0.005 * 34
+
+
+# -------------------------------------------------------------------------------------------------------- corners
+
+
+@pytest.mark.parametrize(("seconds", "rate"), [(0.01, 100.0), (0.02, 100.0), (0.5, 100.0), (0.5, 1.0)])
+def test_short_scans_of_one_detector(seconds: float, rate: float) -> None:
+    o = observe(seconds, rate, camera=instrument(detectors=1, field="0 deg"))
+    op = operator(wind={"speed": "0 m/s"})
+    values = whole(o, op.prepare(o))
+    assert values.shape == (1, max(1, round(seconds * rate)))
+    assert np.isfinite(values).all()
+    assert (values != 0).all()
+
+
+def test_no_fluctuation_when_none_is_asked_for() -> None:
+    o = observe(10.0)
+    state = operator(pwv_rms="0 %").prepare(o)
+    assert not whole(o, state).any()
+    assert not whole(o, state, "transmission").any()
+    assert o.smooth["atmosphere"].evaluate(slice(0, 1), slice(0, 1))[0, 0] > 20
+
+
+@pytest.mark.parametrize("elevation", [5.0, 30.0, 89.8])
+def test_low_and_high_elevations(elevation: float) -> None:
+    o = observe(10.0, elevation=elevation)
+    assert np.isfinite(whole(o, operator().prepare(o))).all()
+    low = o.tally.get("AtmosphereLayers", "node values below 5 deg of elevation, extrapolated")
+    assert (low > 0) == (elevation == 5.0)
+    mean = o.smooth["atmosphere"].evaluate(slice(0, 223), slice(0, 1))[:, 0]
+    # Emission falls with elevation, smoothly through the limit: a parabola in eta leaves < 3 mK over 4 arcmin.
+    left = mean - np.polyval(np.polyfit(o.focalplane.eta, mean, 2), o.focalplane.eta)
+    assert abs(left).max() < 3e-3
+    assert np.corrcoef(mean, o.focalplane.eta)[0, 1] < -0.99
+
+
+def test_elevations_far_below_the_limit_are_an_error() -> None:
+    with pytest.raises(ZondaError, match="5 to 90 deg"):
+        operator().prepare(observe(1.0, elevation=4.0))
+
+
+def test_below_the_horizon_is_an_error() -> None:
+    with pytest.raises(ZondaError, match="below the horizon"):
+        operator().prepare(observe(1.0, elevation=-3.0))
+
+
+def test_wide_throws_take_the_horizontal_plane_and_say_so() -> None:
+    t = np.arange(4000) / 100
+    o = observe(40.0, elevation=50.0)
+    o.boresight_azel = quaternions(np.radians(180 + 50 * np.sin(2 * np.pi * t / 40)), np.full(4000, np.radians(50.0)))
+    track = tracks([o])[0]
+    assert track.horizontal
+    assert track.bound == pytest.approx(1 / np.tan(np.radians(50.0)) ** 2, rel=1e-6)
+    operator(layers=2, tolerance=1e-3).prepare(o)
+    said = {what: text for _, what, text in o.tally}
+    assert "horizontal" in said["plane of the turbulence"]
+    assert "70.4%" in said["plane of the turbulence"]
+    narrow = tracks([observe(40.0, elevation=50.0, scan=4.0)])[0]
+    assert not narrow.horizontal
+    assert narrow.bound < 0.01
+
+
+def test_transverse_plane_measures_separations_across_the_line_of_sight() -> None:
+    # Detectors 1 arcmin apart in any direction, at any elevation, are z theta apart on the plane.
+    for elevation in (20.0, 57.0, 89.0):
+        o = observe(1.0, elevation=elevation)
+        track = tracks([o])[0]
+        theta = np.radians(1 / 60)
+        angle = np.linspace(0, 2 * np.pi, 9)
+        u = rays(axes(o.boresight_azel[:1]), np.r_[0, theta * np.cos(angle)], np.r_[0, theta * np.sin(angle)])
+        x, y = track.positions(crossing(u), np.zeros(1), 1000.0, np.array([3.0, 4.0]))
+        r = np.hypot(x[1:] - x[0], y[1:] - y[0])[:, 0]
+        np.testing.assert_allclose(r, 1000 / np.sin(np.radians(elevation)) * theta, rtol=3e-3)
+
+
+def test_rays_agree_with_azimuth_and_elevation() -> None:
+    az, el = np.radians([10.0, 200.0]), np.radians([30.0, 70.0])
+    u = rays(axes(quaternions(az, el)), np.array([0.0, 1e-4, 0.0]), np.array([0.0, 0.0, 1e-4]))
+    np.testing.assert_allclose(u[:, 0], [np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)], atol=1e-14)
+    azimuth, elevation = np.arctan2(u[0], u[1]) % (2 * np.pi), np.arcsin(u[2])
+    np.testing.assert_allclose(azimuth[1] - az, 1e-4 / np.cos(el), rtol=1e-6)
+    np.testing.assert_allclose(elevation[2] - el, 1e-4, rtol=1e-6)
+
+
+def test_wind_directions_are_where_the_wind_comes_from() -> None:
+    np.testing.assert_allclose(Wind(speed="10 m/s", direction="270 deg").vector, [10, 0], atol=1e-14)
+    np.testing.assert_allclose(Wind(speed="10 m/s", direction="0 deg").vector, [0, -10], atol=1e-14)
+
+
+def test_winds_and_weights_per_layer() -> None:
+    o = observe(1.0)
+    op = operator(layers=2, wind=[{"speed": "3 m/s"}, {"speed": "5 m/s", "direction": "0 deg"}], weights="equal")
+    profile, _ = op._weather(o)
+    one, two = op._layers(profile)
+    np.testing.assert_allclose([one.amplitude, two.amplitude], np.sqrt(0.5))
+    np.testing.assert_allclose([one.wind, two.wind], [[3, 0], [0, -5]], atol=1e-14)
+    vapour = operator()._layers(profile)
+    assert sum(v.amplitude**2 for v in vapour) == pytest.approx(1)
+    assert [v.amplitude for v in vapour] == sorted((v.amplitude for v in vapour), reverse=True)
+    np.testing.assert_allclose(vapour[3].wind, [profile.at(2000.0).wind_east, profile.at(2000.0).wind_north])
+
+
+def test_climatology_gives_the_pwv_where_none_is_asked_for() -> None:
+    o = observe(1.0)
+    AtmosphereLayers().prepare(o)
+    said = {what: text for _, what, text in o.tally}
+    assert said["mean PWV"].endswith("mm (climatology)")
+
+
+def test_near_field_beam() -> None:
+    camera = instrument()
+    assert beam_sigma(camera.telescope, camera.band, 0.0) == pytest.approx(100 / 2.3548, rel=1e-4)
+    far = 1e9
+    rayleigh = np.pi * 50**2 * camera.band.centre / 299792458
+    assert beam_sigma(camera.telescope, camera.band, far) == pytest.approx(100 / 2.3548 * far / rayleigh, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"layers": 3, "wind": [{"speed": "3 m/s"}]}, "1 winds for 3 layers"),
+        ({"lowest": "6 km"}, "lowest must be below highest"),
+        ({"pwv_rms": "-1 %"}, "greater than or equal"),
+        ({"pwv": "0 mm"}, "greater than"),
+        ({"layers": 0}, "greater than or equal"),
+        ({"tolerance": 0.0}, "greater than or equal"),
+    ],
+)
+def test_bad_parameters(parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        AtmosphereLayers(**parameters)
+
+
+def test_an_outer_scale_beyond_the_measured_range_is_refused() -> None:
+    with pytest.raises(ZondaError, match="outer scale"):
+        operator(outer_scale="100 km").prepare(observe(1.0))

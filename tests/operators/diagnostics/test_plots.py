@@ -1,0 +1,244 @@
+"""Pictures say what they show, need no window system, and draw on the Axes they are given."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from astropy.wcs import WCS
+from matplotlib.figure import Figure
+
+from zonda.core.errors import OutputError
+from zonda.operators.diagnostics.plot_operators import Plots
+from zonda.operators.diagnostics.plots import plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
+from zonda.operators.diagnostics.power_spectrum import Spectrum
+from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
+from zonda.operators.maps.image import Image
+from zonda.operators.maps.map_product import MapProduct
+
+ARCSEC = np.pi / 648000
+
+
+@pytest.fixture
+def wcs():
+    made = WCS(naxis=2)
+    made.wcs.ctype, made.wcs.crval = ["RA---TAN", "DEC--TAN"], [75.0, 20.0]
+    made.wcs.crpix, made.wcs.cdelt = [30.5, 25.5], [-4 / 3600, 4 / 3600]
+    return made
+
+
+@pytest.fixture
+def values():
+    made = np.random.default_rng(1).normal(0, 1e-4, (50, 60))
+    made[25, 30] = -2e-3
+    made[0, :] = np.nan
+    return made
+
+
+@pytest.fixture
+def spectrum():
+    f = np.linspace(0.01, 50, 2000)
+    white, pink = np.full(2000, 6e-6), 6e-6 * 0.5 / f
+    return Spectrum(f, {"signal": white + pink, "white": white, "pink": pink}, 100.0, 6e-6, "PowerSpectrum", 16)
+
+
+@pytest.fixture
+def stream():
+    seconds = np.arange(1000) / 50
+    return TimeStream(seconds, {"signal": np.array([np.sin(seconds), np.cos(seconds)])}, ["d0", "d1"], "scan", "TimeStreams")
+
+
+@pytest.fixture
+def products(wcs, values, spectrum, stream):
+    def product(scale, half):
+        hits = np.full(values.shape, 40)
+        return MapProduct(
+            values * scale,
+            hits,
+            hits * 1e6,
+            np.full(values.shape, 1e-4),
+            values * half if half else None,
+            wcs.to_header(),
+            centre=(np.radians(75.0), np.radians(20.0)),
+            pixel=4 * ARCSEC,
+            weighting="inverse_variance",
+            fwhm=9 * ARCSEC,
+        )
+
+    return {
+        "input": Image(values, wcs.to_header()),
+        "map": product(1.0, 0.5),
+        "noiseless/map": product(0.5, 0),
+        "source_free/map": product(0.1, 0),
+        "spectrum": spectrum,
+        "time_streams": stream,
+    }
+
+
+def texts(ax):
+    return [t.get_text() for t in ax.texts]
+
+
+def drawn(ax):
+    ax.figure.canvas.draw()
+    return ax
+
+
+def test_a_map_has_world_axes_a_unit_and_its_beam(values, wcs):
+    ax = drawn(plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC, circle=60 * ARCSEC))
+    assert ax.get_title() == "The map"
+    assert ax.coords[0].get_axislabel() == "RA (ICRS)"
+    assert "FWHM 9″" in texts(ax)
+    assert "µK" in ax.images[0].colorbar.ax.get_ylabel()
+    low, high = ax.images[0].get_clim()
+    assert low == -high  # zero is white
+    np.testing.assert_allclose(np.ma.getdata(ax.images[0].get_array())[25, 30], -2000)  # uK
+    beam, circle = ax.patches
+    assert beam.width == pytest.approx(9 / 4)  # pixels
+    assert circle.width == pytest.approx(60 / 4)
+
+
+def test_plain_axes_get_offsets_with_east_to_the_left(values, wcs):
+    ax = Figure().add_subplot()
+    assert plot_map(values, wcs, ax=ax, fwhm=9 * ARCSEC) is ax
+    assert ax.get_xlabel() == "RA offset [arcmin]"
+    assert ax.get_xlim() == pytest.approx((2.0, -2.0))  # 60 pixels of 4 arcsec
+    assert ax.patches[0].width == pytest.approx(9 / 60)  # arcmin
+    drawn(ax)
+
+
+@pytest.mark.parametrize("fill", [0.0, np.nan])
+def test_an_empty_map_can_be_drawn(fill, wcs):
+    drawn(plot_map(np.full((50, 60), fill), wcs))
+    drawn(plot_coverage(np.zeros((50, 60), int), wcs))
+
+
+def test_coverage_leaves_unseen_pixels_out(wcs):
+    hits = np.zeros((50, 60), int)
+    hits[10:20] = 7
+    shown = drawn(plot_coverage(hits, wcs)).images[0].get_array()
+    assert shown.mask.sum() == 50 * 60 - 600
+    assert shown.max() == 7
+
+
+def test_spectra_mark_the_white_level_and_the_knee(spectrum):
+    ax = drawn(plot_spectra(spectrum))
+    assert ax.get_xscale() == ax.get_yscale() == "log"
+    assert any("2 NET²" in t and "1.73 mK" in t for t in texts(ax))  # sqrt(6e-6 / 2)
+    assert any(t.startswith("knee 0.5") for t in texts(ax))
+    labels = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert labels == ["signal (all)", "white noise", "pink noise"]
+    assert "Hz" in ax.get_xlabel()
+    assert "K" in ax.get_ylabel()
+
+
+def test_time_streams(stream):
+    ax = drawn(plot_tod(stream))
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["d0", "d1"]
+    assert "scan" in ax.get_title()
+
+
+def test_a_track_starts_at_its_offset(make_observation):
+    observation = make_observation(500)
+    ax = drawn(plot_scan([observation]))
+    x, y = ax.lines[0].get_data()
+    assert np.hypot(x[0], y[0]) < 1e-9  # the fixture's first sample looks at the centre
+    offset = np.radians(0.05) * np.sin(observation.seconds)
+    # Tangent-plane offsets differ from ra cos(dec) by a relative offset * tan(dec) = 3e-4
+    np.testing.assert_allclose(x, -np.degrees(offset) * 60 * np.cos(np.radians(20)), atol=1.5e-3)
+    np.testing.assert_allclose(y, np.degrees(offset) * 60 / 3, atol=1.5e-3)
+    assert ax.xaxis_inverted()
+
+
+def test_no_window_system_and_no_global_state():
+    code = (
+        "import numpy as np, sys; from astropy.wcs import WCS; from zonda.operators.diagnostics.plots import plot_map\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        "w = WCS(naxis=2); w.wcs.ctype = ['RA---TAN', 'DEC--TAN']\n"
+        "plot_map(np.zeros((4, 4)), w).figure.savefig('/dev/null', format='png')\n"
+        "assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, env={"PATH": "", "MPLBACKEND": "tkagg", "HOME": "/tmp"})
+
+
+def test_every_picture_is_written(data, products, make_observation):
+    data.products.update(products)
+    data.observations.append(make_observation(500))
+    Plots().finalize(data)
+    names = {"input", "noiseless_map", "map", "noise_map", "coverage", "power_spectra", "tod", "scan"}
+    assert {p.name for p in data.output.iterdir()} == {f"{n}.png" for n in names}
+    for picture in data.products["pictures"]:
+        assert picture.png.startswith(b"\x89PNG")
+        assert (data.output / f"{picture.name}.png").read_bytes() == picture.png
+        assert picture.caption
+    noise = next(p for p in data.products["pictures"] if p.name == "noise_map")
+    assert "even minus odd scans" in noise.caption
+    assert "run without the sky" in noise.caption
+    assert "smoothed by 9″" in noise.caption
+
+
+def test_only_what_is_there_is_drawn(data):
+    Plots().finalize(data)
+    assert data.products["pictures"] == []
+    assert list(data.output.iterdir()) == []
+
+
+def test_a_healpix_map_is_drawn(data):
+    import healpy as hp
+
+    nside = 1024
+    pixels = hp.query_disc(nside, hp.ang2vec(75.0, 20.0, lonlat=True), np.radians(0.5))
+    n = pixels.size
+    data.products["map"] = MapProduct(
+        np.full(n, 1e-3),
+        np.full(n, 5),
+        np.full(n, 5.0),
+        np.full(n, 1e-3),
+        None,
+        None,
+        centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=hp.nside2resol(nside),
+        nside=nside,
+        pixels=np.sort(pixels),
+        fwhm=9 * ARCSEC,
+    )
+    Plots().finalize(data)
+    assert {p.name for p in data.products["pictures"]} == {"map", "coverage"}
+
+
+def test_no_output_folder(data):
+    data.output = None
+    with pytest.raises(OutputError, match="no output folder"):
+        Plots().finalize(data)
+
+
+def test_a_large_input_keeps_its_place_when_thinned(data, wcs):
+    values = np.zeros((1600, 3200))
+    values[800, 1600] = 1.0
+    wcs.wcs.crpix = [1601, 801]
+    data.products["input"] = Image(values, wcs.to_header())
+    Plots().finalize(data)
+    assert [p.name for p in data.products["pictures"]] == ["input"]
+
+
+def test_time_streams_are_kept_whole(make_observation, data):
+    from zonda.core.data import Block
+    from zonda.core.smooth import SmoothField
+
+    observation, operator = make_observation(5000), TimeStreams(streams=["signal", "pink"], detectors=3)
+    mean = SmoothField.constant(np.arange(19.0), 5000)
+    signal = np.random.default_rng(3).normal(size=(19, 5000)).astype(np.float32)
+    state = operator.prepare(observation)
+    for rows in (slice(0, 16), slice(16, 19)):
+        for columns in (slice(0, 2048), slice(2048, 5000)):
+            operator.exec(Block(observation, rows, columns, {"signal": signal[rows, columns]}, {"signal": mean}), state)
+    operator.collect(data, observation, state)
+    kept = data.products["time_streams"]
+    assert kept.names == ["d00", "d09", "d18"]
+    np.testing.assert_allclose(
+        kept.streams["signal"], signal[[0, 9, 18]] + np.array([0.0, 9, 18])[:, None], rtol=1e-14, atol=1e-14
+    )
+    assert observation.tally.get("TimeStreams", "stream pink is absent at this step") == 1
+    assert TimeStreams(observation=1).prepare(observation) is None

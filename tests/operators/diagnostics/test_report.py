@@ -1,0 +1,148 @@
+"""One page with everything in it, and nothing in it that is not escaped."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from zonda.core.errors import OutputError
+from zonda.operators.diagnostics.plot_operators import Picture
+from zonda.operators.diagnostics.report import Report, readable
+
+PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
+EVIL = "<script>alert('x')</script>&\"quoted\""
+
+
+class Checker(HTMLParser):
+    """Every element closed, nothing loaded from outside, no script."""
+
+    VOID = frozenset({"meta", "img", "br", "link"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.text, self.images = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        assert tag != "script"
+        assert tag != "link"
+        found = dict(attributes)
+        if tag == "img":
+            assert found["src"].startswith("data:image/png;base64,")
+            assert found["alt"]
+            self.images.append(found["alt"])
+        assert not found.get("href", "#").startswith("http")
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+@pytest.fixture
+def report(data, make_observation):
+    def make():
+        data.observations.append(make_observation(500))
+        Report().finalize(data)
+        page = (data.output / "report.html").read_text(encoding="utf-8")
+        checker = Checker()
+        checker.feed(page)
+        assert checker.open == []
+        return page, " ".join(" ".join(checker.text).split()), checker
+
+    return make
+
+
+def test_it_says_what_was_simulated(data, report):
+    data.tally.count("SkyMap", "samples outside the input map", 12345)
+    data.tally.state("AtmosphereLayers", "mean PWV", "7.7 mm")
+    data.provenance["versions"] = {"zonda": "0.1.0", "numpy": "9.9.9"}
+    data.provenance["command"] = "zonda run demo"
+    data.provenance["timings"] = [("SkyMap", "exec", 1.5), ("SkyMap", "prepare", 0.25), ("BinMap", "exec", 0.5)]
+    data.provenance["operators"] = [("PinkNoise", "PinkNoise", {"knee": "0.5 Hz", "radius": "0.0011635528346628863 rad"})]
+    data.products["pictures"] = [Picture("map", "The map", "What came out.", PNG)]
+    page, text, checker = report()
+    for part in (
+        "camera on dish at hill",
+        "seed 7",
+        "2024-11-25T07:00:00.123456789Z",
+        "scan_0",
+        "12 345",
+        "samples outside the input map",
+        "mean PWV",
+        "7.7 mm",
+        "numpy 9.9.9",
+        "zonda run demo",
+        "1.750 s",
+        "4 arcmin",
+        "Simulated, not observed, by zonda 0.1.0",
+        "a: 1",
+        "Main-beam efficiency",
+        "80 to 100 GHz",
+        "1 mK_RJ √s",
+    ):
+        assert part in text, part
+    assert checker.images == ["The map: What came out."]
+    assert 'title="0.0011635528346628863 rad"' in page
+
+
+def test_every_text_is_escaped(data, report):
+    data.provenance.update(name=EVIL, description=EVIL, command=EVIL, resolved_yaml=EVIL, versions={EVIL: EVIL})
+    data.provenance["operators"] = [(EVIL, EVIL, {EVIL: EVIL})]
+    data.provenance["timings"] = [(EVIL, EVIL, 1.0)]
+    data.tally.state(EVIL, EVIL, EVIL)
+    data.products["pictures"] = [Picture("map", EVIL, EVIL, PNG)]
+    page, text, _ = report()
+    assert "<script" not in page
+    assert text.count("<script>") >= 8  # shown as text
+
+
+def test_the_configuration_is_beside_it(data, report):
+    report()
+    assert (data.output / "resolved.yaml").read_text(encoding="utf-8") == "a: 1\nb: 'é'\n"
+    assert sorted(p.name for p in data.output.iterdir()) == ["report.html", "resolved.yaml"]
+
+
+def test_it_draws_its_own_pictures_where_no_step_did(data, report):
+    _, _, checker = report()
+    assert any(alt.startswith("Boresight track") for alt in checker.images)
+
+
+def test_a_run_from_python_has_a_report_too(data, report):
+    data.provenance.clear()
+    page, text, _ = report()
+    assert "zonda run" in text
+    assert not (data.output / "resolved.yaml").exists()
+    assert re.search(r'id="steps"', page) is None  # no empty sections
+
+
+def test_no_output_folder(data):
+    data.output = None
+    with pytest.raises(OutputError, match="no output folder"):
+        Report().finalize(data)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("0.0011635528346628863 rad", "4 arcmin"),
+        ("4.1209164e-05 rad", "8.5 arcsec"),
+        ("516.0 s", "8.6 min"),
+        ("9.3e10 Hz", "93 GHz"),
+        ("0.08 Hz", "0.08 Hz"),
+        ("0.0017 K s(1/2)", "1.7 mK s(1/2)"),
+        ("0.0077 m", "7.7 mm"),
+        ("0.0 s", "0 s"),
+        ("0.3", "0.3"),
+        ("['signal']", "['signal']"),
+        ("-1.5707963267948966 rad", "-90 deg"),
+        ("12 parsec", "12 parsec"),
+        ("0.00024240684055 rad / s", "50 arcsec/s"),
+    ],
+)
+def test_quantities_are_readable(text, shown):
+    assert readable(text) == shown

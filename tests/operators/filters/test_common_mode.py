@@ -1,0 +1,193 @@
+"""Singular modes against numpy by residual; what must never be removed; dead detectors; precision; bits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from zonda.core.errors import PipelineError
+from zonda.core.smooth import SmoothField
+from zonda.operators.filters.common_mode import CommonModeFilter
+from zonda.operators.filters.highpass import HighpassFilter
+
+N_DET, N = 40, 5000
+
+
+def atmosphere_like(common, gradient, white, seed=0, n_det=N_DET, n=N):
+    rng = np.random.default_rng(seed)
+    series = np.cumsum(rng.standard_normal((4, n)), axis=1)
+    series -= series.mean(axis=1, keepdims=True)
+    series /= series.std(axis=1, keepdims=True)
+    place = rng.uniform(-1, 1, (2, n_det))
+    return (
+        common * np.outer(1 + 0.02 * place[0], series[0])
+        + gradient * (place.T @ series[1:3])
+        + white * rng.standard_normal((n_det, n))
+    )
+
+
+def numpy_removed(a, modes):
+    u, s, v = np.linalg.svd(a, full_matrices=False)
+    return a - (u[:, :modes] * s[:modes]) @ v[:modes]
+
+
+def run(bench, a, precision="float64", observation=None, threads=1, memory=1 << 30, **parameters):
+    observation = observation or bench.observation(*a.shape)
+    return bench.run(
+        [CommonModeFilter(**parameters)], observation, {"signal": a}, precision=precision, threads=threads, memory=memory
+    )
+
+
+@pytest.mark.parametrize("case", [(0.3, 0.0, 0.017), (0.3, 0.03, 0.017), (0.02, 0.01, 0.017), (10.0, 1.0, 0.0)])
+@pytest.mark.parametrize("modes", [1, 2])
+def test_equals_numpys_svd_by_residual(bench, case, modes):
+    a = atmosphere_like(*case)
+    result = run(bench, a, modes=modes, on_undetermined="remove", residual=1e-10)
+    expected = numpy_removed(a, modes)
+    assert np.linalg.norm(result.signal - expected) < 1e-7 * np.linalg.norm(expected)
+
+
+def test_residual_is_reached_and_reported(bench):
+    a = atmosphere_like(0.3, 0.03, 0.017)
+    s = np.linalg.svd(a, compute_uv=False)
+    result = run(bench, a, residual=1e-6)
+    removed = a - result.signal
+    u0 = np.linalg.svd(removed, full_matrices=False)[0][:, 0]
+    value = np.linalg.norm(a.T @ u0) ** 2
+    assert np.linalg.norm(a @ (a.T @ u0) - value * u0) / s[0] ** 2 < 1.1e-6
+    reported = float(result.tally["CommonModeFilter", "scan0: singular values / sqrt(detectors x samples)"].split(",")[0])
+    assert abs(reported * np.sqrt(a.size) / s[0] - 1) < 1e-3  # four printed digits
+    assert float(result.tally["CommonModeFilter", "scan0: residual of the modes"].split()[0]) <= 1e-6
+
+
+def test_leading_mode_orthogonal_to_the_mean_is_found(bench):
+    rng = np.random.default_rng(3)
+    a = np.outer(np.tile([1.0, -1.0], N_DET // 2), rng.standard_normal(N)) + 0.1 * rng.standard_normal((N_DET, N))
+    result = run(bench, a)
+    assert result.signal.std() < 0.11
+    two = np.array([[1.0], [-1.0]]) * rng.standard_normal(N) * 3 + 1e-3 * rng.standard_normal((2, N))
+    assert run(bench, two).signal.std() < 2e-3
+
+
+def test_mean_method(bench):
+    a = atmosphere_like(0.3, 0.03, 0.017)
+    result = run(bench, a, method="mean")
+    np.testing.assert_allclose(result.signal, a - a.mean(axis=0), rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match="removes one mode"):
+        CommonModeFilter(method="mean", modes=2)
+
+
+@pytest.mark.parametrize(("policy", "expected"), [("mean", "mean"), ("skip", "same"), ("remove", "svd")])
+def test_closed_gap(bench, policy, expected):
+    a = np.random.default_rng(4).standard_normal((N_DET, N))
+    result = run(bench, a, on_undetermined=policy, residual=1e-8)
+    wanted = {"mean": a - a.mean(axis=0), "same": a, "svd": numpy_removed(a, 1)}[expected]
+    assert np.linalg.norm(result.signal - wanted) < 1e-5 * np.linalg.norm(a)
+    assert result.tally["CommonModeFilter", "modes not determined (gap closed)"] == "1"
+
+
+def test_second_mode_undetermined_is_skipped_and_the_first_removed(bench):
+    a = atmosphere_like(0.3, 0.0, 0.017)
+    result = run(bench, a, modes=2, residual=1e-8)
+    assert np.linalg.norm(result.signal - numpy_removed(a, 1)) < 1e-5 * np.linalg.norm(result.signal)
+    assert result.tally["CommonModeFilter", "modes not determined (gap closed)"] == "1"
+
+
+@pytest.mark.parametrize("n_det", [1, 5])
+@pytest.mark.parametrize("method", ["svd", "mean"])
+def test_single_and_identical_detectors_keep_their_signal(bench, n_det, method):
+    a = np.tile(np.random.default_rng(5).standard_normal(N), (n_det, 1))
+    result = run(bench, a, method=method)
+    np.testing.assert_array_equal(result.signal, a)
+    assert result.tally["CommonModeFilter", "modes kept because the data do not determine them (rank)"] == "1"
+
+
+def test_more_modes_than_rank_allows(bench):
+    rng = np.random.default_rng(6)
+    a = rng.standard_normal((6, 2)) @ rng.standard_normal((2, N)) * np.array([[1.0]])
+    result = run(bench, a, modes=5, on_undetermined="remove")
+    assert np.linalg.matrix_rank(result.signal, tol=1e-6) == 1
+    assert np.linalg.norm(result.signal - numpy_removed(a, 1)) < 1e-5 * np.linalg.norm(a)
+
+
+def test_dead_constant_and_nan_detectors_are_flagged_and_take_no_part(bench):
+    a = atmosphere_like(0.3, 0.03, 0.017)
+    spoilt = a.copy()
+    spoilt[3], spoilt[7], spoilt[11, 200] = 0.0, 4.25, np.nan
+    result = run(bench, spoilt)
+    assert np.flatnonzero(result.observations[0].detector_flags).tolist() == [3, 7, 11]
+    assert result.tally["CommonModeFilter", "detectors flagged: signal constant"] == "2"
+    assert result.tally["CommonModeFilter", "detectors flagged: signal not finite"] == "1"
+    good = np.setdiff1d(np.arange(N_DET), [3, 7, 11])
+    assert np.linalg.norm(result.signal[good] - numpy_removed(a[good], 1)) < 1e-4 * np.linalg.norm(result.signal[good])
+
+
+def test_all_dead_or_nothing_good(bench):
+    result = run(bench, np.zeros((4, 300)))
+    assert (result.signal == 0).all()
+    assert result.observations[0].detector_flags.all()
+
+
+def test_flagged_samples_are_left_out(bench):
+    a = atmosphere_like(0.3, 0.03, 0.017)
+    spoilt, observation = a.copy(), bench.observation(N_DET, N)
+    bad = np.r_[0:10, 2040:2060, 4000:4100]
+    observation.flags[bad] = 1
+    spoilt[:, bad] = np.nan
+    result = run(bench, spoilt, observation=observation, residual=1e-9)
+    good = np.setdiff1d(np.arange(N), bad)
+    assert not result.observations[0].detector_flags.any()
+    expected = numpy_removed(a[:, good], 1)
+    assert np.linalg.norm(result.signal[:, good] - expected) < 1e-6 * np.linalg.norm(expected)
+
+
+def test_mean_emission_is_part_of_the_signal_in_float64_and_refused_in_float32(bench):
+    a = atmosphere_like(0.3, 0.0, 0.017)
+    mean = SmoothField.constant(np.linspace(60, 70, N_DET), N)
+    whole = a + np.linspace(60, 70, N_DET)[:, None]
+    result = bench.run(
+        [CommonModeFilter()], bench.observation(N_DET, N), {"signal": a}, means={"signal": mean}, precision="float64"
+    )
+    assert np.linalg.norm(result.signal - numpy_removed(whole, 1)) < 1e-5 * np.linalg.norm(result.signal)
+    with pytest.raises(PipelineError, match="mean emission") as err:
+        bench.run([CommonModeFilter()], bench.observation(N_DET, N), {"signal": a}, means={"signal": mean}, precision="float32")
+    assert "precision: float64" in str(err.value)
+    bench.run(
+        [HighpassFilter(), CommonModeFilter()],
+        bench.observation(N_DET, N),
+        {"signal": a},
+        means={"signal": mean},
+        precision="float32",
+    )
+
+
+def test_common_mode_of_1e7_times_the_signal(bench):
+    """hard_cases.md: float64 leaves < 1e-8 K, float32 refuses."""
+    rng = np.random.default_rng(8)
+    t = np.arange(N)
+    signal = 1e-6 * np.array([np.exp(-0.5 * ((t - 1000 - 70 * d) / 20.0) ** 2) for d in range(N_DET)])
+    common = 10 * np.cumsum(rng.standard_normal(N)) / np.sqrt(N)
+    a = common + signal
+    result = run(bench, a, residual=1e-11)
+    assert np.abs(result.signal - numpy_removed(a, 1)).max() < 1e-8
+    assert result.signal.max() > 0.9e-6
+    with pytest.raises(PipelineError, match="more than float32 can carry"):
+        run(bench, a, precision="float32")
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_identical_bits_for_threads_and_blocks(bench, precision):
+    a = atmosphere_like(0.3, 0.05, 0.017, n_det=37, n=9001)
+    results = [run(bench, a, precision, threads=t, memory=m).signal for t, m in ((1, 1 << 30), (3, 1 << 30), (2, 4 << 20))]
+    np.testing.assert_array_equal(results[0], results[1])
+    np.testing.assert_array_equal(results[0], results[2])
+
+
+def test_point_source_amplitude_survives_and_is_not_skewed(bench):
+    """A source that each detector sees at another time keeps its amplitude but for its share of the mode, 1 / n_det."""
+    t = np.arange(N)
+    source = np.array([np.exp(-0.5 * ((t - 500 - 100 * d) / 9.0) ** 2) for d in range(N_DET)])
+    a = atmosphere_like(0.5, 0.0, 0.0, seed=9) + 1e-3 * source
+    cleaned = run(bench, a).signal
+    peak = [cleaned[d, 500 + 100 * d] for d in range(N_DET)]
+    assert abs(np.mean(peak) / 1e-3 - (1 - 1 / N_DET)) < 0.01

@@ -1,0 +1,220 @@
+"""A written map opens elsewhere with every source where it was, its unit, its beam and its history."""
+
+from __future__ import annotations
+
+import errno
+
+import healpy as hp
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from zonda.core.errors import OutputError, PipelineError
+from zonda.operators.io.save_map import SaveMap
+from zonda.operators.maps.map_product import MapProduct
+
+ARCSEC = np.pi / 648000
+
+
+def wcs_map(nx, ny, seed=0, half=True, source=None):
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval = [75.0, 20.0]
+    wcs.wcs.crpix = [(nx + 1) / 2, (ny + 1) / 2]
+    wcs.wcs.cdelt = [-2 / 3600, 2 / 3600]
+    rng = np.random.default_rng(seed)
+    signal = rng.normal(0, 1e-4, (ny, nx))
+    signal[0, 0] = np.nan
+    if source is not None:
+        x, y = np.rint(wcs.world_to_pixel_values(*source)).astype(int)
+        signal[y, x] = 1.0
+    hits = rng.integers(0, 50, (ny, nx))
+    return MapProduct(
+        signal,
+        hits,
+        hits * 1e6,
+        1e-3 / np.sqrt(np.maximum(hits, 1)),
+        rng.normal(0, 1e-4, (ny, nx)) if half else None,
+        wcs.to_header(),
+        centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=2 * ARCSEC,
+        weighting="inverse_variance",
+        fwhm=9 * ARCSEC,
+    )
+
+
+def healpix_map(n, nside=1024, nest=True):
+    centre = hp.ang2pix(nside, 75.0, 20.0, nest=True, lonlat=True)
+    pixels = np.sort(centre // 4096 * 4096 + np.random.default_rng(4).permutation(4096)[:n])
+    if not nest:
+        pixels = hp.nest2ring(nside, pixels)
+    signal = np.arange(n) * 1e-5 + 1e-9
+    return MapProduct(
+        signal,
+        np.arange(n) + 1,
+        (np.arange(n) + 1) * 1e6,
+        np.full(n, 1e-3),
+        None,
+        None,
+        centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=hp.nside2resol(nside),
+        nside=nside,
+        nest=nest,
+        pixels=pixels,
+        fwhm=9 * ARCSEC,
+    )
+
+
+@pytest.fixture
+def run(data, make_observation):
+    data.observations.append(make_observation(100))
+    data.tally.count("SkyMap", "samples outside", 3)
+
+    def finalize(**products):
+        data.products.update({k.replace("__", "/"): v for k, v in products.items()})
+        SaveMap().finalize(data)
+        return data.output
+
+    return finalize
+
+
+@pytest.mark.parametrize("shape", [(100, 100), (101, 101), (64, 37), (37, 64), (1, 1)])
+def test_a_source_is_at_its_world_coordinate(run, shape):
+    source = (75.0 + 20 / 3600, 20.0 - 14 / 3600) if min(shape) > 30 else (75.0, 20.0)
+    with fits.open(run(map=wcs_map(*shape, source=source)) / "map.fits") as file:
+        wcs, values = WCS(file[0].header), file[0].data
+        y, x = np.unravel_index(np.nanargmax(values), values.shape)
+        found = wcs.pixel_to_world(x, y)
+        assert found.frame.name == "icrs"
+        # The source was put into the pixel nearest to it: at most half a pixel (1 arcsec) off in each direction
+        assert abs(found.ra.deg - source[0]) * np.cos(np.radians(20)) <= 1.0001 / 3600
+        assert abs(found.dec.deg - source[1]) <= 1.0001 / 3600
+
+
+def test_every_plane_comes_back(run):
+    product = wcs_map(50, 40)
+    with fits.open(run(map=product) / "map.fits") as file:
+        file.verify("exception")
+        names = ["SIGNAL", "HITS", "WEIGHTS", "NOISE", "HALF_DIFFERENCE"]
+        assert [h.name for h in file][:5] == names
+        for name in names:
+            np.testing.assert_array_equal(file[name].data, getattr(product, name.lower()))
+            np.testing.assert_allclose(WCS(file[name].header).wcs.crval, [75, 20], rtol=1e-13)
+        assert file["HITS"].data.dtype.kind == "i"
+        assert "BUNIT" not in file["HITS"].header
+        assert file["WEIGHTS"].header["BUNIT"] == "K-2"
+        assert "BMAJ" not in file["HITS"].header
+
+
+def test_the_beam_is_the_resolution_of_the_map(run):
+    product = wcs_map(60, 60).smoothed(12 * ARCSEC)
+    header = fits.getheader(run(map=product) / "map.fits")
+    assert header["BMAJ"] == pytest.approx(15 / 3600)  # 9 and 12 in quadrature
+
+
+def test_the_header_says_what_it_is(run):
+    header = fits.getheader(run(map=wcs_map(50, 40)) / "map.fits")
+    assert header["BUNIT"] == "K"
+    assert header["TEMPSCAL"] == "K_RJ"
+    assert header["BMAJ"] == header["BMIN"] == pytest.approx(9 / 3600)
+    assert header["BPA"] == 0
+    assert header["SEED"] == 7
+    assert header["CREATOR"] == "zonda 0.1.0"
+    assert header["PIPELINE"] == "demo <b>"
+    assert header["SITE"] == "hill"
+    assert header["DATE-OBS"].startswith("2024-11-25T07:00:00.123456789")
+    assert list(header["HISTORY"]) == ["a: 1", "b: '\\xe9'"]
+
+
+def test_the_tables_hold_the_configuration_and_the_tally(run):
+    with fits.open(run(map=wcs_map(50, 40)) / "map.fits") as file:
+        assert list(file["RESOLVED_YAML"].data["LINE"]) == ["a: 1", "b: '\\xe9'"]
+        assert file["TALLY"].data["VALUE"][0] == "3"
+
+
+def test_companion_runs_and_the_noise_map(run, data):
+    free = wcs_map(120, 120, seed=2)
+    main = wcs_map(120, 120, seed=1)
+    folder = run(map=main, source_free__map=free, noiseless__map=wcs_map(120, 120))
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "map.fits",
+        "noise_map.fits",
+        "noiseless_map.fits",
+        "source_free_map.fits",
+    ]
+    with fits.open(folder / "noise_map.fits") as file:
+        assert [h.name for h in file][:2] == ["HALF_DIFFERENCE", "SOURCE_FREE"]
+        np.testing.assert_array_equal(file["SOURCE_FREE"].data, free.signal)
+        header = file[0].header
+        # Within 30 arcsec of the centre, 2 arcsec pixels, the centre at a pixel corner: a disc of 15 pixels' radius. Pixels on
+        # the rim may fall either way: 12 of 700, so 1 %
+        y, x = np.mgrid[:120, :120] - 59.5
+        inside = np.hypot(x, y) <= 15
+        w = main.weights[inside]
+        assert header["RMSHALF"] == pytest.approx(np.sqrt((w * main.half_difference[inside] ** 2).sum() / w.sum()), rel=0.01)
+        w = free.weights[inside]
+        assert header["RMSFREE"] == pytest.approx(np.sqrt((w * free.signal[inside] ** 2).sum() / w.sum()), rel=0.01)
+        # White noise smoothed with a beam of sigma s pixels falls by 1 / (2 sqrt(pi) s); 50 independent beams: 10 %, four sigma
+        sigma = 9 / 2 / 2.3548
+        assert header["RMSFREEB"] == pytest.approx(1e-4 / (2 * np.sqrt(np.pi) * sigma), rel=0.4)
+    assert len(data.products["map_file"]) == 4
+
+
+def test_a_centre_without_data_has_no_rms(run):
+    empty = wcs_map(120, 120)
+    empty.half_difference[:] = np.nan
+    header = fits.getheader(run(map=empty) / "noise_map.fits")
+    assert header["RMSHALF"] is None
+
+
+@pytest.mark.parametrize("n", [1, 7, 99, 100, 101, 1500])
+@pytest.mark.parametrize("nest", [True, False])
+def test_healpy_reads_a_partial_map(run, n, nest):
+    """healpy's own partial writer loses pixels below 100: ours must not."""
+    product = healpix_map(n, nest=nest)
+    path = run(map=product) / "map.fits"
+    values, header = hp.read_map(path, field=0, nest=nest, h=True, dtype=np.float64)
+    header = dict(header)
+    assert values.size == hp.nside2npix(1024)
+    np.testing.assert_array_equal(values[product.pixels], product.signal)
+    assert np.count_nonzero(values != hp.UNSEEN) == n
+    np.testing.assert_array_equal(hp.read_map(path, field=1, nest=nest)[product.pixels], product.hits)
+    assert header["COORDSYS"] == "C"
+    assert header["TUNIT2"] == "K"
+    assert header["TEMPSCAL"] == "K_RJ"
+    assert header["SEED"] == 7
+
+
+def test_no_output_folder_and_no_map(data):
+    with pytest.raises(PipelineError, match="no map to write"):
+        SaveMap().finalize(data)
+    data.output = None
+    with pytest.raises(OutputError, match="no output folder"):
+        SaveMap().finalize(data)
+
+
+def test_an_earlier_file_is_kept_on_request(run, data):
+    run(map=wcs_map(20, 20))
+    before = (data.output / "map.fits").read_bytes()
+    with pytest.raises(OutputError, match="is there already"):
+        SaveMap(overwrite=False).finalize(data)
+    assert (data.output / "map.fits").read_bytes() == before
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_a_failure_in_the_middle_leaves_the_old_file(run, data, monkeypatch, error):
+    run(map=wcs_map(20, 20))
+    before = (data.output / "map.fits").read_bytes()
+
+    def half(self, name, **_):
+        with open(name, "wb") as file:
+            file.write(b"SIMPLE")
+        raise error
+
+    monkeypatch.setattr(fits.HDUList, "writeto", half)
+    expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else OutputError
+    with pytest.raises(expected):
+        SaveMap().finalize(data)
+    assert (data.output / "map.fits").read_bytes() == before
+    assert not [p for p in data.output.iterdir() if "part" in p.name]

@@ -1,0 +1,324 @@
+"""Streams in files: every number comes back, TOAST finds what it requires, and a failure leaves nothing."""
+
+from __future__ import annotations
+
+import errno
+import threading
+
+import h5py
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from zonda.core.data import Block
+from zonda.core.errors import InputError, OutputError
+from zonda.core.smooth import SmoothField
+from zonda.operators.io import fits_table, toast_hdf5
+from zonda.operators.io.save_tod import SaveTOD, load_tod, save_tod
+from zonda.operators.io.time_ordered_data import detector_quaternions
+
+
+def blocks(observation, streams, mean, detectors=16, samples=2048):
+    for d in range(0, observation.n_detectors, detectors):
+        for s in range(0, observation.n_samples, samples):
+            ds, ss = slice(d, min(d + detectors, observation.n_detectors)), slice(s, min(s + samples, observation.n_samples))
+            yield Block(observation, ds, ss, {k: v[ds, ss].copy() for k, v in streams.items()}, {"signal": mean})
+
+
+@pytest.fixture
+def streams():
+    noise = np.random.default_rng(1)
+    return {k: noise.normal(0, 1e-3, (19, 5000)).astype(np.float32) for k in ("signal", "sky", "transmission")}
+
+
+@pytest.fixture
+def mean():
+    return SmoothField.constant(np.linspace(70.0, 75.0, 19), 5000)
+
+
+def write(operator, observation, data, streams, mean, threads=False, **sizes):
+    state = operator.prepare(observation)
+    if threads:
+        workers = [
+            threading.Thread(target=operator.exec, args=(b, state))
+            for b in reversed(list(blocks(observation, streams, mean, **sizes)))
+        ]
+        for w in workers:
+            w.start()
+        for w in workers:
+            w.join()
+    else:
+        for block in blocks(observation, streams, mean, **sizes):
+            operator.exec(block, state)
+    observation.detector_flags[3] = 1  # set while the chain ran: must be in the file
+    operator.collect(data, observation, state)
+    (path,) = data.products["tod_file"]
+    return path
+
+
+def equal(a, b):
+    for name, x in vars(a).items():
+        y = getattr(b, name)
+        if isinstance(x, dict):
+            assert list(x) == list(y) or set(x) == set(y), name
+            for k in x:
+                np.testing.assert_array_equal(x[k], y[k], err_msg=f"{name}[{k}]")
+        else:
+            np.testing.assert_array_equal(x, y, err_msg=name)
+
+
+@pytest.mark.parametrize("format", ["hdf5", "fits"])
+@pytest.mark.parametrize("threads", [False, True])
+def test_what_is_written_is_what_was_there(format, threads, make_observation, data, streams, mean):
+    observation = make_observation()
+    operator = SaveTOD(format=format, streams=["signal", "sky", "transmission"])
+    path = write(operator, observation, data, streams, mean, threads)
+    tod = load_tod(path)
+    np.testing.assert_array_equal(
+        tod.streams["signal"], streams["signal"].astype(float) + mean.evaluate(slice(0, 19), slice(0, 5000))
+    )
+    for name in ("sky", "transmission"):
+        np.testing.assert_array_equal(tod.streams[name], streams[name])
+    assert tod.streams["signal"].dtype == np.float64
+    np.testing.assert_array_equal(tod.seconds, observation.seconds)
+    assert tod.start == "2024-11-25T07:00:00.123456789Z"
+    np.testing.assert_array_equal(tod.flags, observation.flags)
+    assert tod.detector_flags.tolist() == [0, 0, 0, 1] + [0] * 15
+    np.testing.assert_array_equal(tod.boresight_radec, observation.boresight_radec)
+    fp = observation.focalplane
+    # Directions are unit vectors rounded to 1e-16; nothing is lost beyond that
+    np.testing.assert_allclose(tod.xi, fp.xi, rtol=0, atol=4e-16)
+    np.testing.assert_allclose(tod.eta, fp.eta, rtol=0, atol=4e-16)
+    np.testing.assert_allclose(tod.columns["net"], fp.net, rtol=1e-15)
+    np.testing.assert_allclose(tod.columns["fwhm"], fp.fwhm, rtol=1e-15)
+    assert tod.metadata["resolved_yaml"] == "a: 1\nb: 'é'\n"
+    assert tod.metadata["seed"] == 7
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("format", ["hdf5", "fits"])
+def test_the_file_does_not_depend_on_blocks(format, make_observation, data, streams, mean):
+    observation = make_observation()
+    first = load_tod(write(SaveTOD(format=format), observation, data, streams, mean, detectors=16, samples=2048))
+    data.products.clear()
+    second = load_tod(write(SaveTOD(format=format), observation, data, streams, mean, detectors=19, samples=5000))
+    equal(first, second)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".fits"])
+def test_load_save_load_is_equal(suffix, make_observation, data, streams, mean, tmp_path):
+    format = "hdf5" if suffix == ".h5" else "fits"
+    first = load_tod(write(SaveTOD(format=format, streams=["signal", "sky"]), make_observation(), data, streams, mean))
+    second = load_tod(save_tod(tmp_path / f"again{suffix}", first))
+    for exact in ("seconds", "times", "quats", "boresight_azel", "boresight_radec", "flags", "detector_flags"):
+        np.testing.assert_array_equal(getattr(first, exact), getattr(second, exact))
+    for name in first.streams:
+        np.testing.assert_array_equal(first.streams[name], second.streams[name])
+    for name in first.columns:  # deg <-> rad and GHz <-> Hz may cost a last bit
+        np.testing.assert_allclose(first.columns[name], second.columns[name], rtol=4e-16)
+    assert (first.name, first.start, first.names, first.metadata) == (second.name, second.start, second.names, second.metadata)
+    assert first.site[0] == second.site[0]
+    np.testing.assert_allclose(first.site[1:], second.site[1:], rtol=4e-16)
+
+
+def test_float32_says_what_it_rounds(make_observation, data, streams, mean):
+    observation = make_observation()
+    path = write(SaveTOD(dtype="float32"), observation, data, streams, mean)
+    with h5py.File(path) as f:
+        assert f["detdata/signal"].dtype == np.float32
+        truth = streams["signal"].astype(float) + np.linspace(70.0, 75.0, 19)[:, None]
+        worst = np.abs(f["detdata/signal"][:] - truth).max()
+    rows = {what: float(value) for who, what, value in observation.tally if who == "SaveTOD"}
+    stated = rows["largest rounding to float32 [K]"]
+    assert worst <= stated * 1.05  # two digits are stated
+    assert stated < 1e-5
+
+
+def test_detector_quaternions_follow_the_frame():
+    rng = np.random.default_rng(2)
+    xi, eta, angle = rng.uniform(-0.02, 0.02, (3, 50))
+    x, y, z, w = detector_quaternions(xi, eta, angle * 50).T
+    np.testing.assert_allclose(np.linalg.norm([x, y, z, w], axis=0), 1, rtol=4e-16)
+    direction = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    expected = np.array([-eta, -xi, np.ones(50)])
+    np.testing.assert_allclose(direction, expected / np.linalg.norm(expected, axis=0), atol=3e-16)
+    # The polarization axis is X turned about Z by the angle, up to the tilt of the tangent plane (xi^2 = 4e-4)
+    axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])
+    np.testing.assert_allclose(axis, [np.cos(angle * 50), np.sin(angle * 50)], atol=5e-4)
+
+
+ROOT = [
+    "toast_format_version",
+    "observation_name",
+    "observation_uid",
+    "observation_samples",
+    "observation_detectors",
+    "observation_detector_flags",
+    "observation_detector_sets",
+    "observation_sample_sets",
+]
+INSTRUMENT = [
+    "toast_format_version",
+    *(f"telescope_{k}" for k in ("class", "name", "uid")),
+    *(f"site_{k}" for k in ("class", "name", "uid", "lat_deg", "lon_deg", "alt_m")),
+]
+
+
+def test_everything_that_toast_requires_is_there(make_observation, data, streams, mean):
+    path = write(SaveTOD(), make_observation(), data, streams, mean)
+    with h5py.File(path) as f:
+        assert set(ROOT) <= set(f.attrs)
+        assert f.attrs["toast_format_version"] == 2
+        assert f.attrs["observation_samples"] == 5000
+        assert set(INSTRUMENT) <= set(f["instrument"].attrs)
+        for item in (
+            "instrument/focalplane",
+            "instrument/focalplane.__table_column_meta__",
+            "metadata/other",
+            "attr",
+            "intervals/throw",
+        ):
+            assert item in f
+        assert f["metadata/other"].attrs["python_data_type"] == "dict"
+        assert f["intervals"].attrs["times"] == "times"
+        for name in ("times", "azimuth", "elevation", "boresight_azel", "boresight_radec", "flags"):
+            assert f["shared"][name].attrs["comm_type"] == "column"
+        assert f["shared/times"].dtype == np.float64
+        assert f["detdata/signal"].attrs["units"] == "K"
+        assert f["detdata/signal"].dtype == np.float64
+        assert f["detdata/signal"].compression is None
+        assert f["detdata/flags"].attrs["units"] == ""
+        assert {"name", "quat"} <= set(f["instrument/focalplane"].dtype.names)
+        meta = b"\n".join(f["instrument/focalplane.__table_column_meta__"][:]).decode()
+        assert "sample_rate" in meta
+        assert "field_of_view" in meta
+        noise = f["metadata/noise_model"]
+        frequency = noise["psds"][0]
+        assert frequency[0] <= 1 / 100.0  # at or below the lowest bin of a 100 s scan
+        assert frequency[-1] == pytest.approx(25.0, rel=0.01)  # within 1 % of Nyquist
+        # Two-sided: NET^2 at the high end, twice that at the knee of 1 Hz
+        assert np.interp(1.0, frequency, noise["psds"][1]) == pytest.approx(2e-6, rel=0.02)
+
+
+def test_azimuth_and_elevation_in_the_file(make_observation, data, streams, mean):
+    observation = make_observation()
+    with h5py.File(write(SaveTOD(), observation, data, streams, mean)) as f:
+        np.testing.assert_allclose(f["shared/azimuth"][:], observation.azimuth, atol=1e-14)
+        np.testing.assert_allclose(f["shared/elevation"][:], observation.elevation, atol=1e-14)
+
+
+def test_the_fits_file_opens_in_astropy(make_observation, data, streams, mean):
+    path = write(SaveTOD(format="fits"), make_observation(), data, streams, mean)
+    with fits.open(path) as file:
+        file.verify("exception")
+        assert [h.name for h in file] == ["PRIMARY", "TOD", "SAMPLES", "DETECTORS", "PROVENANCE"]
+        assert file[0].header["TEMPSCAL"] == "K_RJ"
+        assert file["TOD"].columns["SIGNAL"].unit == "K"
+    table = Table.read(path, hdu="TOD")
+    assert table["SIGNAL"].shape == (19, 5000)
+    assert list(table["DETECTOR"])[:2] == ["d00", "d01"]
+
+
+@pytest.mark.parametrize("format", ["hdf5", "fits"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_run_leaves_nothing(format, error, make_observation, data, streams, mean):
+    observation, operator = make_observation(), SaveTOD(format=format)
+    state = operator.prepare(observation)
+    with pytest.raises(error):  # noqa: PT012
+        for k, block in enumerate(blocks(observation, streams, mean)):
+            operator.exec(block, state)
+            if k == 2:
+                raise error
+    assert list(observation.output.iterdir())  # there is a temporary file while it runs ...
+    operator.discard(observation, state)
+    assert list(observation.output.iterdir()) == []  # ... and none afterwards
+    operator.discard(observation, state)  # a second time is harmless
+
+
+@pytest.mark.parametrize("format", ["hdf5", "fits"])
+def test_a_full_disk_is_an_error_with_a_cure(format, make_observation, data, streams, mean, monkeypatch):
+    observation, operator = make_observation(), SaveTOD(format=format)
+    state = operator.prepare(observation)
+    real = state.writer._file
+
+    class Full:
+        def __getattr__(self, name):
+            return getattr(real, name)
+
+        def write(self, _):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def __getitem__(self, _):
+            raise OSError("Can't write data (file write failed: errno = 28, error message = 'No space left on device')")
+
+    state.writer._file = Full()
+    with pytest.raises(OutputError, match="no space left on the disk") as caught:
+        operator.exec(next(iter(blocks(observation, streams, mean))), state)
+    assert "free some space" in caught.value.cure
+    operator.discard(observation, state)
+    assert list(observation.output.iterdir()) == []
+
+
+def test_a_file_in_place_of_the_folder(make_observation, tmp_path):
+    observation = make_observation()
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(OutputError, match="there is a file of that name"):
+        SaveTOD().prepare(observation)
+
+
+def test_no_output_folder(make_observation):
+    observation = make_observation()
+    observation.output = None
+    with pytest.raises(OutputError, match="no output folder"):
+        SaveTOD().prepare(observation)
+
+
+def test_a_stream_that_is_not_there(make_observation, streams, mean):
+    observation, operator = make_observation(), SaveTOD(streams=["white"])
+    state = operator.prepare(observation)
+    with pytest.raises(OutputError, match="no stream 'white'") as caught:
+        operator.exec(next(iter(blocks(observation, streams, mean))), state)
+    assert "signal, sky, transmission" in caught.value.cure
+    operator.discard(observation, state)
+
+
+@pytest.mark.parametrize("module", [toast_hdf5, fits_table])
+def test_files_that_cannot_be_read(module, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        module.read(tmp_path / "absent")
+    (tmp_path / "text").write_text("this is neither HDF5 nor FITS\n" * 200)
+    with pytest.raises(InputError, match="cannot be read as"):
+        module.read(tmp_path / "text")
+
+
+def test_an_incomplete_hdf5_file(tmp_path, make_observation, data, streams, mean):
+    path = write(SaveTOD(), make_observation(), data, streams, mean)
+    with h5py.File(path, "a") as f:
+        del f["shared/times"]
+    with pytest.raises(InputError, match="incomplete"):
+        load_tod(path)
+    with h5py.File(path, "a") as f:
+        f.attrs["toast_format_version"] = 1
+    with pytest.raises(InputError, match="toast_format_version is 1"):
+        load_tod(path)
+
+
+def test_one_detector_one_sample(make_observation, data):
+    observation = make_observation(1)
+    for format in ("hdf5", "fits"):
+        data.products.clear()
+        one = {"signal": np.ones((19, 1), np.float32)}
+        path = write(SaveTOD(format=format), observation, data, one, SmoothField.constant(np.zeros(19), 1))
+        assert load_tod(path).streams["signal"].tolist() == [[1.0]] * 19
+
+
+def test_toast_itself_reads_the_file(make_observation, data, streams, mean):
+    toast = pytest.importorskip("toast", reason="TOAST is not installed")
+    toast_io = pytest.importorskip("toast.io")
+    observation = make_observation()
+    path = write(SaveTOD(), observation, data, streams, mean)
+    found = toast_io.load_hdf5(str(path), toast.Comm())
+    assert found.name == observation.name
+    np.testing.assert_array_equal(found.detdata["signal"].data, load_tod(path).streams["signal"])
+    np.testing.assert_array_equal(found.shared["boresight_radec"].data, observation.boresight_radec)

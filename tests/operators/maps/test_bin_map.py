@@ -1,0 +1,341 @@
+"""Where samples land, what is dropped, exact sums, noise, half-differences, smoothing, HEALPix."""
+
+from __future__ import annotations
+
+import math
+
+import healpy
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zonda.core.errors import InputError, PipelineError
+from zonda.core.projection import directions, frame_rotation
+from zonda.core.smooth import SmoothField
+from zonda.operators.filters.highpass import HighpassFilter
+from zonda.operators.maps.bin_map import BinMap
+from zonda.operators.maps.map_product import ARCMIN
+
+ARCSEC = np.radians(1 / 3600)
+N_DET, N = 19, 4500
+STEP = 2.0**-36
+
+
+def sky_of(observation, function):
+    """``function`` of tangent offsets (east, north) [rad] from the observation's centre, at every sample."""
+    d = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    ra, dec = observation.centre
+    centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    w = d @ centre
+    return function(d @ east / w, d @ np.cross(centre, east) / w)
+
+
+def source(x0, y0, fwhm=8.5 * ARCSEC):
+    sigma = fwhm / np.sqrt(8 * np.log(2))
+    return lambda x, y: np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * sigma**2))
+
+
+@pytest.mark.parametrize("frame", ["icrs", "galactic"])
+@pytest.mark.parametrize("shape", [(120, 120), (121, 121), (120, 91)])
+def test_source_at_the_right_world_coordinate(bench, frame, shape):
+    observation = bench.observation(61, 20000)
+    x0, y0 = 11 * ARCSEC, -23 * ARCSEC
+    nx, ny = shape
+    operator = BinMap(width=f"{2 * nx} arcsec", height=f"{2 * ny} arcsec", frame=frame)
+    product = bench.run([operator], observation, {"signal": lambda o: sky_of(o, source(x0, y0))}).map
+    assert product.signal.shape == (ny, nx)
+    values = np.nan_to_num(product.signal)
+    y, x = np.indices(values.shape)
+    centroid = (values * x).sum() / values.sum(), (values * y).sum() / values.sum()
+    found = product.wcs.pixel_to_world(*centroid).icrs
+    # a gnomonic offset of 25 arcsec is an angle to 1e-8
+    ra, dec = observation.centre
+    expected = SkyCoord(ra, dec, unit="rad").spherical_offsets_by(*(np.array([x0, y0]) * __import__("astropy.units").units.rad))
+    # samples fill the pixels unevenly: a twentieth of a pixel
+    assert found.separation(expected).arcsec < 0.1
+    middle = product.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2).icrs
+    assert middle.separation(SkyCoord(ra, dec, unit="rad")).arcsec < 1e-6
+
+
+def test_every_sample_is_in_the_pixel_that_astropy_says(bench):
+    observation = bench.observation(7, 3000)
+    a = np.arange(7 * 3000.0).reshape(7, 3000) % 97
+    product = bench.run([BinMap(width="90 arcsec", height="70 arcsec")], observation, {"signal": a}, precision="float64").map
+    d = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    sky = SkyCoord(x=d[..., 0], y=d[..., 1], z=d[..., 2], representation_type="cartesian")
+    sky.representation_type = "unitspherical"
+    x, y = (np.floor(p + 0.5).astype(int) for p in product.wcs.world_to_pixel(sky))
+    inside = (x >= 0) & (x < 45) & (y >= 0) & (y < 35)
+    hits, total = np.zeros((35, 45), int), np.zeros((35, 45))
+    np.add.at(hits, (y[inside], x[inside]), 1)
+    np.add.at(total, (y[inside], x[inside]), a[inside])
+    np.testing.assert_array_equal(product.hits, hits)
+    with np.errstate(invalid="ignore"):
+        np.testing.assert_allclose(product.signal, total / hits, rtol=1e-12)
+
+
+def test_outside_flagged_and_nan_are_dropped_and_counted(bench):
+    observation = bench.observation(N_DET, N)
+    observation.flags[100:150] = 1
+    observation.detector_flags[4] = 1
+    a = np.ones((N_DET, N))
+    a[2, 300:310] = np.nan
+    a[3, 301] = -np.inf
+    a[:, 100:150] = 1e30
+    result = bench.run([BinMap(width="1 arcmin")], observation, {"signal": a})
+    count = {what: int(v) for (who, what), v in result.tally.items() if who == "BinMap" and what.startswith("samples")}
+    assert count["samples dropped: flagged"] == N + (N_DET - 1) * 50
+    assert count["samples dropped: not finite"] == 11
+    assert count["samples dropped: outside the map"] > 1000
+    assert sum(count.values()) == N_DET * N
+    assert result.map.hits.sum() == count["samples binned"]
+    assert np.isnan(result.map.signal[result.map.hits == 0]).all()
+    np.testing.assert_array_equal(result.map.signal[result.map.hits > 0], 1.0)
+    whole = bench.run([BinMap()], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))})
+    assert whole.tally["BinMap", "samples dropped: outside the map"] == "0"
+
+
+def test_nothing_is_piled_into_the_edge(bench):
+    """A small map equals the middle of a large one (centre off the scan's, so that no sample lies on a pixel's corner)."""
+    maps = [
+        bench.run(
+            [BinMap(width=w, centre="75.0001 deg 20.0001 deg")], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))}
+        ).map
+        for w in ("1 arcmin", "7 arcmin")
+    ]
+    small, large = (m.hits for m in maps)
+    np.testing.assert_array_equal(small, large[90:120, 90:120])
+    assert large.sum() == N_DET * N
+
+
+def test_default_map_covers_the_scan_closely(bench):
+    observation = bench.observation(61, 20000)
+    product = bench.run([BinMap()], observation, {"signal": np.ones((61, 20000))}).map
+    rows, columns = np.flatnonzero(product.hits.any(axis=1)), np.flatnonzero(product.hits.any(axis=0))
+    assert min(rows[0], columns[0]) < 12  # the field of view is a circle around every boresight: at most some pixels too wide
+    assert product.hits.sum() == 61 * 20000
+
+
+def test_uniform_sky_returns_its_value_with_the_mean_beside_the_stream(bench):
+    mean = SmoothField.constant(np.full(N_DET, 65.5), N)
+    a = np.full((N_DET, N), 1e-6)
+    product = bench.run([BinMap()], bench.observation(N_DET, N), {"signal": a}, means={"signal": mean}).map
+    hit = product.hits > 0
+    # float32 holds 1e-6 to 6e-14, the mean is a float64 spline (1e-14 of 65), the sums round to 2^-37
+    assert np.abs(product.signal[hit] - 65.500001).max() < 2e-11
+
+
+@pytest.mark.parametrize("weights", ["uniform", "inverse_variance"])
+@pytest.mark.parametrize("noise", ["net", "scatter"])
+@pytest.mark.parametrize("scattered", [False, True])
+def test_noise_of_the_pixels(bench, weights, noise, scattered):
+    """The map's noise in units of the stated one has unit variance."""
+    many = [bench.observation(N_DET, 30000, index=i) for i in range(2)]
+    rng = np.random.default_rng(0)
+    for o in many:
+        if scattered:
+            o.focalplane.net = o.focalplane.net * np.linspace(0.5, 2.0, N_DET)
+    sigma = many[0].focalplane.net[:, None] * 10.0
+    drawn = {o.name: sigma * rng.standard_normal((N_DET, 30000)) for o in many}
+    product = bench.run([BinMap(pixel="4 arcsec", weights=weights, noise=noise)], many, {"signal": lambda o: drawn[o.name]}).map
+    use = product.hits > 60
+    n = int(use.sum())
+    assert n > 1000
+    ratio = (product.signal / product.noise)[use]
+    # variance of n unit normals: 1 +- sqrt(2 / n); scatter: the t-distribution with > 60 degrees widens it by < 4 %; with
+    # scattered NETs the estimate from the scatter is that of the mean NET only for uniform weights and many detectors
+    if scattered and noise == "scatter":
+        assert 0.8 < ratio.std() < 1.3
+    else:
+        assert abs(ratio.var() - 1) < 4 * math.sqrt(2 / n) + (0.04 if noise == "scatter" else 0)
+    half = (
+        product.half_difference[use & np.isfinite(product.half_difference)]
+        / product.noise[use & np.isfinite(product.half_difference)]
+    )
+    if not (noise == "scatter" and scattered) and weights == "inverse_variance":
+        assert abs(half.var() - 1) < 4 * math.sqrt(2 / half.size) + (0.04 if noise == "scatter" else 0)
+    if weights == "inverse_variance":
+        np.testing.assert_allclose(product.weights[use], 1 / (product.noise[use] ** 2), rtol=1e-6 if noise == "net" else 3)
+    else:
+        np.testing.assert_allclose(product.weights, product.hits)
+
+
+def test_half_difference_removes_the_sky(bench):
+    many = [bench.observation(N_DET, 20000, index=0), bench.observation(N_DET, 20000, index=0)]
+    many[1].index, many[1].name = 1, "scan1"
+    product = bench.run([BinMap()], many, {"signal": lambda o: sky_of(o, source(0, 0))}).map
+    both = np.isfinite(product.half_difference)
+    assert both.any()
+    assert np.abs(product.half_difference[both]).max() < 2 * STEP
+    assert product.signal[both].max() > 0.9
+    alone = bench.run([BinMap()], many[:1], {"signal": lambda o: sky_of(o, source(0, 0))})
+    assert alone.map.half_difference is None
+    assert alone.tally["BinMap", "half-difference"].startswith("not made")
+    assert (
+        bench.run([BinMap(half_difference=False)], many, {"signal": lambda o: sky_of(o, source(0, 0))}).map.half_difference
+        is None
+    )
+
+
+def test_identical_bits_for_blocks_threads_and_order(bench):
+    def run(threads, memory, order=1, scatter="net"):
+        many = [bench.observation(37, 9001, index=i) for i in range(3)]
+        for o in many:
+            o.focalplane.net = o.focalplane.net * np.linspace(0.5, 2.0, 37)
+        rng = np.random.default_rng(1)
+        drawn = {o.name: rng.standard_normal((37, 9001)) for o in many}
+        operator = BinMap(half_difference=False, noise=scatter, width="4 arcmin")
+        return bench.run([operator], many[::order], {"signal": lambda o: drawn[o.name]}, threads=threads, memory=memory).map
+
+    for scatter in ("net", "scatter"):
+        first = run(1, 1 << 30, scatter=scatter)
+        for other in (run(3, 1 << 30, scatter=scatter), run(2, 8 << 20, scatter=scatter), run(1, 1 << 30, -1, scatter=scatter)):
+            for name in ("signal", "hits", "weights", "noise"):
+                np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 1000), a=st.floats(-3, 3), b=st.floats(-3, 3))
+def test_maps_are_linear_without_singular_modes(seed, a, b):
+    from ..conftest import Workbench
+
+    bench, rng = Workbench(), np.random.default_rng(seed)
+    one, two = rng.standard_normal((2, 7, 3000))
+
+    def mapped(signal):
+        return bench.run(
+            [HighpassFilter(), BinMap()], bench.observation(7, 3000), {"signal": signal}, precision="float64"
+        ).map.signal
+
+    np.testing.assert_allclose(mapped(a * one + b * two), a * mapped(one) + b * mapped(two), rtol=0, atol=8 * STEP + 1e-11)
+
+
+def test_filtered_point_source_is_neither_shifted_nor_skewed_and_keeps_its_amplitude(bench):
+    """Zero phase, and no window: what the brick wall takes from a fast crossing is small and known."""
+    observation = bench.observation(61, 20000)
+    signal = sky_of(observation, source(0, 0))
+    operators = [HighpassFilter(frequency="0.02 Hz"), BinMap(pixel="2 arcsec", width="121 arcsec", height="121 arcsec")]
+    product = bench.run(operators, observation, {"signal": signal}, precision="float64").map
+    plain = bench.run([operators[1]], observation, {"signal": signal}, precision="float64").map
+    near = product.distance() < 6 * ARCSEC
+    offset = np.nanmean((plain.signal - product.signal)[near])
+    recovered = (product.signal + offset)[near]
+    assert abs(np.nansum(recovered * plain.signal[near]) / np.nansum(plain.signal[near] ** 2) - 1) < 0.01
+    y, x = np.indices(product.signal.shape)
+    ok = near & np.isfinite(product.signal)
+    weight, reference = (product.signal + offset)[ok], plain.signal[ok]
+    for axis in (x[ok], y[ok]):
+        assert abs((weight * axis).sum() / weight.sum() - (reference * axis).sum() / reference.sum()) < 0.02
+
+
+@pytest.mark.parametrize("smooth", ["beam", "17 arcsec"])
+def test_smoothing_is_normalized_local_and_states_its_noise(bench, smooth):
+    many = [bench.observation(N_DET, 30000, index=i) for i in range(2)]
+    rng = np.random.default_rng(2)
+    sigma = many[0].focalplane.net[:, None] * 10.0
+    drawn = {o.name: sigma * rng.standard_normal((N_DET, 30000)) for o in many}
+    product = bench.run([BinMap(smooth=smooth, pixel="3 arcsec")], many, {"signal": lambda o: drawn[o.name]}).map
+    fwhm = 8.5 * ARCSEC if smooth == "beam" else 17 * ARCSEC
+    assert abs(product.smoothed_by - fwhm) < 1e-12
+    assert (np.isnan(product.signal) == (product.hits == 0)).all()
+    inner = product.distance() < 1.2 * ARCMIN
+    use = inner & (product.hits > 0)
+    ratio = (product.signal / product.noise)[use]
+    # independent beams: area over 2 pi sigma^2 * 2 (the noise's own correlation area, 4 pi sigma^2)
+    independent = use.sum() * product.pixel**2 / (4 * np.pi * (fwhm / 2.3548) ** 2)
+    assert abs(ratio.var() - 1) < 4 * math.sqrt(2 / independent)
+    flat = bench.run([BinMap(smooth=smooth, pixel="3 arcsec")], many, {"signal": np.ones((N_DET, 30000))}).map
+    np.testing.assert_allclose(flat.signal[flat.hits > 0], 1.0, rtol=1e-12)
+
+
+def test_rms_in_the_central_arcmin(bench):
+    product = bench.run([BinMap()], bench.observation(N_DET, N), {"signal": np.full((N_DET, N), -3.0)}).map
+    assert abs(product.rms() - 3) < 1e-9
+    product.signal[product.distance() > 0.5 * ARCMIN] = 1e9
+    assert abs(product.rms() - 3) < 1e-9
+    assert product.rms(2 * ARCMIN) > 1e6
+    with pytest.raises(InputError, match="half-difference"):
+        product.rms(of="half_difference")
+    assert "pixels hit" in product._repr_html_()
+
+
+@pytest.mark.parametrize("ordering", ["ring", "nested"])
+@pytest.mark.parametrize("frame", ["icrs", "galactic"])
+def test_healpix_map(bench, ordering, frame):
+    observation = bench.observation(N_DET, N, radius=600 * ARCSEC)
+    a = np.arange(N_DET * N, dtype=float).reshape(N_DET, N) % 11
+    product = bench.run([BinMap(nside=1024, ordering=ordering, frame=frame)], observation, {"signal": a}, precision="float64").map
+    where = (
+        directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta) @ frame_rotation(frame).T
+    )
+    pixel = healpy.vec2pix(1024, *np.moveaxis(where, 2, 0), nest=ordering == "nested").ravel()
+    hits = np.bincount(pixel, minlength=12 * 1024**2)
+    np.testing.assert_array_equal(product.pixels, np.flatnonzero(hits))
+    np.testing.assert_array_equal(product.hits, hits[product.pixels])
+    total = np.bincount(pixel, a.ravel(), minlength=12 * 1024**2)
+    np.testing.assert_allclose(product.signal, (total / np.maximum(hits, 1))[product.pixels], rtol=1e-12)
+    full = product.healpix_full
+    assert (full != healpy.UNSEEN).sum() == len(product.pixels)
+    assert math.isfinite(product.rms(5 * ARCMIN))
+
+
+def test_healpix_smoothing(bench):
+    observation = bench.observation(N_DET, N, radius=2400 * ARCSEC)
+    product = bench.run([BinMap(nside=256, smooth="40 arcmin")], observation, {"signal": np.ones((N_DET, N))}).map
+    np.testing.assert_allclose(product.signal, 1.0, rtol=1e-9)
+
+
+def test_far_too_large_samples_and_overflow_are_refused(bench):
+    a = np.zeros((N_DET, N))
+    a[0, 0] = 1e9
+    with pytest.raises(PipelineError, match="too large"):
+        bench.run([BinMap()], bench.observation(N_DET, N), {"signal": a})
+    with pytest.raises(PipelineError, match="overflow"):
+        bench.run([BinMap(pixel="1 deg", width="1 deg")], bench.observation(N_DET, N), {"signal": np.full((N_DET, N), 1.2e4)})
+
+
+def test_zero_net_needs_uniform_weights(bench):
+    observation = bench.observation(7, 300)
+    observation.focalplane.net[3] = 0
+    with pytest.raises(PipelineError, match="NET 0"):
+        bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
+    assert bench.run([BinMap(weights="uniform")], observation, {"signal": np.ones((7, 300))}).map.hits.sum() == 2100
+
+
+def test_two_maps_need_two_names(bench):
+    signal = {"signal": np.ones((7, 300))}
+    with pytest.raises(PipelineError, match="two steps make the product"):
+        bench.run([BinMap(), BinMap(pixel="4 arcsec")], bench.observation(7, 300), signal)
+    products = bench.run([BinMap(), BinMap(nside=512, product="sphere")], bench.observation(7, 300), signal).data.products
+    assert sorted(products) == ["map", "sphere"]
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"pixel": "0 arcsec"}, {"nside": 100}, {"nside": 64, "pixel": "2 arcsec"}, {"ordering": "nested"}, {"projection": "CAR"},
+        {"centre": "az 180 deg el 60 deg"}, {"smooth": "-1 arcsec"}, {"smooth": "0 arcsec"}, {"weights": "best"}, {"product": "a/b"},
+    ],
+)  # fmt: skip
+def test_bad_parameters(bad):
+    with pytest.raises(ValueError):
+        BinMap(**bad)
+
+
+def test_a_map_of_too_many_pixels_is_refused(bench):
+    with pytest.raises(InputError, match="too large"):
+        bench.run([BinMap(pixel="0.001 arcsec")], bench.observation(7, 300), {"signal": np.ones((7, 300))})
+
+
+def test_scan_too_wide_for_a_tangent_plane_is_refused(bench):
+    observation = bench.observation(1, 3000, radius=np.radians(80), centre=(1.0, 0.0))
+    with pytest.raises(InputError, match="75 deg"):
+        bench.run([BinMap()], observation, {"signal": np.ones((1, 3000))})
+
+
+def test_one_detector_one_sample(bench):
+    product = bench.run([BinMap()], bench.observation(1, 1), {"signal": np.ones((1, 1))}).map
+    assert product.hits.sum() == 1

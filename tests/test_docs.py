@@ -1,0 +1,43 @@
+"""What the documentation shows, runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(language):
+    for page in PAGES:
+        for number, text in enumerate(re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)):
+            yield pytest.param(text, id=f"{page.name}-{number}")
+
+
+def in_a_folder_with_a_map(folder, monkeypatch):
+    (folder / "my_cluster.fits").write_bytes((ROOT / "pipelines" / "data" / "merging_cluster.fits").read_bytes())
+    monkeypatch.chdir(folder)
+
+
+@pytest.mark.parametrize("text", blocks("python"))
+def test_python(text, tmp_path, monkeypatch):
+    in_a_folder_with_a_map(tmp_path, monkeypatch)
+    names = {}
+    exec(compile(text.replace('"5 min"', '"20 s"'), "documentation", "exec"), names)  # shorter scans, same code
+    assert names
+
+
+@pytest.mark.parametrize("text", [b for b in blocks("yaml") if "operators:" in b.values[0]])
+def test_yaml(text, tmp_path, monkeypatch):
+    from zonda.core.configuration.pipeline_file import load
+
+    in_a_folder_with_a_map(tmp_path, monkeypatch)
+    (tmp_path / "page.yaml").write_text(text)
+    assert load(tmp_path / "page.yaml").pipeline().operators
+
+
+def test_links():
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"

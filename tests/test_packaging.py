@@ -1,0 +1,35 @@
+"""Every importable folder is listed in pyproject.toml (an editable install would hide an omission)."""
+
+import pathlib
+import tomllib
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+def test_all_packages_are_listed():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    found = {"zonda"}
+    for top in ("core", "operators", "plugins", "pipelines"):
+        for init in (ROOT / top).rglob("__init__.py"):
+            found.add(".".join(["zonda", *init.parent.relative_to(ROOT).parts]))
+    assert found == set(listed)
+
+
+def test_every_entry_point_resolves():
+    from importlib import import_module
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for group, entries in project["entry-points"].items():
+        for name, reference in entries.items():
+            module, _, attribute = reference.partition(":")
+            target = import_module(module)
+            assert not attribute or hasattr(target, attribute), f"{group}: {name}"
+
+
+def test_version_is_the_same_everywhere():
+    import zonda
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert zonda.__version__ == project["version"]
+    assert f"version: {zonda.__version__}" in (ROOT / "CITATION.cff").read_text()
+    assert f"## [{zonda.__version__}]" in (ROOT / "CHANGELOG.md").read_text()

@@ -1,0 +1,64 @@
+"""zonda: what a ground-based (sub-)millimetre telescope records, and the maps made of it.
+
+>>> import zonda
+>>> scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+
+Nothing heavy is imported until a name is used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_WHERE = {
+    "Data": "zonda.core.data",
+    "Observation": "zonda.core.data",
+    "Focalplane": "zonda.core.focalplane",
+    "Scene": "zonda.core.scene",
+    "Site": "zonda.core.site",
+    "Instrument": "zonda.core.instrument",
+    "Telescope": "zonda.core.instrument",
+    "Band": "zonda.core.instrument",
+    "Operator": "zonda.core.operator",
+    "Pipeline": "zonda.core.pipeline",
+    "ZondaError": "zonda.core.errors",
+    "load": "zonda.core.configuration.pipeline_file",
+    "hookimpl": "zonda.core.hooks",
+}
+
+__all__ = ["__version__", *_WHERE]
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.pipeline_file import load as load
+    from zonda.core.data import Data as Data
+    from zonda.core.data import Observation as Observation
+    from zonda.core.errors import ZondaError as ZondaError
+    from zonda.core.focalplane import Focalplane as Focalplane
+    from zonda.core.hooks import hookimpl as hookimpl
+    from zonda.core.instrument import Band as Band
+    from zonda.core.instrument import Instrument as Instrument
+    from zonda.core.instrument import Telescope as Telescope
+    from zonda.core.operator import Operator as Operator
+    from zonda.core.pipeline import Pipeline as Pipeline
+    from zonda.core.scene import Scene as Scene
+    from zonda.core.site import Site as Site
+
+
+def __getattr__(name: str) -> Any:
+    if name in _WHERE:
+        return getattr(import_module(_WHERE[name]), name)
+    if name.startswith("_"):
+        raise AttributeError(f"module 'zonda' has no attribute {name!r}")
+    from zonda.core.registry import mapmakers, operators
+
+    for registry in (operators, mapmakers):  # zonda.BinMap, zonda.WhiteNoise and every plugin's operator
+        if name in registry:
+            return registry.get(name)
+    raise AttributeError(f"module 'zonda' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
