@@ -242,6 +242,32 @@ class Block:
 
 
 @dataclass
+class Stream:
+    """A named stream of one whole observation, between two segments.
+
+    Attributes
+    ----------
+    array
+        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file.
+    means
+        What must be added in float64 to have all of it, see `Block.means`.
+    threads
+        Threads an operator's ``measure`` may use.
+    """
+
+    name: str
+    observation: Observation
+    array: Floats
+    means: dict[str, SmoothField]
+    threads: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        n_det, n_samp = self.array.shape
+        return n_det, n_samp
+
+
+@dataclass
 class Data:
     """The scene, its observations, and what came out of them.
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from .data import Block, Data, Floats, Observation
+from .data import Block, Data, Floats, Observation, Stream
 from .errors import PipelineError
 from .operator import Operator
 from .smooth import SmoothField
@@ -29,32 +29,6 @@ from .tiles import TILE_DETECTORS, TILE_SAMPLES
 
 SCRATCH_STREAMS = 3
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
-
-
-@dataclass
-class Stream:
-    """A named stream of one whole observation, between two segments.
-
-    Attributes
-    ----------
-    array
-        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file.
-    means
-        What must be added in float64 to have all of it, see `Block.means`.
-    threads
-        Threads an operator's ``measure`` may use.
-    """
-
-    name: str
-    observation: Observation
-    array: Floats
-    means: dict[str, SmoothField]
-    threads: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        n_det, n_samp = self.array.shape
-        return n_det, n_samp
 
 
 @dataclass

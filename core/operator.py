@@ -9,8 +9,7 @@ from pydantic import PrivateAttr
 from .configuration.parameters import Parameters
 
 if TYPE_CHECKING:
-    from .data import Block, Data, Observation
-    from .execution import Stream
+    from .data import Block, Data, Observation, Stream
 
 API_VERSION = 1
 """Version of the contract below; a plugin written for another one is refused with a message that says so."""

@@ -27,6 +27,9 @@ from zonda.core.errors import PointingError
 
 Floats = NDArray[np.float64]
 
+LARGEST_REACH = 0.05
+"""rad: how far a path is extrapolated beyond the ends of a scan."""
+
 
 def axes(quaternions: Floats) -> Floats:
     """Focal-plane axes (x, y, boresight) of quaternions (n, 4) in (east, north, up). Shape (n, 3 components, 3 axes).
@@ -44,7 +47,8 @@ def axes_at(quaternions: Floats, index: NDArray[np.int64], step: int) -> Floats:
     """`axes` at sample numbers ``index``, which may lie before the first or after the last sample. Shape (len(index), 3, 3).
 
     Beyond the ends, where values only feed the margin of the spline in time, the path goes on with its last velocity and
-    acceleration and comes to rest within a few ``step``: A + A' s + A'' s^2 / 2, s = t / (1 + (t / T)^4)^(1/4), T = 4 step.
+    acceleration and comes to rest within a few ``step``: A + A' s + A'' s^2 / 2, s = t / (1 + (t / T)^4)^(1/4), T <= 4 step,
+    short enough that it moves by less than `LARGEST_REACH` (fast scans therefore need shorter steps).
     """
     n = len(quaternions)
     out = axes(quaternions[np.clip(index, 0, n - 1)])
@@ -56,7 +60,9 @@ def axes_at(quaternions: Floats, index: NDArray[np.int64], step: int) -> Floats:
         a, b, c = axes(quaternions[[end, end + inward * gap, end + 2 * inward * gap]])
         first, second = (4 * b - 3 * a - c) / (2 * gap), (a - 2 * b + c) / gap**2
         t = abs(index[beyond] - end).astype(np.float64)
-        s = -t / (1 + (t / (4 * step)) ** 4) ** 0.25
+        speed, acceleration = abs(first).max() + 1e-30, abs(second).max() + 1e-30
+        reach = min(4.0 * step, LARGEST_REACH / 2 / speed, (LARGEST_REACH / acceleration) ** 0.5)
+        s = -t / (1 + (t / reach) ** 4) ** 0.25
         out[beyond] = a + s[:, None, None] * first + (s**2 / 2)[:, None, None] * second
     return out
 

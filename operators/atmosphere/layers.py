@@ -57,6 +57,9 @@ LOG_NORMAL_FROM = 0.15
 LOWEST_ELEVATION = math.radians(4.5)
 """Lowest line of sight that is accepted, see `Sky`."""
 
+SMALLEST_DIFFERENCE = 1e-5
+"""Share of the fluctuation that must differ between detectors for `tolerance` to be judged by it."""
+
 CELLS_AT_ONCE = 1 << 20
 """Lattice points made at a time: bounds the memory."""
 
@@ -127,8 +130,8 @@ class AtmosphereLayers(Operator):
     """Accuracy of the turbulence: its covariance is within 0.16 % or 0.03 % of the variance."""
     lattice: float = Field(0.6, gt=0, le=0.6)
     """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used)."""
-    tolerance: float = Field(3e-5, ge=1e-6, le=0.1)
-    """Rms error of the evaluation at nodes, in units of the rms of the atmosphere's fluctuation."""
+    tolerance: Fraction = quantity("1 %", ge=1e-4, le=1)
+    """Rms error of the evaluation at nodes, as a fraction of what subtraction of the focal-plane mean leaves of the atmosphere."""
 
     _origin: Any = PrivateAttr(None)
     _tracks: dict[str, Track] = PrivateAttr(default_factory=dict)
@@ -268,19 +271,22 @@ class AtmosphereLayers(Operator):
         say("beam sigma / lattice spacing, per layer", ", ".join(dict.fromkeys(sizes)))
         say("turbulence covariance", f"within {beams[0].fidelity.error:.1%} of the variance ({self.fidelity})")
         say("nodes", f"{plan.nodes}; expected rms error {plan.focal_plane_error:.1e} of the fluctuation")
-        left = f"{plan.differential:.1e} of the fluctuation is left after subtraction of the focal-plane mean"
         say("step in time", f"{plan.step} samples; expected rms error {plan.time_error:.1e} of the fluctuation")
-        say("differential signal", left)
+        say("error allowed", f"{plan.tolerance:.1e} of the fluctuation each, for nodes and for the step")
+        say(
+            "differential signal", f"{plan.differential:.1e} of the fluctuation is left after subtraction of the focal-plane mean"
+        )
         kind = "horizontal (wide throw)" if track.horizontal else "transverse to the mean line of sight"
         say("plane of the turbulence", f"{kind}; squared separations within {track.bound:.1%}")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Nodes and step in time, and the errors expected of them, relative to the rms of the fluctuation after the beam."""
+    """Nodes and step in time; the error allowed and those expected, relative to the rms of the fluctuation after the beam."""
 
     nodes: Nodes
     step: int
+    tolerance: float
     focal_plane_error: float
     time_error: float
     differential: float
@@ -409,22 +415,24 @@ def _plan(
     sky: Sky,
     pwv: float,
 ) -> Plan:
-    """The coarsest nodes and step that keep each error below `tolerance`: of the fluctuation, and of the mean emission."""
+    """The coarsest nodes and step that keep each error below the tolerance: of the fluctuation, and of the mean emission."""
     xi, eta = observation.focalplane.xi, observation.focalplane.eta
     rms = math.sqrt(variance)
     stretch = 1 / math.sin(track.elevation) if track.horizontal else 1.0
-    some_xi, some_eta = some(xi, eta)
+    left = differential_rms(*some(xi, eta), models, stretch)
+    # Of the rms of the fluctuation. A single detector, or none apart, is judged as if a hundredth were left.
+    tolerance = operator.tolerance * (left / rms if left > SMALLEST_DIFFERENCE * rms else 0.01)
 
     path = _Path(observation, xi, eta)
     elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
     slope = float(np.max(abs(_slope(sky, pwv, elevations))))
-    # What the mean emission may be wrong by, K_RJ: as much as the fluctuation, and float64 noise where there is none.
+    # What the mean emission may be wrong by, K_RJ: as much as the fluctuation (or 0.01 % of the water where there is none).
     kelvin = float(sky.emission(pwv, elevations[1]))
-    allowed = max(operator.tolerance * kelvin * max(operator.pwv_rms, 1e-4), 1e-9)
+    allowed = max(tolerance * kelvin * max(operator.pwv_rms, 1e-4), 1e-9)
 
     at_least = 1
     while True:
-        nodes, error = choose_nodes(xi, eta, models, operator.tolerance * rms, stretch, at_least)
+        nodes, error = choose_nodes(xi, eta, models, tolerance * rms, stretch, at_least)
         if nodes.shape is None or _mean_error(nodes, xi, eta, sky, pwv, elevations) <= allowed:
             break
         at_least = max(nodes.shape) + 1
@@ -439,10 +447,9 @@ def _plan(
         deltas = [float(np.sqrt((track.matrix @ delta_x * m.height) ** 2).max()) for m in models]
         speeds = [path.speeds(track, layer) for layer in layers]
         late = time_error(models, speeds, deltas, step / observation.sample_rate)
-        if late <= operator.tolerance * rms:
+        if late <= tolerance * rms:
             break
-    left = differential_rms(some_xi, some_eta, models, stretch)
-    return Plan(nodes, step, error / rms, late / rms, left / rms)
+    return Plan(nodes, step, tolerance, error / rms, late / rms, left / rms)
 
 
 def _slope(sky: Sky, pwv: float, elevation: Floats) -> Floats:

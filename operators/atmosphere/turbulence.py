@@ -186,7 +186,8 @@ class Turbulence:
         """Lags on level k between the lattice points that a and b of level 0 are interpolated from (one axis), and weights."""
         (xa, wa), (xb, wb) = self._sources(a, k), self._sources(b, k)
         lag, inverse = np.unique(np.subtract.outer(xa, xb), return_inverse=True)
-        return np.asarray(lag, np.int64), np.bincount(inverse.ravel(), np.multiply.outer(wa, wb).ravel())
+        weight = np.bincount(inverse.ravel(), np.multiply.outer(wa, wb).ravel())
+        return np.asarray(lag, np.int64), np.asarray(weight, np.float64)
 
     def _sources(self, index: int, k: int) -> tuple[NDArray[np.int64], Floats]:
         weights, half = self._weights.astype(np.float64), self.fidelity.taps // 2
@@ -240,14 +241,14 @@ def _kernel(outer_scale: float, sigma: float, low: float, high: float, spacing: 
 @lru_cache(maxsize=8)
 def _kriging(taps: int, resolution: float) -> Field:
     """Weights that predict the middle of two lattice points from ``taps`` neighbours: best for the sum of coarser levels."""
-    x = np.arange(taps) - (taps - 1) / 2
+    x: Floats = np.arange(taps, dtype=np.float64) - (taps - 1) / 2
     octaves = np.arange(4)
 
     def model(r: Floats) -> Floats:
         scale, weight = 2 ** (-octaves / 2), 2 ** (NU * octaves)
         return np.asarray((np.exp(-((np.multiply.outer(r, scale) * resolution / 2) ** 2)) * weight).sum(-1), np.float64)
 
-    between = model(x[:, None] - x)
+    between = model(np.asarray(x[:, None] - x, np.float64))
     between = between + 1e-12 * between[0, 0] * np.eye(taps)
     return np.asarray(np.linalg.solve(between, model(x)), np.float32)
 

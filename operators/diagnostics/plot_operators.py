@@ -56,6 +56,10 @@ class Plots(Operator):
     least_coverage: float = Field(0.1, ge=0, lt=1)
     """Map pixels with fewer samples than this share of the 99th percentile are left grey in the pictures."""
 
+    def observe(self, data: Data) -> None:
+        """Refuse a missing or unwritable output folder before anything is simulated."""
+        output_folder(data, self.label)
+
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         made = pictures(data, self)

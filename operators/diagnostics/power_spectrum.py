@@ -136,11 +136,8 @@ class PowerSpectrum(Operator):
 
     def prepare(self, observation: Observation) -> _State:
         usable = np.flatnonzero(observation.detector_flags == 0)
-        chosen = (
-            np.unique(np.linspace(0, usable.size - 1, min(usable.size, self.detectors)).round().astype(np.int64))
-            if usable.size
-            else []
-        )
+        count = min(usable.size, self.detectors)
+        chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
         length = min(observation.n_samples, max(2, round(self.segment * observation.sample_rate)))
         if flagged := int(np.count_nonzero(observation.flags)):
             observation.tally.count(self.label, "flagged samples that the power spectra include", flagged)

@@ -44,6 +44,10 @@ class Report(Operator):
     central_diameter: Angle = quantity("1 arcmin", gt=0)
     """Diameter of the circle about the map's centre in which the noise is stated."""
 
+    def observe(self, data: Data) -> None:
+        """Refuse a missing or unwritable output folder before anything is simulated."""
+        output_folder(data, self.label)
+
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         if text := str(data.provenance.get("resolved_yaml", "")):
@@ -198,7 +202,7 @@ def _scene(data: Data) -> str:
         ("Instrument", f"{instrument.name}: {instrument.detectors} detectors in a field of {_angle(instrument.field_of_view)}"),
         (
             "Band",
-            f"{band.name}: {band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz, centre {band.centre / 1e9:.4g} GHz",
+            f"{band.name}: {band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz about {band.centre / 1e9:.4g} GHz",
         ),
         ("Target", scene.target if scene.target is not None else "given by the pointing step"),
         ("Start", scene.time),

@@ -14,21 +14,18 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from zonda.core.data import Block, Observation
+from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
 from zonda.core.tiles import TILE_SAMPLES
-
-if TYPE_CHECKING:
-    from zonda.core.execution import Stream
 
 Floats = NDArray[np.float64]
 

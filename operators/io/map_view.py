@@ -132,7 +132,7 @@ class NoiseFigure:
 
 
 def noise_figures(maps: Mapping[str, MapProduct], diameter: float) -> list[NoiseFigure]:
-    """Weighted rms about zero within ``diameter`` / 2 [rad] of the centre, of all that holds noise alone (see `noise_sources`)."""
+    """Weighted rms about zero within ``diameter`` / 2 [rad] of the centre, of what holds noise alone: `noise_sources`."""
     found = []
     for name in maps:
         for of, (product, plane) in noise_sources(maps, name).items():

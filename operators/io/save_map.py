@@ -48,6 +48,10 @@ class SaveMap(Operator):
     overwrite: bool = Field(True)
     """Replace files of an earlier run; if false, they are an error."""
 
+    def observe(self, data: Data) -> None:
+        """Refuse a missing or unwritable output folder before anything is simulated."""
+        output_folder(data, self.label)
+
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         maps = maps_of(data.products)
@@ -75,10 +79,15 @@ class SaveMap(Operator):
 def output_folder(data: Data, place: str) -> Path:
     """The run's output folder, there and writable; `OutputError` otherwise."""
     if data.output is None:
-        raise OutputError(
-            "there is no output folder", place=place, cure="give one: zonda run --output FOLDER, or run(scene, output=...)"
-        )
+        raise no_output_folder(place)
     return check_output_folder(data.output)
+
+
+def no_output_folder(place: str) -> OutputError:
+    """The error of a step that writes where nothing says whereto."""
+    return OutputError(
+        "there is no output folder", place=place, cure="give one: zonda run --output FOLDER, or run(scene, output=...)"
+    )
 
 
 def noise_cards(figures: list[NoiseFigure], diameter: float) -> dict[str, tuple[float | None, str]]:
@@ -105,7 +114,7 @@ def write_map(path: Path, view: MapView, data: Data, cards: dict[str, tuple[floa
         main[keyword] = (value, comment)
     hdus += _provenance_tables(data)
     with atomic_path(path) as temporary:
-        fits.HDUList(hdus).writeto(temporary, output_verify="exception", checksum=True)
+        fits.HDUList(hdus).writeto(temporary, output_verify="exception")
     return path
 
 

@@ -17,6 +17,7 @@ from zonda.core.files import atomic_path, check_output_folder, discard, product_
 from zonda.core.operator import Operator
 
 from . import fits_table, toast_hdf5
+from .save_map import no_output_folder, output_folder
 from .streams import StreamsAsked
 from .time_ordered_data import TimeOrderedData
 
@@ -57,13 +58,13 @@ class SaveTOD(Operator):
     dtype: Literal["float64", "float32"] = "float64"
     """Number type in the file. TOAST wants float64; float32 rounds a mean of 30 K to 2 uK."""
 
+    def observe(self, data: Data) -> None:
+        """Refuse a missing or unwritable output folder before anything is simulated."""
+        output_folder(data, self.label)
+
     def prepare(self, observation: Observation) -> _State:
         if observation.output is None:
-            raise OutputError(
-                "there is no output folder",
-                place=self.label,
-                cure="give one: zonda run --output FOLDER, or run(scene, output=...)",
-            )
+            raise no_output_folder(self.label)
         module = _FORMATS[self.format]
         folder = check_output_folder(observation.output)
         stem = f"tod_{observation.name}" if self.label == "SaveTOD" else f"tod_{self.label}_{observation.name}"

@@ -297,18 +297,18 @@ class Binning:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def of_thread(self) -> tuple[Sums, Sums, NDArray[np.float64]]:
-        """(sums (n_pixel + 1, 4), dropped (4,), largest (4,)) of the calling thread; the last row is for what is dropped."""
+        """(sums (n_pixel + 1, 4, or 2 where alike), dropped (4,), largest (4,)); the last row of sums is for what is dropped."""
         mine = threading.get_ident()
         with self.lock:
             if mine not in self.parts:
-                self.parts[mine] = np.zeros((self.grid.n_pixels + 1, 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
+                self.parts[mine] = np.zeros((self.grid.n_pixels + 1, 2 if self.alike else 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
             return self.parts[mine]
 
     def merged(self) -> tuple[Sums, Sums, NDArray[np.float64]]:
         """All threads' sums together."""
         sums, dropped, largest = np.zeros((self.grid.n_pixels, 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
         for part_sums, part_dropped, part_largest in self.parts.values():
-            sums += part_sums[:-1]
+            sums[:, : part_sums.shape[1]] += part_sums[:-1]
             dropped += part_dropped
             largest = np.maximum(largest, part_largest)
         self.parts.clear()
@@ -333,8 +333,9 @@ class Halves:
         self._largest = np.maximum(self._largest, largest)
         deepest = float(self.sums[:, :, HITS].sum(axis=0).max(initial=0))
         if deepest * self._largest.max() >= 2.0**62:
+            highest = self._largest[DATA] / VALUE
             raise PipelineError(
-                f"{deepest:.0f} samples in one pixel, each up to {self._largest[DATA] / VALUE:.3g} K, overflow the map's fixed-point sums",
+                f"{deepest:.0f} samples in one pixel, each up to {highest:.3g} K, overflow the map's fixed-point sums",
                 place=f"{label}, {observation.name}",
                 cure="make smaller pixels, or put a HighpassFilter before",
             )
@@ -352,7 +353,7 @@ def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_var
     trash = np.int32(sums.shape[0] - 1)
     shifted, cells = np.empty(n), np.empty(n, np.int32)
     bits = shifted.view(np.int64)
-    columns, one, two, three = np.uintp(4), np.uintp(HITS), np.uintp(WEIGHTS), np.uintp(NOISE)
+    columns, one, two, three = np.uintp(sums.shape[1]), np.uintp(HITS), np.uintp(WEIGHTS), np.uintp(NOISE)
     trash_hits = np.uintp(trash) * columns + one
     for d in range(n_det):
         if not use[d]:

@@ -166,7 +166,8 @@ class MapProduct:
             whole = healpy.smoothing(whole, fwhm=fwhm / math.sqrt(power), iter=3)
             if self.nest:
                 whole = healpy.reorder(whole, r2n=True)
-            return np.asarray(whole[self.pixels]) * (4 * math.pi * sigma**2) ** (1 - power)
+            kept: Floats = whole[self.pixels] * (4 * math.pi * sigma**2) ** (1 - power)
+            return kept
 
         return sphere
 

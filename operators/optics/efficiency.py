@@ -224,8 +224,8 @@ def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> t
             if basis is None:
                 left, size, _ = np.linalg.svd(known, full_matrices=False)
                 basis = left[:, : max(1, int(np.count_nonzero(size > 1e-13 * size[0])))]
-            fit: Floats = np.linalg.lstsq(basis, known, rcond=1e-12)[0]
-            field = SmoothField(basis, _spline(fit), step, n_samples)
+            fit = np.linalg.lstsq(basis, known, rcond=1e-12)[0]
+            field = SmoothField(basis, _spline(np.asarray(fit, np.float64)), step, n_samples)
             fitted = field.weights @ _knots(field, step, 0.5)[0]
             error = float(np.abs(fitted - exact)[use].max(initial=0.0))
             if error <= tolerance:

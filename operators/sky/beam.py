@@ -11,9 +11,13 @@ with B of unit integral. Equation (1) is evaluated on a grid of step (pixel / q)
 
 with J [rad per pixel] the linear map from pixels to the tangent plane, so rotated, skewed and oblong pixels are right. A single
 bright pixel comes out as an exact Gaussian of the FWHM, a uniform image ripples by 4 exp(-2 pi^2 (sigma / pixel)^2):
-3e-6 at 2 pixels per FWHM. Along an axis with fewer the image is taken as smooth instead (`Convolved.coarse`): it keeps its grid,
-(2) acts up to the Nyquist frequency, and cubic B-splines pass through the result. Nothing is ever deconvolved: what smoothing
-the pixels of the input carry stays.
+3e-6 at 2 pixels per FWHM. Along an axis with fewer the image is taken as smooth instead (`Convolved.coarse`): the cubic spline
+through its pixels, with the transform
+
+    sinc^4(k) / sum_m sinc^4(k + m)   (k in cycles per pixel)                                                   (3)
+
+is convolved with B and taken at the pixel centres again (q = 1), which folds the product of (2) and (3) over k + m. Nothing is
+ever deconvolved: what smoothing the pixels of the input carry stays.
 
 Beyond its edge the image has the value `outside`; the grid reaches `REACH` sigma further, where the beam has left the image.
 """
@@ -30,6 +34,7 @@ Floats = NDArray[np.float64]
 PIXELS_PER_FWHM = 4.0
 SMOOTH_BELOW = 2.0 - 1e-9
 """Pixels per FWHM below which the image is taken as smooth."""
+FOLDS = (-3, -2, -1, 0, 1, 2, 3)
 REACH = 6.0
 SPLINE_MARGIN = 4
 """Grid points beyond the reach, for the 4 x 4 coefficients of the last sample."""
@@ -78,9 +83,8 @@ def convolve(values: Floats, jacobian: Floats, fwhm: float, outside: float) -> C
     grid = np.zeros((ny, nx))
     grid[pad_y : pad_y + rows * qy : qy, pad_x : pad_x + columns * qx : qx] = (values - outside) * (qx * qy)
     if fwhm > 0:
-        kx, ky = np.fft.rfftfreq(nx) * qx, np.fft.fftfreq(ny)[:, None] * qy  # cycles per input pixel
-        exponent = covariance[0, 0] * kx**2 + 2 * covariance[0, 1] * kx * ky + covariance[1, 1] * ky**2
-        grid = fft.irfft2(fft.rfft2(grid) * np.exp(-2 * np.pi**2 * exponent), (ny, nx))
+        kx, ky = np.float64(qx) * np.fft.rfftfreq(nx), np.float64(qy) * np.fft.fftfreq(ny)[:, None]  # cycles per input pixel
+        grid = fft.irfft2(fft.rfft2(grid) * _transfer(covariance, kx, ky, across < SMOOTH_BELOW), (ny, nx))
     grid = spline_filter(grid, 3, mode="mirror")
     grid[np.abs(grid) < TINY] = 0.0
     return Convolved(
@@ -90,6 +94,25 @@ def convolve(values: Floats, jacobian: Floats, fwhm: float, outside: float) -> C
         steps=(qx, qy),
         coarse=bool((across < SMOOTH_BELOW).any()),
     )
+
+
+def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: NDArray[np.bool_]) -> Floats:
+    """Equation (2) at frequencies ``kx``, ``ky`` [cycles per pixel]; folded with (3) along the axes that are ``smooth``."""
+    total = np.zeros(np.broadcast_shapes(kx.shape, ky.shape))
+    folds_x, folds_y = (FOLDS if s else (0,) for s in smooth)
+    for m in folds_x:
+        weight_x = _spline_transform(kx, m) if smooth[0] else 1.0
+        for n in folds_y:
+            weight_y = _spline_transform(ky, n) if smooth[1] else 1.0
+            x, y = kx + m, ky + n
+            exponent = covariance[0, 0] * x**2 + 2 * covariance[0, 1] * x * y + covariance[1, 1] * y**2
+            total += weight_x * weight_y * np.exp(-2 * np.pi**2 * exponent)
+    return total
+
+
+def _spline_transform(k: Floats, m: int) -> Floats:
+    """Equation (3) at k + m for k in -1/2 .. 1/2."""
+    return np.asarray(np.sinc(k + m) ** 4 / sum(np.sinc(k + n) ** 4 for n in FOLDS))
 
 
 def distinct(fwhm: Floats, tolerance: float = 1e-3) -> tuple[Floats, NDArray[np.int64]]:

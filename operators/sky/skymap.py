@@ -29,6 +29,9 @@ from .sampling import sample
 
 Floats = NDArray[np.float64]
 
+GRID_MARGIN = 16
+"""Points of a working grid beyond the last sample: the spline feels the grid's border by 0.27^16 = 8e-10 there."""
+
 
 class SkyMap(Operator):
     """Sky signal of a FITS or HEALPix map, averaged over the band and convolved with the beam, above the atmosphere (K_RJ).
@@ -134,7 +137,9 @@ class SkyMap(Operator):
         radius = _reach(observation) + REACH * SIGMA * widest
         pixel = _pixel(source)
         step = float(np.clip(finest / 4, pixel / 4, pixel if isinstance(source, WcsMap) else pixel / 1.5))
-        radius = float(step * 1.1 ** np.ceil(np.log(radius / step + 8) / np.log(1.1)))  # scans of nearly one size share a grid
+        radius = float(
+            step * 1.1 ** np.ceil(np.log(radius / step + GRID_MARGIN) / np.log(1.1))
+        )  # scans of nearly one size share a grid
         key = (*bandwise, "grid", ra, dec, radius, step)
         wcs = tangent_wcs(ra, dec, radius, step, place)
         return cast(Sky, self._memory.get(key, lambda: self._resampled(source, wcs, band, key)))

@@ -39,7 +39,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, error):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
 def test_a_really_full_disk(tmp_path):
-    with pytest.raises(OutputError, match="no space left on the disk") as caught, atomic_path(tmp_path / "a.bin") as temporary:
+    with pytest.raises(OutputError, match="no space left on the disk") as caught, atomic_path(tmp_path / "a.bin") as temporary:  # noqa: PT012
         temporary.symlink_to("/dev/full")  # every write to it fails with ENOSPC
         temporary.write_bytes(b"x" * 10)
     assert caught.value.place == str(tmp_path / "a.bin")

@@ -24,7 +24,8 @@ def tan(ctype=("RA---TAN", "DEC--TAN"), crval=(75.0, 20.0), crpix=(17.3, -4.0), 
 @pytest.mark.parametrize(
     "wcs",
     [
-        tan(), tan(lonpole=30.0), tan(("GLON-TAN", "GLAT-TAN")), tan(("DEC--TAN", "RA---TAN"), (20.0, 75.0), cdelt=(3 / 3600, 2 / 3600)),
+        tan(), tan(lonpole=30.0), tan(("GLON-TAN", "GLAT-TAN")),
+        tan(("DEC--TAN", "RA---TAN"), (20.0, 75.0), cdelt=(3 / 3600, 2 / 3600)),
         tan(crval=(0.0, 89.9)), tan(crval=(359.999, -90.0)),
     ],
 )  # fmt: skip

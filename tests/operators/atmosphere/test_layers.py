@@ -19,6 +19,7 @@ from zonda.core.site import Site
 from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
 from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
 from zonda.operators.atmosphere.layers import AtmosphereLayers, Fluctuations, Wind, _model, _turbulence, beam_sigma, sample
+from zonda.operators.atmosphere.nodes import differential_rms
 
 Floats = NDArray[np.float64]
 PWV = 7.7e-3
@@ -186,7 +187,7 @@ def test_large_rms_takes_the_log_normal_map_and_keeps_mean_and_rms() -> None:
 
 @pytest.mark.parametrize(
     ("diameter", "field", "tolerance"),
-    [("100 m", "4.2 arcmin", 3e-5), ("100 m", "4.2 arcmin", 1e-2), ("12 m", "30 arcmin", 1e-3)],
+    [("100 m", "4.2 arcmin", 0.01), ("100 m", "4.2 arcmin", 0.5), ("12 m", "30 arcmin", 0.05)],
 )
 def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: str, field: str, tolerance: float) -> None:
     # Every detector and sample evaluated directly in the same realization. The bound is an ensemble rms; one realization of
@@ -195,6 +196,9 @@ def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: st
     op = operator(layers=3, tolerance=tolerance)
     o = observe(80.0, 50.0, scan=4.0, camera=camera)
     state = op.prepare(o)
+    # `tolerance` is a fraction of what the focal-plane mean leaves; from here on of the whole fluctuation.
+    left = differential_rms(o.focalplane.xi, o.focalplane.eta, layers_of(op, o))
+    tolerance *= op.pwv_rms * left / np.sqrt(expected_variance(op, o))
     profile, band = op._weather(o)
     track = tracks([o])[0]
     u = rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)
@@ -308,7 +312,7 @@ def test_frozen_flow_carries_the_air_to_the_next_detector() -> None:
     # A detector downwind sees the same air r / v later (one layer; the shift along eta = 0 is level with the boresight).
     distance = 2000.0 / np.sin(np.radians(50.0))
     r = 60.0
-    op = operator(layers=1, lowest="2000 m", wind={"speed": "10 m/s", "direction": "270 deg"}, tolerance=1e-5)
+    op = operator(layers=1, lowest="2000 m", wind={"speed": "10 m/s", "direction": "270 deg"}, tolerance="0.1 %")
     o = observe(60.0, 10.0, 50.0, 0.0, offsets=([0.0, r / distance], [0.0, 0.0]))
     west, east = water(op, o)
     np.testing.assert_allclose(east[60:], west[:-60], atol=2e-3 * op.pwv_rms)
@@ -316,14 +320,14 @@ def test_frozen_flow_carries_the_air_to_the_next_detector() -> None:
 
 def test_consecutive_scans_see_the_same_air_continuously() -> None:
     # The second scan starts where the first one ends, 0.3 deg away; at 60 s the pointing jumps, the air does not.
-    op = operator(tolerance=1e-5)
+    op = operator(tolerance="0.1 %")
     whole_scan = observe(120.0, 10.0)
     first = observe(60.0, 10.0, index=0)
     second = observe(60.0, 10.0, index=1, start="2024-11-25T07:01:00Z")
     scene = Scene(site=SITE, instrument=instrument(), time=START)
     op.observe(Data(scene, [first, second]))
     parts = [whole(o, op.prepare(o))[:20] for o in (first, second)]
-    alone = operator(tolerance=1e-5)
+    alone = operator(tolerance="0.1 %")
     alone.observe(Data(scene, [whole_scan]))
     expected = whole(whole_scan, alone.prepare(whole_scan))[:20]
     np.testing.assert_allclose(np.concatenate(parts, axis=1), expected, atol=1e-4 * expected.std() + 5e-6)
@@ -385,7 +389,7 @@ def test_wide_throws_take_the_horizontal_plane_and_say_so() -> None:
     track = tracks([o])[0]
     assert track.horizontal
     assert track.bound == pytest.approx(1 / np.tan(np.radians(50.0)) ** 2, rel=1e-6)
-    operator(layers=2, tolerance=1e-3).prepare(o)
+    operator(layers=2, tolerance="5 %").prepare(o)
     said = {what: text for _, what, text in o.tally}
     assert "horizontal" in said["plane of the turbulence"]
     assert "70.4%" in said["plane of the turbulence"]

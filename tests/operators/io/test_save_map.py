@@ -218,3 +218,19 @@ def test_a_failure_in_the_middle_leaves_the_old_file(run, data, monkeypatch, err
         SaveMap().finalize(data)
     assert (data.output / "map.fits").read_bytes() == before
     assert not [p for p in data.output.iterdir() if "part" in p.name]
+
+
+def test_two_runs_write_the_same_bytes(run, data):
+    run(map=wcs_map(20, 20))
+    before = (data.output / "map.fits").read_bytes()
+    SaveMap().finalize(data)
+    assert (data.output / "map.fits").read_bytes() == before
+
+
+def test_a_missing_folder_is_refused_before_the_run(data, tmp_path):
+    (tmp_path / "out").write_text("a file in its place")
+    with pytest.raises(OutputError, match="there is a file of that name"):
+        SaveMap().observe(data)
+    data.output = None
+    with pytest.raises(OutputError, match="no output folder"):
+        SaveMap().observe(data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import threading
+from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -13,6 +14,7 @@ from astropy.table import Table
 
 from zonda.core.data import Block
 from zonda.core.errors import InputError, OutputError
+from zonda.core.operator import Operator
 from zonda.core.smooth import SmoothField
 from zonda.operators.io import fits_table, toast_hdf5
 from zonda.operators.io.save_tod import SaveTOD, load_tod, save_tod
@@ -322,3 +324,29 @@ def test_toast_itself_reads_the_file(make_observation, data, streams, mean):
     assert found.name == observation.name
     np.testing.assert_array_equal(found.detdata["signal"].data, load_tod(path).streams["signal"])
     np.testing.assert_array_equal(found.shared["boresight_radec"].data, observation.boresight_radec)
+
+
+class Fails(Operator):
+    """Raises in the middle of the second scan."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    how: str = ""
+
+    def exec(self, block, state):
+        if block.observation.index == 1 and block.detectors.start > 0:
+            raise {"interrupt": KeyboardInterrupt, "fault": RuntimeError}[self.how]("stop")
+
+
+@pytest.mark.parametrize(("how", "error"), [("interrupt", KeyboardInterrupt), ("fault", RuntimeError)])
+def test_a_pipeline_that_stops_leaves_whole_files_only(how, error, scene, tmp_path):
+    from zonda.core.pipeline import Pipeline
+    from zonda.operators.noise.white import WhiteNoise
+    from zonda.operators.optics.efficiency import Efficiency
+    from zonda.operators.pointing.stare import PointingStare
+
+    stare = PointingStare(target={"az": "120 deg", "el": "60 deg"}, scan_duration="20 s", scans=2)
+    pipeline = Pipeline([stare, WhiteNoise(), Efficiency(), SaveTOD(), Fails(how=how)])
+    with pytest.raises(error):
+        pipeline.run(scene, output=tmp_path, threads=2)
+    (whole,) = tmp_path.iterdir()  # the first scan was complete
+    assert load_tod(whole).streams["signal"].shape == (19, 1000)

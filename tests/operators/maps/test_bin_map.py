@@ -317,7 +317,8 @@ def test_two_maps_need_two_names(bench):
     "bad",
     [
         {"pixel": "0 arcsec"}, {"nside": 100}, {"nside": 64, "pixel": "2 arcsec"}, {"ordering": "nested"}, {"projection": "CAR"},
-        {"centre": "az 180 deg el 60 deg"}, {"smooth": "-1 arcsec"}, {"smooth": "0 arcsec"}, {"weights": "best"}, {"product": "a/b"},
+        {"centre": "az 180 deg el 60 deg"}, {"smooth": "-1 arcsec"}, {"smooth": "0 arcsec"},
+        {"weights": "best"}, {"product": "a/b"},
     ],
 )  # fmt: skip
 def test_bad_parameters(bad):

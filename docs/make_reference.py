@@ -1,0 +1,61 @@
+"""Write docs/operators.md from the operators themselves: python docs/make_reference.py (a test holds the two together)."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import typing
+from pathlib import Path
+
+from zonda.core.configuration.units import Unit
+from zonda.core.registry import mapmakers, operators
+
+PAGE = Path(__file__).with_name("operators.md")
+FOLDERS = {
+    "pointing": "Where the telescope looks",
+    "sky": "What is in the sky",
+    "atmosphere": "The air in between",
+    "noise": "What the detectors add",
+    "optics": "What the optics take away",
+    "filters": "What the analysis removes",
+    "maps": "From time streams to maps",
+    "diagnostics": "Spectra, pictures, report",
+    "io": "Files",
+}
+
+
+def page() -> str:
+    """The whole page."""
+    classes = [r.get(c.name) for r in (operators, mapmakers) for c in r.candidates() if c.distribution == "zonda"]
+    lines = [
+        "# The operators",
+        "",
+        "Every operator that comes with zonda, made from their own docstrings by `docs/make_reference.py`. Defaults that say",
+        "*none* are taken from the instrument, the site or the scene, as the text says.",
+    ]
+    for folder, title in FOLDERS.items():
+        lines += ["", f"## {title}"]
+        for cls in sorted((c for c in classes if c.__module__.split(".")[2] == folder), key=lambda c: c.__name__):
+            lines += ["", f"### {cls.__name__}", "", inspect.cleandoc(cls.__doc__ or ""), ""]
+            needs, gives = (", ".join(f"`{n}`" for n in sorted(names)) or "nothing" for names in (cls.requires, cls.provides))
+            lines += [f"Requires {needs}; provides {gives}.", "", "| parameter | default | |", "|---|---|---|"]
+            for name, field in cls.model_fields.items():
+                if name != "name":
+                    text = " ".join((field.description or "").split()).replace("|", "\\|")
+                    lines.append(f"| `{name}` | {default(field)} | {text} |")
+    return "\n".join(lines) + "\n"
+
+
+def default(field: typing.Any) -> str:
+    """A field's default as it would stand in YAML."""
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    if value is None:
+        return "*none*"
+    has_unit = any(isinstance(m, Unit) for m in field.metadata)
+    return f"`{value}`" if has_unit or isinstance(value, str) else f"`{json.dumps(value, default=str)}`"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
