@@ -20,7 +20,7 @@ def in_a_folder_with_a_map(folder, monkeypatch):
     monkeypatch.chdir(folder)
 
 
-@pytest.mark.parametrize("text", blocks("python"))
+@pytest.mark.parametrize("text", list(blocks("python")))
 def test_python(text, tmp_path, monkeypatch):
     in_a_folder_with_a_map(tmp_path, monkeypatch)
     names = {}

@@ -131,7 +131,7 @@ class AtmosphereLayers(Operator):
     lattice: float = Field(0.6, gt=0, le=0.6)
     """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used)."""
     tolerance: Fraction = quantity("1 %", ge=1e-4, le=1)
-    """Rms error of the evaluation at nodes, as a fraction of what subtraction of the focal-plane mean leaves of the atmosphere."""
+    """Rms error of the evaluation at nodes, as a fraction of what the focal-plane mean, subtracted, leaves of the atmosphere."""
 
     _origin: Any = PrivateAttr(None)
     _tracks: dict[str, Track] = PrivateAttr(default_factory=dict)

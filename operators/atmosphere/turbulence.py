@@ -228,7 +228,7 @@ def _kernel(outer_scale: float, sigma: float, low: float, high: float, spacing: 
     k = 2 * np.pi * np.fft.fftfreq(_GRID, spacing)
     alias = 2 * np.pi / spacing * np.arange(-2, 3)
     gauss = np.exp(-np.multiply.outer(e, np.add.outer(alias, k) ** 2)).sum(1)
-    power = (gauss.T * w) @ gauss / spacing**2
+    power = np.einsum("ka,kb->ab", gauss * w[:, None], gauss) / spacing**2  # not BLAS: the same bits for any number of threads
     h = np.fft.irfft2(np.sqrt(power[:, : _GRID // 2 + 1]), (_GRID, _GRID))[: radius + 1, : radius + 1]
     index = np.arange(radius + 1)
     h = np.where(np.hypot(index[:, None], index) <= radius, h, 0.0)

@@ -36,6 +36,8 @@ class MapView:
         HEALPix: resolution, pixel numbers (n_pix,) int64, ordering, astropy frame name.
     fwhm
         Resolution of the map, rad; 0 where unknown.
+    centre
+        (lon, lat) of the map's centre in ``frame``, rad.
     """
 
     name: str
@@ -47,6 +49,7 @@ class MapView:
     nest: bool = False
     frame: str = "icrs"
     fwhm: float = 0.0
+    centre: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(cls, name: str, product: MapProduct) -> MapView:
@@ -65,6 +68,7 @@ class MapView:
             product.nest,
             product.frame,
             math.hypot(product.fwhm, product.smoothed_by),
+            product.centre,
         )
 
     @property
@@ -79,7 +83,7 @@ class MapView:
         return WCS(self.header, naxis=2)
 
     def flat(self, size: int = 400) -> MapView:
-        """A HEALPix map on a tangent-plane grid of about ``size`` pixels that holds all its pixels, for pictures; self otherwise.
+        """A HEALPix map on ``size`` x ``size`` points of the tangent plane at its centre, for pictures; any other map as it is.
 
         Each grid point takes the value of the HEALPix pixel it lies in.
         """
@@ -89,14 +93,13 @@ class MapView:
         from astropy.wcs import WCS
 
         directions = np.array(hp.pix2vec(self.nside, self.pixels, nest=self.nest))
-        mean = directions.sum(axis=1)
-        lon, lat = hp.vec2ang(mean, lonlat=True)
-        centre = mean / np.linalg.norm(mean)
+        lon, lat = np.degrees(self.centre)
+        centre = hp.ang2vec(lon, lat, lonlat=True)
         reach = np.arccos(np.clip((centre @ directions).min(), 0.1, 1)) + hp.nside2resol(self.nside)
         wcs = WCS(naxis=2)
         axes = ("RA", "DEC") if self.frame == "icrs" else ("GLON", "GLAT")
         wcs.wcs.ctype = [f"{a}{'-' * (8 - len(a) - 3)}TAN" for a in axes]
-        wcs.wcs.crval = [float(lon[0]), float(lat[0])]
+        wcs.wcs.crval = [float(lon), float(lat)]
         wcs.wcs.crpix = [(size + 1) / 2] * 2
         step = np.degrees(2 * np.tan(reach) / size)
         wcs.wcs.cdelt = [-step, step]
@@ -108,7 +111,9 @@ class MapView:
         found = order[place]
         there = self.pixels[found] == wanted
         planes = {k: np.where(there, v[found], 0 if k == "hits" else np.nan) for k, v in self.planes.items()}
-        return MapView(self.name, planes, self.units, wcs.to_header(relax=True), frame=self.frame, fwhm=self.fwhm)
+        return MapView(
+            self.name, planes, self.units, wcs.to_header(relax=True), frame=self.frame, fwhm=self.fwhm, centre=self.centre
+        )
 
 
 def maps_of(products: Mapping[str, Any]) -> dict[str, MapProduct]:

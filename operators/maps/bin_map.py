@@ -301,7 +301,11 @@ class Binning:
         mine = threading.get_ident()
         with self.lock:
             if mine not in self.parts:
-                self.parts[mine] = np.zeros((self.grid.n_pixels + 1, 2 if self.alike else 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
+                self.parts[mine] = (
+                    np.zeros((self.grid.n_pixels + 1, 2 if self.alike else 4), np.int64),
+                    np.zeros(4, np.int64),
+                    np.zeros(4),
+                )
             return self.parts[mine]
 
     def merged(self) -> tuple[Sums, Sums, NDArray[np.float64]]:

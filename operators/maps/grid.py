@@ -155,7 +155,7 @@ def covered_healpix(observations: Sequence[Observation], nside: int, nest: bool,
     return np.asarray(pieces[0], np.int64)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
 def tangent_pixels(h, first, stop, xi, eta, ny, nx, out):  # type: ignore[no-untyped-def]
     """Flat index y nx + x of the pixel that holds each sample, -1 outside the image or behind it. ``h`` (9, n_samp)."""
     wide, high, row_length = np.float64(nx), np.float64(ny), np.int32(nx)

@@ -114,11 +114,10 @@ def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, cons
         if g[8] > 0.0 and abs(g[2]) < 1e8 * g[8] and abs(g[5]) < 1e8 * g[8]:
             ox, oy = np.floor(g[2] / g[8]), np.floor(g[5] / g[8])
         for t in range(count):
-            g = _homography(quaternions[start + t], matrix)
-            for k in range(3):
-                h[k, t] = g[k] - ox * g[6 + k]
-                h[3 + k, t] = g[3 + k] - oy * g[6 + k]
-                h[6 + k, t] = g[6 + k]
+            g0, g1, g2, g3, g4, g5, g6, g7, g8 = _homography(quaternions[start + t], matrix)
+            h[0, t], h[1, t], h[2, t] = g0 - ox * g6, g1 - ox * g7, g2 - ox * g8
+            h[3, t], h[4, t], h[5, t] = g3 - oy * g6, g4 - oy * g7, g5 - oy * g8
+            h[6, t], h[7, t], h[8, t] = g6, g7, g8
         limits[0], limits[1], limits[2], limits[3] = cast(1 - ox), cast(nx - 3 - ox), cast(1 - oy), cast(ny - 3 - oy)
         edge[0], edge[1], edge[2], edge[3] = (
             cast(bounds[0] - ox),

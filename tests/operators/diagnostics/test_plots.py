@@ -208,6 +208,27 @@ def test_a_healpix_map_is_drawn(data):
     assert {p.name for p in data.products["pictures"]} == {"map", "coverage"}
 
 
+def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
+    import healpy as hp
+
+    from zonda.operators.io.map_view import MapView
+
+    nside = 512
+    pixels = np.sort(hp.query_disc(nside, hp.ang2vec(266.0, -29.0, lonlat=True), np.radians(1.0)))
+    centre = (np.radians(266.0), np.radians(-29.0))
+    view = MapView(
+        "map", {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, nside=nside, pixels=pixels, frame="galactic", centre=centre
+    )
+    flat = view.flat(300)
+    y, x = np.nonzero(flat.planes["hits"])
+    lon, lat = flat.wcs.pixel_to_world_values(x, y)
+    np.testing.assert_array_equal(flat.planes["signal"][y, x], hp.ang2pix(nside, lon, lat, lonlat=True))
+    assert set(flat.planes["signal"][y, x]) == set(pixels)  # none is lost
+    assert np.isnan(flat.planes["signal"][flat.planes["hits"] == 0]).all()
+    np.testing.assert_allclose(flat.wcs.pixel_to_world_values(149.5, 149.5), (266.0, -29.0), atol=1e-9)
+    assert flat.wcs.wcs.ctype[0].startswith("GLON")
+
+
 def test_no_output_folder(data):
     data.output = None
     with pytest.raises(OutputError, match="no output folder"):
