@@ -114,21 +114,31 @@ _set = click.option(
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
 @click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
-def run(pipeline: str, settings: tuple[str, ...], output: Path | None, threads: int | None, memory: int | None) -> None:
+@click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
+def run(
+    pipeline: str, settings: tuple[str, ...], output: Path | None, threads: int | None, memory: int | None, verbose: bool
+) -> None:
     """Run a pipeline file, or a shipped pipeline by its name."""
     from .files import write_text
 
     file = _load(pipeline, settings)
     folder = file.output if output is None else output
     resolved = file.resolved_yaml()
-    data = file.pipeline().run(
-        file.scene(), output=folder, threads=threads, memory=memory, provenance={"resolved_yaml": resolved}
-    )
-    write_text(folder / "pipeline.yaml", resolved)
+    provenance = {"resolved_yaml": resolved, "command": _command(pipeline, settings)}
+    data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
+    write_text(folder / "resolved.yaml", resolved)
+    lost = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
     for who, what, value in data.tally:
-        if "/" not in who and value != "0":  # the companion runs' and what did not happen: in the report
+        if verbose or (who, what) in lost:
             click.echo(f"{who}: {what}: {value}", err=True)
     click.echo(f"{folder}/")
+
+
+def _command(pipeline: str, settings: tuple[str, ...]) -> str:
+    """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
+    import shlex
+
+    return shlex.join(["zonda", "run", pipeline, *(part for text in settings for part in ("--set", text))])
 
 
 @zonda.command()

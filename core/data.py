@@ -58,6 +58,11 @@ class Tally:
             rows = [(*k, f"{v}") for k, v in self._counts.items()] + [(*k, v) for k, v in self._figures.items()]
         return iter(sorted(rows))
 
+    def counts(self) -> list[tuple[str, str, int]]:
+        """The counts alone, in a fixed order."""
+        with self._lock:
+            return sorted((*k, v) for k, v in self._counts.items())
+
     def get(self, who: str, what: str) -> int:
         """A count, 0 where there is none."""
         return self._counts.get((who, what), 0)

@@ -40,6 +40,7 @@ def pipeline() -> zonda.Pipeline:
             zonda.PinkNoise(shared=0.8),
             zonda.Efficiency(),
             zonda.PowerSpectrum(),
+            zonda.TimeStreams(),
             zonda.HighpassFilter(frequency="0.08 Hz"),
             zonda.CommonModeFilter(modes=1),
             zonda.BinMap(pixel="2 arcsec", half_difference=True),

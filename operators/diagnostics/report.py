@@ -31,8 +31,7 @@ _WIDE = 1000
 class Report(Operator):
     """Write ``report.html``: the pictures, what was simulated, with which seed and versions, what was counted and approximated.
 
-    The page needs no other file and no network. ``resolved.yaml``, the configuration with every default filled in, is written
-    beside it when the run came from a file. Acts after all runs: put it last, so that it knows of the files before it.
+    The page needs no other file and no network. Acts after all runs: put it last, so that it knows of the files before it.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
@@ -50,8 +49,6 @@ class Report(Operator):
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
-        if text := str(data.provenance.get("resolved_yaml", "")):
-            write_text(folder / "resolved.yaml", text)
         shown = data.products.get("pictures")
         if shown is None:
             shown = pictures(data, Plots(central_diameter=f"{self.central_diameter!r} rad"))

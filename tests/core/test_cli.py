@@ -152,11 +152,11 @@ def test_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert out == "out/p/\n"
     assert f"Ones: samples: {7 * 4096}" in err
     assert (here / "out/p/total.txt").read_text() == f"half {2.0 * 7 * 4096} 1"
-    resolved = here / "out/p/pipeline.yaml"
+    resolved = here / "out/p/resolved.yaml"
     assert "value: 2.0" in resolved.read_text()
     assert cli.main(["run", str(resolved), "--output", "again"]) == 0
     assert (here / "again/total.txt").read_text() == (here / "out/p/total.txt").read_text()
-    assert (here / "again/pipeline.yaml").read_text() == resolved.read_text()
+    assert (here / "again/resolved.yaml").read_text() == resolved.read_text()
 
 
 def test_check(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -101,10 +101,9 @@ def test_every_text_is_escaped(data, report):
     assert text.count("<script>") >= 8  # shown as text
 
 
-def test_the_configuration_is_beside_it(data, report):
+def test_the_page_is_the_only_file(data, report):
     report()
-    assert (data.output / "resolved.yaml").read_text(encoding="utf-8") == "a: 1\nb: 'é'\n"
-    assert sorted(p.name for p in data.output.iterdir()) == ["report.html", "resolved.yaml"]
+    assert [p.name for p in data.output.iterdir()] == ["report.html"]
 
 
 def test_it_draws_its_own_pictures_where_no_step_did(data, report):
@@ -116,7 +115,6 @@ def test_a_run_from_python_has_a_report_too(data, report):
     data.provenance.clear()
     page, text, _ = report()
     assert "zonda run" in text
-    assert not (data.output / "resolved.yaml").exists()
     assert re.search(r'id="steps"', page) is None  # no empty sections
 
 
