@@ -266,7 +266,8 @@ class Execution:
         if least > share:
             need = 2 * least * self.settings.threads * n_streams * item
             raise PipelineError(
-                f"one block of {rows} detectors needs {need / 1e6:.1f} MB, the budget is {self.settings.memory / 1e6:.1f} MB",
+                f"one block of {rows} detectors needs {need / 1e6:.1f} MB, "
+                f"the memory budget is {self.settings.memory / 1e6:.1f} MB",
                 place=self.observation.name,
                 cure=f"raise --memory to {-(-need // 1_000_000)}MB, use fewer --threads, or make the scan shorter",
             )

@@ -141,9 +141,17 @@ def test_one_detector_zero_wind_offline(source, monkeypatch):
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
     camera = zonda.Instrument(
-        name="one", telescope=zonda.Telescope(name="dish", diameter="100 m"), band="mustang2_90ghz", detectors=1,
-        field_of_view="0 deg", main_beam_efficiency=0.3, illumination_efficiency=0.8, net="1.7 mK s(1/2)", knee="0.5 Hz", sample_rate="100 Hz",
-    )  # fmt: skip
+        name="one",
+        telescope=zonda.Telescope(name="dish", diameter="100 m"),
+        band="mustang2_90ghz",
+        detectors=1,
+        field_of_view="0 deg",
+        main_beam_efficiency=0.3,
+        illumination_efficiency=0.8,
+        net="1.7 mK s(1/2)",
+        knee="0.5 Hz",
+        sample_rate="100 Hz",
+    )
     chain = steps(source, "5 s")
     chain[2] = zonda.AtmosphereLayers(pwv="7.7 mm", wind={"speed": "0 m/s"})
     product = zonda.Pipeline(chain).run(scene(instrument=camera)).products["map"]

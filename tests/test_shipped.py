@@ -53,7 +53,16 @@ def test_maps_carry_what_they_should(folder):
 
 def test_report_says_what_was_simulated(folder):
     text = (folder / "report.html").read_text()
-    for words in ("20241125", "mustang2", "green_bank", "AtmosphereLayers", "7.7 mm", "data:image/png;base64", zonda.__version__, "numpy"):
+    for words in (
+        "20241125",
+        "mustang2",
+        "green_bank",
+        "AtmosphereLayers",
+        "7.7 mm",
+        "data:image/png;base64",
+        zonda.__version__,
+        "numpy",
+    ):
         assert words in text
     assert "http://" not in text.replace("http://www.w3.org", "")
 
