@@ -1,0 +1,268 @@
+"""The conformance kit: `check_operator` finds out whether an operator keeps the contract of `core.operator`.
+
+A plugin's test is one line::
+
+    zonda.testing.check_operator(MyOperator(width="3 s"))
+
+The operator is run over a made-up scan with made-up streams: whatever it requires or can use is there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .configuration.time import Instant
+from .data import Block, Data, Observation
+from .instrument import Band, Instrument, Telescope
+from .operator import Operator
+from .pipeline import Pipeline
+from .random import normals
+from .scene import Scene
+from .site import Site
+from .tiles import TILE_SAMPLES
+
+STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
+"""Streams that the kit can provide."""
+N_DETECTORS, N_SAMPLES, RATE = 37, 3 * TILE_SAMPLES + 321, 50.0
+
+
+def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] | None = None) -> None:
+    """Run every check that applies; raise AssertionError with all that fail.
+
+    Parameters
+    ----------
+    operator
+        An instance, with parameters that suit a scan of 37 detectors and 129 s at 50 Hz.
+    expected_failures
+        Names of checks that are known to fail, each with the reason. One that passes all the same is reported too.
+    """
+    expected = dict(expected_failures or {})
+    wrong = []
+    for check in CHECKS:
+        try:
+            check(operator)
+        except AssertionError as err:
+            if check.__name__ not in expected:
+                wrong.append(f"{check.__name__}: {err}")
+        else:
+            if check.__name__ in expected:
+                wrong.append(f"{check.__name__} passes, though it was expected to fail: {expected[check.__name__]}")
+    assert not wrong, f"{type(operator).__name__} does not keep the contract:\n" + "\n".join(wrong)
+
+
+def check_parameters_are_documented(operator: Operator) -> None:
+    """The class and every field have a docstring: messages, schema and documentation are made of them."""
+    assert (type(operator).__doc__ or "").strip(), "the class has no docstring"
+    for name, field in type(operator).model_fields.items():
+        assert field.description, f"parameter {name} has no docstring"
+
+
+def check_parameters_survive_text(operator: Operator) -> None:
+    """What is written to a resolved YAML file reads back to the same operator."""
+    text = operator.model_dump(mode="json", exclude_unset=True)
+    again = type(operator).model_validate(text)
+    assert again.model_dump() == operator.model_dump(), f"{text} reads back as {again!r}"
+
+
+def check_declared_streams(operator: Operator) -> None:
+    """`exec` reads only what is declared as required or optional, makes only what is provided, and changes nothing else."""
+    if operator.at_end or "boresight" in operator.provides:
+        return
+    observation = _observation()
+    steps = [_Given(), operator]
+    states = []
+    with tempfile.TemporaryDirectory() as folder:
+        observation.output = Path(folder)
+        data = Data(_scene(), [observation], output=observation.output)
+        operator.observe(data)
+        for step in steps:
+            step.configure(observation)
+        states = [step.prepare(observation) for step in steps]
+        block = Block(observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES))
+        steps[0].exec(block, states[0])
+        before = {name: stream.copy() for name, stream in block.detdata.items()}
+        if operator.couples == "all":
+            _measured(operator, block, states[1])
+        watched = _Watched(block.detdata)
+        block.detdata = watched
+        operator.exec(block, states[1])
+        operator.discard(observation, states[1])
+    allowed = operator.requires | operator.optional | operator.provides
+    made = set(watched) - set(before)
+    assert made <= operator.provides, f"makes {sorted(made - operator.provides)}, which it does not provide"
+    assert not (undeclared := watched.read - allowed), f"reads {sorted(undeclared)}, which it does not declare"
+    for name in set(before) - operator.provides:
+        assert np.array_equal(before[name], dict.__getitem__(watched, name), equal_nan=True), (
+            f"changes {name}, which it does not provide"
+        )
+
+
+def check_same_bits(operator: Operator) -> None:
+    """The same seed gives the same bits for every block size and thread count; two seeds of a random operator do not."""
+    one = _products(operator, threads=1, memory=1 << 30)
+    for threads, memory in ((1, _small(operator)), (3, 3 * _small(operator)), (2, 1 << 30)):
+        other = _products(operator, threads=threads, memory=memory)
+        assert _same(one, other), f"other bits with {threads} threads and {memory / 1e6:.1f} MB"
+
+
+def check_finite(operator: Operator) -> None:
+    """Finite streams stay finite."""
+    for name, stream in _products(operator, threads=1, memory=1 << 30).items():
+        if isinstance(stream, np.ndarray):
+            assert np.isfinite(stream).all(), f"{name} is not finite"
+
+
+CHECKS: tuple[Callable[[Operator], None], ...] = (
+    check_parameters_are_documented,
+    check_parameters_survive_text,
+    check_declared_streams,
+    check_same_bits,
+    check_finite,
+)
+
+
+# ---- the made-up run
+
+
+class _Point(Operator):
+    """Points at the made-up scan."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+
+    def observe(self, data: Data) -> None:
+        data.observations.append(_observation())
+
+
+class _Given(Operator):
+    """Provides every stream: a slow wave, common to all detectors, with noise of each detector's own."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset(STREAMS)
+
+    def exec(self, block: Block, state: Any) -> None:
+        start, stop = block.samples.start, block.samples.stop
+        wave = np.sin(np.arange(start, stop) / RATE / 3.0)
+        for number, name in enumerate(STREAMS):
+            stream = block.new(name)
+            for d in range(block.detectors.start, block.detectors.stop):
+                noise = normals(block.observation.key("given", name, d), start, stop)
+                stream[d - block.detectors.start] = 1e-3 * (3 * wave * (number + 1) + noise)
+
+
+def _scene() -> Scene:
+    camera = Instrument(
+        name="conformance",
+        telescope=Telescope(name="dish", diameter="10 m"),
+        band=Band(name="band", low="140 GHz", high="160 GHz"),
+        detectors=N_DETECTORS,
+        field_of_view="10 arcmin",
+        main_beam_efficiency=0.5,
+        illumination_efficiency=0.9,
+        net="1 mK s(1/2)",
+        knee="0.2 Hz",
+        pink_minimum_frequency="10 mHz",
+        sample_rate=f"{RATE} Hz",
+    )
+    site = Site(name="somewhere", latitude="38.4 deg", longitude="-79.8 deg", altitude="800 m", climatology="green_bank")
+    return Scene(site=site, instrument=camera, time=Instant.parse("2024-11-25T07:00"), target="05h +20d", seed=11)
+
+
+def _observation() -> Observation:
+    """A scan in circles of 5 arcmin around RA 75 deg, Dec 20 deg, at 60 deg of elevation."""
+    scene = _scene()
+    t = np.arange(N_SAMPLES) / RATE
+    ra, dec = np.radians(75.0), np.radians(20.0)
+    reach = np.radians(5 / 60)
+    x, y = reach * np.cos(t / 3), reach * np.sin(t / 3)
+    return Observation(
+        "scan-000", 0, scene.site, scene.instrument, scene.instrument.focalplane(), scene.time, t, RATE,
+        _quaternions(-1.0 - x / np.cos(1.05), 1.05 + y), _quaternions(ra + x / np.cos(dec), dec + y), (ra, dec), scene.seed,
+    )  # fmt: skip
+
+
+def _quaternions(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rz(lon) Ry(pi/2 - lat), (n, 4) in the order x y z w."""
+    a, b = lon / 2, (np.pi / 2 - lat) / 2
+    return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
+
+
+def _products(operator: Operator, threads: int, memory: int) -> dict[str, Any]:
+    """Everything that a run of the operator over given streams makes: streams and products."""
+    if operator.at_end:
+        return {}
+    pointing = "boresight" in operator.provides
+    steps = [operator] if pointing else [_Point(), _Given(), operator]
+    keep = sorted(operator.provides & set(STREAMS))
+    with tempfile.TemporaryDirectory() as folder:
+        data = Pipeline(steps).run(_scene(), threads=threads, memory=memory, keep=keep, output=folder)
+    found: dict[str, Any] = {}
+    for observation in data.observations:
+        found |= {f"{observation.name} {name}": stream for name, stream in observation.detdata.items()}
+        if pointing:
+            found |= {f"{observation.name} {name}": getattr(observation, name) for name in ("boresight_azel", "boresight_radec")}
+    return found | {name: _comparable(product) for name, product in data.products.items()}
+
+
+def _measured(operator: Operator, block: Block, state: Any) -> None:
+    from .data import Stream
+
+    (name,) = operator.requires - {"boresight"}
+    operator.measure(Stream(name, block.observation, block.detdata[name], {}, 1), state)
+
+
+def _small(operator: Operator) -> int:
+    """A budget in which blocks are small: whole scans of 16 detectors where the operator needs them, else short pieces."""
+    least = {"time": 16 * N_SAMPLES, "detectors": N_DETECTORS * TILE_SAMPLES}.get(operator.couples, 16 * TILE_SAMPLES)
+    return 2 * 4 * least * (len(STREAMS) + 6)
+
+
+def _comparable(product: Any) -> Any:
+    """Arrays inside a product, by name; texts are left out (they hold paths and times)."""
+    if dataclasses.is_dataclass(product):
+        return {f.name: _comparable(getattr(product, f.name)) for f in dataclasses.fields(product)}
+    if isinstance(product, Mapping):
+        return {k: _comparable(v) for k, v in product.items()}
+    return product if isinstance(product, np.ndarray | int | float) else None
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(_same(a[k], b[k]) for k in a)
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    return bool(a == b)
+
+
+class _Watched(dict[str, Any]):
+    """Streams of a block, noting what is read."""
+
+    def __init__(self, streams: Mapping[str, Any]) -> None:
+        super().__init__(streams)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Any:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        if name in self:
+            self.read.add(name)
+        return super().get(name, default)
+
+    def items(self) -> Any:
+        self.read.update(self)
+        return super().items()
+
+    def values(self) -> Any:
+        self.read.update(self)
+        return super().values()
+
+    def __iter__(self) -> Iterator[str]:
+        return super().__iter__()
