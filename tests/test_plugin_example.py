@@ -52,6 +52,12 @@ def test_a_pipeline_uses_it(installed, tmp_path):
     assert list((tmp_path / "out").glob("*.fits"))
 
 
+def test_its_operator_keeps_the_contract(installed):
+    code = "import zonda.testing; from zonda_example.time_constant import TimeConstant as T; zonda.testing.check_operator(T(tau='50 ms'))"
+    done = subprocess.run([sys.executable, "-c", code], env=installed, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_absent_plugin_is_named(tmp_path):
     done = zonda({**os.environ, "ZONDA_PLUGINS": ""}, "check", EXAMPLE / "pipelines" / "example.yaml")
     assert done.returncode == 2
