@@ -102,6 +102,62 @@ class SmoothField:
         return out
 
 
+@dataclass(frozen=True)
+class DetectorField:
+    """Equation (1) where every detector is its own node: no weights, and no focal-plane interpolation to pay for.
+
+    Attributes
+    ----------
+    coefficients
+        (n_det, ceil(n_samples / step) + 3), as in `SmoothField`.
+    step, n_samples
+        As in `SmoothField`.
+    """
+
+    coefficients: Floats
+    step: int
+    n_samples: int
+
+    @classmethod
+    def from_values(cls, values: Floats, step: int, n_samples: int, dtype: type = np.float64) -> DetectorField:
+        """From detector values with a margin, as `SmoothField.from_values`, filtered a few detectors at a time."""
+        wanted = -(-n_samples // step) + 3
+        kept: Floats = np.empty((len(values), wanted), dtype)
+        one = np.ones((1, 1))
+        for first in range(0, len(values), 64):
+            rows = slice(first, first + 64)
+            kept[rows] = SmoothField.from_values(one, values[rows], step, n_samples).coefficients
+        return cls(kept, step, n_samples)
+
+    def evaluate(self, detectors: slice, samples: slice, out: Floats | None = None) -> Floats:
+        """As `SmoothField.evaluate`."""
+        start, stop = samples.start, samples.stop
+        if not 0 <= start <= stop <= self.n_samples:
+            raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
+        rows = self.coefficients[detectors]
+        if out is None:
+            out = np.empty((len(rows), stop - start))
+        _evaluate_rows(rows, bspline_weights(self.step, out.dtype.type), start, out)
+        return out
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _evaluate_rows(coefficients, basis, start, out):  # type: ignore[no-untyped-def]
+    n_det, n = out.shape
+    step = basis.shape[1]
+    stop = start + n
+    first, last = start // step, (stop + step - 1) // step
+    b0, b1, b2, b3 = basis[0], basis[1], basis[2], basis[3]
+    for d in range(n_det):
+        row, line = out[d], coefficients[d]
+        for m in range(first, last):
+            low, high = max(m * step, start), min((m + 1) * step, stop)
+            r = low - m * step
+            c0, c1, c2, c3 = line[m], line[m + 1], line[m + 2], line[m + 3]
+            for t in range(high - low):
+                row[low - start + t] = c0 * b0[r + t] + c1 * b1[r + t] + c2 * b2[r + t] + c3 * b3[r + t]
+
+
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _evaluate(weights, coefficients, basis, start, out):  # type: ignore[no-untyped-def]
     n_det, n = out.shape

@@ -20,7 +20,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gamma, kve
+from scipy.special import gamma, gammainc, gammaincc, kve
 
 Floats = NDArray[np.float64]
 
@@ -113,6 +113,16 @@ def mixture_between(outer_scale: float, sigma: float, low: float, high: float, n
     x, weight = _gauss_legendre(nodes)
     s = np.exp((a + b) / 2 + (b - a) / 2 * x)
     return s + sigma**2, _density(s, outer_scale) * weight * (b - a) / 2
+
+
+def spectrum_between(k2: Floats, outer_scale: float, split: float) -> tuple[Floats, Floats]:
+    """The parts of the spectrum P (equation 2) with s below and above ``split`` [m2] (equation 3), at squared wave numbers k2.
+
+    Incomplete gamma functions of nu + 1 at split (k^2 + r0^-2).
+    """
+    total = k2 + outer_scale**-2
+    power = 4 * np.pi * NU * outer_scale ** (-2 * NU) * total ** (-NU - 1)
+    return power * gammainc(NU + 1, split * total), power * gammaincc(NU + 1, split * total)
 
 
 @lru_cache(maxsize=4)

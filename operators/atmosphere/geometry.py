@@ -12,20 +12,37 @@ Frozen flow carries the field along with the wind w. For scan k, which begins at
     alpha_(k+1) = alpha_k + (M_k + M_(k+1)) / 2 (X_(k+1) - X_k),      B_(k+1) = B_k + M_k (t_(k+1) - t_k)        (3)
 
 so consecutive scans see the same air, continuously, although their mean lines of sight X_k differ.
+
+In a wide throw or field the transverse plane turns. Separations across the line of sight at azimuth phi and elevation e have
+the metric z^2 (de^2 + cos^2(e) dphi^2), which with rho = cot e = |X| is sin^2(e) drho^2 + rho^2 dphi^2: a surface of revolution.
+Its tangent cone along the mean elevation e_0 unrolls onto a plane without stretching (`Cone`), in polar coordinates
+
+    q = cos e_0 + arsinh(rho) - arsinh(cot e_0),      angle phi / sin(e_0)                                       (4)
+
+exact along the elevation and, at e_0, along the azimuth however wide the throw; the azimuthal scale is off by
+(e - e_0)^2 / (2 sin^2 e_0) at other elevations. It replaces M_k (X - X_k) in equation (2), which it equals to first order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
+from zonda.core.focalplane import Focalplane
 
 Floats = NDArray[np.float64]
+
+FLAT = 0.02
+"""Largest relative error of squared separations up to which one transverse plane serves a whole scan."""
+
+LARGEST_TURN = 0.75 * np.pi
+"""rad: half of the angle that an unrolled cone may cover; farther apart, its two ends would be neighbours."""
 
 LARGEST_REACH = 0.05
 """rad: how far a path is extrapolated beyond the ends of a scan."""
@@ -90,8 +107,43 @@ def crossing(u: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
+class Cone:
+    """The unrolled cone of equation (4) about azimuth ``axis`` (unit vector, 2) and elevation ``elevation`` [rad]."""
+
+    axis: Floats
+    elevation: float
+
+    def polar(self, crossings: Floats) -> tuple[Floats, Floats]:
+        """(q, angle) of crossings X (2, ...)."""
+        x = np.einsum("a,a...->...", self.axis, crossings)
+        y = self.axis[0] * crossings[1] - self.axis[1] * crossings[0]
+        q = np.cos(self.elevation) + np.arcsinh(np.hypot(x, y)) - np.arcsinh(1 / np.tan(self.elevation))
+        return np.asarray(q, np.float64), np.asarray(np.arctan2(y, x) / np.sin(self.elevation), np.float64)
+
+    def unroll(self, crossings: Floats) -> Floats:
+        """Positions on the plane, per metre of height, zero at the centre: (2, ...)."""
+        q, angle = self.polar(crossings)
+        x, y = q * np.cos(angle) - np.cos(self.elevation), q * np.sin(angle)
+        return np.stack([self.axis[0] * x - self.axis[1] * y, self.axis[1] * x + self.axis[0] * y])
+
+    def mean_derivative(self, crossings: Floats) -> Floats:
+        """d unroll / dX, (2, 2), averaged over crossings (2, n): what the wind is multiplied by."""
+        h = 1e-6
+        steps = (h * axis[:, None] for axis in np.eye(2))
+        sides = [(self.unroll(crossings + step) - self.unroll(crossings - step)).mean(1) / (2 * h) for step in steps]
+        return np.stack(sides, axis=1)
+
+    def error(self, crossings: Floats) -> float:
+        """Largest relative error of squared transverse separations at crossings (2, ...); infinite where it overlaps."""
+        q, angle = self.polar(crossings)
+        if q.min() <= 0 or abs(angle).max() > LARGEST_TURN:
+            return np.inf
+        return float(abs((q / np.hypot(*crossings) / np.sin(self.elevation)) ** 2 - 1).max())
+
+
+@dataclass(frozen=True)
 class Track:
-    """The plane of one scan, equations (1) to (3).
+    """The plane of one scan, equations (1) to (4).
 
     Attributes
     ----------
@@ -105,10 +157,16 @@ class Track:
         M of the run's first scan: its image of the wind is the lattice axis, so that strips are narrow.
     elevation
         Of the mean line of sight, rad.
-    horizontal
-        True: the azimuth throw is so wide that the transverse plane turns, and the horizontal plane is used.
+    kind
+        ``transverse``: one plane; ``cone``: the throw or the field is wide, see equation (4); ``horizontal``: both fail (a scan
+        round the whole horizon), separations along the elevation are too large.
     bound
-        Largest relative error of squared transverse separations that either plane makes.
+        Largest relative error of squared transverse separations at one instant, over the whole field and scan; the structure
+        function, concave in the squared separation, is wrong by no more.
+    drift
+        What the wind is multiplied by, (2, 2): M, or the mean over the scan where the plane is a cone.
+    drift_bound
+        Largest relative error of the squared length of the drift of any wind.
     """
 
     matrix: Floats
@@ -117,55 +175,96 @@ class Track:
     advection: Floats
     frame: Floats
     elevation: float
-    horizontal: bool
+    kind: Literal["transverse", "cone", "horizontal"]
     bound: float
+    drift: Floats
+    drift_bound: float
+    cone: Cone | None = None
+
+    def unroll(self, crossings: Floats) -> Floats:
+        """M (X - X_k), or equation (4): positions per metre of height, (2, ...)."""
+        if self.cone:
+            return self.cone.unroll(crossings)
+        shift = self.matrix @ self.centre
+        moved = np.einsum("ab,b...->a...", self.matrix, crossings) - shift.reshape(2, *[1] * (crossings.ndim - 1))
+        return np.asarray(moved, np.float64)
 
     def positions(self, crossings: Floats, seconds: Floats, height: float, wind: Floats) -> tuple[Floats, Floats]:
         """(across, along) the wind, m, of crossings X (2, m, n) at ``seconds`` (n,) after the start. Equation (2)."""
-        moved = self.matrix @ wind
-        offset = height * (self.alpha - self.matrix @ self.centre) - self.advection @ wind
-        p = height * np.einsum("ab,bmn->amn", self.matrix, crossings)
-        p += offset[:, None, None] - moved[:, None, None] * seconds
+        return self.place(self.unroll(crossings), seconds, height, wind)
+
+    def place(self, unrolled: Floats, seconds: Floats, height: float, wind: Floats) -> tuple[Floats, Floats]:
+        """As `positions`, of crossings that `unroll` has been applied to (they are the same for every layer)."""
+        offset = height * self.alpha - self.advection @ wind
+        p = height * unrolled
+        p += offset[:, None, None] - (self.drift @ wind)[:, None, None] * seconds
         along = self.frame @ wind
         speed = float(np.hypot(*along))
         c, s = along / speed if speed > 0 else np.array([1.0, 0.0])
         return -s * p[0] + c * p[1], c * p[0] + s * p[1]
 
 
-def plane(observation: Observation) -> tuple[Floats, Floats, float, bool, float]:
-    """(M, centre, elevation, horizontal, bound) of one scan; see `Track`.
+def plane(observation: Observation) -> Track:
+    """The plane of one scan by itself (alpha and advection zero).
 
-    A separation seen along u has the metric 1 - u_h u_h^T, the plane of n has 1 - n_h n_h^T and the horizontal plane 1.
-    The bound is the spectral norm of the difference over the smallest eigenvalue u_up^2. The horizontal plane is taken
-    where the transverse plane's bound is more than half of its own, and more than 1 %.
+    A separation seen along u has the metric G = 1 - u_h u_h^T, the plane of n has 1 - n_h n_h^T and the horizontal plane 1. The
+    bound is the spectral norm of the difference over the smallest eigenvalue u_up^2, for every line of sight of the scan and
+    the rim of the field. One plane is used where it is good to `FLAT`, else the cone where it is better.
     """
-    every = max(1, observation.n_samples // 5000)
-    u = rays(axes(observation.boresight_azel[::every]), np.zeros(1), np.zeros(1))[:, 0]
-    n = u.mean(1)
+    every = max(1, observation.n_samples // 2000)
+    xi, eta = rim(observation.focalplane)
+    u = rays(axes(observation.boresight_azel[::every]), np.r_[0.0, xi], np.r_[0.0, eta])
+    boresight = u[:, 0]
+    n = boresight.mean(1)
     n = n / np.sqrt(n @ n)
-    outer = u[:2, None] * u[None, :2] - (n[:2, None] * n[None, :2])[..., None]
-    half_trace = (outer[0, 0] + outer[1, 1]) / 2
-    norm = abs(half_trace) + np.hypot((outer[0, 0] - outer[1, 1]) / 2, outer[0, 1])
-    transverse = float((norm / u[2] ** 2).max())
-    flat = float(((u[0] ** 2 + u[1] ** 2) / u[2] ** 2).max())
-    horizontal = transverse > max(0.5 * flat, 0.01)
     level = float(np.hypot(n[0], n[1]))
     a = n[:2] / level if level > 0 else np.zeros(2)
-    matrix = np.eye(2) if horizontal else np.eye(2) - (1 - n[2]) * np.outer(a, a)
-    return matrix, n[:2] / n[2], float(np.arcsin(n[2])), horizontal, flat if horizontal else transverse
+    matrix = np.eye(2) - (1 - n[2]) * np.outer(a, a)
+    nothing, no_advection = np.zeros(2), np.zeros((2, 2))
+    transverse, flat = _error(matrix @ matrix, u), _error(np.eye(2), u)
+    if transverse > FLAT and level > 0:
+        elevation = float(np.median(np.arcsin(boresight[2])))
+        cone = Cone(a, elevation)
+        bound = cone.error(crossing(u)) if elevation < np.pi / 2 - 1e-6 else np.inf
+        if bound < min(transverse, flat):
+            drift = cone.mean_derivative(crossing(boresight))
+            there = np.eye(2) - (1 - np.sin(elevation)) * np.outer(a, a)
+            return Track(
+                there, a / np.tan(elevation), nothing, no_advection, there, elevation, "cone", bound, drift,
+                _error(drift.T @ drift, boresight), cone,
+            )  # fmt: skip
+    elevation, centre = float(np.arcsin(n[2])), n[:2] / n[2]
+    if transverse > max(0.5 * flat, FLAT):
+        return Track(np.eye(2), centre, nothing, no_advection, np.eye(2), elevation, "horizontal", flat, np.eye(2), flat)
+    return Track(matrix, centre, nothing, no_advection, matrix, elevation, "transverse", transverse, matrix, transverse)
+
+
+def rim(focalplane: Focalplane, number: int = 12) -> tuple[Floats, Floats]:
+    """The outermost detectors in ``number`` directions: xi, eta."""
+    angle = 2 * np.pi * np.arange(number) / number
+    outer = np.unique(np.argmax(np.outer(np.cos(angle), focalplane.xi) + np.outer(np.sin(angle), focalplane.eta), axis=1))
+    return focalplane.xi[outer], focalplane.eta[outer]
+
+
+def _error(metric: Floats, u: Floats) -> float:
+    """Largest spectral norm of metric - G over u_up^2, for directions u (3, ...)."""
+    constant = (metric - np.eye(2)).reshape(2, 2, *[1] * (u.ndim - 1))
+    difference = constant + u[:2, None] * u[None, :2]
+    half_trace = (difference[0, 0] + difference[1, 1]) / 2
+    norm = abs(half_trace) + np.hypot((difference[0, 0] - difference[1, 1]) / 2, difference[0, 1])
+    return float((norm / u[2] ** 2).max())
 
 
 def tracks(observations: Sequence[Observation]) -> list[Track]:
     """One `Track` per observation, in order of time given; positions are counted from the first one's start."""
     out: list[Track] = []
     for k, observation in enumerate(observations):
-        matrix, centre, elevation, horizontal, bound = plane(observation)
+        here = plane(observation)
         if not out:
-            alpha, advection, frame = matrix @ centre, np.zeros((2, 2)), matrix
-        else:
-            before = out[-1]
-            alpha = before.alpha + (before.matrix + matrix) / 2 @ (centre - before.centre)
-            advection = before.advection + before.matrix * observation.start.seconds_since(observations[k - 1].start)
-            frame = before.frame
-        out.append(Track(matrix, centre, alpha, advection, frame, elevation, horizontal, bound))
+            out.append(replace(here, alpha=here.matrix @ here.centre))
+            continue
+        before = out[-1]
+        alpha = before.alpha + (before.matrix + here.matrix) / 2 @ (here.centre - before.centre)
+        advection = before.advection + before.drift * observation.start.seconds_since(observations[k - 1].start)
+        out.append(replace(here, alpha=alpha, advection=advection, frame=before.frame))
     return out

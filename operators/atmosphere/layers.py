@@ -26,23 +26,18 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.operator import Operator
-from zonda.core.smooth import SmoothField, coarse_times
+from zonda.core.smooth import DetectorField, SmoothField
 
 from . import weather
 from .band import BandAtmosphere
-from .geometry import Track, axes, axes_at, crossing, rays, tracks
-from .nodes import (
-    MARGIN,
-    LayerModel,
-    Nodes,
-    candidate_steps,
-    choose_nodes,
-    differential_rms,
-    some,
-    time_error,
-)
-from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
-from .turbulence import Turbulence, interpolate
+from .beams import GAUSSIAN_FWHM, Aperture, rayleigh_distance, widened
+from .geometry import Track, axes_at, rays, tracks
+from .nodes import LayerModel
+from .path_delay import delay_per_vapour
+from .plan import Plan, make_plan
+from .radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
+from .sampling import Drifting, evaluate_layers, times_with_margin
+from .turbulence import Turbulence
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -57,14 +52,17 @@ LOG_NORMAL_FROM = 0.15
 LOWEST_ELEVATION = math.radians(4.5)
 """Lowest line of sight that is accepted, see `Sky`."""
 
-SMALLEST_DIFFERENCE = 1e-5
-"""Share of the fluctuation that must differ between detectors for `tolerance` to be judged by it."""
+PLANES = {
+    "transverse": "transverse to the mean line of sight",
+    "cone": "the unrolled cone of the mean elevation (wide throw or field)",
+    "horizontal": "horizontal (the throw is too wide to unroll)",
+}
 
-CELLS_AT_ONCE = 1 << 20
-"""Lattice points made at a time: bounds the memory."""
+ROWS = 64
+"""Nodes whose radiative transfer is done at a time."""
 
-CELLS_IN_ALL = 4e9
-"""Lattice points of one layer and scan beyond which the run is refused."""
+EDGE_TAPER = 10.0
+"""dB: power at the rim of a tapered aperture below that at its centre, where none is given."""
 
 
 class Wind(Parameters):
@@ -92,10 +90,18 @@ class Layer:
 
 @dataclass(frozen=True)
 class Fluctuations:
-    """What `AtmosphereLayers.exec` evaluates: emission [K_RJ] and relative transmission about their means."""
+    """What `AtmosphereLayers.exec` evaluates, about the means: emission [K_RJ], relative transmission, and the `outputs`."""
 
-    emission: SmoothField
-    transmission: SmoothField
+    emission: SmoothField | DetectorField
+    transmission: SmoothField | DetectorField
+    outputs: dict[str, SmoothField | DetectorField]
+
+
+class _Provides:
+    """The streams of an `AtmosphereLayers`: those of every one, and its `outputs`."""
+
+    def __get__(self, operator: AtmosphereLayers | None, owner: type) -> frozenset[str]:
+        return frozenset({"atmosphere", "transmission", *(operator.outputs if operator else ())})
 
 
 class AtmosphereLayers(Operator):
@@ -103,10 +109,12 @@ class AtmosphereLayers(Operator):
 
     Sets ``observation.smooth["atmosphere"]`` (mean emission, K_RJ) and ``["transmission"]`` (band-mean e^-tau), and adds the
     fluctuation of the emission to the stream ``atmosphere`` and that of the transmission, relative, to ``transmission``.
+    With `outputs` it also makes streams of the fluctuation along each line of sight: ``pwv`` (m), ``opacity`` (of the band)
+    and ``path_delay`` (m of excess path, non-dispersive).
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"atmosphere", "transmission"})
+    provides: ClassVar[Any] = _Provides()
 
     pwv: Metres | None = Field(None, gt=0, le=weather.PWV_MAX)
     """Mean precipitable water vapour at zenith; where absent, the climatology's median for the date and hour."""
@@ -127,7 +135,13 @@ class AtmosphereLayers(Operator):
     wind: Literal["profile"] | Wind | list[Wind] = "profile"
     """The climatology's wind at each layer's height, or one wind for all layers, or a list of one for each."""
     fidelity: Literal["default", "fine"] = "default"
-    """Accuracy of the turbulence: its covariance is within 0.16 % or 0.03 % of the variance."""
+    """Accuracy of the turbulence: its covariance is within 0.08 % or 0.01 % of the variance (docs/atmosphere.md)."""
+    beam: Literal["gaussian", "top_hat", "tapered"] = "gaussian"
+    """Footprint in a layer: the paper's Gaussian of FWHM D, the uniform disc of diameter D, or one that falls towards its rim."""
+    edge_taper: float | None = Field(None, gt=0, le=60)
+    """With `beam: tapered`, dB by which the illumination's power falls from the centre to the rim; 10 where absent."""
+    outputs: list[Literal["pwv", "opacity", "path_delay"]] = Field(default_factory=list)
+    """Further streams to make: fluctuations of the line-of-sight water (m), of the band's opacity, of the wet path delay (m)."""
     lattice: float = Field(0.6, gt=0, le=0.6)
     """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used)."""
     tolerance: Fraction = quantity("1 %", ge=1e-4, le=1)
@@ -143,6 +157,8 @@ class AtmosphereLayers(Operator):
             raise ValueError("lowest must be below highest")
         if isinstance(self.wind, list) and len(self.wind) != self.layers:
             raise ValueError(f"wind lists {len(self.wind)} winds for {self.layers} layers")
+        if self.edge_taper is not None and self.beam != "tapered":
+            raise ValueError("edge_taper is for beam: tapered")
         return self
 
     def observe(self, data: Data) -> None:
@@ -157,43 +173,62 @@ class AtmosphereLayers(Operator):
         sky = Sky(band)
         pwv = self.pwv or profile.pwv
         layers = self._layers(profile)
-        models = [_model(layer, track, observation, self.outer_scale) for layer in layers]
+        models = [_model(self, layer, track, observation) for layer in layers]
         beams = [_turbulence(self, observation, n, m) for n, m in enumerate(models)]
         variance = sum(m.amplitude**2 * b.variance for m, b in zip(models, beams, strict=True))
         scale = self.pwv_rms / math.sqrt(variance) if self.pwv_rms_after_beam else self.pwv_rms
 
-        plan = _plan(self, observation, track, layers, models, variance, sky, pwv)
-        index = coarse_times(observation.n_samples, plan.step)
-        index = np.r_[index[0] + plan.step * np.arange(-MARGIN, 0), index, index[-1] + plan.step * np.arange(1, MARGIN + 1)]
-        seconds = float(observation.seconds[0]) + index / observation.sample_rate
-        u = rays(axes_at(observation.boresight_azel, index, plan.step), plan.nodes.xi, plan.nodes.eta)
-        inside = (index >= 0) & (index < observation.n_samples)
-        elevation = np.arcsin(u[2])
-        # The margin of the spline is an extrapolated path: it stays inside the limits of the radiative transfer.
-        elevation[:, ~inside] = np.clip(elevation[:, ~inside], min(ELEVATION_MIN, elevation[:, inside].min()), ELEVATION_MAX)
-        low = int(Sky.below(elevation)[:, inside].sum())
-        observation.tally.count(self.label, "node values below 5 deg of elevation, extrapolated", low)
+        winds = [layer.wind for layer in layers]
+        plan = make_plan(observation, track, models, winds, variance, self.tolerance, sky, pwv, self.pwv_rms)
+        self._means(observation, plan, sky, pwv)
+        parts = zip(beams, layers, plan.steps, strict=True)
+        drifting = [Drifting(beam, layer.height, layer.amplitude, layer.wind, step) for beam, layer, step in parts]
+        g = evaluate_layers(observation, track, plan.nodes, plan.step, drifting)
 
-        g = np.zeros(elevation.shape)
-        for layer, beam in zip(layers, beams, strict=True):
-            across, along = track.positions(crossing(u), seconds, layer.height, layer.wind)
-            sample(beam, across, along, layer.amplitude, g)
-        y = self._water(g, scale, variance)
-        y = self._clip(observation, y, pwv, band)
+        shares = np.array([layer.amplitude for layer in layers])
+        heights = np.array([layer.height for layer in layers])
+        vapour_height = float(shares @ heights / shares.sum())
+        per_vapour = delay_per_vapour(np.asarray(profile.at(heights).temperature), shares)
 
-        def field(values: Floats) -> SmoothField:
-            return SmoothField.from_values(plan.nodes.weights, values, plan.step, observation.n_samples)
+        def values(rows: slice) -> dict[str, Floats]:
+            elevation = self._elevation(observation, plan, rows)
+            y = self._clip(observation, self._water(g[rows].astype(np.float64), scale, variance), pwv, band)
+            found = {
+                "emission": sky.emission_difference(pwv, pwv * y, elevation),
+                "transmission": sky.transmission_ratio(pwv, pwv * y, elevation),
+            }
+            if "opacity" in self.outputs:
+                found["opacity"] = -np.log1p(found["transmission"])
+            if self.outputs:
+                column = pwv * y * airmass(elevation, vapour_height)
+                found |= {"pwv": column, "path_delay": per_vapour * column}
+            return found
 
-        observation.smooth["atmosphere"] = field(sky.emission(pwv, elevation))
-        observation.smooth["transmission"] = field(sky.transmission(pwv, elevation))
+        fields = _fields(plan, observation.n_samples, values, ["emission", "transmission", *dict.fromkeys(self.outputs)])
         self._state(observation, track, plan, models, beams, pwv, scale, variance)
-        return Fluctuations(
-            field(sky.emission_difference(pwv, pwv * y, elevation)), field(sky.transmission_ratio(pwv, pwv * y, elevation))
-        )
+        if "path_delay" in self.outputs:
+            observation.tally.state(self.label, "wet path delay", f"{per_vapour:.3f} times the water (non-dispersive)")
+        return Fluctuations(fields.pop("emission"), fields.pop("transmission"), fields)
+
+    def _means(self, observation: Observation, plan: Plan, sky: Sky, pwv: float) -> None:
+        """Mean emission and transmission, at nodes of their own."""
+        nodes, step = plan.mean_nodes, plan.mean_step
+        elevation = _elevations(observation, nodes.xi, nodes.eta, step)
+        for name, function in (("atmosphere", sky.emission), ("transmission", sky.transmission)):
+            values = function(pwv, elevation)
+            observation.smooth[name] = SmoothField.from_values(nodes.weights, values, step, observation.n_samples)
+
+    def _elevation(self, observation: Observation, plan: Plan, rows: slice) -> Floats:
+        """Of some nodes, (n, n_time); what lies below the radiative transfer's limit is counted."""
+        elevation = _elevations(observation, plan.nodes.xi[rows], plan.nodes.eta[rows], plan.step)
+        index = times_with_margin(observation.n_samples, plan.step)
+        low = Sky.below(elevation)[:, (index >= 0) & (index < observation.n_samples)]
+        observation.tally.count(self.label, "node values below 5 deg of elevation, extrapolated", int(low.sum()))
+        return elevation
 
     def exec(self, block: Block, state: Fluctuations) -> None:
-        """Add the fluctuations to the block's ``atmosphere`` and ``transmission``."""
-        for name, field in (("atmosphere", state.emission), ("transmission", state.transmission)):
+        """Add the fluctuations to the block's ``atmosphere`` and ``transmission``, and to the `outputs`."""
+        for name, field in (("atmosphere", state.emission), ("transmission", state.transmission), *state.outputs.items()):
             if name in block.detdata:
                 block.detdata[name] += field.evaluate(block.detectors, block.samples, np.empty(block.shape, block.dtype))
             else:
@@ -269,27 +304,23 @@ class AtmosphereLayers(Operator):
         say("PWV rms after the beam, per layer", ", ".join(parts))
         sizes = (f"{b.sigma:.3g} m / {b.spacing:g} m" for b in beams)
         say("beam sigma / lattice spacing, per layer", ", ".join(dict.fromkeys(sizes)))
+        if self.beam != "gaussian":
+            telescope, band = observation.instrument.telescope, observation.instrument.band
+            far = rayleigh_distance(telescope.diameter, SPEED_OF_LIGHT / band.centre)
+            beyond = sum(m.distance > far for m in models)
+            say("footprint", f"{self.beam}; {beyond} of {len(models)} layers lie beyond {far:.0f} m, where beams lose their rim")
         say("turbulence covariance", f"within {beams[0].fidelity.error:.1%} of the variance ({self.fidelity})")
         say("nodes", f"{plan.nodes}; expected rms error {plan.focal_plane_error:.1e} of the fluctuation")
-        say("step in time", f"{plan.step} samples; expected rms error {plan.time_error:.1e} of the fluctuation")
+        steps = f"{min(plan.steps)}" if len(set(plan.steps)) == 1 else f"{min(plan.steps)} to {max(plan.steps)}, by layer,"
+        say("step in time", f"{steps} samples; expected rms error {plan.time_error:.1e} of the fluctuation")
+        say("nodes and step of the mean emission", f"{plan.mean_nodes}; {plan.mean_step} samples")
         say("error allowed", f"{plan.tolerance:.1e} of the fluctuation each, for nodes and for the step")
         say(
             "differential signal", f"{plan.differential:.1e} of the fluctuation is left after subtraction of the focal-plane mean"
         )
-        kind = "horizontal (wide throw)" if track.horizontal else "transverse to the mean line of sight"
-        say("plane of the turbulence", f"{kind}; squared separations within {track.bound:.1%}")
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Nodes and step in time; the error allowed and those expected, relative to the rms of the fluctuation after the beam."""
-
-    nodes: Nodes
-    step: int
-    tolerance: float
-    focal_plane_error: float
-    time_error: float
-    differential: float
+        say("plane of the turbulence", f"{PLANES[track.kind]}; squared separations within {track.bound:.1%}")
+        if track.kind == "cone":
+            say("wind on the unrolled cone", f"squared drifts within {track.drift_bound:.1%}")
 
 
 def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
@@ -297,48 +328,41 @@ def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
 
     From the paper's near-field FWHM(z) = D sqrt(z^-2 + z_r^-2) rad, z_r = pi (D/2)^2 / lambda at the band centre.
     """
-    rayleigh = math.pi * (telescope.diameter / 2) ** 2 * band.centre / SPEED_OF_LIGHT
-    return telescope.diameter * math.hypot(1.0, distance / rayleigh) / math.sqrt(8 * math.log(2))
+    return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance) / GAUSSIAN_FWHM
 
 
-def sample(beam: Turbulence, across: Floats, along: Floats, amplitude: float, out: Floats) -> None:
-    """out += amplitude x the field at (across, along) [m], each (n_node, n_time), in boxes of at most `CELLS_AT_ONCE` points.
+def airmass(elevation: Floats, height: float) -> Floats:
+    """Of a spherical shell at ``height`` [m]: equation (1) of `radiative_transfer`."""
+    return np.asarray(1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64)
 
-    Raises `InputError` where that would take more than `CELLS_IN_ALL` points.
+
+def _elevations(observation: Observation, xi: Floats, eta: Floats, step: int) -> Floats:
+    """Elevations (len(xi), n_time) at the times that a `SmoothField` wants.
+
+    The margin of the spline is an extrapolated path: it stays inside the limits of the radiative transfer.
     """
-    x, y = across / beam.spacing, along / beam.spacing
-    todo, made = [(slice(0, x.shape[0]), slice(0, x.shape[1]))], 0.0
-    while todo:
-        nodes, times = todo.pop()
-        px, py = x[nodes, times], y[nodes, times]
-        i0, i1 = math.floor(px.min()) - 1, math.floor(px.max()) + 3
-        j0, j1 = math.floor(py.min()) - 1, math.floor(py.max()) + 3
-        cells = (i1 - i0) * (j1 - j0)
-        if cells > CELLS_AT_ONCE and px.size > 1:
-            todo.extend(_halves(nodes, times, px, py))
-            continue
-        made += cells
-        if made > CELLS_IN_ALL:
-            raise InputError(
-                f"a beam of {beam.sigma:.3g} m sweeps over more than {CELLS_IN_ALL:.0e} lattice points of one layer",
-                place="atmosphere",
-                cure="shorten the scans, narrow the field of view, or raise the lowest layer",
-            )
-        coefficients = beam.coefficients(i0, i1, j0, j1)
-        part = np.zeros(px.shape)
-        interpolate(coefficients, i0, j0, np.ascontiguousarray(px), np.ascontiguousarray(py), amplitude, part)
-        out[nodes, times] += part
+    index = times_with_margin(observation.n_samples, step)
+    elevation = np.arcsin(rays(axes_at(observation.boresight_azel, index, step), xi, eta)[2])
+    inside = (index >= 0) & (index < observation.n_samples)
+    elevation[:, ~inside] = np.clip(elevation[:, ~inside], min(ELEVATION_MIN, elevation[:, inside].min()), ELEVATION_MAX)
+    return np.asarray(elevation, np.float64)
 
 
-def _halves(nodes: slice, times: slice, x: Floats, y: Floats) -> list[tuple[slice, slice]]:
-    """Cut where it makes the boxes smaller: in time, or between nodes once they spread more than the path is long."""
-    spread = np.ptp(x, axis=0).max() + np.ptp(y, axis=0).max()
-    path = np.ptp(x, axis=1).max() + np.ptp(y, axis=1).max()
-    if x.shape[1] > 1 and (path >= spread or x.shape[0] == 1):
-        middle = (times.start + times.stop) // 2
-        return [(nodes, slice(middle, times.stop)), (nodes, slice(times.start, middle))]
-    middle = (nodes.start + nodes.stop) // 2
-    return [(slice(middle, nodes.stop), times), (slice(nodes.start, middle), times)]
+def _fields(
+    plan: Plan, n_samples: int, values: Callable[[slice], dict[str, Floats]], names: list[str]
+) -> dict[str, SmoothField | DetectorField]:
+    """The named fields, from ``values`` of some nodes at a time. In float32 where every detector is a node."""
+    n_node, dtype = len(plan.nodes.xi), np.float64 if plan.nodes.shape else np.float32
+    coefficients: dict[str, NDArray[Any]] = {}
+    for start in range(0, n_node, ROWS):
+        found = values(slice(start, start + ROWS))
+        for name in names:
+            part = DetectorField.from_values(found[name], plan.step, n_samples, dtype).coefficients
+            coefficients.setdefault(name, np.empty((n_node, part.shape[1]), dtype))[start : start + ROWS] = part
+    if plan.nodes.shape is None:
+        return {name: DetectorField(c, plan.step, n_samples) for name, c in coefficients.items()}
+    weights = np.ascontiguousarray(plan.nodes.weights)
+    return {name: SmoothField(weights, c, plan.step, n_samples) for name, c in coefficients.items()}
 
 
 def _thickness(heights: Floats) -> Floats:
@@ -368,6 +392,12 @@ class Sky:
         """transmission(pwv + dpwv) / transmission(pwv) - 1, without cancellation."""
         return np.expm1(self._continued(lambda e: self.band.log_transmission_difference(pwv, dpwv, e), elevation))
 
+    def slope(self, pwv: float, elevation: Floats) -> Floats:
+        """d emission / d elevation, K_RJ per rad."""
+        h = 1e-4
+        low = np.minimum(elevation, ELEVATION_MAX - h)
+        return np.asarray((self.emission(pwv, low + h) - self.emission(pwv, low)) / h, np.float64)
+
     @staticmethod
     def below(elevation: Floats) -> NDArray[np.bool_]:
         """Where values are continued."""
@@ -385,10 +415,14 @@ class Sky:
         return np.where(low, a * (t - 1) * (t - 2) / 2 - b * t * (t - 2) + c * t * (t - 1) / 2, a)
 
 
-def _model(layer: Layer, track: Track, observation: Observation, outer_scale: float) -> LayerModel:
+def _model(operator: AtmosphereLayers, layer: Layer, track: Track, observation: Observation) -> LayerModel:
     distance = layer.height / math.sin(track.elevation)
-    sigma = beam_sigma(observation.instrument.telescope, observation.instrument.band, distance)
-    return LayerModel(layer.amplitude, layer.height, distance, outer_scale, sigma)
+    telescope, band = observation.instrument.telescope, observation.instrument.band
+    if operator.beam == "gaussian":
+        return LayerModel(layer.amplitude, layer.height, distance, operator.outer_scale, beam_sigma(telescope, band, distance))
+    taper = 0.0 if operator.beam == "top_hat" else operator.edge_taper or EDGE_TAPER
+    aperture = Aperture(widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance), taper)
+    return LayerModel(layer.amplitude, layer.height, distance, operator.outer_scale, aperture.sigma, aperture)
 
 
 def _turbulence(operator: AtmosphereLayers, observation: Observation, number: int, model: LayerModel) -> Turbulence:
@@ -400,107 +434,7 @@ def _turbulence(operator: AtmosphereLayers, observation: Observation, number: in
         number,
         outer_scale=model.outer_scale,
         sigma=model.sigma,
+        aperture=model.aperture,
         lattice=operator.lattice,
         fidelity=operator.fidelity,
     )
-
-
-def _plan(
-    operator: AtmosphereLayers,
-    observation: Observation,
-    track: Track,
-    layers: list[Layer],
-    models: list[LayerModel],
-    variance: float,
-    sky: Sky,
-    pwv: float,
-) -> Plan:
-    """The coarsest nodes and step that keep each error below the tolerance: of the fluctuation, and of the mean emission."""
-    xi, eta = observation.focalplane.xi, observation.focalplane.eta
-    rms = math.sqrt(variance)
-    stretch = 1 / math.sin(track.elevation) if track.horizontal else 1.0
-    left = differential_rms(*some(xi, eta), models, stretch)
-    # Of the rms of the fluctuation. A single detector, or none apart, is judged as if a hundredth were left.
-    tolerance = operator.tolerance * (left / rms if left > SMALLEST_DIFFERENCE * rms else 0.01)
-
-    path = _Path(observation, xi, eta)
-    elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
-    slope = float(np.max(abs(_slope(sky, pwv, elevations))))
-    # What the mean emission may be wrong by, K_RJ: as much as the fluctuation (or 0.01 % of the water where there is none).
-    kelvin = float(sky.emission(pwv, elevations[1]))
-    allowed = max(tolerance * kelvin * max(operator.pwv_rms, 1e-4), 1e-9)
-
-    at_least = 1
-    while True:
-        nodes, error = choose_nodes(xi, eta, models, tolerance * rms, stretch, at_least)
-        if nodes.shape is None or _mean_error(nodes, xi, eta, sky, pwv, elevations) <= allowed:
-            break
-        at_least = max(nodes.shape) + 1
-
-    for step in candidate_steps(observation.n_samples):
-        if step == 1:
-            late = 0.0
-            break
-        delta_x, delta_el = path.errors(step)
-        if slope * delta_el > allowed:
-            continue
-        deltas = [float(np.sqrt((track.matrix @ delta_x * m.height) ** 2).max()) for m in models]
-        speeds = [path.speeds(track, layer) for layer in layers]
-        late = time_error(models, speeds, deltas, step / observation.sample_rate)
-        if late <= tolerance * rms:
-            break
-    return Plan(nodes, step, tolerance, error / rms, late / rms, left / rms)
-
-
-def _slope(sky: Sky, pwv: float, elevation: Floats) -> Floats:
-    """d emission / d elevation, K_RJ per rad."""
-    h = 1e-4
-    low = np.minimum(elevation, ELEVATION_MAX - h)
-    return np.asarray((sky.emission(pwv, low + h) - sky.emission(pwv, low)) / h, np.float64)
-
-
-def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, sky: Sky, pwv: float, elevations: Floats) -> float:
-    """Largest error of the mean emission interpolated over the focal plane, K_RJ, at some elevations of the boresight."""
-    worst = 0.0
-    for elevation in elevations:
-        c, s = math.cos(elevation), math.sin(elevation)
-
-        def at(x: Floats, e: Floats, c: float = c, s: float = s) -> Floats:
-            return sky.emission(pwv, np.arcsin((s + e * c) / np.sqrt(1 + x * x + e * e)))
-
-        worst = max(worst, float(abs(at(xi, eta) - nodes.weights @ at(nodes.xi, nodes.eta)).max()))
-    return worst
-
-
-class _Path:
-    """Lines of sight of three points of the focal plane over a scan, and how well a spline in time follows them."""
-
-    def __init__(self, observation: Observation, xi: Floats, eta: Floats) -> None:
-        self._observation = observation
-        centre = np.array([(xi.min() + xi.max()) / 2, (eta.min() + eta.max()) / 2])
-        points = np.array([centre, [xi.max(), eta.max()], [xi.min(), eta.max()]]).T
-        self._xi: Floats = points[0] if len(xi) > 1 else xi
-        self._eta: Floats = points[1] if len(xi) > 1 else eta
-        u = rays(axes(observation.boresight_azel), self._xi, self._eta)
-        self.crossing = crossing(u)
-        self.elevation = np.arcsin(u[2])
-
-    def speeds(self, track: Track, layer: Layer, number: int = 64) -> Floats:
-        """Speeds [m/s] in the layer at quantiles of the scan, shape (<= number,)."""
-        n = self.crossing.shape[2]
-        v = np.repeat((track.matrix @ layer.wind)[:, None], max(n - 1, 1), axis=1)
-        if n > 1:
-            v = v - layer.height * (track.matrix @ np.diff(self.crossing[:, 0])) * self._observation.sample_rate
-        return np.asarray(np.quantile(np.hypot(*v), (np.arange(number) + 0.5) / number), np.float64)
-
-    def errors(self, step: int) -> tuple[Floats, float]:
-        """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points."""
-        o, n = self._observation, self._observation.n_samples
-        index = coarse_times(n, step)
-        index = np.r_[index[0] + step * np.arange(-MARGIN, 0), index, index[-1] + step * np.arange(1, MARGIN + 1)]
-        u = rays(axes_at(o.boresight_azel, index, step), self._xi, self._eta)
-        truth = np.concatenate([self.crossing.reshape(-1, n), self.elevation])
-        values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
-        spline = SmoothField.from_values(np.eye(len(values)), values, step, n).evaluate(slice(0, len(values)), slice(0, n))
-        rms = np.sqrt(((spline - truth) ** 2).mean(1)).reshape(3, -1).max(1)
-        return rms[:2], float(rms[2])

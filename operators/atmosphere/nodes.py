@@ -16,6 +16,7 @@ with P_q the spectrum of exp(-q^2 n^2 / 4).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,7 +24,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .covariance import beam_structure, mixture
+from .beams import Aperture
+from .covariance import mixture
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +35,7 @@ LARGEST_STEP = 2048
 MARGIN = 12
 """Coarse values beyond both ends that `SmoothField.from_values` wants."""
 
-_GRIDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 32, 40, 48, 64)
+GRIDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 32, 40, 48, 64)
 _TRIED = 64
 
 
@@ -46,9 +48,19 @@ class LayerModel:
     distance: float
     outer_scale: float
     sigma: float
+    aperture: Aperture | None = None
+    """A footprint with a rim; ``sigma`` is then that of the Gaussian of equal second moment."""
 
     def components(self) -> tuple[Floats, Floats]:
-        """(e, w) of equation (1)."""
+        """(e, w) of equation (1); behind an aperture those of a spectrum that is nowhere smaller (`Aperture.bound`)."""
+        if self.aperture is None:
+            return self.gaussian()
+        square, share = self.aperture.bound()
+        parts = [mixture(self.outer_scale, math.sqrt(v), step=0.5, depth=1e-6) for v in square]
+        return np.concatenate([e for e, _ in parts]), np.concatenate([c * w for c, (_, w) in zip(share, parts, strict=True)])
+
+    def gaussian(self) -> tuple[Floats, Floats]:
+        """(e, w) behind the Gaussian of ``sigma``."""
         return mixture(self.outer_scale, self.sigma, step=0.5, depth=1e-6)
 
 
@@ -59,6 +71,7 @@ class Nodes:
     xi: Floats
     eta: Floats
     weights: Floats
+    """Empty where the detectors are the nodes."""
     shape: tuple[int, int] | None
     """(along xi, along eta), or None where the detectors are the nodes."""
 
@@ -101,7 +114,7 @@ def grid(xi: Floats, eta: Floats, n: int) -> Nodes:
 
 def detectors_as_nodes(xi: Floats, eta: Floats) -> Nodes:
     """Every detector its own node: no error in the focal plane."""
-    return Nodes(np.asarray(xi, np.float64), np.asarray(eta, np.float64), np.eye(len(xi)), None)
+    return Nodes(np.asarray(xi, np.float64), np.asarray(eta, np.float64), np.zeros((0, 0)), None)
 
 
 def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float = 1.0) -> float:
@@ -137,7 +150,7 @@ def differential_rms(xi: Floats, eta: Floats, layers: Sequence[LayerModel], stre
     r = np.hypot(np.subtract.outer(xi, xi), stretch * np.subtract.outer(eta, eta)).ravel()
     total = 0.0
     for layer in layers:
-        e, w = layer.components()
+        e, w = layer.gaussian()
         total += layer.amplitude**2 * float((-np.expm1(-np.multiply.outer((r * layer.distance) ** 2, 1 / (4 * e)))).mean(0) @ w)
     return float(np.sqrt(total))
 
@@ -159,7 +172,7 @@ def choose_nodes(
     Where a grid would need as many nodes as there are detectors, the detectors are the nodes. ``at_least`` nodes per axis.
     """
     some_xi, some_eta = some(xi, eta)
-    for n in _GRIDS:
+    for n in GRIDS:
         if n < at_least:
             continue
         if n * n >= len(xi):
@@ -210,13 +223,16 @@ def time_error(layers: Sequence[LayerModel], speeds: Sequence[Floats], deltas: S
     ``speeds``: per layer, speeds [m/s] that the rays have at times evenly spread over the scan (the mean of E_t is
     taken); ``deltas``: per layer, rms error of the interpolated ray path, m.
     """
-    total = 0.0
-    for layer, speed, delta in zip(layers, speeds, deltas, strict=True):
-        e, w = layer.components()
-        share = spline_error(np.multiply.outer(speed, dt / np.sqrt(e))).mean(0) @ w
-        share += 2 * beam_structure(delta, layer.outer_scale, layer.sigma)[0]
-        total += layer.amplitude**2 * float(share)
-    return float(np.sqrt(total))
+    parts = (layer_time_error(*one, dt) for one in zip(layers, speeds, deltas, strict=True))
+    return math.sqrt(sum(parts))
+
+
+def layer_time_error(layer: LayerModel, speeds: Floats, delta: float, dt: float) -> float:
+    """One layer's part of `time_error`, squared."""
+    e, w = layer.components()
+    share = spline_error(np.multiply.outer(speeds, dt / np.sqrt(e))).mean(0) @ w
+    share += 2 * (-np.expm1(-(delta**2) / (4 * e)) @ w)
+    return layer.amplitude**2 * float(share)
 
 
 def candidate_steps(n_samples: int) -> list[int]:

@@ -10,17 +10,19 @@ interpolation of L taps:
 Every sum runs over a fixed list of taps in a fixed order, so a lattice point has the same bits in whatever region it is
 asked for. The beam costs nothing and is exact; no matrix is inverted and nothing is periodic.
 
-Largest error of the implied covariance C, relative to the variance, and of the implied structure function S, relative to
-itself and from one cell up (computed exactly, not sampled), against r0 / sigma; `tests/.../test_turbulence.py`:
+Behind an aperture with a rim (`beams`) the finest level takes what two Gaussians leave of the footprint's spectrum.
 
-=========================  ======  ======  ======  ======  ======  ======  ======  ==========
-R, L, c                    0.001   1       30      100     200     400     1000    4000
-=========================  ======  ======  ======  ======  ======  ======  ======  ==========
-default, 8, 10, 0.8: C     1.2e-4  6e-4    6e-4    1.0e-3  1.2e-3  1.4e-3  refused refused
-default, 8, 10, 0.8: S     1.7e-4  7e-4    8e-4    9e-4    1.2e-3  3.2e-3  (1e-2)  (1e-1)
-fine, 12, 12, 0.7: C       1.3e-5  3e-5    9e-5    1.5e-4  1.9e-4  2.2e-4  2.5e-4  3.1e-4
-fine, 12, 12, 0.7: S       1.3e-5  3e-5    8e-5    1.0e-4  1.1e-4  1.2e-4  2.7e-4  3.1e-3
-=========================  ======  ======  ======  ======  ======  ======  ======  ==========
+Largest error of the implied covariance C, relative to the variance, and of the implied structure function S, relative to
+itself and from one cell up (computed exactly, not sampled; `benchmarks/atmosphere.py`), against r0 / sigma:
+
+=========================  ======  ======  ======  ======  ======  ======  ======
+R, L, c                    0.001   1       30      100     1e3     1e4     1e6
+=========================  ======  ======  ======  ======  ======  ======  ======
+default, 8, 10, 0.8: C     2.3e-4  7.1e-4  3.9e-4  3.8e-4  3.7e-4  3.4e-4  3.9e-4
+default, 8, 10, 0.8: S     2.2e-4  7.8e-4  3.9e-4  3.5e-4  3.2e-4  3.2e-4  3.5e-4
+fine, 12, 12, 0.7: C       2.3e-5  2.0e-5  4.6e-5  4.8e-5  4.7e-5  4.6e-5  4.7e-5
+fine, 12, 12, 0.7: S       2.2e-5  3.1e-5  5.1e-5  5.5e-5  6.0e-5  6.4e-5  4.7e-4
+=========================  ======  ======  ======  ======  ======  ======  ======
 """
 
 from __future__ import annotations
@@ -36,10 +38,14 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.random import lattice_normals, stream_key
 
-from .covariance import NU, beam_correlation, mixture_between
+from .beams import Aperture
+from .covariance import NU, beam_correlation, mixture_between, spectrum_between
 
 Floats = NDArray[np.float64]
 Field = NDArray[np.float32]
+
+SMALLEST_RATIO, LARGEST_RATIO = 1e-3, 1e6
+"""Outer scale / sigma of the beam: the range over which the error was measured."""
 
 LARGEST_SCALE = 20.0
 """The mixture is cut at s = 20 r0^2: 2e-9 of the variance lies beyond."""
@@ -52,23 +58,21 @@ _GRID = 96
 
 @dataclass(frozen=True)
 class Fidelity:
-    """Kernel radius R [cells], interpolation taps L, resolution c of the pyramid, and the range where its error was measured."""
+    """Kernel radius R [cells], interpolation taps L and resolution c of the pyramid, and its measured error."""
 
     name: str
     radius: int
     taps: int
     resolution: float
     error: float
-    """Largest error of the implied covariance, relative to the variance, inside the range below."""
+    """Largest error of the implied covariance, relative to the variance."""
     structure_error: float
-    """Largest relative error of the implied structure function, from one cell up, inside the range below."""
-    scale_ratio: float
-    """Largest outer scale / sigma for which both hold."""
+    """Largest relative error of the implied structure function, from one cell up."""
 
 
 FIDELITIES = {
-    "default": Fidelity("default", 8, 10, 0.8, 1.6e-3, 4e-3, 400.0),
-    "fine": Fidelity("fine", 12, 12, 0.7, 3.5e-4, 4e-3, 4000.0),
+    "default": Fidelity("default", 8, 10, 0.8, 8e-4, 1e-3),
+    "fine": Fidelity("fine", 12, 12, 0.7, 1e-4, 6e-4),
 }
 
 
@@ -93,9 +97,11 @@ class Turbulence:
         What the random stream belongs to (`core.random.stream_key`). Lattices are powers of two metres whatever the beam,
         so two beams that look through the same stream see the same air.
     outer_scale, sigma
-        r0 and the beam's standard deviation, m.
+        r0 and the Gaussian beam's standard deviation, m.
+    aperture
+        A footprint with a rim instead of the Gaussian (`beams`).
     lattice
-        Largest spacing, in units of sigma.
+        Largest spacing, in units of sigma (of the Gaussian of equal second moment, less a sixth, behind an aperture).
     fidelity
         ``default`` or ``fine``, see the table above.
 
@@ -106,23 +112,33 @@ class Turbulence:
     """
 
     def __init__(
-        self, seed: int, *names: str | int, outer_scale: float, sigma: float, lattice: float = 0.6, fidelity: str = "default"
+        self,
+        seed: int,
+        *names: str | int,
+        outer_scale: float,
+        sigma: float = 0.0,
+        aperture: Aperture | None = None,
+        lattice: float = 0.6,
+        fidelity: str = "default",
     ) -> None:
-        self.outer_scale, self.sigma, self.fidelity = outer_scale, sigma, FIDELITIES[fidelity]
+        sigma = aperture.sigma if aperture else sigma
+        self.outer_scale, self.sigma, self.aperture, self.fidelity = outer_scale, sigma, aperture, FIDELITIES[fidelity]
         if not (np.isfinite([outer_scale, sigma]).all() and outer_scale > 0 and sigma > 0):
             raise InputError(
                 f"outer scale {outer_scale:g} m and beam {sigma:g} m must be finite and positive", place="turbulence"
             )
         ratio = outer_scale / sigma
-        if ratio > self.fidelity.scale_ratio or ratio < 1e-3:
-            finest = FIDELITIES["fine"].scale_ratio
+        if not SMALLEST_RATIO <= ratio <= LARGEST_RATIO:
             raise InputError(
                 f"outer scale {outer_scale:g} m is {ratio:.3g} times the beam's sigma of {sigma:.3g} m; the error of the "
-                f"{fidelity!r} pyramid is known from 1e-3 to {self.fidelity.scale_ratio:g}",
+                f"turbulence is known from {SMALLEST_RATIO:g} to {LARGEST_RATIO:g}",
                 place="turbulence",
-                cure="use fidelity: fine" if self.fidelity.scale_ratio < ratio <= finest else "choose another outer_scale",
+                cure=f"choose an outer_scale from {SMALLEST_RATIO * sigma:.2g} m to {LARGEST_RATIO * sigma:.2g} m",
             )
-        self.levels = _levels(outer_scale, sigma, lattice, fidelity)
+        if aperture:
+            self.levels = _aperture_levels(outer_scale, aperture, lattice, fidelity)
+        else:
+            self.levels = _levels(outer_scale, sigma, lattice, fidelity)
         self.spacing = self.levels[0].spacing
         self._keys = [stream_key(seed, *names, "level", level.exponent) for level in self.levels]
         self._weights = _kriging(self.fidelity.taps, self.fidelity.resolution)
@@ -130,11 +146,13 @@ class Turbulence:
     @property
     def variance(self) -> float:
         """Variance after the beam (1 before it)."""
+        if self.aperture:
+            return self.aperture.variance(self.outer_scale)
         return float(beam_correlation(0.0, self.outer_scale, self.sigma)[0])
 
     def region(self, i0: int, i1: int, j0: int, j1: int) -> Field:
         """The field at lattice points i0 <= i < i1, j0 <= j < j1 (any integers). Shape (i1 - i0, j1 - j0), float32."""
-        radius, pad = self.fidelity.radius, self.fidelity.taps // 2
+        pad = self.fidelity.taps // 2
         boxes = [(i0, i1, j0, j1)]
         for _ in self.levels[1:]:
             a, b, c, d = boxes[-1]
@@ -147,6 +165,7 @@ class Turbulence:
                 _upsample(field, boxes[k + 1][0], boxes[k + 1][2], self._weights, here, a, c)
             kernel = self.levels[k].kernel
             if kernel is not None:
+                radius = len(kernel) - 1
                 noise = lattice_normals(self._keys[k], a - radius, b + radius, c - radius, d + radius)
                 _convolve(noise, kernel, here)
             field = here
@@ -167,7 +186,7 @@ class Turbulence:
         for k, level in enumerate(self.levels):
             if level.kernel is None:
                 continue
-            r = self.fidelity.radius
+            r = len(level.kernel) - 1
             h = np.zeros((4 * r + 2, 4 * r + 2))
             index = np.arange(-r, r + 1)
             h[np.ix_(index, index)] = level.kernel[np.ix_(abs(index), abs(index))]
@@ -222,25 +241,75 @@ def _levels(outer_scale: float, sigma: float, lattice: float, fidelity: str) -> 
     return tuple(levels)
 
 
+@lru_cache(maxsize=64)
+def _aperture_levels(outer_scale: float, aperture: Aperture, lattice: float, fidelity: str) -> tuple[Level, ...]:
+    """As `_levels`; the mixture beyond s_0 = sigma^2 is seen through `Aperture.gaussians`, all else by the finest level."""
+    f = FIDELITIES[fidelity]
+    exponent = math.floor(math.log2(aperture.sigma * lattice / 1.2))
+    low, top = aperture.sigma**2, LARGEST_SCALE * outer_scale**2
+    levels = [Level(exponent, _aperture_kernel(outer_scale, aperture, low, math.ldexp(1.0, exponent), f))]
+    while low < top:
+        exponent += 1
+        spacing, kernel = math.ldexp(1.0, exponent), None
+        high = min((2 * spacing / f.resolution) ** 2 - aperture.sigma**2, top)
+        if high > low:
+            s, w = mixture_between(outer_scale, 0.0, low, high)
+            e = np.concatenate([s + square for _, square in aperture.gaussians])
+            kernel = _separable_kernel(e, np.concatenate([c * w for c, _ in aperture.gaussians]), spacing, f.radius)
+            low = high
+        levels.append(Level(exponent, kernel))
+    return tuple(levels)
+
+
+def _aperture_kernel(outer_scale: float, aperture: Aperture, split: float, spacing: float, f: Fidelity) -> Field:
+    """The finest level behind an aperture: B^2 P for s < split, and what equation (3) of `beams` leaves for s > split."""
+    radius = math.ceil((aperture.diameter / 2 + 0.4 * f.radius * math.sqrt(split)) / spacing)
+    grid = 4 * (radius + 8)
+    k = 2 * np.pi * np.fft.fftfreq(grid, spacing)[: grid // 2 + 1]
+    alias = 2 * np.pi / spacing * np.arange(-2, 3)
+    square = np.add.outer(alias, k) ** 2
+    k2 = square[:, :, None, None] + square
+    beam = aperture.transform(np.sqrt(k2))
+    left = beam**2 - sum(c * np.exp(-s * k2) for c, s in aperture.gaussians)
+    below, above = spectrum_between(k2, outer_scale, split)
+    power = np.maximum(beam**2 * below + left * above, 0.0).sum((0, 2)) / spacing**2
+    quarter = np.sqrt(power) * np.sign(beam[2, :, 2])
+    index = np.minimum(np.arange(grid), grid - np.arange(grid))
+    h = np.fft.irfft2(quarter[index], (grid, grid))[: radius + 1, : radius + 1]
+    return _cut(h, float(power[np.ix_(index, index)].mean()))
+
+
 def _kernel(outer_scale: float, sigma: float, low: float, high: float, spacing: float, radius: int) -> Field:
     """Quadrant (R + 1, R + 1) of the kernel whose power is the aliased spectrum of low <= e < high, cut at R cells."""
-    e, w = mixture_between(outer_scale, sigma, low, high)
+    return _separable_kernel(*mixture_between(outer_scale, sigma, low, high), spacing, radius)
+
+
+def _separable_kernel(e: Floats, w: Floats, spacing: float, radius: int) -> Field:
+    """The kernel whose power is the aliased spectrum sum w exp(-e k^2)."""
     k = 2 * np.pi * np.fft.fftfreq(_GRID, spacing)
     alias = 2 * np.pi / spacing * np.arange(-2, 3)
     gauss = np.exp(-np.multiply.outer(e, np.add.outer(alias, k) ** 2)).sum(1)
     power = np.einsum("ka,kb->ab", gauss * w[:, None], gauss) / spacing**2  # not BLAS: the same bits for any number of threads
     h = np.fft.irfft2(np.sqrt(power[:, : _GRID // 2 + 1]), (_GRID, _GRID))[: radius + 1, : radius + 1]
-    index = np.arange(radius + 1)
-    h = np.where(np.hypot(index[:, None], index) <= radius, h, 0.0)
+    return _cut(h, float((w / (4 * np.pi * e)).sum()))
+
+
+def _cut(h: Floats, variance: float) -> Field:
+    """Cut to a circle and scale to the variance."""
+    index = np.arange(len(h))
+    h = np.where(np.hypot(index[:, None], index) <= len(h) - 1, h, 0.0)
     times = np.where(index > 0, 2.0, 1.0)
     total = times @ (h * h) @ times
-    variance = (w / (4 * np.pi * e)).sum()
     return np.ascontiguousarray(h * math.sqrt(variance / total), np.float32)
 
 
 @lru_cache(maxsize=8)
 def _kriging(taps: int, resolution: float) -> Field:
-    """Weights that predict the middle of two lattice points from ``taps`` neighbours: best for the sum of coarser levels."""
+    """Weights that predict the middle of two lattice points from ``taps`` neighbours: best for the sum of coarser levels.
+
+    Ordinary kriging: the weights sum to 1. A field that hardly varies between lattice points (an outer scale of many cells)
+    passes through twenty levels unharmed; weights off by 1e-4 would swamp the structure function at one cell.
+    """
     x: Floats = np.arange(taps, dtype=np.float64) - (taps - 1) / 2
     octaves = np.arange(4)
 
@@ -249,8 +318,10 @@ def _kriging(taps: int, resolution: float) -> Field:
         return np.asarray((np.exp(-((np.multiply.outer(r, scale) * resolution / 2) ** 2)) * weight).sum(-1), np.float64)
 
     between = model(np.asarray(x[:, None] - x, np.float64))
-    between = between + 1e-12 * between[0, 0] * np.eye(taps)
-    return np.asarray(np.linalg.solve(between, model(x)), np.float32)
+    system = np.ones((taps + 1, taps + 1))
+    system[:taps, :taps] = between + 1e-12 * between[0, 0] * np.eye(taps)
+    system[taps, taps] = 0
+    return np.asarray(np.linalg.solve(system, np.append(model(x), 1.0))[:taps], np.float32)
 
 
 @lru_cache(maxsize=1)

@@ -16,11 +16,12 @@ from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-from zonda.operators.atmosphere import layers
+from zonda.operators.atmosphere import sampling
 from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
 from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
-from zonda.operators.atmosphere.layers import AtmosphereLayers, Fluctuations, Wind, _model, _turbulence, beam_sigma, sample
+from zonda.operators.atmosphere.layers import AtmosphereLayers, Fluctuations, Wind, _model, _turbulence, beam_sigma
 from zonda.operators.atmosphere.nodes import differential_rms
+from zonda.operators.atmosphere.sampling import sample
 from zonda.operators.atmosphere.turbulence import Turbulence
 
 Floats = NDArray[np.float64]
@@ -99,7 +100,7 @@ def water(op: AtmosphereLayers, observation: Observation) -> Floats:
 def layers_of(op: AtmosphereLayers, observation: Observation) -> list[Any]:
     profile, _ = op._weather(observation)
     track = tracks([observation])[0]
-    return [_model(layer, track, observation, op.outer_scale) for layer in op._layers(profile)]
+    return [_model(op, layer, track, observation) for layer in op._layers(profile)]
 
 
 def expected_variance(op: AtmosphereLayers, observation: Observation) -> float:
@@ -206,7 +207,7 @@ def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: st
     u = rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)
     g = np.zeros(u.shape[1:])
     for number, layer in enumerate(op._layers(profile)):
-        beam = _turbulence(op, o, number, _model(layer, track, o, op.outer_scale))
+        beam = _turbulence(op, o, number, _model(op, layer, track, o))
         across, along = track.positions(crossing(u), o.seconds, layer.height, layer.wind)
         sample(beam, across, along, layer.amplitude, g)
     elevation = np.arcsin(u[2])
@@ -243,12 +244,12 @@ def test_chunks_do_not_change_bits_and_bound_the_memory(monkeypatch: pytest.Monk
     monkeypatch.setattr(Turbulence, "region", watched)
     expected = series()
     once = len(boxes)
-    monkeypatch.setattr(layers, "CELLS_AT_ONCE", 200)
+    monkeypatch.setattr(sampling, "CELLS_AT_ONCE", 200)
     np.testing.assert_array_equal(series(), expected)
     assert len(boxes) > 4 * once
     # 200 cells and the 10 on either side that the prefilter wants: at most (20 + n) (20 + m), n m <= 200.
     assert max(boxes[once:]) <= 600 + 20 * 200
-    monkeypatch.setattr(layers, "CELLS_IN_ALL", 300)
+    monkeypatch.setattr(sampling, "CELLS_IN_ALL", 300)
     with pytest.raises(ZondaError, match="lattice points of one layer"):
         series()
 
@@ -411,20 +412,68 @@ def test_below_the_horizon_is_an_error() -> None:
         operator().prepare(observe(1.0, elevation=-3.0))
 
 
-def test_wide_throws_take_the_horizontal_plane_and_say_so() -> None:
-    t = np.arange(4000) / 100
-    o = observe(40.0, elevation=50.0)
-    o.boresight_azel = quaternions(np.radians(180 + 50 * np.sin(2 * np.pi * t / 40)), np.full(4000, np.radians(50.0)))
+def swept(elevation: float, azimuths: Floats, camera: Instrument | None = None) -> Observation:
+    """A scan through given azimuths [deg] at constant elevation, 100 Hz."""
+    o = observe(len(azimuths) / 100, elevation=elevation, camera=camera)
+    o.boresight_azel = quaternions(np.radians(azimuths), np.full(len(azimuths), np.radians(elevation)))
+    return o
+
+
+def back_and_forth(throw: float) -> Floats:
+    """4000 azimuths of one period, ``throw`` deg from end to end."""
+    return 180 + throw / 2 * np.sin(2 * np.pi * np.arange(4000) / 4000)
+
+
+@pytest.mark.parametrize(
+    ("elevation", "throw", "field", "bound"),
+    [(50.0, 60.0, "1 arcmin", 1e-3), (30.0, 60.0, "2 deg", 3e-3), (50.0, 93.0, "2 deg", 2e-3), (50.0, 60.0, "35 deg", 0.18)],
+)
+def test_wide_throws_unroll_the_cone(elevation: float, throw: float, field: str, bound: float) -> None:
+    # Pairs of detectors, any azimuth of the scan: squared separation on the plane against that across the line of sight.
+    camera = instrument(detectors=61, field=field, diameter="6 m")
+    o = swept(elevation, back_and_forth(throw), camera)
     track = tracks([o])[0]
-    assert track.horizontal
-    assert track.bound == pytest.approx(1 / np.tan(np.radians(50.0)) ** 2, rel=1e-6)
-    operator(layers=2, tolerance="5 %").prepare(o)
+    assert track.kind == "cone"
+    assert track.bound < bound
+    u = rays(axes(o.boresight_azel[::200]), o.focalplane.xi, o.focalplane.eta)
+    near = 1e-4  # towards xi and eta of every detector: the metric itself
+    for step in ((near, 0.0), (0.0, near), (near, near)):
+        other = rays(axes(o.boresight_azel[::200]), o.focalplane.xi + step[0], o.focalplane.eta + step[1])
+        on_plane = ((track.unroll(crossing(other)) - track.unroll(crossing(u))) ** 2).sum(0)
+        across = np.cross(u, other, axis=0)
+        sky = (across**2).sum(0) / (u[2] * other[2])  # (theta z)^2 per squared metre of height, z that of the pair
+        assert abs(on_plane / sky - 1).max() < track.bound + 3 * near / np.sin(np.radians(elevation - 20))
+    operator(layers=2, tolerance="20 %").prepare(swept(elevation, back_and_forth(throw)[:400], camera))
+
+
+def test_a_narrow_scan_keeps_one_plane_and_the_horizon_falls_back() -> None:
+    narrow = tracks([observe(40.0, elevation=50.0, scan=4.0)])[0]
+    assert (narrow.kind, narrow.cone) == ("transverse", None)
+    assert narrow.bound < 0.01
+    np.testing.assert_array_equal(narrow.drift, narrow.matrix)
+    o = swept(50.0, np.linspace(0, 360, 2000))
+    track = tracks([o])[0]
+    assert track.kind == "horizontal"
+    assert track.bound == pytest.approx(1 / np.tan(np.radians(50.0)) ** 2, rel=0.01)
+    operator(layers=2, tolerance="20 %").prepare(o)
     said = {what: text for _, what, text in o.tally}
     assert "horizontal" in said["plane of the turbulence"]
-    assert "70.4%" in said["plane of the turbulence"]
-    narrow = tracks([observe(40.0, elevation=50.0, scan=4.0)])[0]
-    assert not narrow.horizontal
-    assert narrow.bound < 0.01
+
+
+def test_the_cone_is_the_plane_to_first_order_and_wind_drifts_within_its_bound() -> None:
+    o = swept(50.0, back_and_forth(60.0))
+    track = tracks([o])[0]
+    h = 1e-5
+    for e in np.eye(2):
+        moved = track.unroll((track.centre + h * e)[:, None]) - track.unroll(track.centre[:, None])
+        np.testing.assert_allclose(moved[:, 0] / h, track.matrix @ e, atol=1e-4)
+    # The drift of any wind, squared, against that across the line of sight at every azimuth.
+    u = rays(axes(o.boresight_azel[::100]), np.zeros(1), np.zeros(1))[:, 0]
+    for angle in np.radians(np.arange(0, 360, 15)):
+        wind = np.array([np.sin(angle), np.cos(angle)])
+        across = 1 - (wind @ u[:2]) ** 2
+        assert abs(((track.drift @ wind) ** 2).sum() / across - 1).max() < track.drift_bound
+    assert track.drift_bound < 0.5
 
 
 def test_transverse_plane_measures_separations_across_the_line_of_sight() -> None:
@@ -510,4 +559,4 @@ def test_bad_parameters(parameters: dict[str, Any], message: str) -> None:
 
 def test_an_outer_scale_beyond_the_measured_range_is_refused() -> None:
     with pytest.raises(ZondaError, match="outer scale"):
-        operator(outer_scale="100 km").prepare(observe(1.0))
+        operator(outer_scale="1e9 m").prepare(observe(1.0))

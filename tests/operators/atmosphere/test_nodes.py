@@ -104,10 +104,9 @@ def test_where_nodes_do_not_pay_the_detectors_are_the_nodes() -> None:
     nodes, error = choose_nodes(XI * 100, ETA * 100, LAYERS, 1e-5)
     assert nodes.shape is None
     assert error == 0.0
-    np.testing.assert_array_equal(nodes.weights, np.eye(300))
+    assert nodes.weights.size == 0
     one, error = choose_nodes(np.array([0.3]), np.array([0.2]), LAYERS, 1e-5)
     assert (one.xi, one.eta, error) == (0.3, 0.2, 0.0)
-    assert one.weights.tolist() == [[1.0]]
     assert str(one) == "the 1 detectors"
     assert str(grid(XI, ETA, 2)) == "2 x 2 Chebyshev"
 

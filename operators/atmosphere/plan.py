@@ -1,0 +1,180 @@
+"""Where one scan's atmosphere is evaluated: nodes and steps in time that keep every error below the tolerance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Observation
+from zonda.core.smooth import SmoothField
+
+from .geometry import Track, axes, axes_at, crossing, rays
+from .nodes import (
+    GRIDS,
+    LayerModel,
+    Nodes,
+    candidate_steps,
+    choose_nodes,
+    differential_rms,
+    grid,
+    layer_time_error,
+    some,
+    time_error,
+)
+from .sampling import times_with_margin
+
+if TYPE_CHECKING:
+    from .layers import Sky
+
+Floats = NDArray[np.float64]
+
+SMALLEST_DIFFERENCE = 1e-5
+"""Share of the fluctuation that must differ between detectors for the tolerance to be judged by it."""
+
+MEAN_SHARE = 0.1
+"""The mean emission's error, as a share of what the fluctuation's may be: it is so smooth that this costs nothing."""
+
+PAYS_FROM = 1 << 18
+"""Points (nodes x times) from which coarser steps for single layers are worth their interpolation."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Nodes and steps in time; the error allowed and those expected, relative to the rms of the fluctuation after the beam.
+
+    ``steps``: one for each layer, multiples of ``step``. ``mean_nodes``, ``mean_step``: for the mean emission.
+    """
+
+    nodes: Nodes
+    step: int
+    steps: tuple[int, ...]
+    tolerance: float
+    focal_plane_error: float
+    time_error: float
+    differential: float
+    mean_nodes: Nodes
+    mean_step: int
+
+
+def make_plan(
+    observation: Observation,
+    track: Track,
+    models: Sequence[LayerModel],
+    winds: Sequence[Floats],
+    variance: float,
+    tolerance: float,
+    sky: Sky,
+    pwv: float,
+    pwv_rms: float,
+) -> Plan:
+    """The coarsest nodes and steps that keep each error below ``tolerance`` of what the focal-plane mean, subtracted, leaves.
+
+    ``variance`` is that of the sum of the layers after the beam. The mean emission may be wrong by `MEAN_SHARE` of that.
+    """
+    xi, eta = observation.focalplane.xi, observation.focalplane.eta
+    rms = math.sqrt(variance)
+    stretch = 1 / math.sin(track.elevation) if track.kind == "horizontal" else 1.0
+    left = differential_rms(*some(xi, eta), models, stretch)
+    # Of the rms of the fluctuation. A single detector, or none apart, is judged as if a hundredth were left.
+    tolerance = tolerance * (left / rms if left > SMALLEST_DIFFERENCE * rms else 0.01)
+    nodes, error = choose_nodes(xi, eta, models, tolerance * rms, stretch)
+
+    path = _Path(observation, xi, eta)
+    elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
+    slope = float(np.max(abs(sky.slope(pwv, elevations))))
+    # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the water fluctuated where none does).
+    kelvin = float(sky.emission(pwv, elevations[1]))
+    allowed = max(MEAN_SHARE * tolerance * kelvin * max(pwv_rms, 1e-4), 1e-9)
+    mean_nodes = next(
+        (g for g in (grid(xi, eta, n) for n in GRIDS) if _mean_error(g, xi, eta, sky, pwv, elevations) <= allowed),
+        grid(xi, eta, 64),
+    )
+
+    speeds = [path.speeds(track, model.height, wind) for model, wind in zip(models, winds, strict=True)]
+    candidates = candidate_steps(observation.n_samples)
+    tried: dict[int, tuple[list[float], float]] = {}
+
+    def path_errors(step: int) -> tuple[list[float], float]:
+        """Of the position in each layer [m], and of the elevation [rad]."""
+        if step not in tried:
+            delta_x, delta_el = path.errors(step) if step > 1 else (np.zeros(2), 0.0)
+            stretched = track.matrix @ delta_x if track.cone is None else delta_x
+            tried[step] = [float(abs(stretched * m.height).max()) for m in models], delta_el
+        return tried[step]
+
+    mean_step = next(s for s in candidates if s == 1 or slope * path_errors(s)[1] <= allowed)
+    step, late = 1, 0.0
+    for candidate in candidates[:-1]:
+        late = time_error(models, speeds, path_errors(candidate)[0], candidate / observation.sample_rate)
+        if late <= tolerance * rms:
+            step = candidate
+            break
+        late = 0.0
+
+    steps = [step] * len(models)
+    if len(nodes.xi) * observation.n_samples / step > PAYS_FROM:
+
+        def layer_error(k: int, of: int) -> float:
+            deltas = path_errors(of)[0]
+            return layer_time_error(models[k], speeds[k], deltas[k], of / observation.sample_rate) if of > 1 else 0.0
+
+        spent = late**2
+        for k in range(len(models)):
+            while 2 * steps[k] <= candidates[0]:
+                more = layer_error(k, 2 * steps[k]) - layer_error(k, steps[k])
+                if spent + more > (tolerance * rms) ** 2:
+                    break
+                spent, steps[k] = spent + more, 2 * steps[k]
+        late = math.sqrt(spent)
+    return Plan(nodes, step, tuple(steps), tolerance, error / rms, late / rms, left / rms, mean_nodes, mean_step)
+
+
+def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, sky: Sky, pwv: float, elevations: Floats) -> float:
+    """Largest error of the mean emission interpolated over the focal plane, K_RJ, at some elevations of the boresight."""
+    worst = 0.0
+    for elevation in elevations:
+        c, s = math.cos(elevation), math.sin(elevation)
+
+        def at(x: Floats, e: Floats, c: float = c, s: float = s) -> Floats:
+            return sky.emission(pwv, np.arcsin((s + e * c) / np.sqrt(1 + x * x + e * e)))
+
+        worst = max(worst, float(abs(at(xi, eta) - nodes.weights @ at(nodes.xi, nodes.eta)).max()))
+    return worst
+
+
+class _Path:
+    """Lines of sight of three points of the focal plane over a scan, and how well a spline in time follows them."""
+
+    def __init__(self, observation: Observation, xi: Floats, eta: Floats) -> None:
+        self._observation = observation
+        centre = np.array([(xi.min() + xi.max()) / 2, (eta.min() + eta.max()) / 2])
+        points = np.array([centre, [xi.max(), eta.max()], [xi.min(), eta.max()]]).T
+        self._xi: Floats = points[0] if len(xi) > 1 else xi
+        self._eta: Floats = points[1] if len(xi) > 1 else eta
+        u = rays(axes(observation.boresight_azel), self._xi, self._eta)
+        self.crossing = crossing(u)
+        self.elevation = np.arcsin(u[2])
+
+    def speeds(self, track: Track, height: float, wind: Floats, number: int = 64) -> Floats:
+        """Speeds [m/s] in the layer at quantiles of the scan, shape (<= number,)."""
+        n = self.crossing.shape[2]
+        v = np.repeat((track.drift @ wind)[:, None], max(n - 1, 1), axis=1)
+        if n > 1:
+            v = v - height * np.diff(track.unroll(self.crossing[:, 0])) * self._observation.sample_rate
+        return np.asarray(np.quantile(np.hypot(*v), (np.arange(number) + 0.5) / number), np.float64)
+
+    def errors(self, step: int) -> tuple[Floats, float]:
+        """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points."""
+        o, n = self._observation, self._observation.n_samples
+        index = times_with_margin(n, step)
+        u = rays(axes_at(o.boresight_azel, index, step), self._xi, self._eta)
+        truth = np.concatenate([self.crossing.reshape(-1, n), self.elevation])
+        values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
+        spline = SmoothField.from_values(np.eye(len(values)), values, step, n).evaluate(slice(0, len(values)), slice(0, n))
+        rms = np.sqrt(((spline - truth) ** 2).mean(1)).reshape(3, -1).max(1)
+        return rms[:2], float(rms[2])
