@@ -154,8 +154,10 @@ def _evaluate_rows(coefficients, basis, start, out):  # type: ignore[no-untyped-
             low, high = max(m * step, start), min((m + 1) * step, stop)
             r = low - m * step
             c0, c1, c2, c3 = line[m], line[m + 1], line[m + 2], line[m + 3]
-            for t in range(high - low):
-                row[low - start + t] = c0 * b0[r + t] + c1 * b1[r + t] + c2 * b2[r + t] + c3 * b3[r + t]
+            into = row[low - start : high - start]
+            w0, w1, w2, w3 = b0[r : r + into.size], b1[r : r + into.size], b2[r : r + into.size], b3[r : r + into.size]
+            for t in range(into.size):
+                into[t] = c0 * w0[t] + c1 * w1[t] + c2 * w2[t] + c3 * w3[t]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)

@@ -17,9 +17,10 @@ with P_q the spectrum of exp(-q^2 n^2 / 4).
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,14 +103,13 @@ def lagrange(nodes: Floats, x: Floats) -> Floats:
 
 def grid(xi: Floats, eta: Floats, n: int) -> Nodes:
     """n x n Chebyshev nodes over the rectangle that holds the detectors (one node across a rectangle of no width)."""
-    sides = []
-    for offsets in (xi, eta):
-        low, high = float(offsets.min()), float(offsets.max())
-        nodes = chebyshev(low, high, n if high > low else 1)
-        sides.append((nodes, lagrange(nodes, offsets)))
-    (x, wx), (y, wy) = sides
-    weights = (wx[:, :, None] * wy[:, None, :]).reshape(len(xi), -1)
+    x, y = _sides(xi, eta, n)
+    weights = (lagrange(x, xi)[:, :, None] * lagrange(y, eta)[:, None, :]).reshape(len(xi), -1)
     return Nodes(np.repeat(x, len(y)), np.tile(y, len(x)), weights, (len(x), len(y)))
+
+
+def _sides(xi: Floats, eta: Floats, n: int) -> list[Floats]:
+    return [chebyshev(float(v.min()), float(v.max()), n if v.max() > v.min() else 1) for v in (xi, eta)]
 
 
 def detectors_as_nodes(xi: Floats, eta: Floats) -> Nodes:
@@ -126,7 +126,10 @@ def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[La
     if nodes.shape is None:
         return 0.0
     ny = nodes.shape[1]
-    x, y = nodes.xi[::ny], nodes.eta[:ny]
+    return _grid_error(nodes.xi[::ny], nodes.eta[:ny], xi, eta, layers, stretch)
+
+
+def _grid_error(x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float) -> float:
     wx, wy = lagrange(x, xi), lagrange(y, eta)
     total = 0.0
     for layer in layers:
@@ -172,16 +175,17 @@ def choose_nodes(
     Where a grid would need as many nodes as there are detectors, the detectors are the nodes. ``at_least`` nodes per axis.
     """
     some_xi, some_eta = some(xi, eta)
-    for n in GRIDS:
-        if n < at_least:
-            continue
-        if n * n >= len(xi):
-            break
-        nodes = grid(xi, eta, n)
-        error = focal_plane_error(nodes, some_xi, some_eta, layers, stretch)
-        if error <= tolerance:
-            return nodes, error
-    return detectors_as_nodes(xi, eta), 0.0
+
+    @cache
+    def error(n: int) -> float:
+        x, y = _sides(xi, eta, n)
+        return _grid_error(x, y, some_xi, some_eta, layers, stretch)
+
+    sizes = [n for n in GRIDS if n >= at_least and n * n < len(xi)]
+    if not sizes or error(sizes[-1]) > tolerance:
+        return detectors_as_nodes(xi, eta), 0.0
+    n = sizes[bisect_left(sizes, True, key=lambda size: error(size) <= tolerance)]
+    return grid(xi, eta, n), error(n)
 
 
 @lru_cache(maxsize=1)

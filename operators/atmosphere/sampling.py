@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +19,17 @@ from .turbulence import Turbulence, interpolate
 
 Floats = NDArray[np.float64]
 
-CELLS_AT_ONCE = 1 << 20
-"""Lattice points made at a time: bounds the memory."""
+CELLS_AT_ONCE = 1 << 22
+"""Lattice points worked on at a time: bounds the memory."""
 
-CELLS_IN_ALL = 4e9
-"""Lattice points of one layer and scan beyond which the run is refused."""
+TILE = 256
+"""Cells: side of a tile of spline coefficients that is kept for lines of sight which come back to it."""
+
+TILES_KEPT = 2000
+"""Tiles, of 256 kB each."""
+
+CELLS_IN_ALL = 2e10
+"""Lattice points of one scan beyond which the run is refused."""
 
 POINTS_AT_ONCE = 1 << 20
 """Lines of sight worked on at a time."""
@@ -51,15 +58,16 @@ def evaluate_layers(observation: Observation, track: Track, nodes: Nodes, step: 
     first = int(times_with_margin(observation.n_samples, step)[0])
     dtype = np.float64 if n_node * n_time <= DOUBLE_UP_TO else np.float32
     out = np.zeros((n_node, n_time), dtype)
+    tiles = Tiles()
     for own in sorted({d.step for d in drifting}):
         ratio = own // step
         group = [d for d in drifting if d.step == own]
         if ratio == 1:
-            _add(observation, track, nodes, first + step * np.arange(n_time), step, group, out)
+            _add(observation, track, nodes, first + step * np.arange(n_time), step, group, out, tiles)
             continue
         coarse = first + own * (np.arange(-(-n_time // ratio) + 3 + 2 * MARGIN) - PAD - MARGIN)
         values = np.zeros((n_node, len(coarse)), dtype)
-        _add(observation, track, nodes, coarse, own, group, values)
+        _add(observation, track, nodes, coarse, own, group, values, tiles)
         for start in range(0, n_node, 64):
             rows = slice(start, start + 64)
             part = DetectorField.from_values(values[rows], ratio, n_time)
@@ -73,7 +81,14 @@ def times_with_margin(n_samples: int, step: int) -> NDArray[np.int64]:
 
 
 def _add(
-    observation: Observation, track: Track, nodes: Nodes, index: NDArray[np.int64], step: int, group: list[Drifting], out: Floats
+    observation: Observation,
+    track: Track,
+    nodes: Nodes,
+    index: NDArray[np.int64],
+    step: int,
+    group: list[Drifting],
+    out: Floats,
+    tiles: Tiles,
 ) -> None:
     chunk = max(1, POINTS_AT_ONCE // len(nodes.xi))
     for start in range(0, len(index), chunk):
@@ -82,36 +97,68 @@ def _add(
         plane = track.unroll(crossing(rays(axes_at(observation.boresight_azel, index[now], step), nodes.xi, nodes.eta)))
         for layer in group:
             across, along = track.place(plane, seconds, layer.height, layer.wind)
-            sample(layer.field, across, along, layer.amplitude, out[:, now])
+            sample(layer.field, across, along, layer.amplitude, out[:, now], tiles)
 
 
-def sample(beam: Turbulence, across: Floats, along: Floats, amplitude: float, out: Floats) -> None:
+class Tiles:
+    """Spline coefficients of wide boxes, assembled from tiles that are kept: a scan comes back to the same air."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[tuple[int, int, int], NDArray[np.float32]] = OrderedDict()
+        self.made = 0
+        """Lattice points made so far."""
+
+    def coefficients(self, field: Turbulence, i0: int, i1: int, j0: int, j1: int) -> NDArray[np.float32]:
+        """As `Turbulence.coefficients`."""
+        if min(i1 - i0, j1 - j0) < TILE:
+            self.made += (i1 - i0) * (j1 - j0)
+            return field.coefficients(i0, i1, j0, j1)
+        out = np.empty((i1 - i0, j1 - j0), np.float32)
+        for i in range(i0 // TILE, -(-i1 // TILE)):
+            for j in range(j0 // TILE, -(-j1 // TILE)):
+                a, b, c, d = max(i * TILE, i0), min(i * TILE + TILE, i1), max(j * TILE, j0), min(j * TILE + TILE, j1)
+                tile = self._tile(field, i, j)
+                out[a - i0 : b - i0, c - j0 : d - j0] = tile[a - i * TILE : b - i * TILE, c - j * TILE : d - j * TILE]
+        return out
+
+    def _tile(self, field: Turbulence, i: int, j: int) -> NDArray[np.float32]:
+        key = (id(field), i, j)
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        self.made += TILE * TILE
+        tile = field.coefficients(i * TILE, (i + 1) * TILE, j * TILE, (j + 1) * TILE)
+        self._kept[key] = tile
+        if len(self._kept) > TILES_KEPT:
+            self._kept.popitem(last=False)
+        return tile
+
+
+def sample(field: Turbulence, across: Floats, along: Floats, amplitude: float, out: Floats, tiles: Tiles | None = None) -> None:
     """out += amplitude x the field at (across, along) [m], each (n_node, n_time), in boxes of at most `CELLS_AT_ONCE` points.
 
-    Raises `InputError` where that would take more than `CELLS_IN_ALL` points.
+    Raises `InputError` where more than `CELLS_IN_ALL` points have been made.
     """
-    x, y = across / beam.spacing, along / beam.spacing
-    todo, made = [(slice(0, x.shape[0]), slice(0, x.shape[1]))], 0.0
+    tiles = tiles or Tiles()
+    x, y = across / field.spacing, along / field.spacing
+    todo = [(slice(0, x.shape[0]), slice(0, x.shape[1]))]
     while todo:
         nodes, times = todo.pop()
         px, py = x[nodes, times], y[nodes, times]
         i0, i1 = math.floor(px.min()) - 1, math.floor(px.max()) + 3
         j0, j1 = math.floor(py.min()) - 1, math.floor(py.max()) + 3
-        cells = (i1 - i0) * (j1 - j0)
-        if cells > CELLS_AT_ONCE and px.size > 1:
+        if (i1 - i0) * (j1 - j0) > CELLS_AT_ONCE and px.size > 1:
             todo.extend(_halves(nodes, times, px, py))
             continue
-        made += cells
-        if made > CELLS_IN_ALL:
+        coefficients = tiles.coefficients(field, i0, i1, j0, j1)
+        if tiles.made > CELLS_IN_ALL:
             raise InputError(
-                f"a beam of {beam.sigma:.3g} m sweeps over more than {CELLS_IN_ALL:.0e} lattice points of one layer",
+                f"the lines of sight sweep over more than {CELLS_IN_ALL:.0e} lattice points of the turbulence "
+                f"({field.spacing:g} m for a beam of {field.sigma:.3g} m)",
                 place="atmosphere",
                 cure="shorten the scans, narrow the field of view, or raise the lowest layer",
             )
-        coefficients = beam.coefficients(i0, i1, j0, j1)
-        part = np.zeros(px.shape)
-        interpolate(coefficients, i0, j0, np.ascontiguousarray(px), np.ascontiguousarray(py), amplitude, part)
-        out[nodes, times] += part
+        interpolate(coefficients, i0, j0, px, py, amplitude, out[nodes, times])
 
 
 def _halves(nodes: slice, times: slice, x: Floats, y: Floats) -> list[tuple[slice, slice]]:

@@ -429,20 +429,21 @@ def _prefilter(field, taps, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def interpolate(coefficients, i0, j0, x, y, amplitude, out):  # type: ignore[no-untyped-def]
-    """out += amplitude * field at the points (x, y) (lattice units, float64, any equal shapes), by cubic B-spline.
+    """out += amplitude * field at the points (x, y) (lattice units, float64, 2-D), by cubic B-spline. Same shapes.
 
-    ``coefficients`` begin at lattice point (i0, j0) and must cover floor(x) - 1 .. floor(x) + 2, and y alike. out: float64.
+    ``coefficients`` begin at lattice point (i0, j0) and must cover floor(x) - 1 .. floor(x) + 2, and y alike.
     """
-    for n in range(x.size):
-        px, py = x.flat[n], y.flat[n]
-        fx, fy = np.floor(px), np.floor(py)
-        u, v = px - fx, py - fy
-        i, j = np.int64(fx) - i0 - 1, np.int64(fy) - j0 - 1
-        um, vm = 1 - u, 1 - v
-        a = (um * um * um / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - um * um * (2 - um) / 2, u * u * u / 6)
-        b = (vm * vm * vm / 6, 2 / 3 - v * v * (2 - v) / 2, 2 / 3 - vm * vm * (2 - vm) / 2, v * v * v / 6)
-        total = 0.0
-        for k in range(4):
-            line = coefficients[i + k]
-            total += a[k] * (b[0] * line[j] + b[1] * line[j + 1] + b[2] * line[j + 2] + b[3] * line[j + 3])
-        out.flat[n] += amplitude * total
+    for n in range(x.shape[0]):
+        px, py, row = x[n], y[n], out[n]
+        for m in range(px.size):
+            fx, fy = np.floor(px[m]), np.floor(py[m])
+            u, v = px[m] - fx, py[m] - fy
+            i, j = np.int64(fx) - i0 - 1, np.int64(fy) - j0 - 1
+            um, vm = 1 - u, 1 - v
+            a = (um * um * um / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - um * um * (2 - um) / 2, u * u * u / 6)
+            b = (vm * vm * vm / 6, 2 / 3 - v * v * (2 - v) / 2, 2 / 3 - vm * vm * (2 - vm) / 2, v * v * v / 6)
+            total = 0.0
+            for k in range(4):
+                line = coefficients[i + k]
+                total += a[k] * (b[0] * line[j] + b[1] * line[j + 1] + b[2] * line[j + 2] + b[3] * line[j + 3])
+            row[m] += amplitude * total

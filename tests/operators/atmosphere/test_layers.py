@@ -250,7 +250,7 @@ def test_chunks_do_not_change_bits_and_bound_the_memory(monkeypatch: pytest.Monk
     # 200 cells and the 10 on either side that the prefilter wants: at most (20 + n) (20 + m), n m <= 200.
     assert max(boxes[once:]) <= 600 + 20 * 200
     monkeypatch.setattr(sampling, "CELLS_IN_ALL", 300)
-    with pytest.raises(ZondaError, match="lattice points of one layer"):
+    with pytest.raises(ZondaError, match="lattice points of the turbulence"):
         series()
 
 

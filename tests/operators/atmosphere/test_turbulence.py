@@ -182,9 +182,9 @@ def test_interpolation_passes_through_the_field_and_is_the_cubic_spline() -> Non
     exact = spline_filter(field.astype(np.float64), 3, mode="mirror")[30:70, 30:70]
     assert abs(coefficients - exact).max() < 2e-6
     i, j = (v.ravel().astype(np.float64) for v in np.mgrid[-8:26, -8:26])
-    at = np.zeros(i.size)
-    interpolate(coefficients, -10, -10, i, j, 2.0, at)
-    np.testing.assert_allclose(at, 2 * field[32:66, 32:66].ravel(), atol=4e-6)
+    at = np.zeros((1, i.size))
+    interpolate(coefficients, -10, -10, i[None], j[None], 2.0, at)
+    np.testing.assert_allclose(at[0], 2 * field[32:66, 32:66].ravel(), atol=4e-6)
 
 
 @pytest.mark.parametrize(("outer_scale", "sigma"), [(0.021, 21.0), (21e6, 21.0), (1.0, 900.0)])
