@@ -68,9 +68,7 @@ def observation(case: str, seconds: float | None = None):
         az, el = 150 * DEG + reach * np.sin(t * speed * DEG / np.cos(elevation) / reach), np.full(len(t), elevation)
     a, b = az / 2, (np.pi / 2 - el) / 2
     q = np.stack([np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
-    site = Site(
-        name="here", latitude="-23.0193 deg", longitude="-67.7532 deg", altitude="5050 m", climatology="chajnantor"
-    )
+    site = Site(name="here", latitude="-23.0193 deg", longitude="-67.7532 deg", altitude="5050 m", climatology="chajnantor")
     start = Instant.parse("2022-08-01T23:00:00Z")
     return Observation(case, 0, site, camera, plane, start, t, float(rate), q, q, (0.0, 0.0), 1)
 
@@ -116,6 +114,53 @@ def cost(case: str) -> None:
         print(f"    {what}: {said[what]}")
 
 
+def implied_error(layer, ratio: float) -> tuple[float, float]:
+    """Largest errors of C (of the variance) and S (of itself), along, across and oblique, from one cell to 3 r0."""
+    top = max(400, int(3 * ratio * layer.sigma / layer.spacing))
+    lags = np.unique(np.r_[1, 2, 3, 5, 8, np.geomspace(12, top, 8).astype(int)])
+    worst_c = worst_s = 0.0
+    for phase in ((0, 0), (1, 1), (22, 41)):
+        for direction in ((0, 1), (1, 1), (1, 3)):
+            a = np.array([phase] * len(lags))
+            b = a + lags[:, None] * np.array(direction)
+            here, there, between = (layer.implied_covariance(p, q) for p, q in ((a[:1], a[:1]), (b, b), (a, b)))
+            s = structure_of(layer, lags * np.hypot(*direction) * layer.spacing)
+            worst_c = max(
+                worst_c, abs(between / layer.variance - 1 + s / layer.variance).max(), abs(there / layer.variance - 1).max()
+            )
+            worst_s = max(worst_s, abs(((here + there) / 2 - between) / s - 1).max())
+    return worst_c, worst_s
+
+
+def structure_of(layer, r):
+    from zonda.operators.atmosphere.covariance import beam_structure
+
+    if layer.aperture:
+        return layer.aperture.structure(r, layer.outer_scale)
+    return beam_structure(r, layer.outer_scale, layer.sigma)
+
+
+def covariance() -> None:
+    from zonda.operators.atmosphere.beams import Aperture
+    from zonda.operators.atmosphere.turbulence import FIDELITIES, Turbulence
+
+    ratios = (1e-3, 0.06, 1.0, 30.0, 100.0, 1e3, 1e4, 1e6)
+    print("Gaussian footprint; r0 / sigma:", *(f"{r:g}" for r in ratios), sep="\t")
+    for name in FIDELITIES:
+        rows = []
+        for ratio in ratios:
+            layers = [Turbulence(0, outer_scale=ratio * s, sigma=s, fidelity=name) for s in (14.0, 21.0, 26.6)]
+            rows.append(np.max([implied_error(layer, ratio) for layer in layers], axis=0))
+        for what, values in zip("CS", np.transpose(rows), strict=True):
+            print(f"{name} {what}", *(f"{v:.1e}" for v in values), sep="\t", flush=True)
+    print("Apertures, r0 = 500 m; D [m], taper [dB]: C, S")
+    for name in FIDELITIES:
+        for diameter, taper in ((0.42, 0.0), (6.0, 0.0), (50.0, 0.0), (100.0, 0.0), (6.0, 10.0), (100.0, 10.0)):
+            layer = Turbulence(0, outer_scale=500.0, aperture=Aperture(diameter, taper), fidelity=name)
+            c, s = implied_error(layer, 500.0 / layer.sigma)
+            print(f"{name}\t{diameter:g}\t{taper:g}\t{c:.1e}\t{s:.1e}", flush=True)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=["cost", "covariance"])
@@ -126,3 +171,5 @@ if __name__ == "__main__":
     elif arguments.what == "cost":
         for name in arguments.cases or CASES:
             subprocess.run([sys.executable, __file__, "cost", name], check=True)
+    else:
+        covariance()

@@ -126,13 +126,6 @@ class Cone:
         x, y = q * np.cos(angle) - np.cos(self.elevation), q * np.sin(angle)
         return np.stack([self.axis[0] * x - self.axis[1] * y, self.axis[1] * x + self.axis[0] * y])
 
-    def mean_derivative(self, crossings: Floats) -> Floats:
-        """d unroll / dX, (2, 2), averaged over crossings (2, n): what the wind is multiplied by."""
-        h = 1e-6
-        steps = (h * axis[:, None] for axis in np.eye(2))
-        sides = [(self.unroll(crossings + step) - self.unroll(crossings - step)).mean(1) / (2 * h) for step in steps]
-        return np.stack(sides, axis=1)
-
     def error(self, crossings: Floats) -> float:
         """Largest relative error of squared transverse separations at crossings (2, ...); infinite where it overlaps."""
         q, angle = self.polar(crossings)
@@ -164,7 +157,7 @@ class Track:
         Largest relative error of squared transverse separations at one instant, over the whole field and scan; the structure
         function, concave in the squared separation, is wrong by no more.
     drift
-        What the wind is multiplied by, (2, 2): M, or the mean over the scan where the plane is a cone.
+        What the wind is multiplied by, (2, 2): M, or the root of the metric's mean over the scan where the plane is a cone.
     drift_bound
         Largest relative error of the squared length of the drift of any wind.
     """
@@ -227,7 +220,7 @@ def plane(observation: Observation) -> Track:
         cone = Cone(a, elevation)
         bound = cone.error(crossing(u)) if elevation < np.pi / 2 - 1e-6 else np.inf
         if bound < min(transverse, flat):
-            drift = cone.mean_derivative(crossing(boresight))
+            drift = _root_of_mean_metric(boresight)
             there = np.eye(2) - (1 - np.sin(elevation)) * np.outer(a, a)
             return Track(
                 there, a / np.tan(elevation), nothing, no_advection, there, elevation, "cone", bound, drift,
@@ -237,6 +230,12 @@ def plane(observation: Observation) -> Track:
     if transverse > max(0.5 * flat, FLAT):
         return Track(np.eye(2), centre, nothing, no_advection, np.eye(2), elevation, "horizontal", flat, np.eye(2), flat)
     return Track(matrix, centre, nothing, no_advection, matrix, elevation, "transverse", transverse, matrix, transverse)
+
+
+def _root_of_mean_metric(u: Floats) -> Floats:
+    """The symmetric matrix whose square is the mean of 1 - u_h u_h^T over directions u (3, n)."""
+    values, vectors = np.linalg.eigh(np.eye(2) - (u[:2] @ u[:2].T) / u.shape[1])
+    return np.asarray(vectors @ np.diag(np.sqrt(values)) @ vectors.T, np.float64)
 
 
 def rim(focalplane: Focalplane, number: int = 12) -> tuple[Floats, Floats]:

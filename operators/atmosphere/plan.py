@@ -95,7 +95,9 @@ def make_plan(
         grid(xi, eta, 64),
     )
 
-    speeds = [path.speeds(track, model.height, wind) for model, wind in zip(models, winds, strict=True)]
+    velocity, quantiles = path.velocity(track), (np.arange(64) + 0.5) / 64
+    drifts = ((model.height * velocity - (track.drift @ wind)[:, None]) for model, wind in zip(models, winds, strict=True))
+    speeds = [np.asarray(np.quantile(np.hypot(*v), quantiles), np.float64) for v in drifts]
     candidates = candidate_steps(observation.n_samples)
     tried: dict[int, tuple[list[float], float]] = {}
 
@@ -160,13 +162,14 @@ class _Path:
         self.crossing = crossing(u)
         self.elevation = np.arcsin(u[2])
 
-    def speeds(self, track: Track, height: float, wind: Floats, number: int = 64) -> Floats:
-        """Speeds [m/s] in the layer at quantiles of the scan, shape (<= number,)."""
+    def velocity(self, track: Track, number: int = 4096) -> Floats:
+        """Velocity of the crossing point on the plane per metre of height, 1/s, over the scan: (2, <= number)."""
         n = self.crossing.shape[2]
-        v = np.repeat((track.drift @ wind)[:, None], max(n - 1, 1), axis=1)
-        if n > 1:
-            v = v - height * np.diff(track.unroll(self.crossing[:, 0])) * self._observation.sample_rate
-        return np.asarray(np.quantile(np.hypot(*v), (np.arange(number) + 0.5) / number), np.float64)
+        if n == 1:
+            return np.zeros((2, 1))
+        at = np.unique(np.linspace(0, n - 2, number).astype(np.int64))
+        ends = track.unroll(self.crossing[:, 0, np.stack([at, at + 1])])
+        return np.asarray((ends[:, 1] - ends[:, 0]) * self._observation.sample_rate, np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
         """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points."""

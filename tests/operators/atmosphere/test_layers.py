@@ -16,7 +16,8 @@ from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-from zonda.operators.atmosphere import sampling
+from zonda.core.smooth import DetectorField
+from zonda.operators.atmosphere import plan, sampling
 from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
 from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
 from zonda.operators.atmosphere.layers import AtmosphereLayers, Fluctuations, Wind, _model, _turbulence, beam_sigma
@@ -560,3 +561,146 @@ def test_bad_parameters(parameters: dict[str, Any], message: str) -> None:
 def test_an_outer_scale_beyond_the_measured_range_is_refused() -> None:
     with pytest.raises(ZondaError, match="outer scale"):
         operator(outer_scale="1e9 m").prepare(observe(1.0))
+
+
+# ------------------------------------------------------------------------------------------------------- products
+
+
+def test_outputs_are_the_fluctuations_along_each_line_of_sight() -> None:
+    o = observe(60.0, scan=4.0, camera=instrument(detectors=7))
+    op = operator(layers=3, outputs=["pwv", "opacity", "path_delay"])
+    state = op.prepare(o)
+    block = Block(o, slice(0, 7), slice(0, o.n_samples), dtype=np.float64)
+    op.exec(block, state)
+    assert set(block.detdata) == {"atmosphere", "transmission", "pwv", "opacity", "path_delay"} == op.provides
+    y = water(operator(layers=3), o)
+    elevation = np.arcsin(rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)[2])
+    pwv = block.detdata["pwv"]
+    # Airmass of a shell some 1.5 km up: 1 / sin(elevation) to 1e-3 at 57 deg. Emission is linear in y to some 1e-3.
+    np.testing.assert_allclose(pwv, PWV * y / np.sin(elevation), rtol=0.01, atol=0.005 * pwv.std())
+    np.testing.assert_allclose(np.exp(-block.detdata["opacity"]) - 1, block.detdata["transmission"], atol=1e-8)
+    assert np.corrcoef(block.detdata["opacity"].ravel(), pwv.ravel())[0, 1] > 0.999
+    ratio = block.detdata["path_delay"] / pwv
+    assert np.ptp(ratio) < 1e-6
+    # Bevis et al. (1994): 6.2 to 6.5 over the world's weather; here vapour at about 0 C (0.35 % per K).
+    assert 6.3 < ratio.mean() < 6.8
+    said = {what: text for _, what, text in o.tally}
+    assert said["wet path delay"].startswith(f"{ratio.mean():.3f} times")
+
+
+def test_outputs_are_made_only_where_asked_for() -> None:
+    assert operator().provides == AtmosphereLayers.provides == {"atmosphere", "transmission"}
+    o = observe(5.0)
+    assert operator().prepare(o).outputs == {}
+    with pytest.raises(ValidationError, match="outputs"):
+        operator(outputs=["ozone"])
+
+
+def test_outputs_can_be_kept_by_a_pipeline(bench: Any) -> None:
+    o = observe(20.0, camera=instrument(detectors=3))
+    op = operator(layers=2, outputs=["pwv", "path_delay"])
+    run = bench.run([op], o, keep=("pwv", "path_delay", "atmosphere"))
+    kept = run.observations[0].detdata
+    assert kept["pwv"].shape == kept["path_delay"].shape == (3, o.n_samples)
+    assert 1e-6 < kept["pwv"].std() < 1e-3  # m: 0.5 % of 7.7 mm
+
+
+def test_delay_per_vapour_is_that_of_bevis() -> None:
+    from zonda.operators.atmosphere.path_delay import delay_per_vapour
+
+    # Bevis et al. (1994): T_m = 270 K, 0.15 being a rule of thumb for its inverse.
+    assert 1 / delay_per_vapour(np.array([270.0]), np.ones(1)) == pytest.approx(0.154, abs=1e-3)
+    mixed = delay_per_vapour(np.array([290.0, 250.0]), np.array([3.0, 1.0]))
+    assert delay_per_vapour(np.array([290.0]), np.ones(1)) < mixed < delay_per_vapour(np.array([250.0]), np.ones(1))
+
+
+# ----------------------------------------------------------------------------------- without focal-plane compression
+
+
+def test_wide_field_per_detector_evaluation_agrees_with_direct_evaluation() -> None:
+    # A 6 m telescope with 10 deg: no grid of nodes pays. Every detector and sample directly, in the same air.
+    camera = instrument(detectors=61, field="10 deg", diameter="6 m")
+    op = operator(layers=3, tolerance="1 %")
+    o = swept(50.0, 180 + 12 * np.sin(2 * np.pi * np.arange(3000) / 6000), camera)
+    state = op.prepare(o)
+    assert isinstance(state.emission, DetectorField)
+    assert state.emission.step > 1
+    direct, band, elevation = directly(op, o)
+    left = direct - direct.mean(0)
+    wrong = whole(o, state) - band.emission_difference(PWV, PWV * op.pwv_rms * direct, elevation)
+    slope = np.mean(band.emission_difference(PWV, 0.01 * PWV, elevation)) / 0.01 * op.pwv_rms
+    # The bound is on the ensemble; this realization of 30 s holds some tens of independent errors: factor 3.
+    assert np.sqrt(np.mean((wrong / slope) ** 2)) < 3 * 0.01 * np.sqrt(np.mean(left**2))
+
+
+def test_layers_take_steps_of_their_own_within_the_same_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plan, "PAYS_FROM", 0)
+    camera = instrument(detectors=61, field="10 deg", diameter="6 m")
+    op = operator(layers=4, lowest="300 m", tolerance="1 %")
+    o = swept(50.0, 180 + 12 * np.sin(2 * np.pi * np.arange(3000) / 6000), camera)
+    state = op.prepare(o)
+    said = {what: text for _, what, text in o.tally}
+    assert "by layer" in said["step in time"]
+    direct, band, elevation = directly(op, o)
+    left = direct - direct.mean(0)
+    wrong = whole(o, state) - band.emission_difference(PWV, PWV * op.pwv_rms * direct, elevation)
+    slope = np.mean(band.emission_difference(PWV, 0.01 * PWV, elevation)) / 0.01 * op.pwv_rms
+    assert np.sqrt(np.mean((wrong / slope) ** 2)) < 3 * 0.01 * np.sqrt(np.mean(left**2))
+
+
+def test_kept_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = instrument(detectors=19, field="10 deg", diameter="6 m")
+
+    def series() -> Floats:
+        o = swept(50.0, 180 + 4 * np.sin(2 * np.pi * np.arange(1000) / 500), camera)
+        return whole(o, operator(layers=1, lowest="3 km").prepare(o))
+
+    expected = series()
+    monkeypatch.setattr(sampling, "TILE", 64)
+    monkeypatch.setattr(sampling, "TILES_KEPT", 40)
+    np.testing.assert_array_equal(series(), expected)
+    monkeypatch.setattr(sampling, "POINTS_AT_ONCE", 2000)
+    np.testing.assert_array_equal(series(), expected)
+
+
+def directly(op: AtmosphereLayers, o: Observation) -> tuple[Floats, Any, Floats]:
+    """(sum of the layers, band, elevation) at every detector and sample."""
+    track = tracks([o])[0]
+    u = rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)
+    profile, band = op._weather(o)
+    g = np.zeros(u.shape[1:])
+    for number, layer in enumerate(op._layers(profile)):
+        beam = _turbulence(op, o, number, _model(op, layer, track, o))
+        across, along = track.positions(crossing(u), o.seconds, layer.height, layer.wind)
+        sample(beam, across, along, layer.amplitude, g)
+    return g, band, np.arcsin(u[2])
+
+
+@pytest.mark.parametrize("angle", [37.0, 180.0])
+def test_turning_a_wide_throw_and_the_wind_together_changes_nothing(angle: float) -> None:
+    def series(turn: float) -> Floats:
+        o = swept(50.0, turn + back_and_forth(60.0)[:1000], instrument(detectors=7, field="2 deg", diameter="6 m"))
+        op = operator(layers=2, wind={"speed": "12 m/s", "direction": f"{40 + turn} deg"}, tolerance="5 %")
+        return whole(o, op.prepare(o))
+
+    one = series(0.0)
+    # But for the path beyond the ends of the scan, which is extrapolated by components.
+    np.testing.assert_allclose(series(angle), one, atol=1e-4 * one.std())
+
+
+@pytest.mark.parametrize("direction", [0.0, 90.0, 180.0, 45.0])
+def test_wind_along_across_and_against_the_scan(direction: float) -> None:
+    # A scan at constant speed s along a parallel of elevation and a wind w: consecutive samples lie |s - w| dt apart on the
+    # layer, and so do they on the plane; s = w along the scan would see the same air for ever.
+    az = 180 + np.arange(500) * 0.002 / np.cos(np.radians(50.0))
+    o = swept(50.0, az, instrument(detectors=1, field="0 deg"))
+    track = tracks([o])[0]
+    speed = np.radians(0.2) * 2000 / np.sin(np.radians(50.0))
+    # Looking south with growing azimuth: the line of sight moves west.
+    wind = speed * np.array([-np.cos(np.radians(direction)), np.sin(np.radians(direction))])
+    u = rays(axes(o.boresight_azel), np.zeros(1), np.zeros(1))
+    across, along = track.positions(crossing(u), o.seconds, 2000.0, wind)
+    step = np.hypot(np.diff(across[0]), np.diff(along[0])) * 100
+    foreshortened = np.array([wind[0], wind[1] * np.sin(np.radians(50.0))])
+    expected = np.hypot(-speed - foreshortened[0], -foreshortened[1])
+    np.testing.assert_allclose(step, expected, atol=0.03 * speed)  # the path is an arc: 1.5 deg of azimuth
