@@ -43,6 +43,7 @@ from .nodes import (
 )
 from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 from .turbulence import Turbulence, interpolate
+from .weather_sources import air_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -109,7 +110,8 @@ class AtmosphereLayers(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"atmosphere", "transmission"})
 
     pwv: Metres | None = Field(None, gt=0, le=weather.PWV_MAX)
-    """Mean precipitable water vapour at zenith; where absent, the climatology's median for the date and hour."""
+    """Mean precipitable water vapour at zenith; where absent, that of the scene's `weather` (by default the climatology's median
+    for the date and hour). A scene whose weather gives another PWV is refused: it would be given twice."""
     pwv_rms: Fraction = quantity("0.5 %", ge=0, le=1)
     """Ensemble rms of the water along a line of sight, as a fraction of its mean (at one point of the sky, over all weather)."""
     pwv_rms_after_beam: bool = False
@@ -125,7 +127,7 @@ class AtmosphereLayers(Operator):
     outer_scale: Metres = quantity("500 m", gt=0)
     """Outer scale r0 of the turbulence (van Marrewijk et al. 2024), a length in the von Karman covariance."""
     wind: Literal["profile"] | Wind | list[Wind] = "profile"
-    """The climatology's wind at each layer's height, or one wind for all layers, or a list of one for each."""
+    """The weather's wind at each layer's height (see `weather: wind`), or one wind for all layers, or a list of one for each."""
     fidelity: Literal["default", "fine"] = "default"
     """Accuracy of the turbulence: its covariance is within 0.16 % or 0.03 % of the variance."""
     lattice: float = Field(0.6, gt=0, le=0.6)
@@ -134,6 +136,7 @@ class AtmosphereLayers(Operator):
     """Rms error of the evaluation at nodes, as a fraction of what the focal-plane mean, subtracted, leaves of the atmosphere."""
 
     _origin: Any = PrivateAttr(None)
+    _source: Any = PrivateAttr(None)
     _tracks: dict[str, Track] = PrivateAttr(default_factory=dict)
     _air: dict[Any, tuple[Profile, BandAtmosphere]] = PrivateAttr(default_factory=dict)
 
@@ -147,13 +150,16 @@ class AtmosphereLayers(Operator):
 
     def observe(self, data: Data) -> None:
         """Note when the run begins and how its scans follow each other: all of them look through the same drifting air."""
-        self._origin = data.scene.time
+        self._origin, self._source = data.scene.time, data.scene.weather
         self._tracks = dict(zip((o.name for o in data.observations), tracks(data.observations), strict=True))
 
     def prepare(self, observation: Observation) -> Fluctuations:
         """Draw the turbulence at the nodes; set the smooth means."""
         track = self._tracks.get(observation.name) or tracks([observation])[0]
         profile, band = self._weather(observation)
+        for what, text in profile.stated:
+            if what != "wind" or self.wind == "profile":
+                observation.tally.state(self.label, what, text)
         sky = Sky(band)
         pwv = self.pwv or profile.pwv
         layers = self._layers(profile)
@@ -202,12 +208,12 @@ class AtmosphereLayers(Operator):
     # ------------------------------------------------------------------------------------------------------------------------
 
     def _weather(self, observation: Observation) -> tuple[Profile, BandAtmosphere]:
-        """One weather for the run: the climatology at its start."""
+        """One weather for the run: the scene's at its start."""
         time: Instant = self._origin or observation.start
         band: Band = observation.instrument.band
-        key = (repr(observation.site), time, self.pwv, repr(band))
+        key = (repr(observation.site), time, self.pwv, repr(band), repr(self._source), observation.seed)
         if key not in self._air:
-            profile = weather.profile(observation.site, time, self.pwv)
+            profile = air_of(self._source, observation.site, time, observation.seed, self.pwv)
             rise = math.exp(7 * self._log_width(1.0)) if self.pwv_rms >= LOG_NORMAL_FROM else 1 + 8 * self.pwv_rms
             largest = min((self.pwv or profile.pwv) * max(rise, 1.05), weather.PWV_MAX)
             self._air[key] = profile, BandAtmosphere(band, profile, largest)
@@ -260,7 +266,7 @@ class AtmosphereLayers(Operator):
             observation.tally.state(self.label, what, text)
 
         before, after = scale, scale * math.sqrt(variance)
-        say("mean PWV", f"{pwv * 1e3:.3f} mm" + ("" if self.pwv else " (climatology)"))
+        say("mean PWV", f"{pwv * 1e3:.3f} mm" + ("" if self.pwv else " (of the weather)"))
         say("PWV rms", f"{before:.3%} of the mean before the beam, {after:.3%} after it")
         say("distribution of the water", "log-normal" if self.pwv_rms >= LOG_NORMAL_FROM else "normal")
         parts = (

@@ -471,7 +471,7 @@ def test_climatology_gives_the_pwv_where_none_is_asked_for() -> None:
     o = observe(1.0)
     AtmosphereLayers().prepare(o)
     said = {what: text for _, what, text in o.tally}
-    assert said["mean PWV"].endswith("mm (climatology)")
+    assert said["mean PWV"].endswith("mm (of the weather)")
 
 
 def test_near_field_beam() -> None:
