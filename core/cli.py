@@ -45,6 +45,10 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
+ELSEWHERE = {"weather": "zonda.plugins.weather_command:weather"}
+"""Built-in commands that live with what they use, imported when they are named or listed."""
+
+
 class Interrupted(Exception):
     """Ctrl-C; click would print an empty line for a KeyboardInterrupt."""
 
@@ -61,7 +65,9 @@ class Commands(click.Group):
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         """One command."""
-        if name not in self.commands:
+        if name in ELSEWHERE:
+            self._import(name)
+        elif name not in self.commands:
             self._extend()
         return super().get_command(ctx, name)
 
@@ -82,7 +88,15 @@ class Commands(click.Group):
         except KeyboardInterrupt:
             raise Interrupted from None
 
+    def _import(self, name: str) -> None:
+        from importlib import import_module
+
+        module, _, attribute = ELSEWHERE[name].partition(":")
+        self.commands[name] = getattr(import_module(module), attribute)
+
     def _extend(self) -> None:
+        for name in ELSEWHERE:
+            self._import(name)
         if not self._extended:
             self._extended = True
             from .discovery import others_may_declare
@@ -155,7 +169,7 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 @zonda.command()
 @click.option("--check", is_flag=True, help="Import each one; exit status 1 where one fails.")
 def plugins(check: bool) -> None:
-    """List operators, instruments, sites, bands, noise models, mapmakers and hooks, and where each comes from."""
+    """List operators, instruments, sites, bands, noise models, weather sources, mapmakers and hooks, and where each comes from."""
     from . import hooks
     from .discovery import discover
     from .registry import registries
