@@ -169,7 +169,7 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 @zonda.command()
 @click.option("--check", is_flag=True, help="Import each one; exit status 1 where one fails.")
 def plugins(check: bool) -> None:
-    """List operators, instruments, sites, bands, noise models, weather sources, mapmakers and hooks, and where each comes from."""
+    """List operators, instruments, sites, bands, noise models, weather sources, mapmakers, hooks; where each comes from."""
     from . import hooks
     from .discovery import discover
     from .registry import registries

@@ -26,7 +26,7 @@ class Scene(Parameters):
     target: Target | None = None
     """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or {az: 180 deg, el: 60 deg}."""
     weather: Annotated[SerializeAsAny[WeatherSource], BeforeValidator(weather_source)] | None = None
-    """The air: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: profile.csv}; None: the climatology's median."""
+    """The air: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: air.csv}; None: the climatology's median."""
     seed: int = Field(0, ge=0, lt=2**63)
     """Root of every random stream; the same seed gives the same bits."""
 

@@ -120,7 +120,7 @@ CAMERAS = {
         (
             Channel("spt3g_150ghz", 5_380, "0.4 mK s(1/2)", "1.2 arcmin"),
             Channel("spt3g_95ghz", 5_380, "0.5 mK s(1/2)", "1.6 arcmin"),
-            Channel("spt3g_220ghz", 5_380, "0.7 mK s(1/2)", "1.1 arcmin"),
+            Channel("spt3g_220ghz", 5_380, "0.7 mK s(1/2)", "1 arcmin"),
         ),
         ROUND,
     ),
@@ -133,7 +133,10 @@ CAMERAS = {
     "cmb_s4": Camera(
         "a camera like CMB-S4's on a 6 m telescope",
         *("CMB-S4 LAT", "7.8 deg", 0.7, 0.95, "0.1 Hz", "200 Hz"),
-        (Channel("cmb_s4_150ghz", 52_000, "0.2 mK s(1/2)", "1.4 arcmin"), Channel("cmb_s4_95ghz", 52_000, "0.2 mK s(1/2)", "2.2 arcmin")),
+        (
+            Channel("cmb_s4_150ghz", 52_000, "0.2 mK s(1/2)", "1.4 arcmin"),
+            Channel("cmb_s4_95ghz", 52_000, "0.2 mK s(1/2)", "2.2 arcmin"),
+        ),
         ROUND,
     ),
     "apex": Camera(

@@ -49,7 +49,9 @@ _time = click.option("--time", metavar="TIME", help="UTC unless it carries an of
 @click.option("--table", metavar="FILE.csv", help="Table to take the air from, instead of the climatology.")
 @click.option("--elevation", default="90 deg", show_default=True, metavar="ANGLE", help="Of the line of sight, 5 deg to 90 deg.")
 @click.option("--seed", default=0, show_default=True, help="Of a random PWV.")
-@click.option("--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The figure.  [default: out/weather/SITE.png]")
+@click.option(
+    "--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The figure.  [default: out/weather/SITE.png]"
+)
 def show(
     site: str,
     time: str | None,

@@ -40,7 +40,12 @@ VARIABLES = {
     "o3": "ozone_mass_mixing_ratio",
 }
 """Short names in the file, and what the Climate Data Store calls them."""
-AXES = {"time": ("valid_time", "time"), "level": ("pressure_level", "level"), "lat": ("latitude", "lat"), "lon": ("longitude", "lon")}
+AXES = {
+    "time": ("valid_time", "time"),
+    "level": ("pressure_level", "level"),
+    "lat": ("latitude", "lat"),
+    "lon": ("longitude", "lon"),
+}
 """Names of the axes."""
 
 SPACING_MAX = 1.0
@@ -76,7 +81,9 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
         weights = {
             "time": _time_weights(file, axes["time"], time, place),
             "lat": _latitude_weights(file.values(axes["lat"]), np.degrees(site.latitude), place),
-            "lon": _longitude_weights(file.values(axes["lon"]), np.degrees(site.longitude), abs(np.degrees(site.latitude)), place),
+            "lon": _longitude_weights(
+                file.values(axes["lon"]), np.degrees(site.longitude), abs(np.degrees(site.latitude)), place
+            ),
         }
         order = np.argsort(-pressure)
 
@@ -121,7 +128,9 @@ class _File:
         """Unpacked values, NaN where they are missing."""
         raw = np.asarray(self._variables[name][where])
         missing = [self.attribute(name, key) for key in ("_FillValue", "missing_value")]
-        out = raw.astype(np.float64) * float(self.attribute(name, "scale_factor", 1.0)) + float(self.attribute(name, "add_offset", 0))
+        out = raw.astype(np.float64) * float(self.attribute(name, "scale_factor", 1.0)) + float(
+            self.attribute(name, "add_offset", 0)
+        )
         for value in missing:
             if value is not None:
                 out = np.where(raw == value, np.nan, out)
@@ -151,7 +160,9 @@ class _File:
             whole = np.flatnonzero(np.isfinite(values).all(axis=0))
             values = values[:, whole[0] if len(whole) else 0]
         if not np.isfinite(values).all():
-            raise InputError(f"the variable {name} has no values at this place and time", place=place, cure="download the file again")
+            raise InputError(
+                f"the variable {name} has no values at this place and time", place=place, cure="download the file again"
+            )
         return values
 
 
@@ -216,8 +227,10 @@ def _pressure(file: _File, name: str, place: str) -> Array:
 def _time_weights(file: _File, name: str, time: Instant, place: str) -> dict[int, float]:
     match = re.match(r"(seconds|hours|days) since (\d+)-(\d+)-(\d+)", str(file.attribute(name, "units", "")))
     if not match:
-        raise InputError(f"its {name} has the unit '{file.attribute(name, 'units')}'", place=place, cure="expected hours since a date")
-    start = datetime(*(int(part) for part in match.groups()[1:]), tzinfo=UTC).timestamp()
+        raise InputError(
+            f"its {name} has the unit '{file.attribute(name, 'units')}'", place=place, cure="expected hours since a date"
+        )
+    start = datetime(int(match[2]), int(match[3]), int(match[4]), tzinfo=UTC).timestamp()
     seconds = start + file.values(name) * {"seconds": 1.0, "hours": 3600.0, "days": 86400.0}[match[1]]
     order, wanted = np.argsort(seconds), time.posix
     first, last = seconds[order[0]], seconds[order[-1]]

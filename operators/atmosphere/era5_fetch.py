@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from zonda.core.site import Site
 
 DATASET = "reanalysis-era5-pressure-levels"
-LEVELS = (1, 2, 3, 5, 7, 10, 20, 30, 50, 70, 100, 125, 150, 175, 200, 225, 250, 300, 350, 400, 450, 500, 550, 600, 650, 700)
-LEVELS += (750, 775, 800, 825, 850, 875, 900, 925, 950, 975, 1000)
+_HIGH = (1, 2, 3, 5, 7, 10, 20, 30, 50, 70, 100, 125, 150, 175, 200, 225, 250, 300, 350, 400, 450, 500, 550, 600, 650, 700)
+LEVELS = (*_HIGH, 750, 775, 800, 825, 850, 875, 900, 925, 950, 975, 1000)
 """hPa: all of them."""
 KEY = "https://cds.climate.copernicus.eu/how-to-api says how to get a free key and where to put it"
 
@@ -59,7 +59,9 @@ def retrieve(site: Site, time: Instant, hours: int, path: Path) -> None:
     try:
         client = import_module("cdsapi").Client
     except ImportError:
-        raise InputError("the package cdsapi is not installed", place="zonda weather fetch", cure="pip install 'zonda[weather]'") from None
+        raise InputError(
+            "the package cdsapi is not installed", place="zonda weather fetch", cure="pip install 'zonda[weather]'"
+        ) from None
     try:
         client(quiet=True).retrieve(DATASET, request(site, time, hours), str(path))
     except Exception as err:  # cdsapi raises bare Exceptions: no key, no licence accepted, no network

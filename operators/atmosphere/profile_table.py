@@ -120,7 +120,9 @@ def _header(cells: list[str], place: str) -> list[tuple[str, str]]:
         lacks = ", ".join([*missing, *([] if any(n in names for n in HUMIDITY) else [f"a humidity ({', '.join(HUMIDITY)})"])])
         raise InputError(f"lacks {lacks}", place=place, cure=f"a header is e.g. {EXAMPLE}")
     if sum(name in names for name in HUMIDITY) > 1 or ("wind east" in names) != ("wind north" in names):
-        raise InputError("has two humidities, or one component of the wind only", place=place, cure="one humidity, both or no winds")
+        raise InputError(
+            "has two humidities, or one component of the wind only", place=place, cure="one humidity, both or no winds"
+        )
     return columns
 
 
@@ -129,12 +131,16 @@ def _numbers(lines: list[tuple[int, list[str]]], columns: list[tuple[str, str]],
     table = np.empty((len(lines) - 1, len(columns)))
     for row, (number, cells) in enumerate(lines[1:]):
         if len(cells) != len(columns):
-            raise InputError(f"line {number} has {len(cells)} cells for {len(columns)} columns", place=place, cure="mend that line")
+            raise InputError(
+                f"line {number} has {len(cells)} cells for {len(columns)} columns", place=place, cure="mend that line"
+            )
         for k, cell in enumerate(cells):
             try:
                 table[row, k] = float(cell)
             except ValueError:
-                raise InputError(f"line {number}: '{cell}' is not a number", place=place, cure=f"mend {columns[k][0]} there") from None
+                raise InputError(
+                    f"line {number}: '{cell}' is not a number", place=place, cure=f"mend {columns[k][0]} there"
+                ) from None
             if not np.isfinite(table[row, k]):
                 message = f"line {number}: {columns[k][0]} is {cell}"
                 raise InputError(message, place=place, cure="give every value, or leave the row out")
@@ -154,7 +160,9 @@ def _limits(values: dict[str, Array], rows: list[int], place: str) -> None:
     falls = "the pressure does not fall with height"
     refuse(np.append(pressure[:1] <= 0, (np.diff(pressure) >= 0) | (pressure[1:] <= 0)), falls, "check pressures and their unit")
     low, high = TEMPERATURES
-    refuse(~((temperature > low) & (temperature < high)), f"the temperature is not between {low:g} and {high:g} K", "check its unit")
+    refuse(
+        ~((temperature > low) & (temperature < high)), f"the temperature is not between {low:g} and {high:g} K", "check its unit"
+    )
     for name in (*HUMIDITY, "ozone"):
         if name in values:
             refuse(values[name] < 0, f"the {name} is negative", "a humidity is at least 0")

@@ -39,7 +39,7 @@ EXTEND_BELOW = 1500.0
 
 def temperature(height: ArrayLike) -> Array:
     """K at geopotential heights [m above sea level]; constant above 47 km."""
-    return np.asarray(np.interp(height, HEIGHT, TEMPERATURE))
+    return np.asarray(np.interp(np.asarray(height, np.float64), HEIGHT, TEMPERATURE))
 
 
 def pressure(height: ArrayLike) -> Array:
@@ -48,7 +48,7 @@ def pressure(height: ArrayLike) -> Array:
     step = np.diff(fine) * GRAVITY / DRY_AIR_GAS_CONSTANT / temperature((fine[1:] + fine[:-1]) / 2)
     logarithm = np.concatenate([[0.0], -np.cumsum(step)])
     at_sea_level = np.interp(0.0, fine, logarithm)
-    return SEA_LEVEL_PRESSURE * np.exp(np.interp(height, fine, logarithm) - at_sea_level)
+    return np.asarray(SEA_LEVEL_PRESSURE * np.exp(np.interp(np.asarray(height, np.float64), fine, logarithm) - at_sea_level))
 
 
 def wind_speed(above_ground: ArrayLike) -> Array:
@@ -64,7 +64,8 @@ def ozone(pressures: ArrayLike) -> Array:
 
 def standard_column(site: Site) -> Column:
     """The standard atmosphere above a site, a west wind, and 10 mm of water at sea level: to be scaled to the PWV wanted."""
-    height = np.concatenate([site.altitude + np.array([-100.0, 0, 250, 500, 1000, 1500]), np.arange(2e3, 31e3, 1e3) + site.altitude])
+    low = site.altitude + np.array([-100.0, 0, 250, 500, 1000, 1500])
+    height = np.concatenate([low, np.arange(site.altitude + 2e3, 47e3, 1e3)])
     t, p = temperature(height), pressure(height)
     density = 5e-3 * np.exp(-height / VAPOUR_SCALE_HEIGHT)
     return Column(
@@ -74,7 +75,7 @@ def standard_column(site: Site) -> Column:
         h2o=np.maximum(density * VAPOUR_GAS_CONSTANT * t / p, STRATOSPHERIC_WATER),
         wind_east=wind_speed(np.maximum(height - site.altitude, 0.0)),
         wind_north=np.zeros_like(height),
-        stated="US Standard Atmosphere 1976 (no climatology here): temperatures may be 30 K off at the poles, the wind is a guess",
+        stated="US Standard Atmosphere 1976: temperatures may be 30 K off at the poles, the wind is a guess",
     )
 
 

@@ -67,7 +67,10 @@ def place_lines(site: Site, time: Instant, air: Profile) -> list[str]:
 
 def profile_lines(air: Profile) -> list[str]:
     """A table of the profile; the wind is that which blows, coming from a direction."""
-    lines = ["  above site   pressure  temperature   vapour     wind      from", "           m        hPa            K     g/m3      m/s       deg"]
+    lines = [
+        "  above site   pressure  temperature   vapour     wind      from",
+        "           m        hPa            K     g/m3      m/s       deg",
+    ]
     for h in HEIGHTS:
         a = air.at(h)
         east, north = float(a.wind_east), float(a.wind_north)

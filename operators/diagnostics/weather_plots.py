@@ -47,12 +47,16 @@ def plot_water(water: WaterByMonth, ax: Any = None) -> Any:
     ax = _axes(ax)
     month = np.arange(12)
     low, lower, _, upper, high = water.quantiles.T * 1e3
-    ax.fill_between(month, low, high, color=SEQUENCE[5], alpha=0.3, lw=0, label=f"{100 * QUANTILES[0]:g} to {100 * QUANTILES[-1]:g} %")
-    ax.fill_between(month, lower, upper, color=SEQUENCE[5], alpha=0.6, lw=0, label=f"{100 * QUANTILES[1]:g} to {100 * QUANTILES[3]:g} %")
+    ax.fill_between(
+        month, low, high, color=SEQUENCE[5], alpha=0.3, lw=0, label=f"{100 * QUANTILES[0]:g} to {100 * QUANTILES[-1]:g} %"
+    )
+    ax.fill_between(
+        month, lower, upper, color=SEQUENCE[5], alpha=0.6, lw=0, label=f"{100 * QUANTILES[1]:g} to {100 * QUANTILES[3]:g} %"
+    )
     from matplotlib import colormaps
 
     for k, hour in enumerate(HOURS):
-        colour = colormaps["twilight"]((hour + 3) % 24 / 24)
+        colour = colormaps["viridis"](hour / 24)
         ax.plot(month, water.median[:, k] * 1e3, color=colour, lw=1.2, label=f"median, {hour:02d} h UTC")
     ax.set_yscale("log")
     ax.set_xticks(month, [name[0] for name in MONTHS])
@@ -73,12 +77,17 @@ def plot_spectrum(
         values = seen.brightness if which == "brightness" else np.exp(-seen.slant_opacity)
         own = pwv == air.pwv
         ax.plot(
-            seen.frequency / 1e9, values, color="black" if own else SEQUENCE[k % 6], lw=1.4 if own else 0.9, label=f"PWV {pwv * 1e3:.3g} mm"
+            seen.frequency / 1e9,
+            values,
+            color="black" if own else SEQUENCE[k % 6],
+            lw=1.4 if own else 0.9,
+            label=f"PWV {pwv * 1e3:.3g} mm",
         )
     top = 1.0 if which == "transmission" else ax.get_ylim()[1]
     for k, band in enumerate(bands):
         ax.fill_between(band.frequency / 1e9, band.transmission * top, color=SEQUENCE[(k + 3) % 7], alpha=0.2, lw=0)
-        ax.annotate(band.name, (band.centre / 1e9, top * 0.98), rotation=90, ha="center", va="top", fontsize=7)
+        at, side = (0.98 * top, "top") if which == "brightness" else (0.02, "bottom")
+        ax.annotate(band.name, (band.centre / 1e9, at), rotation=90, ha="center", va=side, fontsize=7)
     ax.set_xlim(low / 1e9, high / 1e9)
     ax.set_ylim(0, top)
     ax.set_xlabel("frequency [GHz]")
