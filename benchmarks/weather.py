@@ -27,7 +27,9 @@ print(first - start, table - first, (perf_counter() - table) / 100)
 
 
 def main() -> None:
-    runs = [subprocess.run([sys.executable, "-c", LOAD], capture_output=True, text=True, check=True).stdout.split() for _ in range(5)]
+    runs = [
+        subprocess.run([sys.executable, "-c", LOAD], capture_output=True, text=True, check=True).stdout.split() for _ in range(5)
+    ]
     names = ("climatology loaded and first profile", "absorption table loaded", "each further profile")
     for name, values in zip(names, zip(*runs, strict=True), strict=True):
         print(f"{name:40s} {1e3 * min(float(v) for v in values):8.2f} ms")

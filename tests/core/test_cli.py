@@ -113,7 +113,13 @@ def here(plugin: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_help_and_import_are_light() -> None:
-    for arguments in ("['--help']", "['--version']", "['run', '--help']"):
+    for arguments in (
+        "['--help']",
+        "['--version']",
+        "['run', '--help']",
+        "['weather', '--help']",
+        "['weather', 'show', '--help']",
+    ):
         code = (
             f"import sys, zonda; from zonda.core.cli import main; main({arguments});"
             f"print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
