@@ -5,6 +5,7 @@ Only click is imported with this module; each command imports what it needs.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +48,7 @@ _time = click.option("--time", metavar="TIME", help="UTC unless it carries an of
 @click.option("--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]")
 @click.option("--file", metavar="FILE.nc", help="ERA5 file to take the air from, instead of the climatology.")
 @click.option("--table", metavar="FILE.csv", help="Table to take the air from, instead of the climatology.")
-@click.option("--elevation", default="90 deg", show_default=True, metavar="ANGLE", help="Of the line of sight, 5 deg to 90 deg.")
+@click.option("--elevation", default="90 deg", show_default=True, metavar="ANGLE", help="Of the line of sight.")
 @click.option("--seed", default=0, show_default=True, help="Of a random PWV.")
 @click.option(
     "--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The figure.  [default: out/weather/SITE.png]"
@@ -77,7 +78,8 @@ def show(
     source = _checked("weather", lambda: cls.model_validate(values))
     angle = _checked("--elevation", lambda: Unit("rad").parse(elevation))
     if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
-        raise click.BadParameter(f"{elevation} is outside the limits, 5 deg to 90 deg", param_hint="'--elevation'")
+        limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
+        raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")
     bands = list(dict.fromkeys(registry.instruments.create(name).band for name in instruments))
     air = air_of(source, place, when, seed)
     water = summary.water_by_month(place, when.datetime.year) if place.climatology is not None else None

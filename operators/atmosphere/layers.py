@@ -157,13 +157,13 @@ class AtmosphereLayers(Operator):
         """Draw the turbulence at the nodes; set the smooth means."""
         track = self._tracks.get(observation.name) or tracks([observation])[0]
         profile, band = self._weather(observation)
-        for what, text in profile.stated:
-            if what != "wind" or self.wind == "profile":
-                observation.tally.state(self.label, what, text)
         sky = Sky(band)
         pwv = self.pwv or profile.pwv
         layers = self._layers(profile)
         models = [_model(layer, track, observation, self.outer_scale) for layer in layers]
+        for what, text in profile.stated:
+            if what != "wind" or self.wind == "profile":
+                observation.tally.state(self.label, what, text)
         beams = [_turbulence(self, observation, n, m) for n, m in enumerate(models)]
         variance = sum(m.amplitude**2 * b.variance for m, b in zip(models, beams, strict=True))
         scale = self.pwv_rms / math.sqrt(variance) if self.pwv_rms_after_beam else self.pwv_rms
