@@ -197,7 +197,7 @@ class Execution:
         def work(detectors: slice, samples: slice) -> None:
             margin = -(-segment.halo // TILE_SAMPLES) * TILE_SAMPLES
             reach = slice(max(0, samples.start - margin), min(shape[1], samples.stop + margin))
-            block = self._block(detectors, reach, sources, made if not segment.halo else {})
+            block = self._block(detectors, reach, sources, made, in_place=not segment.halo)
             for index, operator in enumerate(segment.operators):
                 if self._stop.is_set():
                     return
@@ -216,10 +216,15 @@ class Execution:
         self._release([s.array for s in [*sources.values(), *made.values()] if id(s.array) not in held])
         return kept
 
-    def _block(self, detectors: slice, samples: slice, sources: dict[str, Stream], made: dict[str, Stream]) -> Block:
-        """A block with its sources in it. Whole scans are worked on where they are kept; parts of scans are copied."""
+    def _block(
+        self, detectors: slice, samples: slice, sources: dict[str, Stream], made: dict[str, Stream], in_place: bool
+    ) -> Block:
+        """A block with its sources in it. Whole scans are worked on where they are kept; parts of scans are copied.
+
+        Not ``in_place`` where blocks have margins: other blocks read the same samples.
+        """
         shape = (detectors.stop - detectors.start, samples.stop - samples.start)
-        whole = shape[1] == self.observation.n_samples
+        whole = in_place and shape[1] == self.observation.n_samples
         buffers = self._local.__dict__.setdefault("buffers", {})
         block = Block(self.observation, detectors, samples, dtype=self.settings.dtype, buffers=buffers)
         if whole:

@@ -171,6 +171,14 @@ def test_blocks_halos_threads_and_spilling_change_no_bit():
         assert (data.products["seen"] == 1).all()
 
 
+def test_margins_that_reach_the_ends_leave_the_source_alone():
+    """A block with margins can be the whole scan: it must not be filtered where other blocks read it."""
+    chain = [Source(), Smooth(width=20)]
+    want, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=1 << 30)
+    got, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=2 * 4 * 4 * 16 * 3 * TILE_SAMPLES + 1000)
+    assert np.array_equal(got, want)
+
+
 def test_spilling_is_stated():
     obs = observation()
     got, _ = run(CHAIN, obs, memory=int(1.9 * obs.n_detectors * obs.n_samples * 4))
