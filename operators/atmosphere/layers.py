@@ -56,6 +56,9 @@ LOG_NORMAL_FROM = 0.15
 SMALLEST_DIFFERENCE = 1e-5
 """Share of the fluctuation that must differ between detectors for `tolerance` to be judged by it."""
 
+SPEEDS = 4096
+"""Samples of a scan, at least half as many and evenly spaced, from which the distribution of its speed is taken."""
+
 CELLS_AT_ONCE = 1 << 20
 """Lattice points made at a time: bounds the memory."""
 
@@ -137,6 +140,9 @@ class AtmosphereLayers(Operator):
     def _consistent(self) -> AtmosphereLayers:
         if self.layers > 1 and not self.lowest < self.highest:
             raise ValueError("lowest must be below highest")
+        of_many = {"highest", "weights"} & self.model_fields_set
+        if self.layers == 1 and of_many:
+            raise ValueError(f"{sorted(of_many)[0]} needs several layers; a single one lies at lowest")
         if isinstance(self.wind, list) and len(self.wind) != self.layers:
             raise ValueError(f"wind lists {len(self.wind)} winds for {self.layers} layers")
         return self
@@ -157,7 +163,10 @@ class AtmosphereLayers(Operator):
         variance = sum(m.amplitude**2 * b.variance for m, b in zip(models, beams, strict=True))
         scale = self.pwv_rms / math.sqrt(variance) if self.pwv_rms_after_beam else self.pwv_rms
 
-        plan = _plan(self, observation, track, layers, models, variance, band, pwv)
+        key = f"{self.label} plan"  # kept for the companion runs
+        if key not in observation.resolved:
+            observation.resolved[key] = _plan(self, observation, track, layers, models, variance, band, pwv)
+        plan: Plan = observation.resolved[key]
         index = coarse_times(observation.n_samples, plan.step)
         index = np.r_[index[0] + plan.step * np.arange(-MARGIN, 0), index, index[-1] + plan.step * np.arange(1, MARGIN + 1)]
         seconds = float(observation.seconds[0]) + index / observation.sample_rate
@@ -436,13 +445,13 @@ class _Path:
         u = rays(axes(observation.boresight_azel), self._xi, self._eta)
         self.crossing = crossing(u)
         self.elevation = np.arcsin(u[2])
+        n = len(self.elevation[0])
+        some = slice(None, None, 1 + n // SPEEDS)
+        self._drift = np.diff(self.crossing[:, 0])[:, some] * observation.sample_rate if n > 1 else np.zeros((2, 1))
 
     def speeds(self, track: Track, layer: Layer, number: int = 64) -> Floats:
         """Speeds [m/s] in the layer at quantiles of the scan, shape (<= number,)."""
-        n = self.crossing.shape[2]
-        v = np.repeat((track.matrix @ layer.wind)[:, None], max(n - 1, 1), axis=1)
-        if n > 1:
-            v = v - layer.height * (track.matrix @ np.diff(self.crossing[:, 0])) * self._observation.sample_rate
+        v = (track.matrix @ layer.wind)[:, None] - layer.height * (track.matrix @ self._drift)
         return np.asarray(np.quantile(np.hypot(*v), (np.arange(number) + 0.5) / number), np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
