@@ -284,7 +284,9 @@ class _Check:
         if not isinstance(items, list) or not items:
             there = ("operators",) in self.document.marks
             span = self.document.mark(("operators",)).start if there else Span(self.document.mark(()).value.source)
-            message = "'operators' must be a list of steps" if there else "the pipeline needs 'operators', a list of steps"
+            empty = items is None or items == []
+            have = "'operators' is empty: it must be a list of steps" if empty else "'operators' must be a list of steps"
+            message = have if there else "the pipeline needs 'operators', a list of steps"
             self.wrong(message, span, "" if there else "add 'operators:'", "write one '- Name: {parameter: value}' per step")
             return []
         steps: list[Step | None] = []

@@ -12,7 +12,6 @@ elevation of the ray. All of it is smooth, so it is computed at nodes (`nodes`) 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -55,11 +54,11 @@ Floats = NDArray[np.float64]
 LOG_NORMAL_FROM = 0.15
 """PWV rms from which y is exp(s g - s^2 var(g) / 2) - 1, so that water stays positive (below, 1 + y < 0 takes 6.7 sigma)."""
 
-LOWEST_ELEVATION = math.radians(4.5)
-"""Lowest line of sight that is accepted, see `Sky`."""
-
 SMALLEST_DIFFERENCE = 1e-5
 """Share of the fluctuation that must differ between detectors for `tolerance` to be judged by it."""
+
+SPEEDS = 4096
+"""Samples of a scan, at least half as many and evenly spaced, from which the distribution of its speed is taken."""
 
 CELLS_AT_ONCE = 1 << 20
 """Lattice points made at a time: bounds the memory."""
@@ -144,6 +143,9 @@ class AtmosphereLayers(Operator):
     def _consistent(self) -> AtmosphereLayers:
         if self.layers > 1 and not self.lowest < self.highest:
             raise ValueError("lowest must be below highest")
+        of_many = {"highest", "weights"} & self.model_fields_set
+        if self.layers == 1 and of_many:
+            raise ValueError(f"{sorted(of_many)[0]} needs several layers; a single one lies at lowest")
         if isinstance(self.wind, list) and len(self.wind) != self.layers:
             raise ValueError(f"wind lists {len(self.wind)} winds for {self.layers} layers")
         return self
@@ -157,7 +159,6 @@ class AtmosphereLayers(Operator):
         """Draw the turbulence at the nodes; set the smooth means."""
         track = self._tracks.get(observation.name) or tracks([observation])[0]
         profile, band = self._weather(observation)
-        sky = Sky(band)
         pwv = self.pwv or profile.pwv
         layers = self._layers(profile)
         models = [_model(layer, track, observation, self.outer_scale) for layer in layers]
@@ -168,7 +169,10 @@ class AtmosphereLayers(Operator):
         variance = sum(m.amplitude**2 * b.variance for m, b in zip(models, beams, strict=True))
         scale = self.pwv_rms / math.sqrt(variance) if self.pwv_rms_after_beam else self.pwv_rms
 
-        plan = _plan(self, observation, track, layers, models, variance, sky, pwv)
+        key = f"{self.label} plan"  # kept for the companion runs
+        if key not in observation.resolved:
+            observation.resolved[key] = _plan(self, observation, track, layers, models, variance, band, pwv)
+        plan: Plan = observation.resolved[key]
         index = coarse_times(observation.n_samples, plan.step)
         index = np.r_[index[0] + plan.step * np.arange(-MARGIN, 0), index, index[-1] + plan.step * np.arange(1, MARGIN + 1)]
         seconds = float(observation.seconds[0]) + index / observation.sample_rate
@@ -176,9 +180,7 @@ class AtmosphereLayers(Operator):
         inside = (index >= 0) & (index < observation.n_samples)
         elevation = np.arcsin(u[2])
         # The margin of the spline is an extrapolated path: it stays inside the limits of the radiative transfer.
-        elevation[:, ~inside] = np.clip(elevation[:, ~inside], min(ELEVATION_MIN, elevation[:, inside].min()), ELEVATION_MAX)
-        low = int(Sky.below(elevation)[:, inside].sum())
-        observation.tally.count(self.label, "node values below 5 deg of elevation, extrapolated", low)
+        elevation[:, ~inside] = np.clip(elevation[:, ~inside], ELEVATION_MIN, ELEVATION_MAX)
 
         g = np.zeros(elevation.shape)
         for layer, beam in zip(layers, beams, strict=True):
@@ -190,12 +192,11 @@ class AtmosphereLayers(Operator):
         def field(values: Floats) -> SmoothField:
             return SmoothField.from_values(plan.nodes.weights, values, plan.step, observation.n_samples)
 
-        observation.smooth["atmosphere"] = field(sky.emission(pwv, elevation))
-        observation.smooth["transmission"] = field(sky.transmission(pwv, elevation))
+        observation.smooth["atmosphere"] = field(band.emission(pwv, elevation))
+        observation.smooth["transmission"] = field(band.transmission(pwv, elevation))
         self._state(observation, track, plan, models, beams, pwv, scale, variance)
-        return Fluctuations(
-            field(sky.emission_difference(pwv, pwv * y, elevation)), field(sky.transmission_ratio(pwv, pwv * y, elevation))
-        )
+        ratio = np.expm1(band.log_transmission_difference(pwv, pwv * y, elevation))
+        return Fluctuations(field(band.emission_difference(pwv, pwv * y, elevation)), field(ratio))
 
     def exec(self, block: Block, state: Fluctuations) -> None:
         """Add the fluctuations to the block's ``atmosphere`` and ``transmission``."""
@@ -351,46 +352,6 @@ def _thickness(heights: Floats) -> Floats:
     return np.asarray(np.gradient(heights) if len(heights) > 1 else np.ones(1), np.float64)
 
 
-class Sky:
-    """A band's emission and transmission, continued a little below the lowest elevation of the radiative transfer.
-
-    A telescope at its limit of 5 deg has detectors lower than that. Down to `LOWEST_ELEVATION` values follow from the
-    parabola in ln sin(elevation) through three points above the limit; the error 0.04 deg below it is < 1 mK of 100 K.
-    """
-
-    def __init__(self, band: BandAtmosphere) -> None:
-        self.band = band
-
-    def emission(self, pwv: float, elevation: Floats) -> Floats:
-        return self._continued(lambda e: self.band.emission(pwv, e), elevation)
-
-    def transmission(self, pwv: float, elevation: Floats) -> Floats:
-        return self._continued(lambda e: self.band.transmission(pwv, e), elevation)
-
-    def emission_difference(self, pwv: float, dpwv: Floats, elevation: Floats) -> Floats:
-        return self._continued(lambda e: self.band.emission_difference(pwv, dpwv, e), elevation)
-
-    def transmission_ratio(self, pwv: float, dpwv: Floats, elevation: Floats) -> Floats:
-        """transmission(pwv + dpwv) / transmission(pwv) - 1, without cancellation."""
-        return np.expm1(self._continued(lambda e: self.band.log_transmission_difference(pwv, dpwv, e), elevation))
-
-    @staticmethod
-    def below(elevation: Floats) -> NDArray[np.bool_]:
-        """Where values are continued."""
-        return np.asarray((elevation < ELEVATION_MIN) & (elevation.min() >= LOWEST_ELEVATION))
-
-    def _continued(self, function: Callable[[Floats], Floats], elevation: Floats) -> Floats:
-        elevation = np.asarray(elevation, np.float64)
-        low = self.below(elevation)
-        if not low.any():
-            return function(elevation)
-        h, bottom = 0.02, math.sin(ELEVATION_MIN)
-        above = [np.arcsin(bottom * math.exp(k * h)) for k in range(3)]
-        a, b, c = (function(np.where(low, e, elevation)) for e in above)
-        t = np.log(np.sin(elevation) / bottom) / h
-        return np.where(low, a * (t - 1) * (t - 2) / 2 - b * t * (t - 2) + c * t * (t - 1) / 2, a)
-
-
 def _model(layer: Layer, track: Track, observation: Observation, outer_scale: float) -> LayerModel:
     distance = layer.height / math.sin(track.elevation)
     sigma = beam_sigma(observation.instrument.telescope, observation.instrument.band, distance)
@@ -418,7 +379,7 @@ def _plan(
     layers: list[Layer],
     models: list[LayerModel],
     variance: float,
-    sky: Sky,
+    band: BandAtmosphere,
     pwv: float,
 ) -> Plan:
     """The coarsest nodes and step that keep each error below the tolerance: of the fluctuation, and of the mean emission."""
@@ -431,15 +392,15 @@ def _plan(
 
     path = _Path(observation, xi, eta)
     elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
-    slope = float(np.max(abs(_slope(sky, pwv, elevations))))
+    slope = float(np.max(abs(_slope(band, pwv, elevations))))
     # What the mean emission may be wrong by, K_RJ: as much as the fluctuation (or 0.01 % of the water where there is none).
-    kelvin = float(sky.emission(pwv, elevations[1]))
+    kelvin = float(band.emission(pwv, elevations[1]))
     allowed = max(tolerance * kelvin * max(operator.pwv_rms, 1e-4), 1e-9)
 
     at_least = 1
     while True:
         nodes, error = choose_nodes(xi, eta, models, tolerance * rms, stretch, at_least)
-        if nodes.shape is None or _mean_error(nodes, xi, eta, sky, pwv, elevations) <= allowed:
+        if nodes.shape is None or _mean_error(nodes, xi, eta, band, pwv, elevations) <= allowed:
             break
         at_least = max(nodes.shape) + 1
 
@@ -458,21 +419,21 @@ def _plan(
     return Plan(nodes, step, tolerance, error / rms, late / rms, left / rms)
 
 
-def _slope(sky: Sky, pwv: float, elevation: Floats) -> Floats:
+def _slope(band: BandAtmosphere, pwv: float, elevation: Floats) -> Floats:
     """d emission / d elevation, K_RJ per rad."""
     h = 1e-4
     low = np.minimum(elevation, ELEVATION_MAX - h)
-    return np.asarray((sky.emission(pwv, low + h) - sky.emission(pwv, low)) / h, np.float64)
+    return np.asarray((band.emission(pwv, low + h) - band.emission(pwv, low)) / h, np.float64)
 
 
-def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, sky: Sky, pwv: float, elevations: Floats) -> float:
+def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, band: BandAtmosphere, pwv: float, elevations: Floats) -> float:
     """Largest error of the mean emission interpolated over the focal plane, K_RJ, at some elevations of the boresight."""
     worst = 0.0
     for elevation in elevations:
         c, s = math.cos(elevation), math.sin(elevation)
 
         def at(x: Floats, e: Floats, c: float = c, s: float = s) -> Floats:
-            return sky.emission(pwv, np.arcsin((s + e * c) / np.sqrt(1 + x * x + e * e)))
+            return band.emission(pwv, np.arcsin((s + e * c) / np.sqrt(1 + x * x + e * e)))
 
         worst = max(worst, float(abs(at(xi, eta) - nodes.weights @ at(nodes.xi, nodes.eta)).max()))
     return worst
@@ -490,13 +451,13 @@ class _Path:
         u = rays(axes(observation.boresight_azel), self._xi, self._eta)
         self.crossing = crossing(u)
         self.elevation = np.arcsin(u[2])
+        n = len(self.elevation[0])
+        some = slice(None, None, 1 + n // SPEEDS)
+        self._drift = np.diff(self.crossing[:, 0])[:, some] * observation.sample_rate if n > 1 else np.zeros((2, 1))
 
     def speeds(self, track: Track, layer: Layer, number: int = 64) -> Floats:
         """Speeds [m/s] in the layer at quantiles of the scan, shape (<= number,)."""
-        n = self.crossing.shape[2]
-        v = np.repeat((track.matrix @ layer.wind)[:, None], max(n - 1, 1), axis=1)
-        if n > 1:
-            v = v - layer.height * (track.matrix @ np.diff(self.crossing[:, 0])) * self._observation.sample_rate
+        v = (track.matrix @ layer.wind)[:, None] - layer.height * (track.matrix @ self._drift)
         return np.asarray(np.quantile(np.hypot(*v), (np.arange(number) + 0.5) / number), np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
