@@ -388,6 +388,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "time": {"time": "2024-11-25T07:30"},
         "target": {"target": "05h00m10s +20d"},
         "seed": {"seed": 4},
+        "weather": {"weather": {"wind": "median"}},
     },
     "site": {
         "latitude": {"latitude": "39 deg"},
