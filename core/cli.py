@@ -45,6 +45,10 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
+ELSEWHERE = {"weather": "zonda.plugins.weather_command:weather"}
+"""Built-in commands that live with what they use, imported when they are named or listed."""
+
+
 class Interrupted(Exception):
     """Ctrl-C; click would print an empty line for a KeyboardInterrupt."""
 
@@ -61,7 +65,9 @@ class Commands(click.Group):
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         """One command."""
-        if name not in self.commands:
+        if name in ELSEWHERE:
+            self._import(name)
+        elif name not in self.commands:
             self._extend()
         return super().get_command(ctx, name)
 
@@ -82,7 +88,15 @@ class Commands(click.Group):
         except KeyboardInterrupt:
             raise Interrupted from None
 
+    def _import(self, name: str) -> None:
+        from importlib import import_module
+
+        module, _, attribute = ELSEWHERE[name].partition(":")
+        self.commands[name] = getattr(import_module(module), attribute)
+
     def _extend(self) -> None:
+        for name in ELSEWHERE:
+            self._import(name)
         if not self._extended:
             self._extended = True
             from .discovery import others_may_declare
@@ -118,7 +132,14 @@ _set = click.option(
 def run(
     pipeline: str, settings: tuple[str, ...], output: Path | None, threads: int | None, memory: int | None, verbose: bool
 ) -> None:
-    """Run a pipeline file, or a shipped pipeline by its name."""
+    """Run a pipeline file, or a shipped pipeline by its name.
+
+    The products are in the folder that the last line names.
+    """
+    from .compiled import ensure_cache, one_blas_thread
+
+    one_blas_thread()
+    ensure_cache()
     from .files import write_text
 
     file = _load(pipeline, settings)
@@ -127,7 +148,8 @@ def run(
     provenance = {"resolved_yaml": resolved, "command": _command(pipeline, settings)}
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
     write_text(folder / "resolved.yaml", resolved)
-    lost = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
+    counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
+    lost = {(who, what) for who, what in counts if what != "samples binned"}
     for who, what, value in data.tally:
         if verbose or (who, what) in lost:
             click.echo(f"{who}: {what}: {value}", err=True)
@@ -145,7 +167,11 @@ def _command(pipeline: str, settings: tuple[str, ...]) -> str:
 @_pipeline
 @_set
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
-    """Check a pipeline file: every mistake at once, each with its place."""
+    """Check a pipeline file without running it.
+
+    Every mistake in the file is shown at once, with its place. Only `zonda run` reads the input maps and finds out whether the
+    target is up.
+    """
     file = _load(pipeline, settings)
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
     for step in file.steps:
@@ -155,7 +181,11 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 @zonda.command()
 @click.option("--check", is_flag=True, help="Import each one; exit status 1 where one fails.")
 def plugins(check: bool) -> None:
-    """List operators, instruments, sites, bands, noise models, mapmakers and hooks, and where each comes from."""
+    """List operators, instruments, sites and other components.
+
+    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources and hooks, each with the distribution
+    and the module that it comes from.
+    """
     from . import hooks
     from .discovery import discover
     from .registry import registries
@@ -198,7 +228,7 @@ def plugins(check: bool) -> None:
 
 @zonda.command()
 def pipelines() -> None:
-    """List the shipped pipelines, which `zonda run` takes by name."""
+    """List the shipped pipelines, to be run by their names."""
     from .configuration import locate, yaml_places
 
     rows = []
@@ -212,7 +242,7 @@ def pipelines() -> None:
 
 @zonda.command()
 def schema() -> None:
-    """Print the JSON schema of pipeline files, for completion in editors."""
+    """Print the JSON schema of pipeline files, for editors."""
     import json
 
     from .configuration.schema import json_schema

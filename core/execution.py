@@ -1,9 +1,10 @@
 """Runs a chain of operators over one observation, in blocks of detectors x samples inside a memory budget.
 
-The chain is cut into segments where the coupling changes (see `Operator.couples`). Inside a segment a block passes through
-all operators while it is hot in the cache; between segments the streams that later operators need are kept in memory, or
-spilled to a temporary file where they do not fit. Blocks begin at multiples of `TILE_DETECTORS` and `TILE_SAMPLES`, so that
-no result depends on the budget or on the number of threads.
+The chain is cut into segments where the coupling changes (see `Operator.couples`). A segment works through the observation
+in blocks; operators that couple nothing work through a block in pieces of `TILE_DETECTORS` x `PIECE` samples, each of which
+passes through all of them while it is hot in the cache. Between segments the streams that later operators need are kept in
+memory, or spilled to a temporary file where they do not fit. Blocks and pieces begin at multiples of `TILE_DETECTORS` and
+`TILE_SAMPLES`, so that no result depends on the budget or on the number of threads.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +30,9 @@ from .tiles import TILE_DETECTORS, TILE_SAMPLES
 
 SCRATCH_STREAMS = 3
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
+
+PIECE = 4 * TILE_SAMPLES
+"""Samples that operators without coupling see at once: 0.5 MB per float32 stream, and little time lost between calls."""
 
 
 @dataclass
@@ -49,6 +53,14 @@ class Segment:
     operators: list[Operator]
     span: str = "sample"
     halo: int = 0
+
+    def split(self) -> tuple[list[Operator], list[Operator]]:
+        """The first operators, which take a block in pieces, and those from the first coupled one on."""
+        if self.halo:
+            return [], self.operators
+        coupled = [o.couples in ("detectors", "time") for o in self.operators]
+        cut = coupled.index(True) if any(coupled) else len(coupled)
+        return self.operators[:cut], self.operators[cut:]
 
 
 def cut(operators: Sequence[Operator], observation: Observation) -> list[Segment]:
@@ -82,6 +94,11 @@ class Timer:
         """Add to a stage."""
         with self._lock:
             self.seconds[label, stage] = self.seconds.get((label, stage), 0.0) + seconds
+
+    def rows(self) -> list[tuple[str, str, float]]:
+        """(label, stage, seconds) in the order in which they first took time."""
+        with self._lock:
+            return [(*key, seconds) for key, seconds in self.seconds.items()]
 
 
 class Execution:
@@ -176,7 +193,6 @@ class Execution:
         observation, settings = self.observation, self.settings
         shape = (observation.n_detectors, observation.n_samples)
         provided = set(sources).union(*(o.provides | o.optional | o.requires for o in segment.operators))
-        n_streams = len(provided - {"boresight"}) + SCRATCH_STREAMS
         made: dict[str, Stream] = {}
         for name in sorted(wanted & provided):
             if name in sources and not segment.halo:
@@ -186,27 +202,29 @@ class Execution:
         seen: set[str] = set()
         means: dict[str, SmoothField] = {}
 
-        def store(block: Block) -> None:
+        first, rest = segment.split()
+        passed_on = set(made).union(*(o.requires | o.optional for o in rest))
+        in_block = set(sources).union(passed_on, *(o.provides for o in rest)) if rest else provided
+        n_streams = len((in_block & provided) - {"boresight"}) + SCRATCH_STREAMS
+
+        def work(detectors: slice, samples: slice) -> None:
+            margin = -(-segment.halo // TILE_SAMPLES) * TILE_SAMPLES
+            reach = slice(max(0, samples.start - margin), min(shape[1], samples.stop + margin))
+            # whole scans, and what is only taken in pieces, are worked on where they are kept
+            in_place = not segment.halo and (not rest or reach == slice(0, shape[1]))
+            block = self._block(detectors, reach, sources, made, in_place)
+            if first:
+                self._in_pieces(first, block, passed_on)
+            self._exec(rest[:1], block)
+            if reach != samples:
+                block = _trimmed(block, samples)
+            self._exec(rest[1:], block)
             for name, stream in made.items():
                 if name in block.detdata:
                     seen.add(name)
                     if block.detdata[name] is not block.places.get(name):
                         stream.array[block.detectors, block.samples] = block.detdata[name]
             means.update(block.means)  # the same fields in every block
-
-        def work(detectors: slice, samples: slice) -> None:
-            margin = -(-segment.halo // TILE_SAMPLES) * TILE_SAMPLES
-            reach = slice(max(0, samples.start - margin), min(shape[1], samples.stop + margin))
-            block = self._block(detectors, reach, sources, made if not segment.halo else {})
-            for index, operator in enumerate(segment.operators):
-                if self._stop.is_set():
-                    return
-                start = time.thread_time()
-                operator.exec(block, self.states[operator.label])
-                self.timer.add(operator.label, "exec", time.thread_time() - start)
-                if index == 0 and reach != samples:
-                    block = _trimmed(block, samples)
-            store(block)
 
         blocks = list(self._blocks(segment.span, shape, n_streams))
         what = ", ".join(o.label for o in segment.operators)
@@ -216,22 +234,47 @@ class Execution:
         self._release([s.array for s in [*sources.values(), *made.values()] if id(s.array) not in held])
         return kept
 
-    def _block(self, detectors: slice, samples: slice, sources: dict[str, Stream], made: dict[str, Stream]) -> Block:
-        """A block with its sources in it. Whole scans are worked on where they are kept; parts of scans are copied."""
-        shape = (detectors.stop - detectors.start, samples.stop - samples.start)
-        whole = shape[1] == self.observation.n_samples
-        buffers = self._local.__dict__.setdefault("buffers", {})
+    def _exec(self, operators: list[Operator], block: Block) -> None:
+        for operator in operators:
+            if self._stop.is_set():
+                return
+            start = time.thread_time()
+            operator.exec(block, self.states[operator.label])
+            self.timer.add(operator.label, "exec", time.thread_time() - start)
+
+    def _block(
+        self, detectors: slice, samples: slice, sources: dict[str, Stream], made: dict[str, Stream], in_place: bool
+    ) -> Block:
+        """A block with its sources in it: where they are kept, or copies. With margins never in place: others read them too."""
+        buffers = self._local.__dict__.setdefault("blocks", {})
         block = Block(self.observation, detectors, samples, dtype=self.settings.dtype, buffers=buffers)
-        if whole:
-            block.places = {name: stream.array[detectors] for name, stream in made.items()}
+        if in_place:
+            block.places = {name: stream.array[detectors, samples] for name, stream in made.items()}
         for name, stream in sources.items():
-            if whole and (name in block.places or name not in made):
-                block.detdata[name] = block.places.get(name, stream.array[detectors])
+            if in_place:
+                block.detdata[name] = block.places.get(name, stream.array[detectors, samples])
             else:
-                block.detdata[name] = block.buffer(name, shape)
+                block.detdata[name] = block.buffer(name, block.shape)
                 block.detdata[name][...] = stream.array[detectors, samples]
             block.means.update(stream.means)
         return block
+
+    def _in_pieces(self, operators: list[Operator], block: Block, passed_on: set[str]) -> None:
+        """Let operators that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
+        given, means = dict(block.detdata), block.means
+        buffers = self._local.__dict__.setdefault("pieces", {})
+        for detectors, samples in _pieces(block.detectors, block.samples):
+            piece = Block(block.observation, detectors, samples, means=dict(means), dtype=block.dtype, buffers=buffers)
+            where = _within(block.detectors, detectors), _within(block.samples, samples)
+            for name, stream in given.items():
+                piece.detdata[name] = piece.buffer(name, piece.shape)
+                piece.detdata[name][...] = stream[where]
+            self._exec(operators, piece)
+            for name in passed_on & piece.detdata.keys():
+                if name not in block.detdata:
+                    block.detdata[name] = block.places[name] if name in block.places else block.buffer(name, block.shape)
+                block.detdata[name][where] = piece.detdata[name]
+            block.means = piece.means  # the same fields in every piece
 
     def _allocate(self, name: str, shape: tuple[int, int]) -> Floats:
         size = shape[0] * shape[1] * np.dtype(self.settings.dtype).itemsize
@@ -285,13 +328,11 @@ class Execution:
                 progress(done, total, f"{self.observation.name}: {what}")
             return
         with ThreadPoolExecutor(self.settings.threads) as pool:
-            futures = {pool.submit(work, *block) for block in blocks}
+            futures = [pool.submit(work, *block) for block in blocks]
             try:
-                while futures:
-                    finished, futures = wait(futures, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        future.result()
-                    progress(total - len(futures), total, f"{self.observation.name}: {what}")
+                for done, future in enumerate(as_completed(futures), 1):
+                    future.result()
+                    progress(done, total, f"{self.observation.name}: {what}")
             except BaseException:
                 self._stop.set()
                 for future in futures:
@@ -299,9 +340,21 @@ class Execution:
                 raise
 
 
+def _pieces(detectors: slice, samples: slice) -> Iterator[tuple[slice, slice]]:
+    """The pieces of a block."""
+    for first in range(detectors.start, detectors.stop, TILE_DETECTORS):
+        for start in range(samples.start, samples.stop, PIECE):
+            yield slice(first, min(first + TILE_DETECTORS, detectors.stop)), slice(start, min(start + PIECE, samples.stop))
+
+
+def _within(whole: slice, part: slice) -> slice:
+    """Where ``part`` lies in an array that begins where ``whole`` does."""
+    return slice(part.start - whole.start, part.stop - whole.start)
+
+
 def _trimmed(block: Block, samples: slice) -> Block:
     """The block without its margins."""
-    inside = slice(samples.start - block.samples.start, samples.stop - block.samples.start)
+    inside = _within(block.samples, samples)
     detdata = {name: np.ascontiguousarray(array[:, inside]) for name, array in block.detdata.items()}
     return Block(block.observation, block.detectors, samples, detdata, block.means, block.dtype)
 

@@ -13,7 +13,7 @@ from .errors import InputError
 Floats = NDArray[np.float64]
 
 
-@dataclass
+@dataclass(repr=False)
 class Focalplane:
     """Detectors of one instrument. Every array has shape (n_det,).
 
@@ -66,6 +66,30 @@ class Focalplane:
                 if not np.isfinite(value).all():
                     bad = self.names[int(np.flatnonzero(~np.isfinite(value))[0])]
                     raise InputError(f"{f.name} of detector {bad} is not finite", place="focal plane")
+
+    def __repr__(self) -> str:
+        reach = np.degrees(np.arctan(self.radius)) * 60
+        return f"<Focalplane: {len(self)} detectors within {reach:.3g} arcmin of the boresight>"
+
+    def _repr_html_(self) -> str:
+        from .data import html_table
+
+        def span(values: Floats, scale: float, unit: str) -> str:
+            low, high = (f"{v * scale:.4g}" for v in (values.min(), values.max()))
+            return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
+
+        if not len(self):
+            return html_table("Focalplane", [("detectors", 0)])
+        rows = [
+            ("detectors", len(self)),
+            ("bands", ", ".join(sorted(set(self.band)))),
+            ("farthest from the boresight", f"{np.degrees(np.arctan(self.radius)) * 60:.4g} arcmin"),
+            ("FWHM", span(self.fwhm, np.degrees(3600), "arcsec")),
+            ("NET on the sky", span(self.net, 1e3, "mK_RJ sqrt(s)")),
+            ("main-beam efficiency zeta", span(self.main_beam_efficiency, 1, "")),
+            ("illumination efficiency epsilon", span(self.illumination_efficiency, 1, "")),
+        ]
+        return html_table("Focalplane", rows)
 
     def __len__(self) -> int:
         return len(self.names)

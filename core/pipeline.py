@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -233,10 +234,11 @@ class Pipeline:
             for operator in steps:
                 self._finalize(operator, data, timer, hooks)
         data.run = ""
-        data.provenance["timings"] = [(label, stage, seconds) for (label, stage), seconds in timer.seconds.items()]
         for operator in self.operators:
             if operator.at_end:
+                data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
                 self._finalize(operator, data, timer, hooks)
+        data.provenance["timings"] = timer.rows()
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 
@@ -272,12 +274,20 @@ class Pipeline:
 def versions() -> dict[str, str]:
     """Versions of everything that can change a number."""
     import platform
-    from importlib.metadata import PackageNotFoundError, version
 
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for package in ("zonda", "numpy", "scipy", "astropy", "astropy-iers-data", "numba", "healpy", "h5py"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
+        installed = _version(package)
+        if installed is not None:
+            found[package] = installed
     return found
+
+
+@cache
+def _version(package: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

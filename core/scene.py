@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field, field_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, field_validator
 
 from .configuration.parameters import Parameters
 from .configuration.target import Target
 from .configuration.time import Instant
 from .instrument import Instrument
 from .site import Site
+from .weather import WeatherSource, weather_source
 
 
 class Scene(Parameters):
@@ -24,6 +25,8 @@ class Scene(Parameters):
     """Start of the first scan, UTC unless it carries an offset, e.g. 2024-11-25T07:00 or 2024-11-25T02:00-05:00."""
     target: Target | None = None
     """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or {az: 180 deg, el: 60 deg}."""
+    weather: Annotated[SerializeAsAny[WeatherSource], BeforeValidator(weather_source)] | None = None
+    """The air: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: air.csv}; None: the climatology's median."""
     seed: int = Field(0, ge=0, lt=2**63)
     """Root of every random stream; the same seed gives the same bits."""
 

@@ -11,6 +11,7 @@ kelvin) and its turbulent part (float32) are such fields; see ``docs/atmosphere.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numba as nb
 import numpy as np
@@ -36,6 +37,11 @@ def bspline_weights(step: int, dtype: type = np.float64) -> Floats:
     u = np.arange(step) / step
     v = 1.0 - u
     return np.array([v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6]).astype(dtype)
+
+
+@lru_cache(maxsize=32)
+def _basis(step: int, dtype: str) -> Floats:
+    return bspline_weights(step, np.dtype(dtype).type)
 
 
 @dataclass(frozen=True)
@@ -97,8 +103,7 @@ class SmoothField:
             raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
         if out is None:
             out = np.empty((weights.shape[0], stop - start))
-        basis = bspline_weights(self.step, out.dtype.type)
-        _evaluate(weights, self.coefficients, basis, start, out)
+        _evaluate(weights, self.coefficients, _basis(self.step, out.dtype.str), start, out)
         return out
 
 
@@ -137,7 +142,7 @@ class DetectorField:
         rows = self.coefficients[detectors]
         if out is None:
             out = np.empty((len(rows), stop - start))
-        _evaluate_rows(rows, bspline_weights(self.step, out.dtype.type), start, out)
+        _evaluate_rows(rows, _basis(self.step, out.dtype.str), start, out)
         return out
 
 

@@ -37,6 +37,20 @@ def test_yaml(text, tmp_path, monkeypatch):
     assert load(tmp_path / "page.yaml").pipeline().operators
 
 
+def test_the_readme_shows_one_pipeline_twice(tmp_path, monkeypatch):
+    from zonda.core.configuration.pipeline_file import load
+
+    in_a_folder_with_a_map(tmp_path, monkeypatch)
+    page = (ROOT / "README.md").read_text()
+    (tmp_path / "my.yaml").write_text(next(t for t in re.findall(r"```yaml\n(.*?)```", page, re.S) if "operators:" in t))
+    file = load(tmp_path / "my.yaml")
+    python = next(t for t in re.findall(r"```python\n(.*?)```", page, re.S))
+    names = {}
+    exec(compile(python[: python.index(".run(")].replace("data = ", "pipeline = "), "documentation", "exec"), names)
+    assert names["scene"] == file.scene()
+    assert [repr(o) for o in names["pipeline"].operators] == [repr(o) for o in file.operators]
+
+
 def test_links():
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):

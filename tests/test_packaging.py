@@ -33,3 +33,13 @@ def test_version_is_the_same_everywhere():
     assert zonda.__version__ == project["version"]
     assert f"version: {zonda.__version__}" in (ROOT / "CITATION.cff").read_text()
     assert f"## [{zonda.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_operators_are_found_by_tab_and_misspellings_are_named():
+    import pytest
+
+    import zonda
+
+    assert {"PointingDaisy", "BinMap", "Pipeline"} <= set(dir(zonda))
+    with pytest.raises(AttributeError, match="did you mean 'Pipeline'"):
+        _ = zonda.Pipline

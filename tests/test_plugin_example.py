@@ -53,7 +53,10 @@ def test_a_pipeline_uses_it(installed, tmp_path):
 
 
 def test_its_operator_keeps_the_contract(installed):
-    code = "import zonda.testing; from zonda_example.time_constant import TimeConstant as T; zonda.testing.check_operator(T(tau='50 ms'))"
+    code = (
+        "import zonda.testing; from zonda_example.time_constant import TimeConstant; "
+        "zonda.testing.check_operator(TimeConstant(tau='50 ms'))"
+    )
     done = subprocess.run([sys.executable, "-c", code], env=installed, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

@@ -96,6 +96,14 @@ def test_the_twin_gives_identical_bits():
             assert np.array_equal(getattr(one.products[name], part), getattr(other.products[name], part), equal_nan=True)
 
 
+def test_the_run_tells_of_losses_alone(tmp_path, capsys):
+    assert command(*ARGUMENTS, "--output", tmp_path / "out") == 0
+    said = capsys.readouterr()
+    assert said.out == f"{tmp_path / 'out'}/\n"
+    assert "samples binned" not in said.err
+    assert all(line.startswith("SkyMap: samples outside the input map: ") for line in said.err.splitlines())
+
+
 def test_output_is_a_file(tmp_path, capsys):
     (tmp_path / "out").write_text("")
     assert command(*ARGUMENTS, "--output", tmp_path / "out") == 2

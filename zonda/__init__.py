@@ -50,15 +50,23 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name in _WHERE:
         return getattr(import_module(_WHERE[name]), name)
-    if name.startswith("_"):
-        raise AttributeError(f"module 'zonda' has no attribute {name!r}")
-    from zonda.core.registry import mapmakers, operators
+    if not name.startswith("_"):
+        for registry in _steps():  # zonda.BinMap, zonda.WhiteNoise and every plugin's operator
+            if name in registry:
+                return registry.get(name)
+        from difflib import get_close_matches
 
-    for registry in (operators, mapmakers):  # zonda.BinMap, zonda.WhiteNoise and every plugin's operator
-        if name in registry:
-            return registry.get(name)
+        near = get_close_matches(name, __dir__(), n=1)
+        raise AttributeError(f"module 'zonda' has no attribute {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""))
     raise AttributeError(f"module 'zonda' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted({*__all__, *(name for registry in _steps() for name in registry)})
+
+
+def _steps() -> tuple[Any, Any]:
+    """The registries of operators; reading them imports nothing heavy."""
+    from zonda.core.registry import mapmakers, operators
+
+    return operators, mapmakers

@@ -21,6 +21,17 @@ _LIMITS = {
     "less_than_equal": ("le", "at most"),
 }
 
+_WANTED = {
+    "int": "a whole number",
+    "bool": "true or false",
+    "float": "a number",
+    "string": "text",
+    "list": "a list",
+    "dict": "a mapping of keys",
+    "model": "a mapping of keys",
+}
+"""What pydantic's errors of type (or parsing) want, by the first word of their kind."""
+
 
 def explain(
     error: ValidationError, model: type[BaseModel], document: Document, at: Path, who: str, keys: Iterable[str] = ()
@@ -80,6 +91,8 @@ def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str,
         message = _limit(e, _unit(field), document, path)
     elif kind == "literal_error":
         label = nearest(e["input"], re.findall(r"'([^']*)'", context.get("expected", "")))
+    elif kind.endswith(("_parsing", "_type", "_from_float")) and kind.split("_")[0] in _WANTED and "error" not in context:
+        message = f"expected {_WANTED[kind.split('_')[0]]}, got {e['input']!r:.60}"
     message = message[:1].lower() + message[1:] if not message[:2].isupper() else message
     where = f"{who}, {'.'.join(map(str, loc))}" if loc else who
     text = "\n".join(filter(None, (context.get("help"), _description(field))))

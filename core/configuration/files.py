@@ -29,7 +29,7 @@ def find(value: Any, info: ValidationInfo) -> Path:
             raise PydanticCustomError("path_kind", message, {"path": str(value), "help": f"it is {candidate}"})
     where = " and ".join(str(p.parent) for p in tried)
     near = _similar(tried)
-    context = {"path": str(value), "where": where, "help": f"looked in {where}", "label": near}
+    context = {"path": str(value), "where": where, "label": near}
     raise PydanticCustomError("path_missing", "no such file: '{path}', looked in {where}", context)
 
 

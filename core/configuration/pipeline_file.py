@@ -15,6 +15,7 @@ from ..errors import PipelineError, ZondaError
 from ..operator import Operator
 from ..pipeline import Companion, Pipeline, check_order
 from ..scene import Scene
+from ..weather import WeatherSource, resolve
 from . import overrides as settings
 from . import yaml_places
 from .diagnostics import ConfigurationError, Diagnostic, nearest
@@ -48,7 +49,7 @@ class Header(Parameters):
 
 
 SCENE_KEYS = tuple(Scene.model_fields)
-KEYS = ["version", "name", "description", "requires", "seed", "site", "instrument", "time", "target"]
+KEYS = ["version", "name", "description", "requires", "seed", "site", "instrument", "time", "target", "weather"]
 KEYS += [key for key in (*SCENE_KEYS, *Header.model_fields) if key not in KEYS] + ["operators"]
 
 
@@ -247,6 +248,8 @@ class _Check:
             given["instrument"] = dict(given["instrument"])
             if not self.named(given["instrument"], "band", registry.bands, ("instrument", "band")):
                 given["instrument"]["band"] = {"name": "", "low": 1.0, "high": 2.0}  # goes on to find the other mistakes
+        if given.get("weather") is not None:
+            given["weather"] = self.weather(given["weather"])
         before = len(self.mistakes)
         stand_in = {kind: self.tree[kind] for kind in lost}
         given = {key: value for key, value in given.items() if key not in lost}
@@ -254,6 +257,15 @@ class _Check:
         missing = tuple(f"the pipeline needs '{kind}'" for kind in stand_in)
         self.mistakes[before:] = [m for m in self.mistakes[before:] if m.message not in missing]
         return scene
+
+    def weather(self, value: Any) -> WeatherSource | None:
+        """The weather, checked as the source that it names."""
+        try:
+            source, given = resolve(value)
+        except ZondaError as err:
+            self.refused(err, self.document.mark(("weather",)).value)
+            return None
+        return self.validate(source, given, ("weather",), "weather")
 
     def named(self, given: dict[str, Any], key: str, names: registry.Registry, at: yaml_places.Path) -> bool:
         """Put what the name stands for in its place; False where there is no such thing."""
@@ -272,7 +284,9 @@ class _Check:
         if not isinstance(items, list) or not items:
             there = ("operators",) in self.document.marks
             span = self.document.mark(("operators",)).start if there else Span(self.document.mark(()).value.source)
-            message = "'operators' must be a list of steps" if there else "the pipeline needs 'operators', a list of steps"
+            empty = items is None or items == []
+            have = "'operators' is empty: it must be a list of steps" if empty else "'operators' must be a list of steps"
+            message = have if there else "the pipeline needs 'operators', a list of steps"
             self.wrong(message, span, "" if there else "add 'operators:'", "write one '- Name: {parameter: value}' per step")
             return []
         steps: list[Step | None] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from pydantic import BaseModel
@@ -28,7 +29,8 @@ def json_schema() -> dict[str, Any]:
         except (ZondaError, PydanticInvalidForJsonSchema):
             continue
         classes[found.qualified if twice else found.name] = operator
-    wanted: list[type[BaseModel]] = [Header, Scene, *dict.fromkeys(classes.values())]
+    weather = _weather()
+    wanted: list[type[BaseModel]] = [Header, Scene, *dict.fromkeys([*classes.values(), *weather.values()])]
     models = [(model, _MODE) for model in wanted]
     references, definitions = models_json_schema(models, ref_template="#/$defs/{model}")
     defs = definitions.get("$defs", {})
@@ -36,6 +38,8 @@ def json_schema() -> dict[str, Any]:
     properties = header["properties"] | scene["properties"]
     for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
         properties[kind] = _name_or(properties[kind], names)
+    sources = [{"type": "string", "enum": list(weather)}, *(references[model, _MODE] for model in weather.values())]
+    properties["weather"] = {"anyOf": [*sources, {"type": "null"}], "description": properties["weather"]["description"]}
     for definition in defs.values():
         if definition.get("title") == "Instrument":
             definition["properties"]["band"] = _name_or(definition["properties"]["band"], registry.bands)
@@ -51,6 +55,15 @@ def json_schema() -> dict[str, Any]:
         "required": [*scene.get("required", []), "operators"],
         "$defs": defs,
     }
+
+
+def _weather() -> dict[str, type[BaseModel]]:
+    """The weather sources by name; broken plugins are left out."""
+    found: dict[str, type[BaseModel]] = {}
+    for name in registry.weather_sources:
+        with suppress(ZondaError):
+            found[name] = registry.weather_sources.get(name)
+    return found
 
 
 def _step(classes: dict[str, type[Operator]], references: Any) -> dict[str, Any]:

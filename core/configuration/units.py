@@ -21,6 +21,8 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
+from .diagnostics import nearest
+
 
 class Kind(NamedTuple):
     """One kind of quantity: how messages call it, examples, and the units in which values are written back."""
@@ -208,7 +210,9 @@ class Unit:
             parsed = u.Unit(unit)
         except (ValueError, TypeError) as err:
             hint = re.search(r"Did you mean ([^?]*)\?", str(err))
-            label = f"did you mean {hint[1]}?" if hint else f"expected {self.kind.noun}, e.g. '{self.example}'"
+            otherwise = f"did you mean {hint[1]}?" if hint else f"expected {self.kind.noun}, e.g. '{self.example}'"
+            own = read_unit(self.unit)
+            label = nearest(unit, (name for name, (_, powers) in UNITS.items() if own and powers == own.powers), otherwise)
             raise self._error("unit_unknown", f"unknown unit '{unit}' in {text!r:.60}", caret, label) from None
         try:
             return float(parsed.to(u.Unit(self.unit)))

@@ -144,7 +144,7 @@ class BandAtmosphere:
         return min(self._scale * math.expm1(self._u_max * (x + 1) / 2), self.pwv_max)
 
     def _elevation(self, y: float) -> float:
-        """Elevation at y = -1 (zenith) .. 1 (5 deg)."""
+        """Elevation at y = -1 (zenith) .. 1 (4.5 deg)."""
         return max(math.asin(math.exp(-self._v_max * (y + 1) / 2)), ELEVATION_MIN)
 
     def _x(self, pwv: Array) -> Array:
@@ -162,7 +162,7 @@ class BandAtmosphere:
         if not ELEVATION_MIN * (1 - 1e-9) <= low <= high <= ELEVATION_MAX * (1 + 1e-9):
             raise InputError(
                 f"elevations of {math.degrees(low):.2f} to {math.degrees(high):.2f} deg leave the limits "
-                "of the radiative transfer, 5 to 90 deg",
+                "of the radiative transfer, 4.5 to 90 deg",
                 cure="choose a target or a time with a higher elevation",
             )
         return -2 * np.log(np.sin(elevation)) / self._v_max - 1

@@ -25,6 +25,7 @@ exact along the elevation and, at e_0, along the azimuth however wide the throw;
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -63,24 +64,27 @@ def axes(quaternions: Floats) -> Floats:
 def axes_at(quaternions: Floats, index: NDArray[np.int64], step: int) -> Floats:
     """`axes` at sample numbers ``index``, which may lie before the first or after the last sample. Shape (len(index), 3, 3).
 
-    Beyond the ends, where values only feed the margin of the spline in time, the path goes on with its last velocity and
-    acceleration and comes to rest within a few ``step``: A + A' s + A'' s^2 / 2, s = t / (1 + (t / T)^4)^(1/4), T <= 4 step,
-    short enough that it moves by less than `LARGEST_REACH` (fast scans therefore need shorter steps).
+    Beyond the ends, where values only feed the margin of the spline in time, the path goes on with its last velocity,
+    acceleration and jerk and comes to rest within a few ``step``: A + s A1 + s^2 A2 / 2 + s^3 A3 / 6,
+    s = t / (1 + (t / T)^8)^(1/8), T <= 8 step, short enough that it moves by less than about `LARGEST_REACH` (fast scans
+    therefore need shorter steps).
     """
     n = len(quaternions)
     out = axes(quaternions[np.clip(index, 0, n - 1)])
-    gap = min(max(step // 8, 1), (n - 1) // 2)
+    gap = min(max(step // 8, 1), (n - 1) // 3)
     if gap == 0:
         return out
     for end, inward in ((0, 1), (n - 1, -1)):
         beyond = (index < 0) if end == 0 else (index > n - 1)
-        a, b, c = axes(quaternions[[end, end + inward * gap, end + 2 * inward * gap]])
-        first, second = (4 * b - 3 * a - c) / (2 * gap), (a - 2 * b + c) / gap**2
+        a, b, c, d = axes(quaternions[[end + inward * k * gap for k in range(4)]])
+        first = (18 * b - 11 * a - 9 * c + 2 * d) / (6 * gap)
+        second = (2 * a - 5 * b + 4 * c - d) / gap**2
+        third = (3 * b - a - 3 * c + d) / gap**3
         t = abs(index[beyond] - end).astype(np.float64)
-        speed, acceleration = abs(first).max() + 1e-30, abs(second).max() + 1e-30
-        reach = min(4.0 * step, LARGEST_REACH / 2 / speed, (LARGEST_REACH / acceleration) ** 0.5)
-        s = -t / (1 + (t / reach) ** 4) ** 0.25
-        out[beyond] = a + s[:, None, None] * first + (s**2 / 2)[:, None, None] * second
+        sizes = [abs(m).max() / math.factorial(k) + 1e-30 for k, m in enumerate((first, second, third), 1)]
+        limits = [(LARGEST_REACH / 2 / size) ** (1 / k) for k, size in enumerate(sizes, 1)]
+        s = -t / (1 + (t / min(8.0 * step, *limits)) ** 8) ** 0.125
+        out[beyond] = a + s[:, None, None] * (first + (s / 2)[:, None, None] * (second + (s / 3)[:, None, None] * third))
     return out
 
 

@@ -38,6 +38,7 @@ from .plan import Plan, make_plan
 from .radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
 from .sampling import Drifting, evaluate_layers, times_with_margin
 from .turbulence import Turbulence
+from .weather_sources import air_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -48,9 +49,6 @@ Floats = NDArray[np.float64]
 
 LOG_NORMAL_FROM = 0.15
 """PWV rms from which y is exp(s g - s^2 var(g) / 2) - 1, so that water stays positive (below, 1 + y < 0 takes 6.7 sigma)."""
-
-LOWEST_ELEVATION = math.radians(4.5)
-"""Lowest line of sight that is accepted, see `Sky`."""
 
 PLANES = {
     "transverse": "transverse to the mean line of sight",
@@ -117,7 +115,8 @@ class AtmosphereLayers(Operator):
     provides: ClassVar[Any] = _Provides()
 
     pwv: Metres | None = Field(None, gt=0, le=weather.PWV_MAX)
-    """Mean precipitable water vapour at zenith; where absent, the climatology's median for the date and hour."""
+    """Mean precipitable water vapour at zenith; where absent, that of the scene's `weather` (by default the climatology's median
+    for the date and hour). A scene whose weather gives another PWV is refused: it would be given twice."""
     pwv_rms: Fraction = quantity("0.5 %", ge=0, le=1)
     """Ensemble rms of the water along a line of sight, as a fraction of its mean (at one point of the sky, over all weather)."""
     pwv_rms_after_beam: bool = False
@@ -133,7 +132,7 @@ class AtmosphereLayers(Operator):
     outer_scale: Metres = quantity("500 m", gt=0)
     """Outer scale r0 of the turbulence (van Marrewijk et al. 2024), a length in the von Karman covariance."""
     wind: Literal["profile"] | Wind | list[Wind] = "profile"
-    """The climatology's wind at each layer's height, or one wind for all layers, or a list of one for each."""
+    """The weather's wind at each layer's height (see `weather: wind`), or one wind for all layers, or a list of one for each."""
     fidelity: Literal["default", "fine"] = "default"
     """Accuracy of the turbulence: its covariance is within 0.08 % or 0.01 % of the variance (docs/atmosphere.md)."""
     beam: Literal["gaussian", "top_hat", "tapered"] = "gaussian"
@@ -148,6 +147,7 @@ class AtmosphereLayers(Operator):
     """Rms error of the evaluation at nodes, as a fraction of what the focal-plane mean, subtracted, leaves of the atmosphere."""
 
     _origin: Any = PrivateAttr(None)
+    _source: Any = PrivateAttr(None)
     _tracks: dict[str, Track] = PrivateAttr(default_factory=dict)
     _air: dict[Any, tuple[Profile, BandAtmosphere]] = PrivateAttr(default_factory=dict)
 
@@ -155,6 +155,9 @@ class AtmosphereLayers(Operator):
     def _consistent(self) -> AtmosphereLayers:
         if self.layers > 1 and not self.lowest < self.highest:
             raise ValueError("lowest must be below highest")
+        of_many = {"highest", "weights"} & self.model_fields_set
+        if self.layers == 1 and of_many:
+            raise ValueError(f"{sorted(of_many)[0]} needs several layers; a single one lies at lowest")
         if isinstance(self.wind, list) and len(self.wind) != self.layers:
             raise ValueError(f"wind lists {len(self.wind)} winds for {self.layers} layers")
         if self.edge_taper is not None and self.beam != "tapered":
@@ -163,14 +166,16 @@ class AtmosphereLayers(Operator):
 
     def observe(self, data: Data) -> None:
         """Note when the run begins and how its scans follow each other: all of them look through the same drifting air."""
-        self._origin = data.scene.time
+        self._origin, self._source = data.scene.time, data.scene.weather
         self._tracks = dict(zip((o.name for o in data.observations), tracks(data.observations), strict=True))
 
     def prepare(self, observation: Observation) -> Fluctuations:
         """Draw the turbulence at the nodes; set the smooth means."""
         track = self._tracks.get(observation.name) or tracks([observation])[0]
         profile, band = self._weather(observation)
-        sky = Sky(band)
+        for what, text in profile.stated:
+            if what != "wind" or self.wind == "profile":
+                observation.tally.state(self.label, what, text)
         pwv = self.pwv or profile.pwv
         layers = self._layers(profile)
         models = [_model(self, layer, track, observation) for layer in layers]
@@ -178,9 +183,13 @@ class AtmosphereLayers(Operator):
         variance = sum(m.amplitude**2 * b.variance for m, b in zip(models, beams, strict=True))
         scale = self.pwv_rms / math.sqrt(variance) if self.pwv_rms_after_beam else self.pwv_rms
 
-        winds = [layer.wind for layer in layers]
-        plan = make_plan(observation, track, models, winds, variance, self.tolerance, sky, pwv, self.pwv_rms)
-        self._means(observation, plan, sky, pwv)
+        key = f"{self.label} plan"  # kept for the companion runs
+        if key not in observation.resolved:
+            winds = [layer.wind for layer in layers]
+            made = make_plan(observation, track, models, winds, variance, self.tolerance, band, pwv, self.pwv_rms)
+            observation.resolved[key] = made
+        plan: Plan = observation.resolved[key]
+        _means(observation, plan, band, pwv)
         parts = zip(beams, layers, plan.steps, strict=True)
         drifting = [Drifting(beam, layer.height, layer.amplitude, layer.wind, step) for beam, layer, step in parts]
         g = evaluate_layers(observation, track, plan.nodes, plan.step, drifting)
@@ -191,11 +200,11 @@ class AtmosphereLayers(Operator):
         per_vapour = delay_per_vapour(np.asarray(profile.at(heights).temperature), shares)
 
         def values(rows: slice) -> dict[str, Floats]:
-            elevation = self._elevation(observation, plan, rows)
+            elevation = _elevations(observation, plan.nodes.xi[rows], plan.nodes.eta[rows], plan.step)
             y = self._clip(observation, self._water(g[rows].astype(np.float64), scale, variance), pwv, band)
             found = {
-                "emission": sky.emission_difference(pwv, pwv * y, elevation),
-                "transmission": sky.transmission_ratio(pwv, pwv * y, elevation),
+                "emission": band.emission_difference(pwv, pwv * y, elevation),
+                "transmission": np.expm1(band.log_transmission_difference(pwv, pwv * y, elevation)),
             }
             if "opacity" in self.outputs:
                 found["opacity"] = -np.log1p(found["transmission"])
@@ -210,22 +219,6 @@ class AtmosphereLayers(Operator):
             observation.tally.state(self.label, "wet path delay", f"{per_vapour:.3f} times the water (non-dispersive)")
         return Fluctuations(fields.pop("emission"), fields.pop("transmission"), fields)
 
-    def _means(self, observation: Observation, plan: Plan, sky: Sky, pwv: float) -> None:
-        """Mean emission and transmission, at nodes of their own."""
-        nodes, step = plan.mean_nodes, plan.mean_step
-        elevation = _elevations(observation, nodes.xi, nodes.eta, step)
-        for name, function in (("atmosphere", sky.emission), ("transmission", sky.transmission)):
-            values = function(pwv, elevation)
-            observation.smooth[name] = SmoothField.from_values(nodes.weights, values, step, observation.n_samples)
-
-    def _elevation(self, observation: Observation, plan: Plan, rows: slice) -> Floats:
-        """Of some nodes, (n, n_time); what lies below the radiative transfer's limit is counted."""
-        elevation = _elevations(observation, plan.nodes.xi[rows], plan.nodes.eta[rows], plan.step)
-        index = times_with_margin(observation.n_samples, plan.step)
-        low = Sky.below(elevation)[:, (index >= 0) & (index < observation.n_samples)]
-        observation.tally.count(self.label, "node values below 5 deg of elevation, extrapolated", int(low.sum()))
-        return elevation
-
     def exec(self, block: Block, state: Fluctuations) -> None:
         """Add the fluctuations to the block's ``atmosphere`` and ``transmission``, and to the `outputs`."""
         for name, field in (("atmosphere", state.emission), ("transmission", state.transmission), *state.outputs.items()):
@@ -237,12 +230,12 @@ class AtmosphereLayers(Operator):
     # ------------------------------------------------------------------------------------------------------------------------
 
     def _weather(self, observation: Observation) -> tuple[Profile, BandAtmosphere]:
-        """One weather for the run: the climatology at its start."""
+        """One weather for the run: the scene's at its start."""
         time: Instant = self._origin or observation.start
         band: Band = observation.instrument.band
-        key = (repr(observation.site), time, self.pwv, repr(band))
+        key = (repr(observation.site), time, self.pwv, repr(band), repr(self._source), observation.seed)
         if key not in self._air:
-            profile = weather.profile(observation.site, time, self.pwv)
+            profile = air_of(self._source, observation.site, time, observation.seed, self.pwv)
             rise = math.exp(7 * self._log_width(1.0)) if self.pwv_rms >= LOG_NORMAL_FROM else 1 + 8 * self.pwv_rms
             largest = min((self.pwv or profile.pwv) * max(rise, 1.05), weather.PWV_MAX)
             self._air[key] = profile, BandAtmosphere(band, profile, largest)
@@ -295,7 +288,7 @@ class AtmosphereLayers(Operator):
             observation.tally.state(self.label, what, text)
 
         before, after = scale, scale * math.sqrt(variance)
-        say("mean PWV", f"{pwv * 1e3:.3f} mm" + ("" if self.pwv else " (climatology)"))
+        say("mean PWV", f"{pwv * 1e3:.3f} mm" + ("" if self.pwv else " (of the weather)"))
         say("PWV rms", f"{before:.3%} of the mean before the beam, {after:.3%} after it")
         say("distribution of the water", "log-normal" if self.pwv_rms >= LOG_NORMAL_FROM else "normal")
         parts = (
@@ -336,6 +329,14 @@ def airmass(elevation: Floats, height: float) -> Floats:
     return np.asarray(1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64)
 
 
+def _means(observation: Observation, plan: Plan, band: BandAtmosphere, pwv: float) -> None:
+    """Set the mean emission and transmission, at nodes of their own."""
+    nodes, step = plan.mean_nodes, plan.mean_step
+    elevation = _elevations(observation, nodes.xi, nodes.eta, step)
+    for name, function in (("atmosphere", band.emission), ("transmission", band.transmission)):
+        observation.smooth[name] = SmoothField.from_values(nodes.weights, function(pwv, elevation), step, observation.n_samples)
+
+
 def _elevations(observation: Observation, xi: Floats, eta: Floats, step: int) -> Floats:
     """Elevations (len(xi), n_time) at the times that a `SmoothField` wants.
 
@@ -344,7 +345,7 @@ def _elevations(observation: Observation, xi: Floats, eta: Floats, step: int) ->
     index = times_with_margin(observation.n_samples, step)
     elevation = np.arcsin(rays(axes_at(observation.boresight_azel, index, step), xi, eta)[2])
     inside = (index >= 0) & (index < observation.n_samples)
-    elevation[:, ~inside] = np.clip(elevation[:, ~inside], min(ELEVATION_MIN, elevation[:, inside].min()), ELEVATION_MAX)
+    elevation[:, ~inside] = np.clip(elevation[:, ~inside], ELEVATION_MIN, ELEVATION_MAX)
     return np.asarray(elevation, np.float64)
 
 
@@ -367,52 +368,6 @@ def _fields(
 
 def _thickness(heights: Floats) -> Floats:
     return np.asarray(np.gradient(heights) if len(heights) > 1 else np.ones(1), np.float64)
-
-
-class Sky:
-    """A band's emission and transmission, continued a little below the lowest elevation of the radiative transfer.
-
-    A telescope at its limit of 5 deg has detectors lower than that. Down to `LOWEST_ELEVATION` values follow from the
-    parabola in ln sin(elevation) through three points above the limit; the error 0.04 deg below it is < 1 mK of 100 K.
-    """
-
-    def __init__(self, band: BandAtmosphere) -> None:
-        self.band = band
-
-    def emission(self, pwv: float, elevation: Floats) -> Floats:
-        return self._continued(lambda e: self.band.emission(pwv, e), elevation)
-
-    def transmission(self, pwv: float, elevation: Floats) -> Floats:
-        return self._continued(lambda e: self.band.transmission(pwv, e), elevation)
-
-    def emission_difference(self, pwv: float, dpwv: Floats, elevation: Floats) -> Floats:
-        return self._continued(lambda e: self.band.emission_difference(pwv, dpwv, e), elevation)
-
-    def transmission_ratio(self, pwv: float, dpwv: Floats, elevation: Floats) -> Floats:
-        """transmission(pwv + dpwv) / transmission(pwv) - 1, without cancellation."""
-        return np.expm1(self._continued(lambda e: self.band.log_transmission_difference(pwv, dpwv, e), elevation))
-
-    def slope(self, pwv: float, elevation: Floats) -> Floats:
-        """d emission / d elevation, K_RJ per rad."""
-        h = 1e-4
-        low = np.minimum(elevation, ELEVATION_MAX - h)
-        return np.asarray((self.emission(pwv, low + h) - self.emission(pwv, low)) / h, np.float64)
-
-    @staticmethod
-    def below(elevation: Floats) -> NDArray[np.bool_]:
-        """Where values are continued."""
-        return np.asarray((elevation < ELEVATION_MIN) & (elevation.min() >= LOWEST_ELEVATION))
-
-    def _continued(self, function: Callable[[Floats], Floats], elevation: Floats) -> Floats:
-        elevation = np.asarray(elevation, np.float64)
-        low = self.below(elevation)
-        if not low.any():
-            return function(elevation)
-        h, bottom = 0.02, math.sin(ELEVATION_MIN)
-        above = [np.arcsin(bottom * math.exp(k * h)) for k in range(3)]
-        a, b, c = (function(np.where(low, e, elevation)) for e in above)
-        t = np.log(np.sin(elevation) / bottom) / h
-        return np.where(low, a * (t - 1) * (t - 2) / 2 - b * t * (t - 2) + c * t * (t - 1) / 2, a)
 
 
 def _model(operator: AtmosphereLayers, layer: Layer, track: Track, observation: Observation) -> LayerModel:

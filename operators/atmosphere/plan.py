@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from zonda.core.data import Observation
 from zonda.core.smooth import SmoothField
 
+from .band import BandAtmosphere
 from .geometry import Track, axes, axes_at, crossing, rays
 from .nodes import (
     GRIDS,
@@ -26,10 +26,8 @@ from .nodes import (
     some,
     time_error,
 )
+from .radiative_transfer import ELEVATION_MAX
 from .sampling import times_with_margin
-
-if TYPE_CHECKING:
-    from .layers import Sky
 
 Floats = NDArray[np.float64]
 
@@ -68,7 +66,7 @@ def make_plan(
     winds: Sequence[Floats],
     variance: float,
     tolerance: float,
-    sky: Sky,
+    band: BandAtmosphere,
     pwv: float,
     pwv_rms: float,
 ) -> Plan:
@@ -86,12 +84,12 @@ def make_plan(
 
     path = _Path(observation, xi, eta)
     elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
-    slope = float(np.max(abs(sky.slope(pwv, elevations))))
+    slope = float(np.max(abs(_slope(band, pwv, elevations))))
     # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the water fluctuated where none does).
-    kelvin = float(sky.emission(pwv, elevations[1]))
+    kelvin = float(band.emission(pwv, elevations[1]))
     allowed = max(MEAN_SHARE * tolerance * kelvin * max(pwv_rms, 1e-4), 1e-9)
     mean_nodes = next(
-        (g for g in (grid(xi, eta, n) for n in GRIDS) if _mean_error(g, xi, eta, sky, pwv, elevations) <= allowed),
+        (g for g in (grid(xi, eta, n) for n in GRIDS) if _mean_error(g, xi, eta, band, pwv, elevations) <= allowed),
         grid(xi, eta, 64),
     )
 
@@ -136,14 +134,21 @@ def make_plan(
     return Plan(nodes, step, tuple(steps), tolerance, error / rms, late / rms, left / rms, mean_nodes, mean_step)
 
 
-def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, sky: Sky, pwv: float, elevations: Floats) -> float:
+def _slope(band: BandAtmosphere, pwv: float, elevation: Floats) -> Floats:
+    """d emission / d elevation, K_RJ per rad."""
+    h = 1e-4
+    low = np.minimum(elevation, ELEVATION_MAX - h)
+    return np.asarray((band.emission(pwv, low + h) - band.emission(pwv, low)) / h, np.float64)
+
+
+def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, band: BandAtmosphere, pwv: float, elevations: Floats) -> float:
     """Largest error of the mean emission interpolated over the focal plane, K_RJ, at some elevations of the boresight."""
     worst = 0.0
     for elevation in elevations:
         c, s = math.cos(elevation), math.sin(elevation)
 
         def at(x: Floats, e: Floats, c: float = c, s: float = s) -> Floats:
-            return sky.emission(pwv, np.arcsin((s + e * c) / np.sqrt(1 + x * x + e * e)))
+            return band.emission(pwv, np.arcsin((s + e * c) / np.sqrt(1 + x * x + e * e)))
 
         worst = max(worst, float(abs(at(xi, eta) - nodes.weights @ at(nodes.xi, nodes.eta)).max()))
     return worst

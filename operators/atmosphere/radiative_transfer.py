@@ -37,8 +37,8 @@ VAPOUR_GAS_CONSTANT = BOLTZMANN * AVOGADRO / MOLAR_MASS_WATER
 """J / (kg K), of water vapour."""
 EARTH_RADIUS = 6.371e6
 """m, mean."""
-ELEVATION_MIN, ELEVATION_MAX = math.radians(5.0), math.radians(90.0)
-"""rad: limits of equation (1) without refraction."""
+ELEVATION_MIN, ELEVATION_MAX = math.radians(4.5), math.radians(90.0)
+"""rad: limits of equation (1) without refraction; a telescope at 5 deg has detectors a little lower."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,12 @@ class Layers:
         Raises
         ------
         InputError
-            Elevation outside 5 to 90 deg.
+            Elevation outside 4.5 to 90 deg.
         """
         if not ELEVATION_MIN * (1 - 1e-9) <= elevation <= ELEVATION_MAX * (1 + 1e-9):
             raise InputError(
-                f"an elevation of {math.degrees(elevation):.2f} deg is outside the limits of the radiative transfer, 5 to 90 deg",
+                f"an elevation of {math.degrees(elevation):.2f} deg is outside the limits of the radiative transfer, "
+                "4.5 to 90 deg",
                 cure="choose a target or a time with a higher elevation",
             )
         if plane_parallel:

@@ -1,4 +1,4 @@
-"""The air above a site at a time of year and day, from an embedded climatology (see data/README.md).
+"""The air above a site: profiles from the ground up, and the embedded climatology (see data/README.md).
 
 Per site and pressure level the median temperature, ln(vapour density), wind and height of 15 years of ERA5 are harmonics,
 
@@ -9,17 +9,22 @@ with A = 1, cos a, sin a, cos 2a, sin 2a, cos 3a, sin 3a and H = 1, cos b, sin b
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.weather import PWV_MAX as PWV_MAX
+from zonda.core.weather import Column
 
 from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT, Layers
+from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, STRATOSPHERIC_WATER, ozone, standard_column, upper_levels
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -29,8 +34,6 @@ Array = NDArray[np.float64]
 
 CLIMATOLOGY = Path(__file__).parent / "data" / "climatology.npz"
 
-PWV_MAX = 60e-3
-"""m: more water than any air on Earth holds above a telescope."""
 LEVELS = 61
 """Heights of a profile."""
 TOP = 46e3
@@ -38,8 +41,11 @@ TOP = 46e3
 EXTRAPOLATION_MAX = 500.0
 """m that a site may lie below the lowest level of its climatology."""
 
-DRY_AIR_GAS_CONSTANT = 287.05
-"""J / (kg K)."""
+YEARS = (1940, 2100)
+"""Years for which the climatology, of 15 recent ones, is taken: ERA5 begins with the first."""
+STACKING = 0.77
+"""Levels do not vary together: the column's ln(PWV) scatters this much of what the levels' quantiles, stacked, would give.
+ERA5's own columns ask for 0.745 at Green Bank, 0.66 at Chajnantor, 0.88 at the South Pole, in the mean over the year."""
 STRATOSPHERE_LAPSE = 2.8e-3
 """K / m above the highest climatological level, 10 hPa, as in the US Standard Atmosphere 1976 ..."""
 STRATOPAUSE_TEMPERATURE = 270.65
@@ -59,6 +65,20 @@ class Air:
 
 
 @dataclass(frozen=True)
+class WaterDistribution:
+    """Log-normal law of the PWV, cut at `PWV_MAX`: median [m] and standard deviation of the logarithm."""
+
+    median: float
+    sigma: float
+
+    def at(self, quantile: float) -> float:
+        """PWV [m] at a quantile between 0 and 1."""
+        normal, centre = NormalDist(), math.log(self.median)
+        most = normal.cdf((math.log(PWV_MAX) - centre) / self.sigma)
+        return math.exp(centre + self.sigma * normal.inv_cdf(min(max(quantile * most, 1e-300), 1 - 1e-16)))
+
+
+@dataclass(frozen=True)
 class Profile:
     """The air above a site, arrays (61,) from the ground up.
 
@@ -74,6 +94,12 @@ class Profile:
         Velocity of the air towards east and north, m/s (medians of the components).
     altitude
         m above sea level of the site.
+    wind_east_spread, wind_north_spread
+        Standard deviations of the winds [m/s] over the weather of the season and hour; None: not known.
+    distribution
+        How the PWV of that season and hour is distributed, whatever the water is scaled to; None: not known.
+    stated
+        (what, text): where this air comes from, for the reports.
     """
 
     height: Array
@@ -84,6 +110,10 @@ class Profile:
     wind_east: Array
     wind_north: Array
     altitude: float
+    wind_east_spread: Array | None = None
+    wind_north_spread: Array | None = None
+    distribution: WaterDistribution | None = None
+    stated: tuple[tuple[str, str], ...] = ()
 
     @property
     def vapour_density(self) -> Array:
@@ -120,6 +150,26 @@ class Profile:
             profile = replace(profile, h2o=profile.h2o * (pwv / profile.pwv)) if pwv > 0 else replace(self, h2o=0 * self.h2o)
         return profile
 
+    @property
+    def typical_wind(self) -> Profile:
+        """The same air with the median speed along the median direction.
+
+        Of a wind whose components are normal with means (u, v) and spreads su, sv, the median speed is within 3 % of
+
+            V^2 = u^2 + v^2 + s^2 (1 + 0.386 exp(-(u^2 + v^2) / (2 s^2))),   s^2 = (su^2 + sv^2) / 2                (2)
+
+        which the vector of medians understates. Without spreads the profile itself.
+        """
+        if self.wind_east_spread is None or self.wind_north_spread is None:
+            return self
+        squared = self.wind_east**2 + self.wind_north**2
+        variance = np.maximum((self.wind_east_spread**2 + self.wind_north_spread**2) / 2, 1e-12)
+        speed = np.sqrt(squared + variance * (1 + 0.386 * np.exp(-squared / (2 * variance))))
+        median = np.sqrt(squared)
+        east = np.where(median > 0, self.wind_east, 1.0) / np.where(median > 0, median, 1.0)
+        north = np.where(median > 0, self.wind_north, 0.0) / np.where(median > 0, median, 1.0)
+        return replace(self, wind_east=speed * east, wind_north=speed * north)
+
     def at(self, height: ArrayLike) -> Air:
         """The air at heights above the site [m], any shape: winds as vectors, pressure and vapour as logarithms, linearly.
 
@@ -151,16 +201,18 @@ class Profile:
 def profile(site: Site, time: Instant, pwv: float | None = None) -> Profile:
     """The median air above a site at a time, its water scaled to ``pwv`` [m] where that is given.
 
+    A site without climatology has the US Standard Atmosphere where ``pwv`` is given.
+
     Raises
     ------
     InputError
-        A site without climatology, an unknown one, one whose levels begin far above the site, an unphysical PWV.
+        Neither climatology nor PWV, an unknown climatology, one whose levels begin far above the site, an unphysical PWV, a
+        time outside `YEARS`.
     """
     if pwv is not None:
         check_pwv(pwv)
-    levels = _levels(site, time)
-    height = TOP * np.expm1(2.5 * np.linspace(0, 1, LEVELS)) / np.expm1(2.5)
-    median = _on_heights(levels, site.altitude, height)
+    column = standard_column(site) if site.climatology is None and pwv is not None else climatology_column(site, time)
+    median = on_heights(column, site)
     return median if pwv is None else median.scaled(pwv)
 
 
@@ -187,49 +239,51 @@ def coefficients(name: str) -> dict[str, NDArray[np.float32]]:
         return {key.split("/")[1]: file[key] for key in file.files if key.startswith(f"{name}/")}
 
 
-@dataclass(frozen=True)
-class _Levels:
-    """Profiles on the climatology's pressure levels, from the lowest up: Pa, m above sea level, K, volume mixing ratio, m/s."""
-
-    pressure: Array
-    height: Array
-    temperature: Array
-    h2o: Array
-    wind_east: Array
-    wind_north: Array
-    ozone_pressure: Array
-    ozone: Array
-
-
-def _levels(site: Site, time: Instant) -> _Levels:
-    """Equation (1)."""
+def climatology_column(site: Site, time: Instant) -> Column:
+    """Equation (1), with its spreads. Raises `InputError` as `profile`."""
     name, place = site.climatology, f"site '{site.name}'"
     known = climatologies()
     if name is None:
         raise InputError(
             "has no climatology, so the air above it is unknown",
             place=place,
-            cure=f"choose a site that has one (see `zonda plugins`), or set its climatology to one of: {', '.join(known)}",
+            cure="give its water, e.g. weather: {pwv: 3 mm}, or an ERA5 file, weather: {file: era5.nc}, which "
+            "`zonda weather fetch` gets; or choose a site that has a climatology (see `zonda plugins`), or set the site's "
+            f"climatology to one of: {', '.join(known)}",
         )
     if name not in known:
         raise InputError(f"climatology '{name}' does not exist", place=place, cure=f"choose one of: {', '.join(known)}")
+    if not YEARS[0] <= time.datetime.year < YEARS[1]:
+        raise InputError(
+            f"{time} is outside what the climatology stands for, {YEARS[0]} to {YEARS[1]}",
+            place=place,
+            cure="choose a time in these years: the climatology is that of ERA5's recent ones",
+        )
     basis, arrays = harmonics(*_day_and_hour(time)), coefficients(name)
 
     def median(quantity: str) -> Array:
         return np.asarray(basis @ arrays[quantity].astype(np.float64))
 
-    every_pressure, ozone = (arrays[quantity].astype(np.float64) for quantity in ("pressure", "ozone"))
+    every_pressure, ozone_ratio = (arrays[quantity].astype(np.float64) for quantity in ("pressure", "ozone"))
     height, temperature = median("height"), median("temperature")
     pressure = every_pressure[: len(height)]  # the highest levels have ozone only
-    if site.altitude < height[0] - EXTRAPOLATION_MAX:
-        raise InputError(
-            f"lies at {site.altitude:g} m, more than {EXTRAPOLATION_MAX:g} m below the lowest level of climatology "
-            f"'{name}', {height[0]:.0f} m",
-            place=place,
-            cure="check the site's altitude, or choose another climatology",
-        )
     h2o = np.exp(median("log_vapour_density")) * VAPOUR_GAS_CONSTANT * temperature / pressure
-    return _Levels(pressure, height, temperature, h2o, median("wind_east"), median("wind_north"), every_pressure, ozone)
+    annual = basis[:9:3]  # 1, cos a, sin a
+    spread = {name: annual @ arrays[f"{name}_spread"] for name in ("log_vapour_density", "wind_east", "wind_north")}
+    return Column(
+        pressure=pressure,
+        height=height,
+        temperature=temperature,
+        h2o=h2o,
+        wind_east=median("wind_east"),
+        wind_north=median("wind_north"),
+        ozone_pressure=every_pressure,
+        ozone=ozone_ratio,
+        log_vapour_spread=spread["log_vapour_density"],
+        wind_east_spread=spread["wind_east"],
+        wind_north_spread=spread["wind_north"],
+        stated=f"climatology '{name}' (ERA5), {time}",
+    )
 
 
 def _day_and_hour(time: Instant) -> tuple[float, float]:
@@ -246,31 +300,86 @@ def harmonics(day: float, hour: float) -> Array:
     return np.outer(annual, [1.0, np.cos(b), np.sin(b)]).ravel()
 
 
-def _on_heights(levels: _Levels, altitude: float, height: Array) -> Profile:
-    """From pressure levels to heights above the site; above 10 hPa the stratosphere of the US Standard Atmosphere."""
+def on_heights(column: Column, site: Site) -> Profile:
+    """A column from its levels to heights above the site; above it the stratosphere of the US Standard Atmosphere.
+
+    Raises
+    ------
+    InputError
+        A site far below the column's lowest level, or above its highest.
+    """
+    column, altitude = _continued(column), site.altitude
+    if not column.height[0] - EXTRAPOLATION_MAX <= altitude < column.height[-1]:
+        low, who = altitude < column.height[0], column.stated or "its weather"
+        where = f"more than {EXTRAPOLATION_MAX:g} m below the lowest" if low else "above the highest"
+        raise InputError(
+            f"lies at {altitude:g} m, {where} level of {who}, {column.height[0 if low else -1]:.0f} m",
+            place=f"site '{site.name}'",
+            cure="check the site's altitude, or choose another climatology or source of weather",
+        )
+    height = TOP * np.expm1(2.5 * np.linspace(0, 1, LEVELS)) / np.expm1(2.5)
     z = altitude + height
-    inside = np.clip(z, levels.height[0], levels.height[-1])
-    above, below = np.maximum(z - levels.height[-1], 0.0), np.minimum(z - levels.height[0], 0.0)
+    inside = np.clip(z, column.height[0], column.height[-1])
+    above, below = np.maximum(z - column.height[-1], 0.0), np.minimum(z - column.height[0], 0.0)
 
     def linear(values: Array) -> Array:
-        return np.asarray(np.interp(inside, levels.height, values))
+        return np.asarray(np.interp(inside, column.height, values))
 
-    lapse = (levels.temperature[1] - levels.temperature[0]) / (levels.height[1] - levels.height[0])
-    top = levels.temperature[-1]
+    def spread(values: Array | None) -> Array | None:
+        return None if values is None else linear(values)
+
+    log_vapour_spread = spread(column.log_vapour_spread)
+
+    lapse = (column.temperature[1] - column.temperature[0]) / (column.height[1] - column.height[0])
+    top = column.temperature[-1]
     warming = np.minimum(STRATOSPHERE_LAPSE * above, max(STRATOPAUSE_TEMPERATURE - top, 0.0))
-    temperature = linear(levels.temperature) + lapse * below + warming
+    temperature = linear(column.temperature) + lapse * below + warming
     mean = np.where(above > 0, (temperature + top) / 2, temperature)  # of the air between the outermost level and z
-    log_pressure = linear(np.log(levels.pressure)) - GRAVITY * (above + below) / (DRY_AIR_GAS_CONSTANT * mean)
-    rising = np.argsort(levels.ozone_pressure)
-    return Profile(
+    log_pressure = linear(np.log(column.pressure)) - GRAVITY * (above + below) / (DRY_AIR_GAS_CONSTANT * mean)
+    if column.ozone_pressure is None or column.ozone is None:
+        o3 = ozone(np.exp(log_pressure))
+    else:
+        rising = np.argsort(column.ozone_pressure)
+        o3 = np.interp(log_pressure, np.log(column.ozone_pressure[rising]), column.ozone[rising])
+    made = Profile(
         height=height,
         pressure=np.exp(log_pressure),
         temperature=temperature,
-        h2o=np.exp(linear(np.log(levels.h2o))),
-        o3=np.interp(log_pressure, np.log(levels.ozone_pressure[rising]), levels.ozone[rising]),
-        wind_east=linear(levels.wind_east),
-        wind_north=linear(levels.wind_north),
+        h2o=np.exp(linear(np.log(np.maximum(column.h2o, 1e-12)))),
+        o3=o3,
+        wind_east=linear(column.wind_east),
+        wind_north=linear(column.wind_north),
         altitude=altitude,
+        wind_east_spread=spread(column.wind_east_spread),
+        wind_north_spread=spread(column.wind_north_spread),
+        stated=(("weather", column.stated),) if column.stated else (),
+    )
+    if log_vapour_spread is None:
+        return made
+    low, high = (replace(made, h2o=made.h2o * np.exp(sign * log_vapour_spread)).pwv for sign in (-1, 1))
+    return replace(made, distribution=WaterDistribution(made.pwv, STACKING * math.log(high / low) / 2))
+
+
+def _continued(column: Column) -> Column:
+    """A column that ends below 15 hPa, continued to 31 km: standard lapse rates, a dry stratosphere, the topmost wind."""
+    height, pressure, temperature = upper_levels(*(float(a[-1]) for a in (column.height, column.pressure, column.temperature)))
+    if not height.size:
+        return column
+
+    def held(values: Array | None) -> Array | None:
+        return None if values is None else np.append(values, np.full(height.size, values[-1]))
+
+    return replace(
+        column,
+        pressure=np.append(column.pressure, pressure),
+        height=np.append(column.height, height),
+        temperature=np.append(column.temperature, temperature),
+        h2o=np.append(column.h2o, np.full(height.size, min(float(column.h2o[-1]), STRATOSPHERIC_WATER))),
+        wind_east=np.append(column.wind_east, np.full(height.size, column.wind_east[-1])),
+        wind_north=np.append(column.wind_north, np.full(height.size, column.wind_north[-1])),
+        log_vapour_spread=held(column.log_vapour_spread),
+        wind_east_spread=held(column.wind_east_spread),
+        wind_north_spread=held(column.wind_north_spread),
     )
 
 

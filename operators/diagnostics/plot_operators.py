@@ -17,9 +17,9 @@ from zonda.core.operator import Operator
 from zonda.operators.io.map_view import MapView, maps_of, noise_sources
 from zonda.operators.io.save_map import output_folder
 from zonda.operators.maps.image import Image
-from zonda.operators.maps.map_product import MapProduct
+from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 
-from .plots import plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
+from .plots import SHOWN, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
 from .power_spectrum import Spectrum
 from .time_streams import TimeStream
 
@@ -73,6 +73,7 @@ def pictures(data: Data, options: Plots) -> list[Picture]:
     """Every picture that the products allow, in reading order."""
     made: list[Picture] = []
     maps = maps_of(data.products)
+    before = _steps_before(data)
     for name, image in data.products.items():
         if isinstance(image, Image) and "/" not in name:
             made.append(_input(name, image))
@@ -89,10 +90,20 @@ def pictures(data: Data, options: Plots) -> list[Picture]:
         made.append(Picture("scan", "Boresight track", "The boresight about the target, one line per scan.", _png(ax)))
     for name, product in data.products.items():
         if isinstance(product, Spectrum):
-            made.append(_spectra(name, product))
+            made.append(_spectra(name, product, before.get(product.label, "")))
         elif isinstance(product, TimeStream):
-            made.extend(_streams(name, product))
+            made.extend(_streams(name, product, before.get(product.label, "")))
     return made
+
+
+def _steps_before(data: Data) -> dict[str, str]:
+    """For every step's label, the last step above it that may have changed the streams: where a spectrum was taken."""
+    found, last = {}, ""
+    for label, kind, _ in data.provenance.get("operators", []):
+        found[label] = last
+        if kind not in ("PowerSpectrum", "TimeStreams", "SaveTOD"):
+            last = label
+    return found
 
 
 def _png(ax: Any) -> bytes:
@@ -126,30 +137,40 @@ def _arcsec(angle: float) -> str:
 
 
 def _covered(product: MapProduct, options: Plots) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Pixels with enough samples to be shown."""
-    hits = product.hits
-    seen = hits[hits > 0]
-    return np.asarray(hits >= options.least_coverage * np.percentile(seen, 99)) if seen.size else hits > 0
+    """Pixels with enough samples to be shown: samples as smoothed as the map is, so that the edge is not ragged."""
+    hits = product.hits.astype(np.float64)
+    if product.header is not None and product.smoothed_by:
+        from scipy.ndimage import gaussian_filter
+
+        hits = gaussian_filter(hits, product.smoothed_by / product.pixel / FWHM_PER_SIGMA, mode="constant")
+    seen = hits[product.hits > 0]
+    return np.asarray(hits >= options.least_coverage * np.percentile(seen, 99)) if seen.size else product.hits > 0
 
 
-def _limit(values: Any, product: MapProduct) -> float | None:
-    """Brightness scale by what is well covered: the noisy rim must not set it."""
+def _limit(values: Any, product: MapProduct, share: float = 99.7) -> float | None:
+    """Brightness scale that covers ``share`` per cent of what is well covered: the noisy rim must not set it."""
     hits = product.hits
     if not hits.any():
         return None
     good = np.abs(values[(hits > 0.25 * np.percentile(hits[hits > 0], 99)) & np.isfinite(values)])
-    return float(np.percentile(good, 99.7)) if good.size else None
+    return float(np.percentile(good, share)) if good.size else None
 
 
-def _draw(name: str, product: MapProduct, planes: dict[str, Any], titles: dict[str, str], options: Plots, circle: bool) -> bytes:
+def _draw(
+    name: str,
+    product: MapProduct,
+    planes: dict[str, Any],
+    titles: dict[str, str],
+    options: Plots,
+    limit: float | None,
+    circle: bool = False,
+) -> bytes:
     """One panel per plane."""
     from matplotlib.figure import Figure
 
     covered = _covered(product, options)
     view = MapView.of(name, product)
     view.planes = {k: np.where(covered, v, np.nan) for k, v in planes.items()}
-    limits = [_limit(v, product) for v in planes.values()]
-    limit = max((x for x in limits if x), default=None)
     flat = view.flat()
     figure = Figure(figsize=(6.4 * len(planes), 5.2), dpi=110, layout="constrained")
     for k, plane in enumerate(planes, 1):
@@ -160,15 +181,21 @@ def _draw(name: str, product: MapProduct, planes: dict[str, Any], titles: dict[s
 
 
 def _map(name: str, product: MapProduct, options: Plots) -> Picture:
-    run, _, _ = name.rpartition("/")
+    run, _, key = name.rpartition("/")
     shown, how = _shown(product, options)
     title = {"": "Map", "noiseless": "Map of the noiseless run"}.get(run, f"Map of run {run}")
+    title += "" if key == "map" else f" ({key})"
     meaning = {
         "": "Everything: sky, atmosphere and noise, filtered and binned.",
         "noiseless": "The sky alone through the same pointing, filters and binning: what the processing leaves of it.",
     }.get(run, "A companion run.")
-    png = _draw(name, shown, {"signal": shown.signal}, {"signal": title}, options, circle=False)
+    limit = _limit(shown.signal, shown, SHOWN if run == "noiseless" else 99.7)
+    png = _draw(name, shown, {"signal": shown.signal}, {"signal": _titled(title, how)}, options, limit)
     return Picture(product_path("", name).name, title, f"{meaning} {how[0].upper()}{how[1:]}.", png)
+
+
+def _titled(title: str, how: str) -> str:
+    return f"{title}, {how.removesuffix(' for this picture')}"
 
 
 def _noise(name: str, maps: dict[str, MapProduct], options: Plots) -> Picture:
@@ -176,16 +203,18 @@ def _noise(name: str, maps: dict[str, MapProduct], options: Plots) -> Picture:
     planes: dict[str, Any] = {}
     titles: dict[str, str] = {}
     figures = []
-    how = ""
+    resolution, how = _shown(product, options)
+    limits = []
     words = {"half_difference": "even minus odd scans", "source_free": "run without the sky"}
     for of, (source, plane) in noise_sources(maps, name).items():
         shown, how = _shown(source, options)
-        planes[of], titles[of] = np.asarray(getattr(shown, plane)), f"Noise: {words[of]}"
+        planes[of], titles[of] = np.asarray(getattr(shown, plane)), _titled(f"Noise: {words[of]}", how)
+        limits.append(_limit(planes[of], resolution))
         rms = shown.rms(options.central_diameter / 2, of=plane)
         if np.isfinite(rms):
             figures.append(f"{words[of]} {rms * 1e6:.4g} µK_RJ")
-    resolution, _ = _shown(product, options)
-    png = _draw(name, resolution, planes, titles, options, circle=True)
+    limit = max((x for x in limits if x), default=None)
+    png = _draw(name, resolution, planes, titles, options, limit, circle=True)
     text = "Noise maps on one scale, " + how + "."
     if figures:
         text += (
@@ -206,23 +235,25 @@ def _coverage(name: str, product: MapProduct) -> Picture:
     )
 
 
-def _spectra(name: str, spectrum: Spectrum) -> Picture:
-    ax = plot_spectra(spectrum)
+def _spectra(name: str, spectrum: Spectrum, before: str) -> Picture:
+    where = f"after {before}" if before else f"at step {spectrum.label}"
+    ax = plot_spectra(spectrum, title=f"Power spectra of the time streams {where}")
     many = f"{spectrum.detectors} detectors and {spectrum.observations} scan{'s' if spectrum.observations > 1 else ''}"
-    caption = (
-        f"Mean of {many} at step {spectrum.label}, referred to the calibrated sky: divided by ζe^-τ, the atmosphere times ε."
-    )
+    caption = f"Mean of {many} {where}, referred to the calibrated sky: divided by ζe^-τ, the atmosphere times ε."
     if "signal" in spectrum.psd:
         caption += " The signal holds the mean emission too, which changes as the scan moves in elevation."
     suffix = "" if name == "spectrum" else f"_{product_path('', name).name}"
     return Picture(f"power_spectra{suffix}", "Power spectra", caption, _png(ax))
 
 
-def _streams(name: str, stream: TimeStream) -> list[Picture]:
+def _streams(name: str, stream: TimeStream, before: str) -> list[Picture]:
+    where = f"after {before}" if before else f"at step {stream.label}"
     suffix = "" if name == "time_streams" else f"_{product_path('', name).name}"
     made = []
     for which in stream.streams:
         extra = "" if which == "signal" else f"_{which}"
-        caption = f"Stream {which} of {len(stream.names)} detectors at step {stream.label}."
-        made.append(Picture(f"tod{suffix}{extra}", "Time streams", caption, _png(plot_tod(stream, name=which))))
+        meaning = "divided by ζe^-τ, with what is left of the mean emission" if which == "signal" else "at the detector"
+        caption = f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}. Pale: samples; dark: means over 1 s."
+        ax = plot_tod(stream, name=which, title=f"Time streams of {stream.observation} {where}")
+        made.append(Picture(f"tod{suffix}{extra}", "Time streams", caption, _png(ax)))
     return made

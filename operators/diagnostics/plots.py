@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating]
 
 ARCMIN = np.pi / 180 / 60
+SHOWN = 99.95
+"""Per cent of the pixels of a noise-free map that its colour scale covers."""
 
 COLOURS = {
     "signal": "#000000",
@@ -57,15 +59,29 @@ def _is_world(ax: Any) -> bool:
     return hasattr(ax, "coords") and hasattr(ax, "wcs")
 
 
+def _axis_names(wcs: Any) -> tuple[str, str, str]:
+    """Names of the two axes of a map and of their frame, as its WCS says: RA, Dec, ICRS; l, b, Galactic."""
+    kind = str(wcs.wcs.ctype[0])
+    if kind.startswith("GLON"):
+        return "l", "b", "Galactic"
+    if kind.startswith("RA"):
+        return "RA", "Dec", str(wcs.wcs.radesys).strip() or "ICRS"
+    return kind.split("-")[0].lower() or "x", str(wcs.wcs.ctype[1]).split("-")[0].lower() or "y", "as in the file"
+
+
 def _show(ax: Any, wcs: Any, values: Floats, label: str, **style: Any) -> Any:
-    """An image with a colour bar, on RA/Dec axes where ``ax`` has them, else on offsets from the map's centre in arcmin."""
+    """An image with a colour bar, on world axes where ``ax`` has them, else on offsets from the map's centre in arcmin.
+
+    The colour bar has a pointed end where values lie beyond it.
+    """
     from astropy.wcs.utils import proj_plane_pixel_scales
 
     ny, nx = values.shape
+    lon, lat, frame = _axis_names(wcs)
     if _is_world(ax):
         picture = ax.imshow(values, origin="lower", interpolation="nearest", **style)
-        ax.coords[0].set_axislabel("RA (ICRS)")
-        ax.coords[1].set_axislabel("Dec (ICRS)", minpad=0.4)
+        ax.coords[0].set_axislabel(f"{lon} ({frame})")
+        ax.coords[1].set_axislabel(f"{lat} ({frame})", minpad=0.4)
         for coordinate in ax.coords:
             coordinate.set_ticklabel(size=9)
     else:
@@ -74,9 +90,12 @@ def _show(ax: Any, wcs: Any, values: Floats, label: str, **style: Any) -> Any:
         half_x, half_y = nx * dx / 2 * flip, ny * dy / 2
         extent = (-half_x, half_x, -half_y, half_y)
         picture = ax.imshow(values, origin="lower", extent=extent, interpolation="nearest", aspect="equal", **style)
-        ax.set_xlabel("RA offset [arcmin]")
-        ax.set_ylabel("Dec offset [arcmin]")
-    bar = ax.figure.colorbar(picture, ax=ax, pad=0.02, shrink=0.9)
+        ax.set_xlabel(f"{lon} offset [arcmin]")
+        ax.set_ylabel(f"{lat} offset [arcmin]")
+    low, high = picture.get_clim()
+    below, above = bool(np.ma.less(values, low).any()), bool(np.ma.greater(values, high).any())
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
+    bar = ax.figure.colorbar(picture, ax=ax, pad=0.02, shrink=0.9, extend=extend)
     bar.set_label(label)
     return picture
 
@@ -118,12 +137,14 @@ def plot_map(
 ) -> Axes:
     """A brightness map in K_RJ, zero in white, with its colour bar and resolution.
 
+    A map far from zero (one with the mean emission still in it) is shown between its lowest and highest brightness instead.
+
     Parameters
     ----------
     values
         (ny, nx) K_RJ; NaN where nothing was observed (drawn grey).
     wcs
-        Its `astropy.wcs.WCS`; a new figure gets RA/Dec axes, a plain ``ax`` offsets from the centre in arcmin.
+        Its `astropy.wcs.WCS`; a new figure gets world axes, a plain ``ax`` offsets from the centre in arcmin.
     ax
         Axes to draw into.
     title
@@ -131,7 +152,7 @@ def plot_map(
     fwhm
         Resolution, rad; drawn to scale.
     limit
-        Colour scale from -limit to limit, K; default: the 99.8th percentile of the magnitude.
+        Colour scale from -limit to limit, K; default: what `SHOWN` % of the pixels stay below.
     circle
         Diameter of a circle about the centre of the map, rad (where a noise figure was taken).
     """
@@ -139,14 +160,18 @@ def plot_map(
     from matplotlib.patches import Ellipse
 
     ax = _axes(ax, projection=wcs)
-    finite = np.abs(values[np.isfinite(values)])
+    finite = values[np.isfinite(values)]
     if limit is None:
-        limit = float(np.percentile(finite, 99.8)) if finite.size else 1.0
+        limit = float(np.percentile(np.abs(finite), SHOWN)) if finite.size else 1.0
     limit = limit or 1.0
-    factor, unit = _unit(limit)
-    colours = mpl.colormaps["RdBu_r"].with_extremes(bad="0.85")
+    bottom, top, colours = -limit, limit, mpl.colormaps["RdBu_r"]
+    low, high = (float(np.percentile(finite, p)) for p in (100 - SHOWN, SHOWN)) if finite.size else (0.0, 0.0)
+    if low * high > 0 and 0 < high - low < 0.5 * max(abs(low), abs(high)):
+        bottom, top, colours = low, high, mpl.colormaps["viridis"]
+    factor, unit = _unit(max(abs(bottom), abs(top)))
     shown = np.ma.masked_invalid(np.asarray(values, np.float64) * factor)
-    _show(ax, wcs, shown, f"brightness [{unit}]", cmap=colours, vmin=-limit * factor, vmax=limit * factor)
+    bounds = {"vmin": bottom * factor, "vmax": top * factor}
+    _show(ax, wcs, shown, f"brightness [{unit}]", cmap=colours.with_extremes(bad="0.85"), **bounds)
     if fwhm:
         _draw_beam(ax, wcs, values.shape, fwhm)
     if circle:
@@ -276,7 +301,10 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
 
 
 def plot_scan(observations: Sequence[Observation], *, ax: Any = None, title: str = "Boresight track") -> Axes:
-    """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin, a line per scan."""
+    """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin, a line per scan.
+
+    Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
+    """
     ax = _axes(ax, (5.6, 5.2))
     ra0, dec0 = observations[0].centre
     for k, observation in enumerate(observations):
@@ -286,7 +314,8 @@ def plot_scan(observations: Sequence[Observation], *, ax: Any = None, title: str
         near = cosine > 0.1
         x = np.where(near, np.cos(lat) * np.sin(lon) / np.where(near, cosine, 1), np.nan) / ARCMIN
         y = (np.cos(dec0) * np.sin(lat) - np.sin(dec0) * np.cos(lat) * np.cos(lon)) / np.where(near, cosine, 1) / ARCMIN
-        ax.plot(x, y, linewidth=0.6, color=SEQUENCE[k % len(SEQUENCE)], label=observation.name, rasterized=True)
+        width = 0.6 + 1.2 * (1 - (k + 1) / len(observations))
+        ax.plot(x, y, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=observation.name, rasterized=True)
     ax.set_aspect("equal", adjustable="datalim")
     if not ax.xaxis_inverted():
         ax.invert_xaxis()

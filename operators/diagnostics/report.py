@@ -74,9 +74,10 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float) -> str:
     links = "".join(f'<a href="#{key}">{title}</a>' for key, title, _ in parts)
     sections = "\n".join(f'<section id="{key}"><h2>{title}</h2>{body}</section>' for key, title, body in parts)
     scene = data.scene
-    line = f"{scene.instrument.name} on {scene.instrument.telescope.name} at {scene.site.name}, {scene.time}, seed {scene.seed}"
-    description = f"<p>{escape(str(provenance['description']))}</p>" if provenance.get("description") else ""
     version = provenance.get("versions", {}).get("zonda", "")
+    line = f"{scene.instrument.name} on {scene.instrument.telescope.name} at {scene.site.name}, {scene.time}, seed {scene.seed}"
+    line += f", zonda {version}" if version else ""
+    description = f"<p>{escape(str(provenance['description']))}</p>" if provenance.get("description") else ""
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -153,7 +154,7 @@ def _results(data: Data, diameter: float) -> str:
             )
         )
         if smoothed:
-            cards.append((_brightness(figure.rms), f"the same per {_angle(maps[figure.product].pixel)} pixel"))
+            cards.append((_brightness(figure.rms), f"the same before smoothing, per {_angle(maps[figure.product].pixel)} pixel"))
     if (image := data.products.get("input")) is not None and hasattr(image, "values") and np.isfinite(image.values).any():
         cards.append((_brightness(_extreme(image.values)), "strongest pixel of the input"))
     if (product := maps.get("noiseless/map")) is not None and np.isfinite(product.signal).any():
@@ -324,10 +325,11 @@ def _class(kind: str) -> type[Operator] | None:
 
 
 def _tally(data: Data) -> str:
-    """The main run's rows; those of companion runs (``noiseless/BinMap``) folded below."""
+    """The main run's rows in the order of the steps; those of companion runs (``noiseless/BinMap``) folded below."""
     by_run: dict[str, list[tuple[str, str, str]]] = {"": []}
     previous = ""
-    for who, what, value in data.tally:
+    order = {label: k for k, (label, *_) in enumerate(data.provenance.get("operators", []))}
+    for who, what, value in sorted(data.tally, key=lambda row: order.get(row[0].rpartition("/")[2], len(order))):
         run, _, step = who.rpartition("/")
         number = f"{int(value):,}".replace(",", "\u202f") if re.fullmatch(r"\d+", value) else value
         by_run.setdefault(run, []).append((step if who != previous else "", what, number))
@@ -352,11 +354,14 @@ def _timings(data: Data) -> str:
     rows: list[tuple[Any, ...]] = []
     for label, stages in by_step.items():
         used = sum(stages.values())
+        if used < 0.0005:  # the pictures and this page are not done yet
+            continue
         detail = ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005)
         bar = f'<span class="bar" style="width:{100 * used / longest:.1f}%"></span>'
         rows.append((label, f"{used:.3f} s", _Html(bar), _Html(f"<small>{escape(detail)}</small>")))
-    note = f'<p class="note">CPU seconds of all runs, added up over threads: {total:.2f} s (first use includes compilation).</p>'
-    return note + _table(rows, ("step", "CPU", "", "stages"), numbers=(1,))
+    what = "CPU seconds of all runs before the products were written, added up over threads"
+    note = f'<p class="note">{what}: {total:.2f} s (first use compiles).</p>'
+    return f'{note}<div class="timings">{_table(rows, ("step", "CPU", "", "stages"), numbers=(1,))}</div>'
 
 
 def _provenance(data: Data) -> str:
@@ -365,7 +370,10 @@ def _provenance(data: Data) -> str:
     if provenance.get("command"):
         rows.append(("command", provenance["command"]))
     rows += [(k, v) for k, v in provenance.get("versions", {}).items()]
-    rows += [(k, str(provenance[k])) for k in ("precision", "runs") if provenance.get(k)]
+    if provenance.get("precision"):
+        rows.append(("precision", provenance["precision"]))
+    for name, run in provenance.get("runs", {}).items():
+        rows.append((f"run {name}", ", ".join(f"{how} {' and '.join(components)}" for how, components in run.items())))
     files = [str(p.name) for key in ("map_file", "tod_file") for p in data.products.get(key, [])]
     if files:
         rows.append(("files", ", ".join(files)))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.operators.io.streams import StreamsAsked
 
@@ -58,6 +59,15 @@ class TimeStreams(Operator):
     """Number of detectors, chosen evenly."""
     observation: int = Field(0, ge=0)
     """Which scan, counted from 0."""
+
+    def observe(self, data: Data) -> None:
+        """Refuse a scan that is not there."""
+        if self.observation >= len(data.observations):
+            raise PipelineError(
+                f"there is no observation {self.observation}: the pipeline makes {len(data.observations)}, counted from 0",
+                place=self.label,
+                cure="choose another one",
+            )
 
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:

@@ -64,6 +64,9 @@ class CommonModeFilter(Operator):
     def _one_mean(self) -> CommonModeFilter:
         if self.method == "mean" and self.modes != 1:
             raise ValueError("method: mean removes one mode; leave modes at 1 or choose method: svd")
+        of_svd = {"residual", "gap", "on_undetermined"} & self.model_fields_set
+        if self.method == "mean" and of_svd:
+            raise ValueError(f"{sorted(of_svd)[0]} belongs to method: svd; the detectors' mean is exact and always determined")
         return self
 
     def prepare(self, observation: Observation) -> Modes:

@@ -92,7 +92,7 @@ class HighpassFilter(Operator):
     def exec(self, block: Block, state: HighpassPlan) -> None:
         """Filter the block's rows in place."""
         block.means.pop("signal", None)
-        spoilt = sum(state.apply(row) for row in block.detdata["signal"])
+        spoilt = state.apply(block.detdata["signal"])
         block.observation.tally.count(self.label, "samples not finite", spoilt)
 
 
@@ -134,50 +134,58 @@ class HighpassPlan:
     def __post_init__(self) -> None:
         self._weights = {np.dtype(t): np.ascontiguousarray(self.weights, t) for t in (np.float32, np.float64)}
 
-    def apply(self, row: Floats) -> int:
-        """Filter one row (N,) in place. Returns the number of samples that were not finite; they stay as they were."""
-        gaps, lost = self.bad, np.zeros(0, np.intp)
-        coarse = self._spread(row) if self.knots and not gaps.size else None
-        if coarse is None or not np.isfinite(coarse).all():
-            lost = np.flatnonzero(~np.isfinite(row))
-            gaps = np.union1d(gaps, lost)
-            if gaps.size == self.n:
-                return int(lost.size)
-            kept = row[lost]
-            bridge(row, gaps)
-            coarse = self._spread(row) if self.knots else None
-        if coarse is None:
-            row -= self._low_exact(row.astype(np.float64)).astype(row.dtype)
+    def apply(self, rows: Floats) -> int:
+        """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite; they stay as they were."""
+        done = np.zeros(len(rows), bool)
+        if self.knots and not self.bad.size:
+            coarse = self._spread(rows)
+            done[:] = np.isfinite(coarse).all(axis=1)
+            coarse[~done] = 0
+            self._subtract(rows, coarse)
+        return sum(self._bridged(rows[d]) for d in np.flatnonzero(~done))
+
+    def _bridged(self, row: Floats) -> int:
+        """`apply` to one row (N,) that has gaps or no coarse series."""
+        lost = np.flatnonzero(~np.isfinite(row))
+        gaps = np.union1d(self.bad, lost)
+        if gaps.size == self.n:
+            return int(lost.size)
+        kept = row[lost]
+        bridge(row, gaps)
+        if self.knots:
+            self._subtract(row[None], self._spread(row[None]))
         else:
-            _subtract(row, self.edges, self._weights[row.dtype], self._low(coarse).astype(row.dtype))
-        if lost.size:
-            row[lost] = kept
+            row -= self._low_exact(row.astype(np.float64)).astype(row.dtype)
+        row[lost] = kept
         return int(lost.size)
 
-    def _spread(self, row: Floats) -> Floats:
-        s = np.zeros(self.knots + 3)
-        _spread(row, self.edges, self._weights[row.dtype], s)
+    def _spread(self, rows: Floats) -> Floats:
+        s = np.zeros((len(rows), self.knots + 3))
+        _spread(rows, self.edges, self._weights[rows.dtype], s)
         return s
 
+    def _subtract(self, rows: Floats, coarse: Floats) -> None:
+        _subtract(rows, self.edges, self._weights[rows.dtype], self._low(coarse).astype(rows.dtype))
+
     def _low(self, s: Floats) -> Floats:
-        """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s."""
+        """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s, (n_det, M + 3) each."""
         from scipy.fft import dct
 
-        amplitude = self.modes @ s
+        amplitude = s @ self.modes.T
         rest = s - amplitude @ self.spread_modes
         c = amplitude @ self.modes
         if self.cut:
-            folded = rest[1:-1].copy()
-            folded[[0, -1]] *= 2
-            folded[1] += rest[0]
-            folded[-2] += rest[-1]
+            folded = rest[:, 1:-1].copy()
+            folded[:, [0, -1]] *= 2
+            folded[:, 1] += rest[:, 0]
+            folded[:, -2] += rest[:, -1]
             spectrum = dct(folded, type=1)
-            spectrum[self.cut :] = 0
-            spectrum[: self.cut] *= self.response
+            spectrum[:, self.cut :] = 0
+            spectrum[:, : self.cut] *= self.response
             low = dct(spectrum, type=1)
-            c[1:-1] += low
-            c[0] += low[1]
-            c[-1] += low[-2]
+            c[:, 1:-1] += low
+            c[:, 0] += low[:, 1]
+            c[:, -1] += low[:, -2]
         return np.asarray(c)
 
     def _low_exact(self, x: Floats) -> Floats:
@@ -220,9 +228,8 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     raw = np.array([np.ones_like(t), t, t * t - third, t**3 - 3 * third * t])[: degree + 1]
     spread = np.zeros_like(raw)
     for c, s in zip(raw, spread, strict=True):
-        sampled = np.zeros(n)
-        _subtract(sampled, edges, weights, -c)
-        _spread(sampled, edges, weights, s)
+        sampled = sum(weights[j] * c[cell + j] for j in range(4))
+        s += sum(np.bincount(cell + j, weights[j] * sampled, knots + 3) for j in range(4))
     norm = np.linalg.inv(np.linalg.cholesky(raw @ spread.T))
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
@@ -238,43 +245,54 @@ def bridge(row: Floats, gaps: NDArray[np.intp]) -> None:
 
 
 LANES = 16
+"""Partial sums per interval: fixed, so that bits do not depend on the machine's vectors."""
+
+AT_ONCE = 16
+"""Intervals between knots that all rows pass through together, while their weights are in the cache."""
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _spread(row, edges, weights, s):  # type: ignore[no-untyped-def]
-    """s[m] += sum_n weights[j, n] row[n], m = cell + j, in `LANES` fixed partial sums per interval."""
-    lanes = np.empty((4, LANES), row.dtype)
+def _spread(rows, edges, weights, s):  # type: ignore[no-untyped-def]
+    """s[d, m] += sum_n weights[j, n] rows[d, n], m = cell + j, in `LANES` fixed partial sums per interval."""
+    lanes = np.empty((4, LANES), rows.dtype)
     l0, l1, l2, l3 = lanes[0], lanes[1], lanes[2], lanes[3]
-    for m in range(edges.size - 1):
-        first, last = edges[m], edges[m + 1]
-        whole = (last - first) // LANES
-        lanes[:] = 0
-        for k in range(whole):
-            base = first + k * LANES
-            x = row[base : base + LANES]
-            w0, w1 = weights[0, base : base + LANES], weights[1, base : base + LANES]
-            w2, w3 = weights[2, base : base + LANES], weights[3, base : base + LANES]
-            for i in range(LANES):
-                l0[i] += x[i] * w0[i]
-                l1[i] += x[i] * w1[i]
-                l2[i] += x[i] * w2[i]
-                l3[i] += x[i] * w3[i]
-        for j in range(4):
-            total = 0.0
-            for i in range(LANES):
-                total += lanes[j, i]
-            for n in range(first + whole * LANES, last):
-                total += row[n] * weights[j, n]
-            s[m + j] += total
+    for begin in range(0, edges.size - 1, AT_ONCE):
+        for d in range(rows.shape[0]):
+            for m in range(begin, min(begin + AT_ONCE, edges.size - 1)):
+                x = rows[d, edges[m] : edges[m + 1]]
+                w0, w1 = weights[0, edges[m] : edges[m + 1]], weights[1, edges[m] : edges[m + 1]]
+                w2, w3 = weights[2, edges[m] : edges[m + 1]], weights[3, edges[m] : edges[m + 1]]
+                whole = x.size // LANES * LANES
+                lanes[:] = 0
+                for base in range(0, whole, LANES):
+                    for i in range(LANES):
+                        l0[i] += x[base + i] * w0[base + i]
+                        l1[i] += x[base + i] * w1[base + i]
+                        l2[i] += x[base + i] * w2[base + i]
+                        l3[i] += x[base + i] * w3[base + i]
+                for n in range(whole, x.size):
+                    l0[n - whole] += x[n] * w0[n]
+                    l1[n - whole] += x[n] * w1[n]
+                    l2[n - whole] += x[n] * w2[n]
+                    l3[n - whole] += x[n] * w3[n]
+                t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+                for i in range(LANES):
+                    t0, t1, t2, t3 = t0 + l0[i], t1 + l1[i], t2 + l2[i], t3 + l3[i]
+                s[d, m] += t0
+                s[d, m + 1] += t1
+                s[d, m + 2] += t2
+                s[d, m + 3] += t3
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _subtract(row, edges, weights, c):  # type: ignore[no-untyped-def]
-    """row[n] -= sum_j weights[j, n] c[cell + j]."""
-    for m in range(edges.size - 1):
-        c0, c1, c2, c3 = c[m], c[m + 1], c[m + 2], c[m + 3]
-        first, last = edges[m], edges[m + 1]
-        x = row[first:last]
-        w0, w1, w2, w3 = weights[0, first:last], weights[1, first:last], weights[2, first:last], weights[3, first:last]
-        for n in range(x.size):
-            x[n] -= c0 * w0[n] + c1 * w1[n] + c2 * w2[n] + c3 * w3[n]
+def _subtract(rows, edges, weights, c):  # type: ignore[no-untyped-def]
+    """rows[d, n] -= sum_j weights[j, n] c[d, cell + j]."""
+    for begin in range(0, edges.size - 1, AT_ONCE):
+        for d in range(rows.shape[0]):
+            for m in range(begin, min(begin + AT_ONCE, edges.size - 1)):
+                c0, c1, c2, c3 = c[d, m], c[d, m + 1], c[d, m + 2], c[d, m + 3]
+                x = rows[d, edges[m] : edges[m + 1]]
+                w0, w1 = weights[0, edges[m] : edges[m + 1]], weights[1, edges[m] : edges[m + 1]]
+                w2, w3 = weights[2, edges[m] : edges[m + 1]], weights[3, edges[m] : edges[m + 1]]
+                for n in range(x.size):
+                    x[n] -= c0 * w0[n] + c1 * w1[n] + c2 * w2[n] + c3 * w3[n]

@@ -41,6 +41,9 @@ MAGIC = 1.5 * 2.0**52
 """A float64 q + MAGIC has the integer q in its low bits."""
 MAGIC_BITS = 0x4338000000000000
 
+TOGETHER = 4
+"""Detectors that are scattered side by side: successive samples of one often fall in the same pixel and would wait for it."""
+
 DATA, HITS, WEIGHTS, NOISE = range(4)
 OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
 
@@ -352,59 +355,103 @@ def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_var
     The last row of ``sums`` takes what is dropped. ``index`` (n_det, n): pixels of the samples first .. first + n - 1 of the
     block. ``alike``: all detectors weigh the same; the sums of weights and noise follow from the hits.
     """
-    n_det, n = index.shape
-    flat = sums.reshape(-1)
+    n = index.shape[1]
+    flat, columns = sums.reshape(-1), np.uintp(sums.shape[1])
     trash = np.int32(sums.shape[0] - 1)
-    shifted, cells = np.empty(n), np.empty(n, np.int32)
-    bits = shifted.view(np.int64)
-    columns, one, two, three = np.uintp(sums.shape[1]), np.uintp(HITS), np.uintp(WEIGHTS), np.uintp(NOISE)
-    trash_hits = np.uintp(trash) * columns + one
-    for d in range(n_det):
-        if not use[d]:
-            dropped[FLAGGED] += n
-            continue
-        row = signal[d, first : first + n]
-        limit = LARGEST / VALUE / max(weight[d], 1.0)
-        w = np.int64(np.rint(weight[d] * WEIGHT))
-        term = np.int64(np.rint(noise[d] * WEIGHT))
-        factor, square = weight[d] * VALUE, weight[d] * per_variance * WEIGHT
-        if scatter:
-            limit = min(limit, math.sqrt(2.0**60 / square))
-        place = index[d]
-        for t in range(n):  # what is not wanted goes to the last row; adding `MAGIC` rounds to an integer in the low bits
-            x = np.float64(row[t])
-            wanted = (abs(x) < limit) & (place[t] >= 0) & (good[t] != 0)
-            shifted[t] = (x if wanted else 0.0) * factor + MAGIC
-            cells[t] = place[t] if wanted else trash
-        high = np.int64(0)
-        for t in range(n):
-            q = bits[t] - MAGIC_BITS
-            bits[t] = q
-            high = max(high, abs(q))
-        lost = flat[trash_hits]
-        for t in range(n):
-            cell = np.uintp(cells[t]) * columns
-            flat[cell] += bits[t]
-            flat[cell + one] += 1
-        if not alike:
-            for t in range(n):
-                if scatter:
-                    y = np.float64(bits[t]) / factor
-                    term = np.int64(np.rint(square * y * y))
-                cell = np.uintp(cells[t]) * columns
-                flat[cell + two] += w
-                flat[cell + three] += term
-        if flat[trash_hits] != lost:
-            for t in range(n):
-                size = abs(np.float64(row[t]))
-                if not good[t]:
-                    dropped[FLAGGED] += 1
-                elif not size < np.inf:
-                    dropped[NOT_FINITE] += 1
-                elif place[t] < 0:
-                    dropped[OUTSIDE] += 1
-                elif not size < limit:
-                    dropped[TOO_LARGE] += 1
-        largest[DATA] = max(largest[DATA], float(high))
-        largest[WEIGHTS] = max(largest[WEIGHTS], float(w))
-        largest[NOISE] = max(largest[NOISE], square * (high / factor) ** 2 if scatter else float(term))
+    lost = sums[trash, HITS]
+    rows = np.flatnonzero(use)
+    dropped[FLAGGED] += n * (use.size - rows.size)
+    shifted, cells = np.empty((TOGETHER, n)), np.empty((TOGETHER, n), np.int32)
+    units = shifted.view(np.int64)
+    for begin in range(0, rows.size, TOGETHER):
+        group = rows[begin : begin + TOGETHER]
+        for k in range(group.size):
+            d = group[k]
+            limit, factor, square = _scales(weight[d], per_variance, scatter)
+            high = _units(signal[d, first : first + n], index[d], good, limit, factor, trash, shifted[k], units[k], cells[k])
+            w, term = np.int64(np.rint(weight[d] * WEIGHT)), np.int64(np.rint(noise[d] * WEIGHT))
+            if not alike:
+                for t in range(n):
+                    if scatter:
+                        y = np.float64(units[k, t]) / factor
+                        term = np.int64(np.rint(square * y * y))
+                    cell = np.uintp(cells[k, t]) * columns
+                    flat[cell + np.uintp(WEIGHTS)] += w
+                    flat[cell + np.uintp(NOISE)] += term
+            largest[DATA] = max(largest[DATA], float(high))
+            largest[WEIGHTS] = max(largest[WEIGHTS], float(w))
+            largest[NOISE] = max(largest[NOISE], square * (high / factor) ** 2 if scatter else float(term))
+        _scatter(flat, columns, cells[: group.size], units)
+    if sums[trash, HITS] != lost:
+        for d in rows:
+            limit, _, _ = _scales(weight[d], per_variance, scatter)
+            _count_dropped(signal[d, first : first + n], index[d], good, limit, dropped)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _scales(weight, per_variance, scatter):  # type: ignore[no-untyped-def]
+    """Of one detector: the largest |d| [K] that is accepted, units of w d per K, and units of the scatter per K^2."""
+    limit, square = LARGEST / VALUE / max(weight, 1.0), weight * per_variance * WEIGHT
+    if scatter:
+        limit = min(limit, math.sqrt(2.0**60 / square))
+    return limit, weight * VALUE, square
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _units(row, place, good, limit, factor, trash, shifted, units, cells):  # type: ignore[no-untyped-def]
+    """Where each sample goes (``trash``: what is not wanted) and its w d in fixed point; returns the largest. ``units``
+    are the bits of ``shifted``: adding `MAGIC` rounds to an integer in the low bits."""
+    for t in range(row.size):
+        x = np.float64(row[t])
+        wanted = (abs(x) < limit) & (place[t] >= 0) & (good[t] != 0)
+        shifted[t] = (x if wanted else 0.0) * factor + MAGIC
+        cells[t] = place[t] if wanted else trash
+    high = np.int64(0)
+    for t in range(row.size):
+        q = units[t] - MAGIC_BITS
+        units[t] = q
+        high = max(high, abs(q))
+    return high
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _scatter(flat, columns, cells, units):  # type: ignore[no-untyped-def]
+    """Add fixed-point values and hits of all rows of ``cells`` (n_row, n) to their pixels."""
+    hit = np.uintp(HITS)
+    if cells.shape[0] == TOGETHER:
+        a, b, c, d = cells
+        p, q, r, s = units
+        for t in range(np.uintp(cells.shape[1])):
+            at = np.uintp(a[t]) * columns
+            flat[at] += p[t]
+            flat[at + hit] += 1
+            at = np.uintp(b[t]) * columns
+            flat[at] += q[t]
+            flat[at + hit] += 1
+            at = np.uintp(c[t]) * columns
+            flat[at] += r[t]
+            flat[at + hit] += 1
+            at = np.uintp(d[t]) * columns
+            flat[at] += s[t]
+            flat[at + hit] += 1
+        return
+    for k in range(cells.shape[0]):
+        for t in range(np.uintp(cells.shape[1])):
+            at = np.uintp(cells[k, t]) * columns
+            flat[at] += units[k, t]
+            flat[at + hit] += 1
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _count_dropped(row, place, good, limit, dropped):  # type: ignore[no-untyped-def]
+    """Why samples of one detector are not in the map."""
+    for t in range(row.size):
+        size = abs(np.float64(row[t]))
+        if not good[t]:
+            dropped[FLAGGED] += 1
+        elif not size < np.inf:
+            dropped[NOT_FINITE] += 1
+        elif place[t] < 0:
+            dropped[OUTSIDE] += 1
+        elif not size < limit:
+            dropped[TOO_LARGE] += 1

@@ -74,8 +74,9 @@ class BackgroundLimited(NoiseModel):
         NEP^2 = 2 int h nu P_nu dnu + (2 / N) int P_nu^2 dnu                                                   (2)
         NET   = NEP / (sqrt(2) dP/dT),   dP/dT = eta N k int t(nu) dnu                                         (3)
 
-    (Zmuidzinas 2003, Appl. Opt. 42, 4989; W / sqrt(Hz) of one-sided spectrum, hence the root 2). The load is the atmosphere's
-    mean emission times epsilon, the microwave background through the atmosphere, telescope and receiver.
+    (Zmuidzinas 2003, Appl. Opt. 42, 4989; W / sqrt(Hz) of one-sided spectrum, hence the root 2). The load is what comes
+    through the illuminated aperture, epsilon times (the atmosphere's mean emission + the microwave background behind it), the
+    telescope and the receiver.
     """
 
     reference: Literal["detector"] = "detector"
@@ -94,10 +95,11 @@ class BackgroundLimited(NoiseModel):
     def net(self, observation: Observation) -> Array:
         """See `NoiseModel.net`. Without an atmosphere in the pipeline the load has none."""
         smooth, n = observation.smooth, observation.n_detectors
-        emission = time_mean(smooth.get("atmosphere"), n, 0.0) * observation.focalplane.illumination_efficiency
+        epsilon = observation.focalplane.illumination_efficiency
+        emission = time_mean(smooth.get("atmosphere"), n, 0.0)
         transmission = time_mean(smooth.get("transmission"), n, 1.0)
-        load = emission + self.telescope_temperature + self.receiver_temperature
-        return self.net_of_load(observation.instrument.band, load, transmission)
+        load = epsilon * emission + self.telescope_temperature + self.receiver_temperature
+        return self.net_of_load(observation.instrument.band, load, epsilon * transmission)
 
     def net_of_load(self, band: Band, load: Array, cmb_transmission: Array) -> Array:
         """Equations (1) to (3): (n_det,) K_RJ sqrt(s) at the detector.

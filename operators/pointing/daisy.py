@@ -17,7 +17,9 @@ Floats = NDArray[np.float64]
 
 
 class PointingDaisy(Pointing):
-    """A double Lissajous daisy around the target (van Marrewijk et al. 2024): with x + iy the tangent-plane offset,
+    """A double Lissajous daisy around the target (van Marrewijk et al. 2024).
+
+    With x + iy the tangent-plane offset,
 
         phi = phase + speed t / radius
         x + iy = radius [sin(phi) exp(i phi / n) + a sin(phi + pi/2) exp(i sqrt(2) phi / n)]                   (1)

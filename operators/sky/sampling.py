@@ -16,12 +16,12 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
+from .columns import four_columns
+
 Floats = NDArray[np.floating]
 
 CHUNK = 256
 """Samples that share a coordinate origin; divides `TILE_SAMPLES`, so chunks are absolute."""
-
-K1, K2, K3 = np.uint64(1), np.uint64(2), np.uint64(3)
 
 
 def sample(
@@ -204,12 +204,7 @@ def _spline(place, u, v, count, constants, weights):  # type: ignore[no-untyped-
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
 def _columns(f, place, count, stride, weights, columns):  # type: ignore[no-untyped-def]
     """Sums along y of the 4 x 4 coefficients of each sample: four neighbours at once, no gathers."""
-    for t in range(count):
-        p = uint64(max(place[t], int32(0)))  # unsigned: numba adds no test for negative indices
-        q, r, s = p + stride, p + stride + stride, p + stride + stride + stride
-        v0, v1, v2, v3 = weights[4, t], weights[5, t], weights[6, t], weights[7, t]
-        c0 = v0 * f[p] + v1 * f[q] + v2 * f[r] + v3 * f[s]
-        c1 = v0 * f[p + K1] + v1 * f[q + K1] + v2 * f[r + K1] + v3 * f[s + K1]
-        c2 = v0 * f[p + K2] + v1 * f[q + K2] + v2 * f[r + K2] + v3 * f[s + K2]
-        c3 = v0 * f[p + K3] + v1 * f[q + K3] + v2 * f[r + K3] + v3 * f[s + K3]
-        columns[t, 0], columns[t, 1], columns[t, 2], columns[t, 3] = c0, c1, c2, c3
+    flat = columns.reshape(-1)
+    for t in range(uint64(count)):
+        p = uint64(max(place[t], int32(0)))
+        four_columns(f, p, stride, weights[4, t], weights[5, t], weights[6, t], weights[7, t], flat, uint64(4) * t)

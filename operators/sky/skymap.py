@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
@@ -113,6 +114,16 @@ class SkyMap(Operator):
     def collect(self, data: Data, observation: Observation, state: State) -> None:
         beyond, behind = state.totals()
         observation.tally.count(self.label, "samples outside the input map", beyond)
+        total = observation.n_detectors * observation.n_samples
+        if beyond == total:
+            ra, dec = np.degrees(observation.centre)
+            warnings.warn(
+                f"{self.label}: no sample of {observation.name} around RA {ra:.4f} deg, Dec {dec:.4f} deg falls on the input map "
+                f"{self.file.name}; `centre: target` moves the map there",
+                stacklevel=2,
+            )
+        elif beyond:
+            observation.tally.state(self.label, f"{observation.name}: share outside the input map", f"{beyond / total:.1%}")
         if behind:
             observation.tally.count(self.label, "samples more than 90 deg from the input map's centre", behind)
         first = data.products.get("input")  # of the first observation, and of the first SkyMap in the pipeline

@@ -113,7 +113,13 @@ def here(plugin: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_help_and_import_are_light() -> None:
-    for arguments in ("['--help']", "['--version']", "['run', '--help']"):
+    for arguments in (
+        "['--help']",
+        "['--version']",
+        "['run', '--help']",
+        "['weather', '--help']",
+        "['weather', 'show', '--help']",
+    ):
         code = (
             f"import sys, zonda; from zonda.core.cli import main; main({arguments});"
             f"print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
@@ -278,7 +284,12 @@ def test_a_fault_of_the_program_shows_its_traceback(here: Path) -> None:
 def test_interrupted(here: Path) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here.parent / "site-packages"), *sys.path])}
     command = [*RUN, "run", "p.yaml", "--set", "Total.after=sleep"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
+
+    def listen() -> None:  # a shell starts background jobs with Ctrl-C ignored, which children inherit
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=environment, preexec_fn=listen, **pipes) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)

@@ -7,7 +7,7 @@ import pytest
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.execution import Execution, Settings, Timer, cut
+from zonda.core.execution import PIECE, Execution, Settings, Timer, cut
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.operator import Operator
 from zonda.core.smooth import SmoothField
@@ -151,10 +151,10 @@ def run(operators, obs, **settings):
     return obs.detdata["signal"], data
 
 
-def reference(obs):
+def reference(obs, chain=CHAIN):
     block = Block(obs, slice(0, obs.n_detectors), slice(0, obs.n_samples))
     state = {}
-    for operator in CHAIN[:-1]:
+    for operator in chain[:-1]:
         if operator.couples == "all":
             operator.measure(type("S", (), {"array": block.detdata["signal"], "means": block.means})(), state)
         operator.exec(block, state)
@@ -169,6 +169,39 @@ def test_blocks_halos_threads_and_spilling_change_no_bit():
         got, data = run(CHAIN, obs, memory=memory * threads, threads=threads)
         assert np.array_equal(got, want)
         assert (data.products["seen"] == 1).all()
+
+
+class Square(Operator):
+    """Add the square of the signal, kept beside it, so that a second stream comes into being piece by piece."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"square", "signal"})
+    optional: ClassVar[frozenset[str]] = frozenset({"square"})
+
+    def exec(self, block, state):
+        block.new("square")[...] += block.detdata["signal"] ** 2
+        block.detdata["signal"] += block.detdata["square"]
+
+
+@pytest.mark.parametrize("coupled", [Demean(), FocalPlaneMean()])
+def test_pieces_of_a_block_change_no_bit(coupled):
+    """Operators without coupling that share a segment with a coupled one, before and after the stream was stored whole."""
+    chain = [Source(), Square(), coupled, Scale(), Square(), coupled, Sink()]
+    assert observation().n_samples > 2 * PIECE
+    assert [len(s.split()[0]) for s in cut(chain, observation())] == [2, 2]
+    want = reference(observation(), chain)
+    for memory, threads in ((1 << 30, 1), (16 * want.size, 2)):
+        got, data = run(chain, observation(), memory=memory, threads=threads)
+        assert np.array_equal(got, want)
+        assert (data.products["seen"] == 1).all()
+
+
+def test_margins_that_reach_the_ends_leave_the_source_alone():
+    """A block with margins can be the whole scan: it must not be filtered where other blocks read it."""
+    chain = [Source(), Smooth(width=20)]
+    want, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=1 << 30)
+    got, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=2 * 4 * 4 * 16 * 3 * TILE_SAMPLES + 1000)
+    assert np.array_equal(got, want)
 
 
 def test_spilling_is_stated():

@@ -101,3 +101,11 @@ def test_focalplane_refuses_nonsense():
     plane.eta = plane.eta[:-1]
     with pytest.raises(InputError, match="eta has 222 entries for 223 detectors"):
         plane.copy()
+
+
+def test_focalplane_shows_itself():
+    plane = instruments.create("mustang2").focalplane()
+    assert repr(plane) == "<Focalplane: 223 detectors within 2.1 arcmin of the boresight>"
+    page = plane._repr_html_()
+    assert "8.5 arcsec" in page
+    assert "1.7 mK_RJ sqrt(s)" in page

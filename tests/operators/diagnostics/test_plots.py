@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -113,6 +114,58 @@ def test_plain_axes_get_offsets_with_east_to_the_left(values, wcs):
 def test_an_empty_map_can_be_drawn(fill, wcs):
     drawn(plot_map(np.full((50, 60), fill), wcs))
     drawn(plot_coverage(np.zeros((50, 60), int), wcs))
+
+
+@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize(
+    ("kinds", "frame", "names"),
+    [
+        (("GLON-TAN", "GLAT-TAN"), "", ("l", "b", "Galactic")),
+        (("RA---TAN", "DEC--TAN"), "FK5", ("RA", "Dec", "FK5")),
+        (("RA---TAN", "DEC--TAN"), "ICRS", ("RA", "Dec", "ICRS")),
+    ],
+)
+def test_axes_are_named_after_the_frame(values, wcs, plain, kinds, frame, names):
+    wcs.wcs.ctype = kinds
+    wcs.wcs.radesys = frame
+    wcs.wcs.set()
+    ax = plot_map(values, wcs, ax=Figure().add_subplot() if plain else None)
+    if plain:
+        assert (ax.get_xlabel(), ax.get_ylabel()) == tuple(f"{n} offset [arcmin]" for n in names[:2])
+    else:
+        assert [c.get_axislabel() for c in ax.coords] == [f"{n} ({names[2]})" for n in names[:2]]
+
+
+def test_the_colour_bar_says_where_values_lie_beyond_it(wcs):
+    values = np.zeros((50, 60))
+    values[10, 10] = -2.0
+    bar = drawn(plot_map(values, wcs, limit=1.0)).images[0].colorbar
+    assert bar.extend == "min"
+    assert drawn(plot_map(values, wcs, limit=2.0)).images[0].colorbar.extend == "neither"
+
+
+def test_a_map_with_the_mean_emission_in_it_shows_its_variation(wcs):
+    values = 78.7 + 0.1 * np.random.default_rng(1).uniform(-1, 1, (50, 60))
+    low, high = drawn(plot_map(values, wcs, limit=78.8)).images[0].get_clim()
+    assert 78.59 < low < 78.61
+    assert 78.79 < high < 78.81
+    assert drawn(plot_map(np.full((50, 60), 78.7), wcs)).images[0].get_clim() == (-78.7, 78.7)  # no variation at all
+
+
+def test_a_repeated_track_does_not_hide_the_first(make_observation):
+    widths = [line.get_linewidth() for line in plot_scan([make_observation(500, k) for k in range(3)]).lines]
+    assert widths == sorted(widths, reverse=True)
+    assert widths[0] > 1.5 * widths[-1]
+
+
+def test_pictures_say_after_which_step_they_were_taken(data, products, spectrum, stream):
+    steps = ["Efficiency", "PowerSpectrum", "TimeStreams", "HighpassFilter", "After"]
+    data.provenance["operators"] = [(s, {"After": "TimeStreams"}.get(s, s), {}) for s in steps]
+    data.products.update({"spectrum": replace(spectrum, label="PowerSpectrum"), "time_streams": replace(stream, label="After")})
+    Plots().finalize(data)
+    by_name = {p.name: p.caption for p in data.products["pictures"]}
+    assert "after Efficiency" in by_name["power_spectra"]
+    assert "after HighpassFilter" in by_name["tod"]
 
 
 def test_coverage_leaves_unseen_pixels_out(wcs):

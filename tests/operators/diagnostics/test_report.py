@@ -68,7 +68,7 @@ def test_it_says_what_was_simulated(data, report):
     page, text, checker = report()
     for part in (
         "camera on dish at hill",
-        "seed 7",
+        "seed 7, zonda 0.1.0",
         "2024-11-25T07:00:00.123456789Z",
         "scan_0",
         "12 345",
@@ -88,6 +88,19 @@ def test_it_says_what_was_simulated(data, report):
         assert part in text, part
     assert checker.images == ["The map: What came out."]
     assert 'title="0.0011635528346628863 rad"' in page
+
+
+def test_what_was_counted_follows_the_order_of_the_steps(data, report):
+    data.provenance["operators"] = [("SkyMap", "SkyMap", {}), ("BinMap", "BinMap", {})]
+    data.provenance["runs"] = {"noiseless": {"only": ["sky"]}}
+    data.provenance["timings"] = [("SkyMap", "exec", 1.5), ("BinMap", "observe", 0.0)]
+    for step in ("BinMap", "noiseless/BinMap", "SkyMap"):
+        data.tally.count(step, "apples", 1)
+    _, text, _ = report()
+    tally = text[text.index("step what value") : text.index("Computing time", text.index("step what value"))]
+    assert tally.index("SkyMap") < tally.index("BinMap") < tally.index("Run noiseless")
+    assert "run noiseless only sky" in text
+    assert "BinMap" not in text[text.index("step CPU") : text.index("Provenance", text.index("step CPU"))]  # not timed
 
 
 def test_every_text_is_escaped(data, report):

@@ -28,7 +28,7 @@ def brick_wall(x, cut, degree):
 def filtered(x, frequency=CUT / RATE, degree=3, oversampling=24.0):
     plan = plan_highpass(len(x), frequency, degree, oversampling)
     y = np.array(x)
-    plan.apply(y)
+    plan.apply(y[None])
     return y
 
 

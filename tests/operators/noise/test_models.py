@@ -4,6 +4,7 @@ import pytest
 from zonda.core.instrument import Band
 from zonda.core.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
 from zonda.core.registry import noise_models
+from zonda.core.smooth import SmoothField
 from zonda.operators.noise.models import BackgroundLimited, FixedNet, NoiseModel, noise_model
 from zonda.operators.noise.white import WhiteNoise
 
@@ -46,6 +47,15 @@ def test_background_without_atmosphere_is_the_cmb(make_observation):
     expected = model.net_of_load(observation.instrument.band, np.zeros(3), np.ones(3))
     np.testing.assert_allclose(model.net(observation), expected)
     assert (expected > 0).all()
+
+
+def test_load_comes_through_the_illuminated_aperture(make_observation):
+    observation = make_observation(n_det=2, illumination_efficiency=0.8)
+    for name, value in (("atmosphere", 30.0), ("transmission", 0.9)):
+        observation.smooth[name] = SmoothField.constant(np.full(2, value), observation.n_samples)
+    band = observation.instrument.band
+    expected = BackgroundLimited().net_of_load(band, np.full(2, 0.8 * 30.0), np.full(2, 0.8 * 0.9))
+    np.testing.assert_allclose(BackgroundLimited().net(observation), expected, rtol=1e-12)
 
 
 def test_fixed(make_observation):

@@ -110,7 +110,7 @@ def test_background_limited_follows_the_load(make_observation, simulate):
         observation.smooth["transmission"] = SmoothField.constant(np.full(2, 0.9), observation.n_samples)
         model = BackgroundLimited(telescope_temperature="4 K")
         white = simulate(observation, WhiteNoise(model=model))["white"]
-        expected = model.net_of_load(observation.instrument.band, np.full(2, 0.8 * kelvin + 4), np.full(2, 0.9))
+        expected = model.net_of_load(observation.instrument.band, np.full(2, 0.8 * kelvin + 4), np.full(2, 0.8 * 0.9))
         np.testing.assert_allclose(white.std(1, dtype=float), 10 * expected, rtol=4.5 / np.sqrt(1 << 15))
         np.testing.assert_allclose(observation.focalplane.net, expected / (0.5 * 0.9))
         rms.append(expected[0])

@@ -251,7 +251,8 @@ def test_a_sky_that_no_detector_reaches(made, save):
     path = save(np.ones((20, 20)), made.tan_header((20, 20)))
     for ra, dec in ((75.0, 25.0), (180.0, 0.0), (255.0, -20.0)):  # near, far, exactly behind
         scan = made.observation(np.full(300, np.radians(ra)), np.radians(dec), xi=[0, 1e-3], eta=[0, 0])
-        got = made.look(SkyMap(file=path, outside="1 mK"), scan, dtype=np.float32)
+        with pytest.warns(UserWarning, match="no sample of .* falls on the input map .*`centre: target` moves the map there"):
+            got = made.look(SkyMap(file=path, outside="1 mK"), scan, dtype=np.float32)
         np.testing.assert_array_equal(got, np.float32(1e-3))
         assert scan.tally.get("SkyMap", "samples outside the input map") == 600
     assert scan.tally.get("SkyMap", "samples more than 90 deg from the input map's centre") == 600

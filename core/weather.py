@@ -1,0 +1,163 @@
+"""What the scene says of the weather: a source of air, and how much water is in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
+from pydantic_core import PydanticCustomError, core_schema
+
+from .configuration.parameters import Parameters
+from .configuration.units import Unit
+from .errors import InputError, ZondaError
+
+if TYPE_CHECKING:
+    from .configuration.time import Instant
+    from .site import Site
+
+Array = NDArray[np.float64]
+
+PWV_MAX = 60e-3
+"""m: more water than any air on Earth holds above a telescope."""
+
+SHORTHAND = {"file": "era5", "table": "table"}
+"""Keys that name their source by themselves; where there is none, and no `source`, it is the climatology."""
+
+
+@dataclass(frozen=True)
+class Pwv:
+    """Precipitable water vapour as a user gives it: a value, a quantile of what the place has at that season and hour, or a
+    random draw from the same distribution. A pydantic field type.
+    """
+
+    metres: float | None = None
+    """Value, m."""
+    quantile: float | None = None
+    """Quantile, 0 to 1. Where both are None: random."""
+
+    @classmethod
+    def parse(cls, value: Any) -> Pwv:
+        """From ``1.2 mm``, ``25 %``, ``random``, an astropy quantity, or a Pwv. Raises PydanticCustomError."""
+        if isinstance(value, Pwv):
+            return value
+        text = value.strip() if isinstance(value, str) else ""
+        if text.lower() == "random":
+            return cls()
+        if text.endswith("%"):
+            quantile = Unit("").parse(text)
+            if not 0 < quantile < 1:
+                message = f"a quantile of {text} is outside the limits, above 0 % and below 100 %"
+                raise PydanticCustomError("pwv_quantile", "{message}", {"message": message})
+            return cls(quantile=quantile)
+        metres = Unit("m").parse(value)
+        if not 0 <= metres <= PWV_MAX:
+            message = f"a precipitable water vapour of {metres * 1e3:g} mm is outside the limits, 0 to {PWV_MAX * 1e3:g} mm"
+            raise PydanticCustomError("pwv_range", "{message}", {"message": message, "label": "not the air of this planet"})
+        return cls(metres=metres)
+
+    def __str__(self) -> str:
+        if self.metres is not None:
+            return Unit("m").write(self.metres)
+        return f"{self.quantile * 100:.12g} %" if self.quantile is not None else "random"
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            cls.parse, serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json")
+        )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"type": "string", "examples": ["1.2 mm", "25 %", "random"]}
+
+
+@dataclass(frozen=True)
+class Column:
+    """The air above a place on levels, from the lowest up: what a weather source delivers.
+
+    Attributes
+    ----------
+    pressure, height, temperature, h2o
+        (n,) Pa, m above sea level (geopotential), K, volume mixing ratio. Levels below the site are used to interpolate.
+    wind_east, wind_north
+        (n,) velocity of the air towards east and north, m/s.
+    ozone_pressure, ozone
+        (m,) Pa and volume mixing ratio; None: those of the US Standard Atmosphere.
+    log_vapour_spread, wind_east_spread, wind_north_spread
+        (n,) standard deviations of ln(vapour density) and of the winds [m/s] over the weather of that season and hour, where
+        the source knows them: without them there is neither a quantile nor a random draw.
+    stated
+        One line for the reports: where this air comes from.
+    """
+
+    pressure: Array
+    height: Array
+    temperature: Array
+    h2o: Array
+    wind_east: Array
+    wind_north: Array
+    ozone_pressure: Array | None = None
+    ozone: Array | None = None
+    log_vapour_spread: Array | None = None
+    wind_east_spread: Array | None = None
+    wind_north_spread: Array | None = None
+    stated: str = ""
+
+
+class WeatherSource(Parameters):
+    """Base of weather sources. A third party subclasses it and names it in the entry-point group ``zonda.weather_sources``."""
+
+    source: str = ""
+    """Registered name of the source: `climatology`, `era5`, `table`, `standard`, or a plugin's."""
+    pwv: Pwv | None = None
+    """Water at zenith: a value (1.2 mm), a quantile for the season and hour (25 %), or random; None: as the source has it."""
+    wind: Literal["typical", "median", "random"] = "typical"
+    """Of a source that knows the spread of the winds: the median speed along the median direction, the medians of the
+    components (slower), or a draw with the scene's seed."""
+
+    def column(self, site: Site, time: Instant) -> Column:
+        """The air above ``site`` at ``time``.
+
+        Raises
+        ------
+        InputError
+            Where the source does not cover the place or the time, with a cure.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not define column(site, time)")
+
+
+def resolve(value: Any) -> tuple[type[WeatherSource], dict[str, Any]]:
+    """The class that a name or a mapping stands for, and the mapping with its ``source`` filled in.
+
+    Raises
+    ------
+    RegistryError
+        A source that is not installed.
+    InputError
+        Neither a name nor a mapping, or two sources at once.
+    """
+    from .registry import weather_sources
+
+    given = {"source": value} if isinstance(value, str) else value
+    example = "write for example weather: {pwv: 1.2 mm}, {pwv: 25 %}, {file: era5.nc} or {table: profile.csv}"
+    if not isinstance(given, dict):
+        raise InputError(f"the weather is a mapping, not {value!r:.60}", cure=example)
+    named = [key for key in SHORTHAND if key in given]
+    if "source" not in given and len(named) > 1:
+        raise InputError(f"{' and '.join(named)} are two sources of weather", cure=f"keep one; {example}")
+    name = str(given.get("source") or (SHORTHAND[named[0]] if named else "climatology"))
+    return weather_sources.get(name), {**given, "source": name}
+
+
+def weather_source(value: Any, info: ValidationInfo) -> Any:
+    """A `WeatherSource` from its registered name, from a mapping, or as it is. Raises ValueError."""
+    if value is None or isinstance(value, WeatherSource):
+        return value
+    try:
+        source, given = resolve(value)
+    except ZondaError as err:
+        raise ValueError(str(err)) from None
+    return source.model_validate(given, context=info.context)

@@ -1,0 +1,280 @@
+"""The air above a place from a file of ERA5 on pressure levels, as the Copernicus Climate Data Store delivers it.
+
+Both layouts are read: NetCDF-4 with ``valid_time`` and ``pressure_level`` (from 2024), and NetCDF-3 with packed values,
+``time`` and ``level`` (before). Only what surrounds the place and the time is read from the disk. Interpolation is bilinear in
+longitude and latitude and linear in time, of the temperature, the winds, the geopotential and the logarithm of humidity.
+Heights are geopotential heights z / g.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.weather import Column
+
+from .humidity import from_relative, from_specific, ozone_from_mass
+from .radiative_transfer import GRAVITY
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.time import Instant
+    from zonda.core.site import Site
+
+Array = NDArray[np.float64]
+
+VARIABLES = {
+    "t": "temperature",
+    "q": "specific_humidity",
+    "r": "relative_humidity",
+    "u": "u_component_of_wind",
+    "v": "v_component_of_wind",
+    "z": "geopotential",
+    "o3": "ozone_mass_mixing_ratio",
+}
+"""Short names in the file, and what the Climate Data Store calls them."""
+AXES = {
+    "time": ("valid_time", "time"),
+    "level": ("pressure_level", "level"),
+    "lat": ("latitude", "lat"),
+    "lon": ("longitude", "lon"),
+}
+"""Names of the axes."""
+
+SPACING_MAX = 1.0
+"""deg between grid points, beyond which a mountain and its valley are one."""
+STEP_MAX = 6.0
+"""h between times."""
+RATIO_MAX = 1.55
+"""Between neighbouring pressure levels up to `HIGHEST` (700 and 500 hPa pass, 1000 and 500 hPa do not)."""
+HIGHEST = 20000.0
+"""Pa that the levels must reach: the water lies below."""
+HALF_CELL = 0.13
+"""deg that the place may lie outside the grid: half a cell of ERA5's own."""
+
+GET = "`zonda weather fetch SITE --time TIME --output era5.nc` gets such a file, or the Climate Data Store's pages do"
+
+
+def read_era5(path: Path, site: Site, time: Instant) -> Column:
+    """The air above ``site`` at ``time``.
+
+    Raises
+    ------
+    InputError
+        A file that is not NetCDF, lacks a variable or an axis, is too coarse, or does not cover the place or the time.
+    """
+    place = f"ERA5 file {path}"
+    with _opened(path, place) as file:
+        lacking = [name for name in ("t", "u", "v", "z") if name not in file] + ([] if "q" in file or "r" in file else ["q"])
+        if lacking:
+            names = ", ".join(f"{name} ({VARIABLES[name]})" for name in lacking)
+            raise InputError(f"lacks {names}", place=place, cure=f"download these too: {GET}")
+        axes = {kind: _axis(file, names, place) for kind, names in AXES.items()}
+        pressure = _pressure(file, axes["level"], place)
+        weights = {
+            "time": _time_weights(file, axes["time"], time, place),
+            "lat": _latitude_weights(file.values(axes["lat"]), np.degrees(site.latitude), place),
+            "lon": _longitude_weights(
+                file.values(axes["lon"]), np.degrees(site.longitude), abs(np.degrees(site.latitude)), place
+            ),
+        }
+        order = np.argsort(-pressure)
+
+        def column(name: str, logarithm: bool = False) -> Array:
+            return file.interpolated(name, axes, weights, logarithm, place)[order]
+
+        pressure, temperature = pressure[order], column("t")
+        if "q" in file:
+            h2o = from_specific(column("q", logarithm=True))
+        else:
+            h2o = from_relative(column("r", logarithm=True) / 100, pressure, temperature)
+        return Column(
+            pressure=pressure,
+            height=column("z") / GRAVITY,
+            temperature=temperature,
+            h2o=h2o,
+            wind_east=column("u"),
+            wind_north=column("v"),
+            ozone_pressure=pressure if "o3" in file else None,
+            ozone=ozone_from_mass(np.maximum(column("o3"), 0.0)) if "o3" in file else None,
+            stated=f"ERA5 from {path.name}, {time}" + ("" if "o3" in file else " (ozone of the standard atmosphere)"),
+        )
+
+
+class _File:
+    """What NetCDF-3 and NetCDF-4 have in common."""
+
+    def __init__(self, variables: Any, dimensions: dict[str, list[str]]) -> None:
+        self._variables, self._dimensions = variables, dimensions
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._dimensions
+
+    def attribute(self, name: str, key: str, default: Any = None) -> Any:
+        variable = self._variables[name]
+        value = variable.attrs.get(key, default) if hasattr(variable, "attrs") else getattr(variable, key, default)
+        if isinstance(value, bytes):
+            return value.decode()
+        return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+
+    def values(self, name: str, where: Any = ()) -> Array:
+        """Unpacked values, NaN where they are missing."""
+        raw = np.asarray(self._variables[name][where])
+        missing = [self.attribute(name, key) for key in ("_FillValue", "missing_value")]
+        out = raw.astype(np.float64) * float(self.attribute(name, "scale_factor", 1.0)) + float(
+            self.attribute(name, "add_offset", 0)
+        )
+        for value in missing:
+            if value is not None:
+                out = np.where(raw == value, np.nan, out)
+        return np.atleast_1d(out)
+
+    def interpolated(self, name: str, axes: dict[str, str], weights: dict[str, dict[int, float]], log: bool, place: str) -> Array:
+        """(n_level,) of a variable."""
+        total: Array | float = 0.0
+        for i, a in weights["time"].items():
+            for j, b in weights["lat"].items():
+                for k, c in weights["lon"].items():
+                    column = self._column(name, axes, {"time": i, "lat": j, "lon": k}, place)
+                    total = total + a * b * c * (np.log(np.maximum(column, 1e-9)) if log else column)
+        return np.asarray(np.exp(total) if log else total)
+
+    def _column(self, name: str, axes: dict[str, str], at: dict[str, int], place: str) -> Array:
+        names = self._dimensions[name]
+        index = {axes[kind]: value for kind, value in at.items()} | {axes["level"]: slice(None)}
+        if any(axis not in names for axis in axes.values()):
+            message = f"the variable {name} lies on {', '.join(names)}"
+            raise InputError(message, place=place, cure=f"it needs time, level, latitude and longitude: {GET}")
+        values = self.values(name, tuple(index.get(n, slice(None)) for n in names))
+        extra = [n for n in names if n not in index]  # expver: ERA5, and its preliminary months; number: of an ensemble
+        if extra:
+            rest = [n for n in names if n in extra or n == axes["level"]]
+            values = np.moveaxis(values, rest.index(axes["level"]), 0).reshape(values.shape[rest.index(axes["level"])], -1)
+            whole = np.flatnonzero(np.isfinite(values).all(axis=0))
+            values = values[:, whole[0] if len(whole) else 0]
+        if not np.isfinite(values).all():
+            raise InputError(
+                f"the variable {name} has no values at this place and time", place=place, cure="download the file again"
+            )
+        return values
+
+
+@contextmanager
+def _opened(path: Path, place: str) -> Iterator[_File]:
+    import h5py
+
+    try:
+        if h5py.is_hdf5(path):
+            opened = h5py.File(path, "r")
+        else:
+            from scipy.io import netcdf_file
+
+            opened = netcdf_file(path, "r", mmap=False)
+    except (OSError, TypeError, ValueError, EOFError, IndexError) as err:
+        raise _unreadable(err, place) from None
+    with opened as file:
+        try:
+            if isinstance(file, h5py.File):
+                sets = {name: item for name, item in file.items() if isinstance(item, h5py.Dataset)}
+                yield _File(sets, {name: [_label(d) for d in item.dims] for name, item in sets.items()})
+            else:
+                yield _File(file.variables, {name: list(v.dimensions) for name, v in file.variables.items()})
+        except OSError as err:
+            raise _unreadable(err, place) from None
+
+
+def _unreadable(err: Exception, place: str) -> InputError:
+    text = str(err).splitlines()[0] if str(err) else type(err).__name__
+    cure = f"a GRIB file must be converted, a zip file unpacked; {GET}"
+    return InputError(f"cannot be read as NetCDF: {text}", place=place, cure=cure)
+
+
+def _label(dimension: Any) -> str:
+    return str(dimension[0].name).rpartition("/")[2] if len(dimension) else str(dimension.label)
+
+
+def _axis(file: _File, names: tuple[str, ...], place: str) -> str:
+    found = next((name for name in names if name in file), None)
+    if found is None:
+        raise InputError(f"has no axis {' or '.join(names)}", place=place, cure=f"it must be on pressure levels: {GET}")
+    return found
+
+
+def _pressure(file: _File, name: str, place: str) -> Array:
+    """(n_level,) Pa."""
+    unit = str(file.attribute(name, "units", "hPa"))
+    pressure = file.values(name) * (1.0 if unit == "Pa" else 100.0)
+    falling = np.sort(pressure)[::-1]
+    low = falling[falling >= HIGHEST * (1 - 1e-9)]
+    gap = float((low[:-1] / low[1:]).max()) if len(low) > 1 else np.inf
+    if falling[-1] > HIGHEST or gap > RATIO_MAX:
+        raise InputError(
+            f"is too coarse: its {len(falling)} pressure levels ({', '.join(f'{p / 100:g}' for p in falling[:12])} hPa) "
+            + (f"end at {falling[-1] / 100:g} hPa" if falling[-1] > HIGHEST else f"lie up to a factor {gap:.2g} apart"),
+            place=place,
+            cure=f"download all levels up to {HIGHEST / 100:g} hPa or higher, none further apart than 700 and 500 hPa: {GET}",
+        )
+    return pressure
+
+
+def _time_weights(file: _File, name: str, time: Instant, place: str) -> dict[int, float]:
+    match = re.match(r"(seconds|hours|days) since (\d+)-(\d+)-(\d+)", str(file.attribute(name, "units", "")))
+    if not match:
+        raise InputError(
+            f"its {name} has the unit '{file.attribute(name, 'units')}'", place=place, cure="expected hours since a date"
+        )
+    start = datetime(int(match[2]), int(match[3]), int(match[4]), tzinfo=UTC).timestamp()
+    seconds = start + file.values(name) * {"seconds": 1.0, "hours": 3600.0, "days": 86400.0}[match[1]]
+    order, wanted = np.argsort(seconds), time.posix
+    first, last = seconds[order[0]], seconds[order[-1]]
+    if not first - 1800 <= wanted <= last + 1800:
+        covered = " to ".join(f"{datetime.fromtimestamp(t, UTC):%Y-%m-%dT%H:%MZ}" for t in (first, last))
+        raise InputError(f"covers {covered}, not {time}", place=place, cure=f"change the time, or get the file for it: {GET}")
+    weights = _linear(seconds[order], wanted)
+    if len(weights) == 2:
+        low, high = (seconds[order[k]] for k in weights)
+        if high - low > STEP_MAX * 3600 * 1.001:
+            message = f"is too coarse: its times around {time} are {(high - low) / 3600:g} h apart"
+            raise InputError(message, place=place, cure=f"get it every {STEP_MAX:g} h or more often: {GET}")
+    return {int(order[k]): w for k, w in weights.items()}
+
+
+def _latitude_weights(latitude: Array, wanted: float, place: str) -> dict[int, float]:
+    order = np.argsort(latitude)
+    return {int(order[k]): w for k, w in _within(latitude[order], wanted, "latitudes", place).items()}
+
+
+def _longitude_weights(longitude: Array, wanted: float, latitude: float, place: str) -> dict[int, float]:
+    offset = (longitude - wanted + 180) % 360 - 180  # the place is at 0, wherever the file cuts the globe
+    order = np.argsort(offset)
+    if latitude > 89.9:
+        return {int(np.argmin(np.abs(offset))): 1.0}
+    return {int(order[k]): w for k, w in _within(offset[order], 0.0, "longitudes", place, wanted).items()}
+
+
+def _within(points: Array, wanted: float, noun: str, place: str, origin: float = 0.0) -> dict[int, float]:
+    if not points[0] - HALF_CELL <= wanted <= points[-1] + HALF_CELL:
+        message = f"covers {noun} {points[0] + origin:.2f} to {points[-1] + origin:.2f} deg, not {wanted + origin:.2f} deg"
+        raise InputError(message, place=place, cure=f"get the file for this place: {GET}")
+    weights = _linear(points, wanted)
+    spacing = np.ptp(points[list(weights)])
+    if spacing > SPACING_MAX * 1.001:
+        message = f"is too coarse: its {noun} are {spacing:g} deg apart"
+        raise InputError(message, place=place, cure=f"get it on a grid of {SPACING_MAX:g} deg or finer (ERA5 has 0.25): {GET}")
+    return weights
+
+
+def _linear(points: Array, wanted: float) -> dict[int, float]:
+    """Weights of the points around ``wanted``, by index; the nearest end where it is outside."""
+    k = int(np.searchsorted(points, wanted))
+    if k == 0 or k == len(points):
+        return {min(k, len(points) - 1): 1.0}
+    share = float((wanted - points[k - 1]) / (points[k] - points[k - 1]))
+    return {k: 1.0} if share == 1 else {k - 1: 1 - share, k: share}

@@ -1,0 +1,90 @@
+"""The US Standard Atmosphere 1976: the air where nothing better is known, and above what a source reaches."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zonda.core.site import Site
+from zonda.core.weather import Column
+
+from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT
+
+Array = NDArray[np.float64]
+
+DRY_AIR_GAS_CONSTANT = 287.05
+"""J / (kg K)."""
+
+HEIGHT = np.array([-1e3, 0, 11e3, 20e3, 32e3, 47e3])
+"""Geopotential metres above sea level of the corners of the temperature profile."""
+TEMPERATURE = np.array([294.65, 288.15, 216.65, 216.65, 228.65, 270.65])
+"""K at these heights (US Standard Atmosphere 1976, table 4)."""
+SEA_LEVEL_PRESSURE = 101325.0
+"""Pa."""
+
+OZONE_HEIGHT = 1e3 * np.array([0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 27.5, 30, 32.5, 35, 37.5, 40, 45, 50])
+"""m above sea level."""
+OZONE = 1e-6 * np.array(
+    [.027, .032, .034, .041, .06, .13, .31, .50, .87, 1.6, 2.6, 3.6, 4.6, 5.8, 6.6, 7.4, 7.8, 7.8, 7.3, 5.3, 3.1]
+)  # fmt: skip
+"""Volume mixing ratio (AFGL-TR-86-0110, US standard, rounded)."""
+
+VAPOUR_SCALE_HEIGHT = 2e3
+"""m: vapour density falls as exp(-height / this), a round value for clear days."""
+STRATOSPHERIC_WATER = 5e-6
+"""Volume mixing ratio above the tropopause."""
+EXTEND_BELOW = 1500.0
+"""Pa: a source whose highest level has more than this is continued upwards."""
+
+
+def temperature(height: ArrayLike) -> Array:
+    """K at geopotential heights [m above sea level]; constant above 47 km."""
+    return np.asarray(np.interp(np.asarray(height, np.float64), HEIGHT, TEMPERATURE))
+
+
+def pressure(height: ArrayLike) -> Array:
+    """Pa at geopotential heights [m above sea level], hydrostatic."""
+    fine = np.linspace(HEIGHT[0], 80e3, 1621)
+    step = np.diff(fine) * GRAVITY / DRY_AIR_GAS_CONSTANT / temperature((fine[1:] + fine[:-1]) / 2)
+    logarithm = np.concatenate([[0.0], -np.cumsum(step)])
+    at_sea_level = np.interp(0.0, fine, logarithm)
+    return np.asarray(SEA_LEVEL_PRESSURE * np.exp(np.interp(np.asarray(height, np.float64), fine, logarithm) - at_sea_level))
+
+
+def wind_speed(above_ground: ArrayLike) -> Array:
+    """Wind where there is none in the profile, m/s: 8 + 30 exp(-((h - 9400 m) / 4800 m)^2), h above the ground."""
+    return 8 + 30 * np.exp(-(((np.asarray(above_ground, np.float64) - 9400) / 4800) ** 2))
+
+
+def ozone(pressures: ArrayLike) -> Array:
+    """Volume mixing ratio at pressures [Pa]."""
+    at = np.log(pressure(OZONE_HEIGHT))
+    return np.asarray(np.interp(-np.log(pressures), -at, OZONE))
+
+
+def standard_column(site: Site) -> Column:
+    """The standard atmosphere above a site, a west wind, and 10 mm of water at sea level: to be scaled to the PWV wanted."""
+    low = site.altitude + np.array([-100.0, 0, 250, 500, 1000, 1500])
+    height = np.concatenate([low, np.arange(site.altitude + 2e3, 47e3, 1e3)])
+    t, p = temperature(height), pressure(height)
+    density = 5e-3 * np.exp(-height / VAPOUR_SCALE_HEIGHT)
+    return Column(
+        pressure=p,
+        height=height,
+        temperature=t,
+        h2o=np.maximum(density * VAPOUR_GAS_CONSTANT * t / p, STRATOSPHERIC_WATER),
+        wind_east=wind_speed(np.maximum(height - site.altitude, 0.0)),
+        wind_north=np.zeros_like(height),
+        stated="US Standard Atmosphere 1976: temperatures may be 30 K off at the poles, the wind is a guess",
+    )
+
+
+def upper_levels(top_height: float, top_pressure: float, top_temperature: float) -> tuple[Array, Array, Array]:
+    """(height, pressure, temperature) above a source's highest level up to 31 km, with the standard lapse rates."""
+    height = np.arange(top_height + 1e3, 31.5e3, 1e3)
+    if top_pressure < EXTEND_BELOW or not height.size:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    t = top_temperature + temperature(height) - temperature(top_height)
+    edges_h, edges_t = np.concatenate([[top_height], height]), np.concatenate([[top_temperature], t])
+    step = np.diff(edges_h) * GRAVITY / DRY_AIR_GAS_CONSTANT / ((edges_t[1:] + edges_t[:-1]) / 2)
+    return height, top_pressure * np.exp(-np.cumsum(step)), t

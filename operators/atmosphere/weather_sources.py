@@ -1,0 +1,143 @@
+"""The built-in weather sources, and the air that a scene has: a source, a site, a time, a PWV and a seed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+from zonda.core.configuration.files import InputPath
+from zonda.core.errors import InputError
+from zonda.core.random import normals, stream_key, uniforms
+from zonda.core.weather import Column, WeatherSource
+
+from .era5 import read_era5
+from .profile_table import read_table
+from .standard_atmosphere import standard_column
+from .weather import Profile, check_pwv, climatology_column, on_heights
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.time import Instant
+    from zonda.core.site import Site
+
+
+class Climatology(WeatherSource):
+    """The median air of the site's embedded climatology at that season and hour.
+
+    A site without climatology has the US Standard Atmosphere, where its water is given.
+    """
+
+    source: Literal["climatology"] = "climatology"
+    """Registered name."""
+
+    def column(self, site: Site, time: Instant) -> Column:
+        """See `WeatherSource.column`."""
+        if site.climatology is None and self.pwv is not None and self.pwv.metres is not None:
+            return standard_column(site)
+        return climatology_column(site, time)
+
+
+class Standard(WeatherSource):
+    """The US Standard Atmosphere 1976 with a west wind, whatever the place and season: give its PWV."""
+
+    source: Literal["standard"] = "standard"
+    """Registered name."""
+
+    def column(self, site: Site, time: Instant) -> Column:
+        """See `WeatherSource.column`."""
+        if self.pwv is None or self.pwv.metres is None:
+            raise InputError("the standard atmosphere does not know the water", place="weather", cure="give pwv, e.g. 3 mm")
+        return standard_column(site)
+
+
+class Era5(WeatherSource):
+    """ERA5 on pressure levels from the user's NetCDF file, interpolated in space and time."""
+
+    source: Literal["era5"] = "era5"
+    """Registered name."""
+    file: InputPath
+    """NetCDF file of `reanalysis-era5-pressure-levels`: t, q (or r), u, v, z, and o3 where it has it."""
+
+    def column(self, site: Site, time: Instant) -> Column:
+        """See `WeatherSource.column`."""
+        return read_era5(self.file, site, time)
+
+
+class Table(WeatherSource):
+    """The user's own profile in a text table, one row per height; the same at any time."""
+
+    source: Literal["table"] = "table"
+    """Registered name."""
+    table: InputPath
+    """CSV with a header, e.g. `height [m], pressure [hPa], temperature [K], relative humidity [%]`; see docs/weather.md."""
+
+    def column(self, site: Site, time: Instant) -> Column:
+        """See `WeatherSource.column`."""
+        return read_table(self.table, site)
+
+
+def air_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None) -> Profile:
+    """The air of a scene; its ``stated`` says what was taken, and why.
+
+    Parameters
+    ----------
+    weather
+        The scene's; None: the climatology.
+    seed
+        The scene's: of random water and wind.
+    pwv
+        Of the operator, m: it scales the water where the scene gives none.
+
+    Raises
+    ------
+    InputError
+        Two different PWVs, a quantile where the source knows no distribution, and what the source raises.
+    """
+    weather = Climatology() if weather is None else weather
+    if pwv is not None:
+        check_pwv(pwv)
+        if weather.pwv is not None and weather.pwv.metres != pwv:
+            raise InputError(
+                f"the PWV is given twice: {pwv * 1e3:g} mm by the operator, {weather.pwv} by the scene's weather",
+                place="weather",
+                cure="remove pwv from AtmosphereLayers or from weather",
+            )
+    without_climatology = isinstance(weather, Climatology) and site.climatology is None and pwv is not None
+    profile = on_heights(standard_column(site) if without_climatology else weather.column(site, time), site)
+    profile, how = _water(profile, weather, seed, pwv)
+    profile, wind = _wind(profile, weather, seed)
+    return replace(profile, stated=(*profile.stated, ("water", how), ("wind", wind)))
+
+
+def _water(profile: Profile, weather: WeatherSource, seed: int, pwv: float | None) -> tuple[Profile, str]:
+    given = weather.pwv
+    if pwv is not None or (given is not None and given.metres is not None):
+        wanted = pwv if pwv is not None else given.metres if given is not None else None
+        assert wanted is not None
+        return profile.scaled(wanted), f"PWV {wanted * 1e3:.4g} mm, as given"
+    if given is None:
+        return profile, f"PWV {profile.pwv * 1e3:.4g} mm, as the source has it"
+    law = profile.distribution
+    if law is None:
+        raise InputError(
+            f"a PWV of '{given}' needs a distribution, and source '{weather.source}' has one state of the air only",
+            place="weather",
+            cure="give the PWV in mm, or leave it away to take the source's own",
+        )
+    quantile = given.quantile if given.quantile is not None else float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
+    wanted = law.at(quantile)
+    text = (
+        f"PWV {wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile of a log-normal law of median {law.median * 1e3:.4g} mm"
+    )
+    return profile.scaled(wanted), text + f", sigma {law.sigma:.3g}" + ("" if given.quantile is not None else " (drawn)")
+
+
+def _wind(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profile, str]:
+    if profile.wind_east_spread is None or profile.wind_north_spread is None:
+        return profile, "as the source has it"
+    if weather.wind == "median":
+        return profile, "medians of the components"
+    if weather.wind == "typical":
+        return profile.typical_wind, "median speed along the median direction"
+    z = [float(x) for x in normals(stream_key(seed, "weather", "wind"), 0, 2)]
+    east, north = profile.wind_east + z[0] * profile.wind_east_spread, profile.wind_north + z[1] * profile.wind_north_spread
+    return replace(profile, wind_east=east, wind_north=north), f"drawn: medians {z[0]:+.2f}, {z[1]:+.2f} spreads (east, north)"

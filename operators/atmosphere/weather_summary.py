@@ -1,0 +1,110 @@
+"""What `zonda weather` prints: the profile, the water by month and hour, and what instruments see of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.configuration.time import Instant
+
+from .band import BandAtmosphere
+from .weather import PWV_MAX, Profile, profile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from zonda.core.instrument import Band
+    from zonda.core.site import Site
+
+Array = NDArray[np.float64]
+
+HOURS = tuple(range(0, 24, 3))
+"""UTC."""
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+HEIGHTS = (0.0, 250.0, 500.0, 1e3, 2e3, 3e3, 5e3, 8e3, 12e3, 20e3)
+"""m above the site, in the table."""
+MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+
+
+@dataclass(frozen=True)
+class WaterByMonth:
+    """PWV [m] on the 15th of each month: ``median`` (12, n_hour), and the mean over the hours of ``quantiles`` (12, 5)."""
+
+    median: Array
+    quantiles: Array
+
+
+def water_by_month(site: Site, year: int = 2023) -> WaterByMonth:
+    """From the site's climatology. Raises `InputError` where there is none."""
+    median, quantiles = np.empty((12, len(HOURS))), np.zeros((12, len(QUANTILES)))
+    for month in range(12):
+        for k, hour in enumerate(HOURS):
+            law = profile(site, Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z")).distribution
+            assert law is not None  # the climatology has spreads
+            median[month, k] = law.median
+            quantiles[month] += np.array([law.at(q) for q in QUANTILES]) / len(HOURS)
+    return WaterByMonth(median, quantiles)
+
+
+def pwv_steps(air: Profile) -> list[float]:
+    """The PWVs [m] for which spectra are shown: the air's own among round values from very dry to very wet for that air."""
+    law = air.distribution
+    low, high = (law.at(0.05), law.at(0.95)) if law is not None else (air.pwv / 3, min(3 * air.pwv, PWV_MAX))
+    rounded = {float(f"{low * (high / low) ** (k / 3):.1g}") for k in range(4)}
+    return sorted(p for p in {*rounded, air.pwv} if p == air.pwv or abs(p / air.pwv - 1) > 0.05) if air.pwv > 0 else [0.0, 1e-3]
+
+
+def place_lines(site: Site, time: Instant, air: Profile) -> list[str]:
+    """Where and when, and where the air comes from."""
+    where = f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg, {site.altitude:g} m"
+    head = f"{site.name}: {site.description}" if site.description else site.name
+    return [head, f"{where}; {time}", *(f"{what}: {text}" for what, text in air.stated)]
+
+
+def profile_lines(air: Profile) -> list[str]:
+    """A table of the profile; the wind is that which blows, coming from a direction."""
+    lines = [
+        "  above site   pressure  temperature   vapour     wind      from",
+        "           m        hPa            K     g/m3      m/s       deg",
+    ]
+    for h in HEIGHTS:
+        a = air.at(h)
+        east, north = float(a.wind_east), float(a.wind_north)
+        direction = math.degrees(math.atan2(-east, -north)) % 360
+        lines.append(
+            f"{h:12.0f} {float(a.pressure) / 100:10.1f} {float(a.temperature):12.1f} {float(a.vapour_density) * 1e3:8.3g} "
+            f"{math.hypot(east, north):8.1f} {direction:9.0f}"
+        )
+    return lines
+
+
+def water_lines(water: WaterByMonth) -> list[str]:
+    """A table of the PWV by month and hour."""
+    head = "".join(f"{f'{hour:02d}h':>7}" for hour in HOURS) + "  |" + "".join(f"{f'{100 * q:g} %':>7}" for q in QUANTILES)
+    lines = ["PWV [mm]: median by hour (UTC), and quantiles of the month", "     " + head]
+    for month, medians, quantiles in zip(MONTHS, water.median, water.quantiles, strict=True):
+        row = "".join(f"{_short(p)}" for p in medians) + "  |" + "".join(f"{_short(p)}" for p in quantiles)
+        lines.append(f"{month}  {row}")
+    return lines
+
+
+def band_lines(air: Profile, bands: Iterable[Band], elevation: float) -> list[str]:
+    """Emission and transmission of bands at several PWVs and an elevation [rad]."""
+    steps = pwv_steps(air)
+    lines = [f"at an elevation of {math.degrees(elevation):g} deg: emission of the air (background 0 K) and transmission"]
+    for band in bands:
+        seen = BandAtmosphere(band, air, max(*steps, 1e-4) * 1.01)
+        lines.append(f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)")
+        for pwv in steps:
+            mark = "  <" if pwv == air.pwv else ""
+            kelvin, passed = float(seen.emission(pwv, elevation)), float(seen.transmission(pwv, elevation))
+            lines.append(f"    PWV {_short(pwv)} mm: {kelvin:7.2f} K_RJ, {passed:.4f}{mark}")
+    return lines
+
+
+def _short(pwv: float) -> str:
+    return f"{pwv * 1e3:7.2f}" if pwv < 10e-3 else f"{pwv * 1e3:7.1f}"

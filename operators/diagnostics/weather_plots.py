@@ -1,0 +1,123 @@
+"""Pictures of the air above a site: profile, water by month and hour, spectra with the bands of instruments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zonda.operators.atmosphere.radiative_transfer import spectrum
+from zonda.operators.atmosphere.weather_summary import HOURS, MONTHS, QUANTILES, WaterByMonth, pwv_steps
+
+from .plots import SEQUENCE, _axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from zonda.core.instrument import Band
+    from zonda.operators.atmosphere.weather import Profile
+
+LOWEST, HIGHEST = 1e9, 1000e9
+"""Hz: what the absorption table holds."""
+
+
+def plot_profile(air: Profile, ax: Any = None) -> Any:
+    """Temperature, and on a second scale water and wind, up to 20 km above the site."""
+    ax = _axes(ax)
+    low = air.height <= 20e3
+    km = air.height[low] / 1e3
+    ax.plot(air.temperature[low], km, color=SEQUENCE[1])
+    ax.set_xlabel("temperature [K]", color=SEQUENCE[1])
+    ax.set_ylabel("height above the site [km]")
+    ax.set_ylim(0, 20)
+    other = ax.twiny()
+    other.plot(np.hypot(air.wind_east, air.wind_north)[low], km, color=SEQUENCE[0], label="wind [m/s]")
+    scale = 10 ** math.floor(math.log10(20 / (air.vapour_density[0] * 1e3))) if air.vapour_density[0] > 0 else 1.0
+    label = "vapour [g/m³]" if scale == 1 else f"vapour × {scale:g} [g/m³]"
+    other.plot(air.vapour_density[low] * 1e3 * scale, km, color=SEQUENCE[2], label=label)
+    other.set_xlim(left=0)
+    other.legend(loc="upper right", fontsize=8)
+    return ax
+
+
+def plot_water(water: WaterByMonth, ax: Any = None) -> Any:
+    """PWV over the year: the medians of eight hours of the day, and the quantiles of the months."""
+    ax = _axes(ax)
+    month = np.arange(12)
+    low, lower, _, upper, high = water.quantiles.T * 1e3
+    ax.fill_between(
+        month, low, high, color=SEQUENCE[5], alpha=0.3, lw=0, label=f"{100 * QUANTILES[0]:g} to {100 * QUANTILES[-1]:g} %"
+    )
+    ax.fill_between(
+        month, lower, upper, color=SEQUENCE[5], alpha=0.6, lw=0, label=f"{100 * QUANTILES[1]:g} to {100 * QUANTILES[3]:g} %"
+    )
+    from matplotlib import colormaps
+
+    for k, hour in enumerate(HOURS):
+        colour = colormaps["viridis"](hour / 24)
+        ax.plot(month, water.median[:, k] * 1e3, color=colour, lw=1.2, label=f"median, {hour:02d} h UTC")
+    ax.set_yscale("log")
+    ax.set_xticks(month, [name[0] for name in MONTHS])
+    ax.set_ylabel("PWV [mm]")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.legend(fontsize=6.5, ncols=2)
+    return ax
+
+
+def plot_spectrum(
+    air: Profile, elevation: float = math.pi / 2, bands: Sequence[Band] = (), which: str = "brightness", ax: Any = None
+) -> Any:
+    """Emission (``brightness``) or ``transmission`` against frequency for several PWVs, bands shaded."""
+    ax = _axes(ax)
+    low, high = _range(bands)
+    for k, pwv in enumerate(pwv_steps(air)):
+        seen = spectrum(air.scaled(pwv).layers, elevation, low=low, high=high)
+        values = seen.brightness if which == "brightness" else np.exp(-seen.slant_opacity)
+        own = pwv == air.pwv
+        ax.plot(
+            seen.frequency / 1e9,
+            values,
+            color="black" if own else SEQUENCE[k % 6],
+            lw=1.4 if own else 0.9,
+            label=f"PWV {pwv * 1e3:.3g} mm",
+        )
+    top = 1.0 if which == "transmission" else ax.get_ylim()[1]
+    for k, band in enumerate(bands):
+        ax.fill_between(band.frequency / 1e9, band.transmission * top, color=SEQUENCE[(k + 3) % 7], alpha=0.2, lw=0)
+        at, side = (0.98 * top, "top") if which == "brightness" else (0.02, "bottom")
+        ax.annotate(band.name, (band.centre / 1e9, at), rotation=90, ha="center", va=side, fontsize=7)
+    ax.set_xlim(low / 1e9, high / 1e9)
+    ax.set_ylim(0, top)
+    ax.set_xlabel("frequency [GHz]")
+    ax.set_ylabel("emission [K$_\\mathrm{RJ}$]" if which == "brightness" else "transmission")
+    ax.legend(fontsize=7, loc="center left" if which == "brightness" else "lower left")
+    return ax
+
+
+def weather_figure(
+    title: str, air: Profile, water: WaterByMonth | None, elevation: float = math.pi / 2, bands: Sequence[Band] = ()
+) -> Figure:
+    """Profile, water by month and hour (where it is known), emission and transmission: one figure, not pyplot's."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 8.5), dpi=110, layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(2, 2)
+    plot_profile(air, axes[0, 0])
+    if water is not None:
+        plot_water(water, axes[0, 1])
+    else:
+        axes[0, 1].set_axis_off()
+        axes[0, 1].text(0.5, 0.5, "no climatology here: no water by month", ha="center")
+    plot_spectrum(air, elevation, bands, "brightness", axes[1, 0])
+    plot_spectrum(air, elevation, bands, "transmission", axes[1, 1])
+    return figure
+
+
+def _range(bands: Sequence[Band]) -> tuple[float, float]:
+    """Frequencies shown: all, or up to twice the highest band."""
+    if not bands:
+        return LOWEST, HIGHEST
+    return LOWEST, min(HIGHEST, 1.6 * max(float(band.frequency[-1]) for band in bands))

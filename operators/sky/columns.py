@@ -1,0 +1,46 @@
+"""One vector instruction per row of four coefficients, which numba's compiler does not find by itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
+
+FLAGS = ("contract", "nsz")
+
+
+@intrinsic
+def four_columns(typing_context: Any, f: Any, p: Any, stride: Any, v0: Any, v1: Any, v2: Any, v3: Any, out: Any, at: Any) -> Any:
+    """out[at + k] = sum_j v_j f[p + j stride + k], k = 0 .. 3, for C arrays ``f`` and ``out`` (n,) of the type of ``v_j``.
+
+    ``p``, ``stride``, ``at`` are uint64; nothing is checked.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        f, p, stride, *v, out, at = arguments
+        scalar = context.get_data_type(signature.args[0].dtype)
+        four, size = ir.VectorType(scalar, 4), context.get_abi_sizeof(scalar)
+
+        def place(array: Any, kind: Any, index: Any) -> Any:
+            first = make_array(kind)(context, builder, array).data
+            return builder.bitcast(builder.gep(first, [index]), four.as_pointer())
+
+        nothing, integer = ir.Constant(four, ir.Undefined), ir.IntType(32)
+        zeros = ir.Constant(ir.VectorType(integer, 4), [0] * 4)
+
+        def spread(value: Any) -> Any:
+            return builder.shuffle_vector(builder.insert_element(nothing, value, ir.Constant(integer, 0)), nothing, zeros)
+
+        total = None
+        for weight in v:
+            row = builder.load(place(f, signature.args[0], p), align=size)
+            term = builder.fmul(spread(weight), row, flags=FLAGS)
+            total = term if total is None else builder.fadd(total, term, flags=FLAGS)
+            p = builder.add(p, stride)
+        builder.store(total, place(out, signature.args[7], at), align=size)
+        return context.get_dummy_value()
+
+    return types.void(f, types.uint64, types.uint64, v0, v1, v2, v3, out, types.uint64), generate

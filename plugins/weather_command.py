@@ -1,0 +1,163 @@
+"""``zonda weather``: the air above a site, printed and drawn; ``zonda weather fetch``: ERA5 from the Climate Data Store.
+
+Only click is imported with this module; each command imports what it needs.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.time import Instant
+    from zonda.core.site import Site
+
+
+class WithDefault(click.Group):
+    """A group whose first command is meant where none is named: ``zonda weather green_bank``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put ``show`` before what names no command."""
+        if args and args[0] not in self.commands and not (len(args) == 1 and args[0] in ctx.help_option_names):
+            args = ["show", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(cls=WithDefault, subcommand_metavar="SITE [OPTIONS] | fetch SITE [OPTIONS]")
+def weather() -> None:
+    """Show the air above a site: profile, water, and what instruments see of it; `fetch` gets ERA5.
+
+    SITE is a registered name (`zonda plugins`), or 'latitude, longitude, altitude', e.g. '46.5 deg, 8 deg, 3500 m'.
+    """
+
+
+SIGNS = {"ignore_unknown_options": True}
+"""A southern latitude begins with a minus."""
+
+_site = click.argument("site", metavar="SITE")
+_time = click.option("--time", metavar="TIME", help="UTC unless it carries an offset, e.g. 2024-11-25T07:00.  [default: now]")
+
+
+@weather.command(context_settings=SIGNS)
+@_site
+@_time
+@click.option("--instrument", "instruments", multiple=True, metavar="NAME", help="Whose bands to show; may be repeated.")
+@click.option("--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]")
+@click.option("--file", metavar="FILE.nc", help="ERA5 file to take the air from, instead of the climatology.")
+@click.option("--table", metavar="FILE.csv", help="Table to take the air from, instead of the climatology.")
+@click.option("--elevation", default="90 deg", show_default=True, metavar="ANGLE", help="Of the line of sight.")
+@click.option("--seed", default=0, show_default=True, help="Of a random PWV.")
+@click.option(
+    "--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The figure.  [default: out/weather/SITE.png]"
+)
+def show(
+    site: str,
+    time: str | None,
+    instruments: tuple[str, ...],
+    pwv: str | None,
+    file: str | None,
+    table: str | None,
+    elevation: str,
+    seed: int,
+    output: Path | None,
+) -> None:
+    """Print the profile, the water by month and hour, and what bands see; draw them (also as PDF or SVG)."""
+    from zonda.core import registry, weather
+    from zonda.core.configuration.units import Unit
+    from zonda.core.files import atomic_path, product_path
+    from zonda.operators.atmosphere import weather_summary as summary
+    from zonda.operators.atmosphere.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
+    from zonda.operators.atmosphere.weather_sources import air_of
+
+    place, when = _place(site), _instant(time)
+    given = {key: value for key, value in (("pwv", pwv), ("file", file), ("table", table)) if value is not None}
+    cls, values = weather.resolve(given)
+    source = _checked("weather", lambda: cls.model_validate(values))
+    angle = _checked("--elevation", lambda: Unit("rad").parse(elevation))
+    if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
+        limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
+        raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")
+    bands = list(dict.fromkeys(registry.instruments.create(name).band for name in instruments))
+    air = air_of(source, place, when, seed)
+    water = summary.water_by_month(place, when.datetime.year) if place.climatology is not None else None
+
+    parts = [summary.place_lines(place, when, air), summary.profile_lines(air)]
+    if water is not None:
+        parts.append(summary.water_lines(water))
+    if bands:
+        parts.append(summary.band_lines(air, bands, angle))
+    click.echo("\n\n".join("\n".join(lines) for lines in parts))
+
+    from zonda.operators.diagnostics.weather_plots import weather_figure
+
+    path = product_path("out/weather", place.name, ".png") if output is None else output
+    _check_suffix(path)
+    with atomic_path(path) as temporary:
+        weather_figure(f"{place.name}, {when}, PWV {air.pwv * 1e3:.3g} mm", air, water, angle, bands).savefig(temporary)
+    click.echo(f"\n{path}")
+
+
+@weather.command(context_settings=SIGNS)
+@_site
+@_time
+@click.option("--hours", default=6, show_default=True, type=click.IntRange(1, 240), help="How many hours from TIME on.")
+@click.option("--output", type=click.Path(path_type=Path), default=Path("era5.nc"), show_default=True, metavar="FILE.nc")
+def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
+    """Get ERA5 for a site and time from the Climate Data Store, for `weather: {file: era5.nc}`.
+
+    Needs a (free) key and the package cdsapi: pip install 'zonda[weather]', then https://cds.climate.copernicus.eu/how-to-api.
+    """
+    from zonda.core.files import atomic_path
+    from zonda.operators.atmosphere.era5_fetch import retrieve
+
+    place, when = _place(site), _instant(time)
+    with atomic_path(output) as temporary:
+        retrieve(place, when, hours, temporary)
+    click.echo(f"{output}")
+
+
+def _place(text: str) -> Site:
+    from zonda.core.registry import sites
+    from zonda.core.site import Site
+
+    if "," not in text:
+        found: Site = sites.create(text)
+        return found
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 3:
+        raise click.BadParameter("a place is 'latitude, longitude, altitude', e.g. '46.5 deg, 8 deg, 3500 m'", param_hint="SITE")
+    latitude, longitude, altitude = parts
+    given = {"name": "place", "latitude": latitude, "longitude": longitude, "altitude": altitude}
+    made: Site = _checked("SITE", lambda: Site.model_validate(given))
+    return made
+
+
+def _instant(text: str | None) -> Instant:
+    from datetime import UTC, datetime
+
+    from zonda.core.configuration.time import Instant
+
+    made: Instant = _checked("--time", lambda: Instant.parse(text or datetime.now(UTC).replace(second=0, microsecond=0)))
+    return made
+
+
+def _checked(what: str, make: Any) -> Any:
+    """What ``make`` returns; pydantic's refusals as a mistake of the command line."""
+    from pydantic import ValidationError
+    from pydantic_core import PydanticCustomError
+
+    try:
+        return make()
+    except ValidationError as err:
+        text = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in err.errors())
+        raise click.BadParameter(text, param_hint=what) from None
+    except PydanticCustomError as err:
+        raise click.BadParameter(err.message(), param_hint=what) from None
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise click.BadParameter(f"'{path}' does not end in .png, .pdf or .svg", param_hint="'--output'")

@@ -1,0 +1,497 @@
+"""No parameter is accepted and then ignored.
+
+Every field of every operator, noise model, instrument, telescope, band, site and scene is changed alone: the streams, pointing
+or products of a short run change with it, or the run is refused with a message. What is only said about a run (tally, labels)
+does not count as a change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from pydantic import ValidationError
+
+import zonda
+from zonda.core.errors import ZondaError
+from zonda.core.registry import mapmakers, noise_models, operators
+from zonda.core.site import Site
+from zonda.operators.io.save_tod import load_tod
+
+STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
+SCAN = {"scan_duration": "12 s", "scans": 2, "radius": "1 arcmin", "sample_rate": "50 Hz", "offsets": "box"}
+TURN = {"scan_duration": "40 s", "throw": "4 arcmin", "speed": "30 arcsec/s", "acceleration": "20 arcsec/s2"}
+REFUSED = "refused"
+
+
+# ---- the run
+
+
+def scene(**more: Any) -> Any:
+    return zonda.Scene(
+        **{"site": "green_bank", "instrument": instrument(), "time": "2024-11-25T07:00", "target": "05h +20d", "seed": 3} | more
+    )
+
+
+def instrument(band: Any = None, telescope: Any = None, **more: Any) -> Any:
+    dish = {"name": "dish", "diameter": "100 m", "elevation_max": "88 deg"} | (telescope or {})
+    values = {
+        "name": "camera",
+        "telescope": zonda.Telescope(**dish),
+        "band": zonda.Band(**({"name": "b", "low": "78 GHz", "high": "108 GHz"} | (band or {}))),
+        "detectors": 19,
+        "field_of_view": "2 arcmin",
+        "fwhm": "8.5 arcsec",
+        "main_beam_efficiency": 0.3,
+        "illumination_efficiency": 0.8,
+        "net": "1.7 mK s(1/2)",
+        "knee": "0.5 Hz",
+        "sample_rate": "50 Hz",
+    }
+    return zonda.Instrument(**(values | more))
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A source and a slope, 6 arcmin wide: ``map.fits`` in K_RJ, ``flux.fits`` in Jy/pixel, ``hole.fits`` with a NaN."""
+    folder = tmp_path_factory.mktemp("maps")
+    y, x = np.indices((121, 121)) - 60.0
+    values = 0.1 * np.exp(-(x**2 + y**2) / 50) + 1e-4 * x
+    for name, unit in (("map", "K"), ("flux", "Jy/pixel"), ("hole", "K")):
+        image = fits.PrimaryHDU(np.where((x == 3) & (y == 5), np.nan, values) if name == "hole" else values)
+        image.header.update(CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRPIX1=61, CRPIX2=61, CRVAL1=75.0, CRVAL2=20.0)
+        image.header.update(CDELT1=-3 / 3600, CDELT2=3 / 3600, CUNIT1="deg", CUNIT2="deg", RADESYS="ICRS", BUNIT=unit)
+        if unit == "K":
+            image.header["TEMPSCAL"] = "K_RJ"
+        image.writeto(folder / f"{name}.fits")
+    np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
+    return folder
+
+
+def make(which: str, /, **parameters: Any) -> Any:
+    return (mapmakers if which in mapmakers else operators).get(which)(**parameters)
+
+
+def outcome(steps: list[Any], where: Any, folder: Path, runs: Any = None) -> dict[str, Any]:
+    """Everything that a run makes, by name."""
+    keep = [s for s in (*STREAMS, "pwv", "opacity", "path_delay") if any(s in step.provides for step in steps)]
+    data = zonda.Pipeline(steps, runs=runs).run(where, keep=keep, output=folder, threads=1)
+    found: dict[str, Any] = {"scans": len(data.observations)}
+    for o in data.observations:
+        found |= {f"{o.name} {k}": v for k, v in o.detdata.items()}
+        found |= {f"{o.name} {k}": getattr(o, k) for k in ("boresight_azel", "boresight_radec", "flags", "detector_flags")}
+        found[f"{o.name} start"] = str(o.start)
+    for name, product in data.products.items():
+        found[name] = contents(product)
+    for path in sorted(folder.rglob("*")):
+        if path.name.startswith("tod_"):
+            found[path.name] = {k: (v, v.dtype.name) for k, v in load_tod(path).streams.items()}
+        elif path.suffix == ".html":
+            found[path.name] = re.findall(r"<section id=\"results\">.*?</section>", path.read_text(), re.S)
+        elif path.suffix == ".fits":
+            with fits.open(path) as file:
+                found[path.name] = [(h.name, h.data, h.header.get("RMSHALF")) for h in file if h.is_image]
+    return found
+
+
+def contents(product: Any) -> Any:
+    """Numbers and bytes inside a product; labels and paths are left out."""
+    if dataclasses.is_dataclass(product) and not isinstance(product, type):
+        fields = [f.name for f in dataclasses.fields(product) if f.name not in ("lock", "label", "caption", "title")]
+        return {f: contents(getattr(product, f)) for f in fields}
+    if isinstance(product, Mapping):
+        return {k: contents(v) for k, v in product.items()}
+    if isinstance(product, list | tuple):
+        return [contents(v) for v in product]
+    if isinstance(product, np.ndarray | np.generic | bytes | int | float | str | None):
+        return product
+    return str(product) if type(product).__name__ == "Header" else None
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.shape == b.shape and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    return bool(a == b or (a != a and b != b))
+
+
+# ---- operators: (other parameters that the case needs, the change)
+
+POINTING = {
+    "target": ({}, {"target": "05h00m10s +20d00m00s"}),
+    "scan_duration": ({}, {"scan_duration": "14 s"}),
+    "scans": ({}, {"scans": 3}),
+    "gap": ({"scans": 2}, {"gap": "60 s"}),
+    "offsets": ({"offsets": "none"}, {"offsets": "box"}),
+    "offset_size": ({"offsets": "box"}, {"offset_size": "30 arcsec"}),
+    "sample_rate": ({}, {"sample_rate": "40 Hz"}),
+    "interpolation_error": ({"scan_duration": "30 s"}, {"interpolation_error": 1e-9}),
+}
+
+CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
+    "PointingDaisy": POINTING | {
+        "radius": ({}, {"radius": "70 arcsec"}),
+        "speed": ({}, {"speed": "40 arcsec/s"}),
+        "petals": ({}, {"petals": 4.0}),
+        "inner": ({}, {"inner": 0.2}),
+        "phase": ({}, {"phase": "1 rad"}),
+    },
+    "PointingStare": POINTING,
+    "PointingBackAndForth": POINTING | {
+        "throw": ({}, {"throw": "5 arcmin"}),
+        "speed": ({}, {"speed": "20 arcsec/s"}),
+        "acceleration": ({}, {"acceleration": "30 arcsec/s2"}),
+        "flag_turnarounds": ({}, {"flag_turnarounds": True}),
+    },
+    "SkyMap": {
+        "file": ({}, {"file": "flux.fits"}),
+        "unit": ({}, {"unit": "mK_CMB"}),
+        "pixel_size": ({}, {"pixel_size": "4 arcsec"}),
+        "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
+        "beam": ({}, {"beam": "none"}),
+        "fwhm": ({}, {"fwhm": "12 arcsec"}),
+        "outside": ({"pixel_size": "1 arcsec"}, {"outside": "1 K"}),
+        "missing": ({"file": "hole.fits", "missing": "zero"}, {"missing": "error"}),
+        "scale": ({}, {"scale": 2.0}),
+        "spectral_index": ({"file": "flux.fits"}, {"spectral_index": 3.0}),
+    },
+    "AtmosphereLayers": {
+        "pwv": ({}, {"pwv": "5 mm"}),
+        "pwv_rms": ({}, {"pwv_rms": "1 %"}),
+        "pwv_rms_after_beam": ({}, {"pwv_rms_after_beam": True}),
+        "layers": ({}, {"layers": 5}),
+        "lowest": ({}, {"lowest": "600 m"}),
+        "highest": ({}, {"highest": "4000 m"}),
+        "weights": ({}, {"weights": "equal"}),
+        "outer_scale": ({}, {"outer_scale": "400 m"}),
+        "wind": ({}, {"wind": {"speed": "3 m/s", "direction": "10 deg"}}),
+        "fidelity": ({}, {"fidelity": "fine"}),
+        "beam": ({}, {"beam": "top_hat"}),
+        "edge_taper": ({"beam": "tapered"}, {"edge_taper": 20.0}),
+        "outputs": ({}, {"outputs": ["pwv", "opacity", "path_delay"]}),
+        "lattice": ({}, {"lattice": 0.15}),
+        "tolerance": ({}, {"tolerance": "0.01 %"}),
+    },
+    "WhiteNoise": {
+        "net": ({}, {"net": "1 mK s(1/2)"}),
+        "reference": ({"net": "1 mK s(1/2)"}, {"reference": "detector"}),
+        "scatter": ({}, {"scatter": 0.1}),
+        "model": ({}, {"model": "background_limited"}),
+    },
+    "PinkNoise": {
+        "net": ({}, {"net": "1 mK s(1/2)"}),
+        "reference": ({"net": "1 mK s(1/2)"}, {"reference": "detector"}),
+        "knee": ({}, {"knee": "1 Hz"}),
+        "slope": ({}, {"slope": 1.5}),
+        "minimum_frequency": ({}, {"minimum_frequency": "10 mHz"}),
+        "poles": ({}, {"poles": 6}),
+        "shared": ({}, {"shared": 0.5}),
+    },
+    "Efficiency": {
+        "main_beam": ({}, {"main_beam": 0.5}),
+        "illumination": ({}, {"illumination": 0.5}),
+        "scatter": ({}, {"scatter": "5 %"}),
+        "calibration": ({}, {"calibration": "instantaneous"}),
+        "calibration_error": ({}, {"calibration_error": "5 %"}),
+    },
+    "HighpassFilter": {
+        "frequency": ({}, {"frequency": "0.2 Hz"}),
+        "degree": ({}, {"degree": 1}),
+        "trim": ({}, {"trim": "1 s"}),
+        "oversampling": ({}, {"oversampling": 8.0}),
+    },
+    "CommonModeFilter": {
+        "modes": ({}, {"modes": 2}),
+        "method": ({}, {"method": "mean"}),
+        "residual": ({}, {"residual": 1e-2}),
+        "gap": ({"gap": 0.99}, {"gap": 1e-3}),
+        "on_undetermined": ({"gap": 1e-3}, {"on_undetermined": "skip"}),
+    },
+    "BinMap": {
+        "pixel": ({}, {"pixel": "3 arcsec"}),
+        "width": ({}, {"width": "3 arcmin"}),
+        "height": ({"width": "3 arcmin"}, {"height": "2 arcmin"}),
+        "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
+        "projection": ({}, {"projection": REFUSED}),
+        "frame": ({}, {"frame": "galactic"}),
+        "nside": ({}, {"nside": 8192}),
+        "ordering": ({"nside": 8192}, {"ordering": "nested"}),
+        "weights": ({}, {"weights": "uniform"}),
+        "noise": ({}, {"noise": "scatter"}),
+        "half_difference": ({}, {"half_difference": False}),
+        "smooth": ({}, {"smooth": "beam"}),
+        "product": ({}, {"product": "chart"}),
+    },
+    "PowerSpectrum": {
+        "streams": ({}, {"streams": ["signal"]}),
+        "detectors": ({}, {"detectors": 3}),
+        "segment": ({}, {"segment": "4 s"}),
+    },
+    "TimeStreams": {
+        "streams": ({}, {"streams": ["signal", "white"]}),
+        "detectors": ({}, {"detectors": 5}),
+        "observation": ({}, {"observation": 1}),
+    },
+    "SaveTOD": {
+        "format": ({}, {"format": "fits"}),
+        "streams": ({}, {"streams": ["signal", "white"]}),
+        "dtype": ({}, {"dtype": "float32"}),
+    },
+    "SaveMap": {
+        "central_diameter": ({}, {"central_diameter": "30 arcsec"}),
+        "overwrite": ({}, {"overwrite": False}),
+    },
+    "Plots": {
+        "smooth": ({}, {"smooth": "none"}),
+        "central_diameter": ({}, {"central_diameter": "30 arcsec"}),
+        "least_coverage": ({}, {"least_coverage": 0.5}),
+    },
+    "Report": {"central_diameter": ({}, {"central_diameter": "30 arcsec"})},
+}  # fmt: skip
+
+CHAINS = {
+    "SkyMap": ["SkyMap"],
+    "AtmosphereLayers": ["AtmosphereLayers"],
+    "WhiteNoise": ["WhiteNoise"],
+    "PinkNoise": ["PinkNoise"],
+    "Efficiency": ["SkyMap", "AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency"],
+    "HighpassFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "HighpassFilter"],
+    "CommonModeFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "CommonModeFilter"],
+    "BinMap": ["SkyMap", "WhiteNoise", "Efficiency", "BinMap"],
+    "PowerSpectrum": ["WhiteNoise", "PinkNoise", "Efficiency", "PowerSpectrum"],
+    "TimeStreams": ["WhiteNoise", "Efficiency", "TimeStreams"],
+    "SaveTOD": ["WhiteNoise", "Efficiency", "SaveTOD"],
+    "SaveMap": ["WhiteNoise", "Efficiency", "BinMap", "SaveMap"],
+    "Plots": ["WhiteNoise", "Efficiency", "BinMap", "Plots"],
+    "Report": ["WhiteNoise", "Efficiency", "BinMap", "Report"],
+}
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "SkyMap": {"file": "map.fits"},
+    "AtmosphereLayers": {"pwv": "7.7 mm"},
+    "WhiteNoise": {},
+    "BinMap": {"pixel": "4 arcsec"},
+    "HighpassFilter": {"frequency": "0.1 Hz"},
+    "PointingDaisy": SCAN,
+    "PointingStare": {"scan_duration": "12 s"},
+    "PointingBackAndForth": TURN,
+}
+
+
+def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
+    """A short pipeline with this step in it."""
+
+    def step(other: str) -> Any:
+        values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
+        if "file" in values:
+            values = values | {"file": maps / values["file"]}
+        if which == "BinMap" == other and "nside" in values:
+            values.pop("pixel", None)
+        return make(other, **values)
+
+    pointing = which if which.startswith("Pointing") else "PointingDaisy"
+    return [step(pointing), *(step(other) for other in CHAINS.get(which, []))]
+
+
+REFUSALS = {
+    ("BinMap", "projection"): "'TAN'",
+    ("SkyMap", "missing"): "NaN",
+    ("SaveMap", "overwrite"): "is there already",
+}
+"""What a changed parameter is answered with, where it is not another result."""
+
+ALL = [pytest.param(name, field, id=f"{name}.{field}") for name, cases in CASES.items() for field in cases]
+
+
+@pytest.mark.parametrize(("name", "field"), ALL)
+def test_every_parameter_of_every_operator(name: str, field: str, maps: Path, tmp_path: Path, known: dict[str, Any]) -> None:
+    needs, change = CASES[name][field]
+    case = f"{name} {needs}"
+    if case not in known or field == "overwrite":
+        known[case] = outcome(chain(name, maps, **needs), scene(), tmp_path / "before")
+    folder = tmp_path / ("before" if field == "overwrite" else "after")
+    if (name, field) in REFUSALS:
+        with pytest.raises((ZondaError, ValidationError), match=REFUSALS[name, field]):
+            outcome(chain(name, maps, **(needs | change)), scene(), folder)
+    else:
+        assert not same(known[case], outcome(chain(name, maps, **(needs | change)), scene(), folder))
+
+
+@pytest.fixture(scope="module")
+def known() -> dict[str, Any]:
+    """Runs before the change, made once each."""
+    return {}
+
+
+def test_no_operator_and_no_parameter_is_left_out() -> None:
+    own = {c.name: r for r in (operators, mapmakers) for c in r.candidates() if c.distribution == "zonda"}
+    assert set(own) == set(CASES)
+    for name, registry in own.items():
+        assert set(registry.get(name).model_fields) - {"name"} == set(CASES[name]), name
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_the_name_of_a_step_is_its_label(name: str, maps: Path) -> None:
+    given = chain(name, maps, name="mine")
+    assert "mine" in [step.label for step in zonda.Pipeline(given).operators]
+
+
+# ---- what belongs together
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("PointingDaisy", {"offsets": "none", "offset_size": "2 arcmin"}),
+        ("SkyMap", {"beam": "none", "fwhm": "9 arcsec"}),
+        ("WhiteNoise", {"model": "background_limited", "net": "1 mK s(1/2)"}),
+        ("WhiteNoise", {"reference": "detector"}),
+        ("PinkNoise", {"reference": "detector"}),
+        ("BinMap", {"nside": 1024, "pixel": "3 arcsec"}),
+        ("BinMap", {"nside": 1024, "width": "3 arcmin"}),
+        ("BinMap", {"ordering": "nested"}),
+        ("CommonModeFilter", {"method": "mean", "modes": 3}),
+        ("CommonModeFilter", {"method": "mean", "residual": 1e-3}),
+        ("CommonModeFilter", {"method": "mean", "gap": 0.5}),
+        ("CommonModeFilter", {"method": "mean", "on_undetermined": "skip"}),
+        ("AtmosphereLayers", {"layers": 1, "highest": "3000 m"}),
+        ("AtmosphereLayers", {"layers": 1, "weights": "equal"}),
+    ],
+)
+def test_what_would_be_ignored_is_refused(name: str, parameters: dict[str, Any], maps: Path) -> None:
+    values = {"file": maps / "map.fits"} if name == "SkyMap" else {}
+    with pytest.raises(ValidationError):
+        make(name, **values, **parameters)
+
+
+def test_a_scan_that_is_not_there_cannot_be_shown(maps: Path, tmp_path: Path) -> None:
+    with pytest.raises(ZondaError, match="observation"):
+        outcome(chain("TimeStreams", maps, observation=7), scene(), tmp_path)
+
+
+# ---- scene, site, instrument, telescope, band, noise models, companion runs
+
+WHOLE = ["AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency", "BinMap"]
+SAID = {"name", "description", "provenance"}
+"""Texts that name and explain: shown by `zonda plugins` and in products."""
+SITE = {"name": "s", "latitude": "38.4 deg", "longitude": "-79.8 deg", "altitude": "825 m", "climatology": "green_bank"}
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "scene": {
+        "site": {"site": Site(**(SITE | {"latitude": "39 deg"}))},
+        "instrument": {"instrument": instrument(detectors=7)},
+        "time": {"time": "2024-11-25T07:30"},
+        "target": {"target": "05h00m10s +20d"},
+        "seed": {"seed": 4},
+        "weather": {"weather": {"wind": "median"}},
+    },
+    "site": {
+        "latitude": {"latitude": "39 deg"},
+        "longitude": {"longitude": "-70 deg"},
+        "altitude": {"altitude": "1500 m"},
+        "climatology": {"climatology": "meerkat"},
+    },
+    "instrument": {
+        "telescope": {"telescope": {"diameter": "50 m"}},
+        "band": {"band": {"high": "112 GHz"}},
+        "detectors": {"detectors": 7},
+        "field_of_view": {"field_of_view": "3 arcmin"},
+        "fwhm": {"fwhm": None},
+        "main_beam_efficiency": {"main_beam_efficiency": 0.4},
+        "illumination_efficiency": {"illumination_efficiency": 0.7},
+        "net": {"net": "1 mK s(1/2)"},
+        "knee": {"knee": "1 Hz"},
+        "slope": {"slope": 1.4},
+        "pink_minimum_frequency": {"pink_minimum_frequency": "20 mHz"},
+        "sample_rate": {"sample_rate": "40 Hz"},
+    },
+    "telescope": {
+        "diameter": {"diameter": "50 m"},
+        "elevation_min": {"elevation_min": "80 deg"},
+        "elevation_max": {"elevation_max": "20 deg"},
+        "speed_max": {"speed_max": "10 arcsec/s"},
+        "acceleration_max": {"acceleration_max": "1 arcsec/s2"},
+    },
+    "band": {"low": {"low": "80 GHz"}, "high": {"high": "112 GHz"}, "file": {"low": None, "high": None, "file": "band.txt"}},
+    "background_limited": {
+        "reference": {"reference": REFUSED},
+        "optical_efficiency": {"optical_efficiency": 0.5},
+        "polarizations": {"polarizations": 1},
+        "modes": {"modes": 2},
+        "telescope_temperature": {"telescope_temperature": "20 K"},
+        "receiver_temperature": {"receiver_temperature": "20 K"},
+    },
+    "fixed_net": {"reference": {"reference": "detector", "level": "1 mK s(1/2)"}, "level": {"level": "1 mK s(1/2)"}},
+}
+
+
+LIMITS = {
+    ("telescope", "elevation_min"): "reaches 80 deg to 88 deg",
+    ("telescope", "elevation_max"): "reaches 5 deg to 20 deg",
+    ("telescope", "speed_max"): "largest speed is 10 arcsec/s",
+    ("telescope", "acceleration_max"): "largest acceleration is 1 arcsec/s2",
+    ("background_limited", "reference"): "'detector'",
+}
+"""What is refused with which message."""
+
+
+def described(what: str, change: dict[str, Any], maps: Path) -> tuple[Any, dict[str, Any]]:
+    """(scene, parameters of WhiteNoise)."""
+    if what == "scene":
+        return scene(**change), {}
+    if what == "site":
+        return scene(site=Site(**(SITE | change))), {}
+    if what == "instrument":
+        return scene(instrument=instrument(**change)), {}
+    if what == "telescope":
+        return scene(instrument=instrument(telescope=change)), {}
+    if what == "band":
+        return scene(instrument=instrument(band=change | ({"file": maps / change["file"]} if "file" in change else {}))), {}
+    return scene(), {"model": {"name": what, **change}}
+
+
+def whole(noise: dict[str, Any], maps: Path) -> list[Any]:
+    pointing = {k: v for k, v in SCAN.items() if k != "sample_rate"} | {"scans": 1}
+    steps = [make("PointingDaisy", **pointing), make("SkyMap", file=maps / "map.fits")]
+    return steps + [make(n, **(DEFAULTS.get(n, {}) | (noise if n == "WhiteNoise" else {}))) for n in WHOLE]
+
+
+@pytest.fixture(scope="module")
+def unchanged(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The run before the change; where the default depends on what it is of, by its name."""
+    found = {}
+    for what in SETTINGS:
+        where, noise = described(what, {}, maps)
+        found[what] = outcome(whole(noise, maps), where, tmp_path_factory.mktemp("out"))
+    return found
+
+
+@pytest.mark.parametrize(("what", "field"), [(w, f) for w, fields in SETTINGS.items() for f in fields])
+def test_every_parameter_of_the_scene(what: str, field: str, maps: Path, tmp_path: Path, unchanged: dict[str, Any]) -> None:
+    def run() -> dict[str, Any]:
+        where, noise = described(what, SETTINGS[what][field], maps)
+        return outcome(whole(noise, maps), where, tmp_path)
+
+    if (what, field) in LIMITS:
+        with pytest.raises((ZondaError, ValidationError), match=LIMITS[what, field]):
+            run()
+    else:
+        assert not same(unchanged[what], run())
+
+
+def test_no_parameter_of_the_scene_is_left_out() -> None:
+    classes = {
+        "scene": zonda.Scene, "site": Site, "instrument": zonda.Instrument, "telescope": zonda.Telescope, "band": zonda.Band,
+        "background_limited": noise_models.get("background_limited"), "fixed_net": noise_models.get("fixed_net"),
+    }  # fmt: skip
+    assert set(classes) == set(SETTINGS)
+    for what, cls in classes.items():
+        assert set(cls.model_fields) - SAID == set(SETTINGS[what]), what
