@@ -11,7 +11,7 @@ direction lies in the opposite hemisphere and has no pixel.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,23 +38,17 @@ def rotation_matrices(quaternions: Floats) -> Floats:
 
 def frame_rotation(frame: str) -> Floats:
     """Matrix (3, 3) that turns an ICRS direction into one in ``frame`` (``icrs``, ``fk5``, ``galactic`` or astropy's name)."""
-    from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import frame_transform_graph
 
     if frame == "icrs":
         return np.eye(3)
     if frame_transform_graph.lookup_name(frame) is None:
         raise InputError(f"unknown celestial frame {frame!r}", place="frame", cure="use icrs or galactic")
-    axes = SkyCoord(x=[1, 0, 0], y=[0, 1, 0], z=[0, 0, 1], representation_type="cartesian", frame="icrs").transform_to(frame)
-    matrix: Floats = np.array(axes.cartesian.xyz.value, dtype=np.float64)
-    if not np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-12):
-        raise InputError(f"{frame} is not a rotation of ICRS", place="frame", cure="use icrs or galactic")
-    return matrix
+    return _rotation_into(frame, frame, "frame")
 
 
 def wcs_frame_rotation(wcs: WCS) -> Floats:
     """Matrix (3, 3) from ICRS directions to directions in the frame of ``wcs``."""
-    from astropy.coordinates import SkyCoord
     from astropy.wcs.utils import wcs_to_celestial_frame
 
     try:
@@ -63,10 +57,16 @@ def wcs_frame_rotation(wcs: WCS) -> Floats:
         raise InputError("the WCS has no celestial frame", place="WCS", cure="set CTYPE1, CTYPE2 and RADESYS") from None
     if frame.name == "icrs":
         return np.eye(3)
+    return _rotation_into(frame, f"the WCS's frame {frame.name}", "WCS")
+
+
+def _rotation_into(frame: Any, called: str, place: str) -> Floats:
+    from astropy.coordinates import SkyCoord
+
     axes = SkyCoord(x=[1, 0, 0], y=[0, 1, 0], z=[0, 0, 1], representation_type="cartesian", frame="icrs").transform_to(frame)
     matrix: Floats = np.array(axes.cartesian.xyz.value, dtype=np.float64)
     if not np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-12):
-        raise InputError(f"the WCS's frame {frame.name} is not a rotation of ICRS", place="WCS", cure="reproject to ICRS")
+        raise InputError(f"{called} is not a rotation of ICRS", place=place, cure="use icrs or galactic")
     return matrix
 
 
