@@ -46,7 +46,10 @@ class Bytes(click.ParamType[int]):
 
 
 ELSEWHERE = {"weather": "zonda.plugins.weather_command:weather"}
-"""Built-in commands that live with what they use, imported when they are named or listed."""
+"""Built-in commands that live with what they use, imported when they are named or listed.
+
+Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more: pluggy and the metadata.
+"""
 
 
 class Interrupted(Exception):
