@@ -190,9 +190,10 @@ class _BandTransfer:
 
     def __init__(self, band: Band, layers: Layers) -> None:
         weight, frequency, cells = _cell_weights(band)
-        self._weight = weight / weight.sum()
         self._layers = layers
-        self._cross_sections = _at_frequencies(layers, frequency, cells)
+        self._cross_sections, cell, share = layers.in_parts(_at_frequencies(layers, frequency, cells))
+        frequency = frequency[cell]
+        self._weight = weight[cell] * share / weight.sum()
         self._source = rayleigh_jeans(frequency, layers.temperature[:, None])
         self._cmb = rayleigh_jeans(frequency, T_CMB)
 
@@ -224,7 +225,7 @@ def _cell_weights(band: Band) -> tuple[Array, Array, slice]:
     cell = np.clip(np.searchsorted(edges, (points[1:] + points[:-1]) / 2) - 1, 0, len(edges) - 2)
     offset = points - table.frequency[cells][np.append(cell, cell[-1])]  # from the centre of the cell that begins there
     end = offset[:-1] + step
-    integral = np.bincount(cell, step * (values[1:] + values[:-1]) / 2, len(edges) - 1)
+    integral = np.bincount(cell, step * (values[1:] + values[:-1]) / 2, len(edges) - 1).astype(np.float64)
     first = step * (offset[:-1] * (2 * values[:-1] + values[1:]) + end * (values[:-1] + 2 * values[1:])) / 6
     moment = np.bincount(cell, first, len(edges) - 1)
     shift = np.divide(moment, integral, out=np.zeros_like(moment), where=integral > 0)
@@ -239,11 +240,14 @@ def _at_frequencies(layers: Layers, frequency: Array, cells: slice) -> CrossSect
     low = np.clip(np.searchsorted(centre, frequency, "right") - 1, 0, len(centre) - 2)
     upper = (frequency - centre[low]) / (centre[low + 1] - centre[low])
     upper = np.clip(upper, 0.0, 1.0)  # of the first and the last cell of the table
+    nearest = low + (upper > 0.5)
 
     def linear(sections: Array) -> Array:
-        return np.asarray(sections[:, low] * (1 - upper) + sections[:, low + 1] * upper)
+        return np.asarray(sections[..., low] * (1 - upper) + sections[..., low + 1] * upper)
 
-    return CrossSections(linear(known.dry_air), linear(known.water), linear(known.water_self), linear(known.ozone))
+    return CrossSections(
+        linear(known.dry_air), linear(known.water), linear(known.water_self), linear(known.ozone), known.ozone_ratio[..., nearest]
+    )
 
 
 def _chebyshev_points(n: int) -> Array:
