@@ -64,7 +64,7 @@ STARES = {
 }
 """Camera, and offset of four detectors from a fifth at the centre."""
 STARE_RATE, STARE_SECONDS = 4.0, 240.0
-PAIRS = {"across": (1, 2), "in elevation": (3, 4)}
+PAIRS = {"in azimuth": (1, 2), "in elevation": (3, 4)}
 
 
 def boresight(case: Case, t: Floats) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""zonda's whole MUSTANG-2 chain, sky to map: python zonda_chain.py CASE.npz"""
+"""zonda's whole MUSTANG-2 chain, sky to map: python zonda_chain.py CASE.npz. The second of two runs, and the first."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def run(c: dict[str, Any]) -> dict[str, float]:
             zonda.PointingDaisy(
                 radius="4 arcmin", speed="50 arcsec/s", scan_duration=f"{c['duration']} s", sample_rate=f"{c['rate']} Hz"
             ),
-            zonda.SkyMap(file=CLUSTER),
+            zonda.SkyMap(file=CLUSTER, centre="target"),
             zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="3 %"),
             zonda.WhiteNoise(),
             zonda.PinkNoise(),
@@ -34,4 +34,6 @@ def run(c: dict[str, Any]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    report(before=peak(), **run(case()), peak=peak(), version=zonda.__version__)
+    given, before = case(), peak()
+    first = run(given)["simulation"]
+    report(before=before, first=first, **run(given), peak=peak(), version=zonda.__version__)
