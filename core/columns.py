@@ -1,4 +1,4 @@
-"""One vector instruction per row of four coefficients, which numba's compiler does not find by itself."""
+"""Instructions that numba's compiler does not find by itself: four neighbours at once, and fused multiply-adds."""
 
 from __future__ import annotations
 
@@ -47,17 +47,28 @@ def four_columns(typing_context: Any, f: Any, p: Any, stride: Any, v0: Any, v1: 
 
 
 @intrinsic
+def fused(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+    """a b + c, rounded once, for three floats of one type: the same bits in a vector loop as at its end."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fma(*arguments)
+
+    return a(a, b, c), generate
+
+
+@intrinsic
 def four_columns_at(typing_context: Any, address: Any, stride: Any, v0: Any, v1: Any, v2: Any, v3: Any, out: Any, at: Any) -> Any:
     """out[at + k] = sum_j v_j f[j stride + k], k = 0 .. 3, for the float32 numbers ``f`` at a memory ``address``.
 
-    ``out`` is a C array of float64, ``v_j`` float64; ``address``, ``stride``, ``at`` are uint64; nothing is checked. The
-    sums are not contracted, so that they are the same on every CPU.
+    ``out`` is a C array of the type of ``v_j``, float32 or float64; ``address``, ``stride``, ``at`` are uint64; nothing is
+    checked. The sums are not contracted, so that they are the same wherever they are made.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place, stride, *v, out, at = arguments
-        single, double = ir.VectorType(ir.FloatType(), 4), ir.VectorType(ir.DoubleType(), 4)
-        nothing, integer = ir.Constant(double, ir.Undefined), ir.IntType(32)
+        scalar = context.get_data_type(signature.args[2])
+        single, four, size = ir.VectorType(ir.FloatType(), 4), ir.VectorType(scalar, 4), context.get_abi_sizeof(scalar)
+        nothing, integer = ir.Constant(four, ir.Undefined), ir.IntType(32)
         zeros = ir.Constant(ir.VectorType(integer, 4), [0] * 4)
 
         def spread(value: Any) -> Any:
@@ -67,11 +78,11 @@ def four_columns_at(typing_context: Any, address: Any, stride: Any, v0: Any, v1:
         total = None
         for weight in v:
             row = builder.load(builder.inttoptr(place, single.as_pointer()), align=4)
-            term = builder.fmul(spread(weight), builder.fpext(row, double))
+            term = builder.fmul(spread(weight), row if four == single else builder.fpext(row, four))
             total = term if total is None else builder.fadd(total, term)
             place = builder.add(place, four_bytes)
         first = make_array(signature.args[6])(context, builder, out).data
-        builder.store(total, builder.bitcast(builder.gep(first, [at]), double.as_pointer()), align=8)
+        builder.store(total, builder.bitcast(builder.gep(first, [at]), four.as_pointer()), align=size)
         return context.get_dummy_value()
 
     return types.void(types.uint64, types.uint64, v0, v1, v2, v3, out, types.uint64), generate

@@ -26,7 +26,7 @@ from .sampling import Layers
 Water = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
 """(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""
 
-UNIT_DETECTORS, UNIT_SAMPLES = 128, 8192
+UNIT_DETECTORS, UNIT_SAMPLES = 128, 16384
 """What is made at a time."""
 
 BYTES_KEPT = 128 << 20

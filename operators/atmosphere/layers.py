@@ -192,7 +192,8 @@ class AtmosphereLayers(Operator):
         drifting = [Drifting(beam, layer.height, layer.amplitude, layer.wind, step) for beam, layer, step in parts]
         n = observation.n_samples
         first, count = times(slice(0, n), plan.step)
-        turbulence = Layers(observation, track, drifting, plan.step, first, first + count)
+        kind = np.float64 if plan.nodes.shape else np.float32
+        turbulence = Layers(observation, track, drifting, plan.step, first, first + count, kind)
 
         shares, heights = np.array([layer.amplitude for layer in layers]), np.array([layer.height for layer in layers])
         vapour_height = float(shares @ heights / shares.sum())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,17 +123,19 @@ def make_plan(
     steps = [step] * len(models)
     if len(nodes.xi) * observation.n_samples / step > PAYS_FROM:
 
+        @cache
         def layer_error(k: int, of: int) -> float:
             deltas = path_errors(of)[0]
             return layer_time_error(models[k], speeds[k], deltas[k], of / observation.sample_rate) if of > 1 else 0.0
 
         spent = late**2
-        for k in range(len(models)):
-            while 2 * steps[k] <= candidates[0]:
-                more = layer_error(k, 2 * steps[k]) - layer_error(k, steps[k])
-                if spent + more > (tolerance * rms) ** 2:
-                    break
-                spent, steps[k] = spent + more, 2 * steps[k]
+        while True:  # double the step that saves most for the error it adds
+            more = {k: (layer_error(k, 2 * s) - layer_error(k, s)) for k, s in enumerate(steps) if 2 * s <= candidates[0]}
+            fits = [k for k, error in more.items() if spent + error <= (tolerance * rms) ** 2]
+            if not fits:
+                break
+            best = min(fits, key=lambda k: (max(more[k], 0.0) * steps[k], k))
+            spent, steps[best] = spent + more[best], 2 * steps[best]
         late = math.sqrt(spent)
     return Plan(nodes, step, tuple(steps), tolerance, error / rms, late / rms, left / rms, mean_nodes, mean_step)
 

@@ -22,7 +22,7 @@ from .radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
 
 Floats = NDArray[np.float64]
 
-ERROR = 1e-6
+ERROR = 1e-5
 """Largest error of f / y, of the largest |f / y|."""
 
 _DEGREES = ((2, 2), (3, 3), (4, 4), (5, 6), (7, 8), (10, 12), (14, 16))

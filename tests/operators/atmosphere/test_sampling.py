@@ -166,8 +166,8 @@ def test_the_response_is_that_of_the_band(band: Any, rms: float, low: float) -> 
     }
     for name in names:
         largest = abs(expected[name] / y).max()
-        # ERROR = 1e-6 of the largest f / y, at points that the fit was not made from: twice that.
-        assert abs((response(name, y, s) - expected[name]) / y).max() < 2e-6 * largest
+        # ERROR = 1e-5 of the largest f / y, at points that the fit was not made from: twice that.
+        assert abs((response(name, y, s) - expected[name]) / y).max() < 2e-5 * largest
         assert not response(name, np.zeros((1, 3)), s[:1, :3]).any()
         far = np.array([[9 * rms, 0.0]])
         np.testing.assert_allclose(response(name, far, s[:1, :2])[0, 0], _at(band, name, 9 * rms, s[0, 0]), rtol=1e-9)
@@ -186,7 +186,10 @@ def _at(band: Any, name: str, y: float, s: float) -> float:
     }[name]
 
 
-def test_wide_ranges_are_left_to_the_band(band: Any) -> None:
+def test_wide_ranges_are_left_to_the_band(band: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from zonda.operators.atmosphere import response as module
+
+    monkeypatch.setattr(module, "_DEGREES", ((2, 2), (3, 3)))
     response = Response(band, 1e-5, -1.0, 250.0, 0.3, 0.6, 1500.0, 6.5, ("emission",))
     assert response.exact
     y, s = np.array([[-0.9, 0.0, 100.0]]), np.array([[0.4, 0.5, 0.55]])
