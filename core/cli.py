@@ -45,7 +45,7 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
-ELSEWHERE = {"weather": "zonda.plugins.weather_command:weather"}
+ELSEWHERE = {"doctor": "zonda.plugins.doctor_command:doctor", "weather": "zonda.plugins.weather_command:weather"}
 """Built-in commands that live with what they use, imported when they are named or listed.
 
 Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more: pluggy and the metadata.
