@@ -76,7 +76,7 @@ def threads_and_blocks() -> int:
 
 @checks.add(BLOCKS, reference="one thread, one block", limit=0, unit="values")
 def blocks_in_time() -> int:
-    """the same without filters, where blocks are cut in time as well"""
+    """values of the map that differ without filters, where blocks are cut in time as well"""
     one = _run(filters=False)
     return sum(_differing(one, _run(t, m, filters=False)) for t, m in ((3, 8_000_000), (1, 3_000_000)))
 

@@ -12,7 +12,7 @@ from zonda.core.data import Observation
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 
 from .cases import STRIP, WIND
-from .scenes import run, scan
+from .scenes import largest, run, scan
 
 checks = Family("geometry")
 
@@ -41,7 +41,7 @@ def turned_together() -> float:
         one, other = (
             _atmosphere(scan(azimuth=40 + by), wind={"speed": "12 m/s", "direction": f"{200 + by} deg"}) for by in (0.0, angle)
         )
-        worst = max(worst, float(abs(one - other).max()))
+        worst = largest(worst, float(abs(one - other).max()))
     return worst
 
 
@@ -65,7 +65,7 @@ def frozen_flow() -> float:
         ]
         water = run(list(steps), o, keep=("pwv",)).observations[0].detdata["pwv"] / 1e-3
         up, down = water[0, :-late] * s, water[1, late:] * (s + eta * c) / np.sqrt(1 + xi * xi + eta * eta)
-        worst = max(worst, float(abs(up - down).max()) / RMS)
+        worst = largest(worst, float(abs(up - down).max()) / RMS)
     return worst
 
 

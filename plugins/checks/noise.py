@@ -12,7 +12,7 @@ from zonda.operators.noise.one_over_f import PowerLawFilter, power_law_filter
 from zonda.operators.noise.pink import Streams
 
 from .cases import PINK
-from .scenes import unrefused
+from .scenes import largest, unrefused
 
 checks = Family("noise")
 
@@ -32,8 +32,9 @@ def spectrum() -> Measured:
 
 @checks.add(PINK, reference="f^-slope", limit=0.08, quick=False)
 def spectrum_to_lower_frequencies() -> float:
-    """the same, 10 poles, f_min from 1e-8 to 0.3 f_s, slopes 0.5 to 3"""
-    return max(_spectrum_error(power_law_filter(f, s, 10), f, s) for f in (1e-8, 1e-5, 1e-2, 0.3) for s in (0.5, 1.0, 2.0, 3.0))
+    """largest relative error of the PSD, 10 poles, f_min from 1e-8 to 0.3 f_s, slopes 0.5 to 3"""
+    laws = [(f, s) for f in (1e-8, 1e-5, 1e-2, 0.3) for s in (0.5, 1.0, 2.0, 3.0)]
+    return largest(*(_spectrum_error(power_law_filter(f, s, 10), f, s) for f, s in laws))
 
 
 @checks.add(PINK, reference="integral of the PSD", limit=4.5, unit="standard errors")
@@ -68,7 +69,7 @@ def a_week() -> Measured:
 
 @checks.add(PINK, reference="no correlation", limit=5, unit="standard errors", quick=False)
 def no_period() -> float:
-    """correlation of the first day of that week with the second, and with the last: no period, no wrap"""
+    """correlation of a first stretch of 200000 samples with the second, and with the seventh: no period, no wrap"""
     law, n_det, day = power_law_filter(1e-2, 1.0, 8), 16, 200_000
     streams = Streams(law, stream_key(6, "a"), stream_key(6, "b"))
     days = []
@@ -79,7 +80,7 @@ def no_period() -> float:
     f = np.r_[np.linspace(0, 1e-2, 2000, endpoint=False), np.geomspace(1e-2, 0.5, 20_000)]
     power = law.response(f) / law.gain / law.variance
     error = math.sqrt(2 * float(np.trapezoid(power**2, f)) / (day * n_det))  # Bartlett: sum of rho^2 over lags
-    return max(float(abs((days[0] * other).mean())) / error for other in days[1:])
+    return largest(*(float(abs((days[0] * other).mean())) / error for other in days[1:]))
 
 
 @checks.add(PINK, reference="the same filter in float64", limit=1e-3)
@@ -96,7 +97,7 @@ def float32_states() -> float:
         first = law.start @ normals(stream_key(7, "b"), 0, 8 * 16).reshape(8, 16)
         for q, z, s in zip(law.poles, law.zeros, first, strict=True):
             exact, _ = lfilter([1, z - 1], [1, q - 1], exact, axis=1, zi=((z - q) * s)[:, None])
-        worst = max(worst, float((out - exact).std() / exact.std()))
+        worst = largest(worst, float((out - exact).std() / exact.std()))
     return worst
 
 

@@ -22,7 +22,7 @@ from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
 
 from .cases import BAND, OPAQUE, WATER
-from .scenes import SITE, START, camera, run, scan, unrefused
+from .scenes import SITE, START, camera, largest, run, scan, unrefused
 
 checks = Family("opacity")
 
@@ -60,7 +60,7 @@ def saturated_line() -> Measured:
     for pwv in np.array([0.3, 1.0, 2.9]) * PWV:
         for elevation in (LOWEST, 0.7, ZENITH):
             exact = table.direct(float(pwv), float(elevation))[1]
-            worst = max(worst, float(abs(table.log_transmission(pwv, elevation) / exact - 1)))
+            worst = largest(worst, float(abs(table.log_transmission(pwv, elevation) / exact - 1)))
     return worst, f"tau up to {float(table.opacity(2.9 * PWV, LOWEST)):.0f}"
 
 
@@ -81,7 +81,7 @@ def small_differences() -> float:
     for which, method in ((0, table.emission_difference), (1, table.log_transmission_difference)):
         for relative in (0.3, 1e-2, -5e-3, 1e-6, 1e-10, -1e-14):
             exact = _difference(table, which, PWV, relative * PWV, elevation)
-            worst = max(worst, float(abs(method(PWV, relative * PWV, elevation) / exact - 1)))
+            worst = largest(worst, float(abs(method(PWV, relative * PWV, elevation) / exact - 1)))
     return worst
 
 

@@ -22,7 +22,7 @@ from zonda.operators.pointing.stare import PointingStare
 from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
 
 from .cases import SPHERE, TIME
-from .scenes import camera, differing, scene
+from .scenes import camera, differing, largest, scene
 
 checks = Family("pointing")
 
@@ -77,7 +77,7 @@ def over_a_day() -> float:
             seconds = np.round(rng.uniform(0, 86400, 300), 6)
             sky = unit_vectors(rng.uniform(0, 2 * np.pi, 300), np.arcsin(rng.uniform(-1, 1, 300)))
             transform = CelestialTransform(site, start, 86400.0)
-            worst = max(worst, _angle(transform.horizontal(sky, seconds), _erfa(sky, start, seconds, site)))
+            worst = largest(worst, _angle(transform.horizontal(sky, seconds), _erfa(sky, start, seconds, site)))
     return worst
 
 
@@ -89,7 +89,7 @@ def exact_start() -> Measured:
         early = Instant.parse("2027-01-15T03:04:05.678901234Z")
         late = Instant(early.nanoseconds + shift)
         one = CelestialTransform(SITES[0], early, 500.0).horizontal(sky, np.array([shift / 1e9]))
-        worst = max(worst, _angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1))))
+        worst = largest(worst, _angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1))))
     return worst, "0.24 us, the rounding of 1.8e9 s in float64, would be 1.7e-11 rad"
 
 
@@ -112,7 +112,7 @@ def leap_second() -> float:
             0.5, 0.2, 0.0, 0.0, 0.0, 0.0, utc1, utc2, earth.ut1_utc, site.longitude, site.latitude, site.altitude,
             earth.x, earth.y, 0.0, 0.0, 0.0, 1.0,
         )  # fmt: skip
-        worst = max(worst, _angle(transform.horizontal(sky, np.array([elapsed])), unit_vectors(-azimuth, np.pi / 2 - zenith)))
+        worst = largest(worst, _angle(transform.horizontal(sky, np.array([elapsed])), unit_vectors(-azimuth, np.pi / 2 - zenith)))
     return worst
 
 
@@ -121,7 +121,7 @@ def sample_times() -> float:
     """error of the time of any sample of a day at 0.9 Hz"""
     o, _ = _observe(PointingStare(scan_duration="86400 s", sample_rate="0.9 Hz", target="az 0 deg el 45 deg"))
     some = np.unique(np.linspace(0, o.n_samples - 1, 1000).astype(int))
-    return max(float(abs(Fraction(float(o.seconds[k])) - Fraction(int(k) * 10, 9))) for k in some)
+    return largest(*(float(abs(Fraction(float(o.seconds[k])) - Fraction(int(k) * 10, 9))) for k in some))
 
 
 @checks.add(SPHERE, reference="ERFA eraAtco13", limit=ERROR, unit="rad")
@@ -133,7 +133,7 @@ def poles_of_the_sky() -> float:
         sky = unit_vectors(np.full(25, 1.0), np.full(25, math.radians(declination)))
         up = transform.horizontal(sky, seconds)
         _, radec = transform.boresight(up, seconds)
-        worst = max(worst, _angle(up, _erfa(sky, WHEN, seconds, SITES[0])), _angle(rotation_matrices(radec)[:, :, 2], sky))
+        worst = largest(worst, _angle(up, _erfa(sky, WHEN, seconds, SITES[0])), _angle(rotation_matrices(radec)[:, :, 2], sky))
     return worst
 
 
@@ -146,7 +146,7 @@ def zenith_crossing() -> float:
     sky = unit_vectors(np.full(o.n_samples, ra), np.full(o.n_samples, dec))
     some = slice(None, None, 50)
     up = _erfa(sky[some], o.start, o.seconds[some], SITES[0])
-    return max(
+    return largest(
         _angle(rotation_matrices(o.boresight_azel)[some, :, 2], up), _angle(rotation_matrices(o.boresight_radec)[:, :, 2], sky)
     )
 
@@ -164,7 +164,7 @@ def low_and_wrapping() -> float:
         o, _ = _observe(operator, target=target, time="2024-11-25T00:30Z")
         some = slice(None, None, 60)
         azel, radec = (rotation_matrices(q)[some, :, 2] for q in (o.boresight_azel, o.boresight_radec))
-        worst = max(worst, _angle(azel, _erfa(radec, o.start, o.seconds[some], SITES[0])))
+        worst = largest(worst, _angle(azel, _erfa(radec, o.start, o.seconds[some], SITES[0])))
     return worst
 
 

@@ -146,6 +146,11 @@ def unrefused(attempts: list[tuple[Callable[[], Any], str]]) -> tuple[int, str]:
     return len(missed), ", ".join(missed)
 
 
+def largest(*figures: float) -> float:
+    """The largest; NaN where one is (`max` would pass over it)."""
+    return float(np.max(figures))
+
+
 def differing(one: Any, other: Any) -> int:
     """How many values of two arrays are not the same bits (NaN equals NaN)."""
     a, b = np.asarray(one), np.asarray(other)
