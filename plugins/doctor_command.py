@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 def doctor(everything: bool, as_json: bool) -> None:
     """Check this machine: its arithmetic, and what the hard cases reach on it.
 
-    Prints the figures of docs/stability.md as measured here. Exit status 1 where one is beyond its limit.
+    Prints the figures of docs/stability.md as measured here. Exit status 1 where one is beyond its limit. The first run after
+    installation also compiles, which takes a minute.
     """
     from zonda.core.compiled import ensure_cache, one_blas_thread
 
