@@ -19,7 +19,7 @@ from zonda.core.operator import Operator
 from zonda.plugins.checks import scenes
 from zonda.plugins.checks.scenes import camera, differing, scan, sky_file
 
-few = settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+few = settings(max_examples=3, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 seeds = st.integers(0, 2**62)
 WIND = {"speed": "12 m/s", "direction": "200 deg"}
 PLANES = ("signal", "hits", "weights", "noise")
@@ -177,10 +177,11 @@ def test_the_order_of_detectors_changes_no_map(seed: int) -> None:
     for filters in ((), (zonda.HighpassFilter(),)):
         one, other = (mapped(p, *filters).products["map"] for p in (same, order))
         assert sum(differing(getattr(one, plane), getattr(other, plane)) for plane in PLANES) == 0
-    modes = (zonda.HighpassFilter(), zonda.CommonModeFilter(residual=1e-9))
+    modes = (zonda.HighpassFilter(), zonda.CommonModeFilter(residual=1e-11))
     one, other = (mapped(p, *modes).products["map"] for p in (same, order))
     assert np.array_equal(one.hits, other.hits)
-    np.testing.assert_allclose(one.signal, other.signal, atol=1e-8 * np.nanstd(one.signal) + 3e-11)
+    # |du| <= residual / (1 - (sigma_2 / sigma_1)^2) <= 2e-11 in either run, times v <= sqrt(19) max |signal|; sums to 1.5e-11 K
+    np.testing.assert_allclose(one.signal, other.signal, rtol=0, atol=4e-11 * np.sqrt(19) * abs(signal).max() + 3e-11)
 
 
 @few
