@@ -1,4 +1,4 @@
-"""The climatology against ERA5's quantiles and TOAST's MERRA-2 statistics: the table in docs/weather.md.
+"""The climatology against ERA5's quantiles and TOAST's MERRA-2 statistics, at the sites of the reference data.
 
 python benchmarks/weather_reference.py FOLDER_OF_REFERENCE
 """

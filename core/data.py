@@ -223,11 +223,12 @@ class Block:
     def shape(self) -> tuple[int, int]:
         return self.detectors.stop - self.detectors.start, self.samples.stop - self.samples.start
 
-    def new(self, name: str) -> Floats:
-        """Stream ``name``, made of zeros when it is not there yet."""
+    def new(self, name: str, *, zero: bool = True) -> Floats:
+        """Stream ``name``, made of zeros when it is not there yet; or of anything (not ``zero``), to be overwritten."""
         if name not in self.detdata:
             self.detdata[name] = self.places[name] if name in self.places else self.buffer(name, self.shape)
-            self.detdata[name].fill(0)
+            if zero:
+                self.detdata[name].fill(0)
         return self.detdata[name]
 
     def buffer(self, name: str, shape: tuple[int, int]) -> Floats:

@@ -13,7 +13,7 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -48,11 +48,15 @@ class Settings:
 
 @dataclass
 class Segment:
-    """Operators that see the same blocks. ``span``: what a block must hold whole (sample: nothing)."""
+    """Operators that see the same blocks. ``span``: what a block must hold whole (sample: nothing).
+
+    ``in_time_order``: blocks hold all detectors and come in order of time (`Operator.in_time_order`).
+    """
 
     operators: list[Operator]
     span: str = "sample"
     halo: int = 0
+    in_time_order: bool = False
 
     def split(self) -> tuple[list[Operator], list[Operator]]:
         """The first operators, which take a block in pieces, and those from the first coupled one on."""
@@ -63,13 +67,15 @@ class Segment:
         return self.operators[:cut], self.operators[cut:]
 
 
-def cut(operators: Sequence[Operator], observation: Observation) -> list[Segment]:
-    """Cut a chain into segments."""
+def cut(operators: Sequence[Operator], observation: Observation, ordered: Collection[str] = ()) -> list[Segment]:
+    """Cut a chain into segments. ``ordered``: labels of the operators that want their blocks in order of time."""
     segments = [Segment([])]
     for operator in operators:
         last = segments[-1]
-        couples, halo = operator.couples, operator.halo(observation)
-        if couples == "all":
+        couples, halo, in_order = operator.couples, operator.halo(observation), operator.label in ordered
+        if (in_order and last.span == "time") or (last.in_time_order and couples == "time"):
+            segments.append(Segment([operator], couples, in_time_order=in_order))
+        elif couples == "all":
             segments.append(Segment([operator]))
         elif halo > 0 and last.span != "time":  # whole scans need no halo; otherwise read the stream with margins
             segments.append(Segment([operator], halo=halo))
@@ -80,6 +86,7 @@ def cut(operators: Sequence[Operator], observation: Observation) -> list[Segment
             last.span = couples
         else:
             segments.append(Segment([operator], couples))
+        segments[-1].in_time_order |= in_order
     return [s for s in segments if s.operators]
 
 
@@ -147,7 +154,8 @@ class Execution:
     # ---- segments
 
     def _execute(self, before: Callable[..., None], after: Callable[..., None]) -> None:
-        segments = cut(self.operators, self.observation)
+        ordered = [o.label for o in self.operators if o.in_time_order(self.observation, self.states[o.label])]
+        segments = cut(self.operators, self.observation, ordered)
         streams: dict[str, Stream] = {}
         for number, segment in enumerate(segments):
             last = number + 1 == len(segments)
@@ -226,7 +234,7 @@ class Execution:
                         stream.array[block.detectors, block.samples] = block.detdata[name]
             means.update(block.means)  # the same fields in every block
 
-        blocks = list(self._blocks(segment.span, shape, n_streams))
+        blocks = list(self._blocks(segment, shape, n_streams))
         what = ", ".join(o.label for o in segment.operators)
         self._map(work, blocks, what)
         kept = {name: Stream(name, observation, s.array, means, settings.threads) for name, s in made.items() if name in seen}
@@ -297,7 +305,8 @@ class Execution:
         for array in {id(a): a for a in arrays if not isinstance(a, np.memmap)}.values():
             self.settings.spare.append(array)
 
-    def _blocks(self, span: str, shape: tuple[int, int], n_streams: int) -> Iterator[tuple[slice, slice]]:
+    def _blocks(self, segment: Segment, shape: tuple[int, int], n_streams: int) -> Iterator[tuple[slice, slice]]:
+        span = segment.span
         n_det, n_samp = shape
         item = np.dtype(self.settings.dtype).itemsize
         share = self.settings.memory // 2 // self.settings.threads // (n_streams * item)  # samples a block may hold
@@ -314,6 +323,13 @@ class Execution:
                 place=self.observation.name,
                 cure=f"raise --memory to {-(-need // 1_000_000)}MB, use fewer --threads, or make the scan shorter",
             )
+        if segment.in_time_order and span == "sample":
+            columns = min(n_samp, PIECE, max(1, share // rows // TILE_SAMPLES) * TILE_SAMPLES)
+            rows = min(n_det, max(1, share // columns // TILE_DETECTORS) * TILE_DETECTORS)
+            for start in range(0, n_samp, columns):
+                for first in range(0, n_det, rows):
+                    yield slice(first, min(first + rows, n_det)), slice(start, min(start + columns, n_samp))
+            return
         columns = n_samp if span == "time" else min(n_samp, max(1, share // rows // TILE_SAMPLES) * TILE_SAMPLES)
         for first in range(0, n_det, rows):
             for start in range(0, n_samp, columns):
@@ -341,9 +357,9 @@ class Execution:
 
 
 def _pieces(detectors: slice, samples: slice) -> Iterator[tuple[slice, slice]]:
-    """The pieces of a block."""
-    for first in range(detectors.start, detectors.stop, TILE_DETECTORS):
-        for start in range(samples.start, samples.stop, PIECE):
+    """The pieces of a block, in order of time."""
+    for start in range(samples.start, samples.stop, PIECE):
+        for first in range(detectors.start, detectors.stop, TILE_DETECTORS):
             yield slice(first, min(first + TILE_DETECTORS, detectors.stop)), slice(start, min(start + PIECE, samples.stop))
 
 

@@ -78,6 +78,10 @@ class Operator(Parameters):
         """Samples on each side of a block that `exec` needs to be right inside it (a finite filter's half-length)."""
         return 0
 
+    def in_time_order(self, observation: Observation, state: Any) -> bool:
+        """Whether `exec` is much cheaper when it sees all detectors at one time before it goes on to the next."""
+        return False
+
     def measure(self, stream: Stream, state: Any) -> None:
         """Read the whole stream (``couples = "all"`` only); leave the result in ``state``."""
 

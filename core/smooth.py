@@ -23,6 +23,27 @@ PAD = 1
 """Coefficients before the first sample's interval, so that every sample has its four neighbours."""
 
 
+SPLINE_MARGIN = 12
+"""Values on either side that `spline_coefficients` uses up: its filter is cut where it has fallen to 1.4e-7."""
+
+
+def spline_coefficients(values: Floats, dtype: type = np.float64) -> Floats:
+    """Cubic B-spline coefficients of rows of values (n, m + 2 `SPLINE_MARGIN`): (n, m), each from its neighbours alone.
+
+    A finite filter, normalized to unit sum, so that a coefficient has the same bits wherever the rows begin.
+    """
+    out: Floats = np.empty((values.shape[0], values.shape[1] - 2 * SPLINE_MARGIN), dtype)
+    _prefilter(np.ascontiguousarray(values, np.float64), _inverse_taps(), out)
+    return out
+
+
+@lru_cache(maxsize=1)
+def _inverse_taps() -> NDArray[np.float64]:
+    """One-sided inverse of (1, 4, 1) / 6, (`SPLINE_MARGIN` + 1,)."""
+    taps = np.sqrt(3.0) * (np.sqrt(3.0) - 2.0) ** np.arange(SPLINE_MARGIN + 1)
+    return np.asarray(taps / (taps[0] + 2 * taps[1:].sum()), np.float64)
+
+
 def coarse_times(n_samples: int, step: int) -> NDArray[np.int64]:
     """Sample indices (may be negative or past the end) of the coefficients that cover ``n_samples`` samples.
 
@@ -144,6 +165,23 @@ class DetectorField:
             out = np.empty((len(rows), stop - start))
         _evaluate_rows(rows, _basis(self.step, out.dtype.str), start, out)
         return out
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _prefilter(values, taps, out):  # type: ignore[no-untyped-def]
+    half, n = taps.size - 1, nb.uint64(out.shape[1])
+    total = np.empty(out.shape[1])
+    for d in range(out.shape[0]):
+        row, target = values[d], out[d]
+        middle = row[half:]
+        for t in range(n):
+            total[t] = taps[0] * middle[t]
+        for k in range(1, half + 1):
+            weight, left, right = taps[k], row[half - k :], row[half + k :]
+            for t in range(n):
+                total[t] += weight * (left[t] + right[t])
+        for t in range(n):
+            target[t] = total[t]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)

@@ -89,6 +89,11 @@ class Column:
     log_vapour_spread, wind_east_spread, wind_north_spread
         (n,) standard deviations of ln(vapour density) and of the winds [m/s] over the weather of that season and hour, where
         the source knows them: without them there is neither a quantile nor a random draw.
+    column_spread
+        Standard deviation of ln(PWV) below and above its median, as shares of what ``log_vapour_spread`` would give if all
+        levels varied together; None: 0.77 both.
+    ground_temperature
+        K of the air on the ground, where an inversion lies there that the levels do not resolve; None: as the levels have it.
     stated
         One line for the reports: where this air comes from.
     """
@@ -104,6 +109,8 @@ class Column:
     log_vapour_spread: Array | None = None
     wind_east_spread: Array | None = None
     wind_north_spread: Array | None = None
+    column_spread: tuple[float, float] | None = None
+    ground_temperature: float | None = None
     stated: str = ""
 
 

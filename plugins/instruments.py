@@ -154,7 +154,7 @@ CAMERAS = {
 }
 """By name; efficiencies are the main beam's and the illumination's."""
 
-ALIASES = {"fyst": "ccat", "toltec": "lmt", "spt3g": "spt", "laboca": "apex"}
+ALIASES = {"gbt": "mustang2", "fyst": "ccat", "toltec": "lmt", "spt3g": "spt", "laboca": "apex"}
 """Other names people use."""
 
 

@@ -152,10 +152,22 @@ def _checked(what: str, make: Any) -> Any:
     try:
         return make()
     except ValidationError as err:
-        text = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in err.errors())
+        text = "; ".join(f"{'.'.join(map(str, e['loc']))}: {_fault(e)}" for e in err.errors())
         raise click.BadParameter(text, param_hint=what) from None
     except PydanticCustomError as err:
         raise click.BadParameter(err.message(), param_hint=what) from None
+
+
+LIMITS = {"latitude": "-90 to 90 deg", "longitude": "-360 to 360 deg", "altitude": "-500 to 9000 m"}
+"""Of a place, in the units a user writes."""
+
+
+def _fault(error: Any) -> str:
+    limits = LIMITS.get(str(error["loc"][-1])) if error["type"].startswith(("less_than", "greater_than")) else None
+    if limits is None:
+        return str(error["msg"])
+    value = float(error["input"]) if limits.endswith(" m") else math.degrees(error["input"])
+    return f"{value:g} {limits.split()[-1]} is outside the limits, {limits}"
 
 
 def _check_suffix(path: Path) -> None:

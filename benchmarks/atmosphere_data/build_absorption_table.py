@@ -29,6 +29,10 @@ TEMPERATURE_OFFSETS = np.array([-60.0, -30.0, 0.0, 25.0, 50.0])
 """K, about the US Standard Atmosphere 1976 (8 K below it under 500 hPa, where high dry sites are cold)."""
 CELL, LOWEST, HIGHEST = 0.5, 1.0, 1000.0
 """GHz: width of the frequency cells, first and last cell centre."""
+OZONE_PARTS = (2, 4, 8, 16, 34)
+"""Sixty-fourths of a cell, from the most opaque ones down: ozone's lines are narrower than cells and saturate low in the sky."""
+RATIO_LOW, RATIO_HIGH = 1e-3, 64.0
+"""Limits of the packed ratios."""
 WATER_LOW, WATER_HIGH, OZONE = 1e-5, 0.02, 1e-6
 """Volume mixing ratios of the single-layer models."""
 
@@ -51,6 +55,12 @@ def molecules(pressure: float, mixing_ratio: float = 0.0) -> float:
 
 def cell_opacity(pressure: float, temperature: float, column: str, step: float) -> NDArray[np.float64]:
     """Opacity of one layer, averaged over every cell with the trapezium rule at ``step`` GHz."""
+    fine = fine_opacity(pressure, temperature, column, step)
+    return fine.mean(axis=1)
+
+
+def fine_opacity(pressure: float, temperature: float, column: str, step: float) -> NDArray[np.float64]:
+    """(cell, part) opacity of one layer in parts of ``step`` GHz of every cell."""
     import am
 
     first, last = LOWEST - CELL / 2, HIGHEST + CELL / 2
@@ -68,7 +78,7 @@ def cell_opacity(pressure: float, temperature: float, column: str, step: float) 
     cells, per_cell = round((HIGHEST - LOWEST) / CELL) + 1, round(CELL / step)
     tau = tau[np.argmin(abs(np.asarray(run.frequency) - first)) :][: cells * per_cell + 1]
     low, high = tau[:-1].reshape(cells, per_cell), tau[1:].reshape(cells, per_cell)
-    return (low.mean(1) + high.mean(1)) / 2
+    return (low + high) / 2
 
 
 def cross_sections(pressure: float, temperature: float) -> NDArray[np.float64]:
@@ -82,6 +92,24 @@ def cross_sections(pressure: float, temperature: float) -> NDArray[np.float64]:
     ozone = cell_opacity(pressure, temperature, f"column o3 hydrostatic {OZONE}", step) / (molecules(pressure, OZONE) * OZONE)
     slope = (high - low) / (WATER_HIGH - WATER_LOW)
     return np.array([dry, low - WATER_LOW * slope, high, ozone])
+
+
+def ozone_ratios(temperature: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(part, pressure, cell) ozone's cross-section in parts of a cell over its mean there, logarithm in 1/255 of the range.
+
+    The parts hold the same frequencies at all pressures: those sorted by the opacity of the standard atmosphere's ozone.
+    """
+    from zonda.operators.atmosphere.standard_atmosphere import ozone
+
+    column = f"column o3 hydrostatic {OZONE}"
+    fine = np.array([fine_opacity(p, t, column, CELL / 64) / p for p, t in zip(PRESSURE, temperature, strict=True)])
+    amount = ozone(PRESSURE * 100) * PRESSURE  # per step of the logarithm of pressure
+    order = np.argsort(-np.einsum("p,pcs->cs", amount, fine), axis=1)
+    fine = np.take_along_axis(fine, order[None], axis=2) / fine.mean(axis=2, keepdims=True)
+    starts = np.concatenate([[0], np.cumsum(OZONE_PARTS)[:-1]])
+    ratio = np.add.reduceat(fine, starts, axis=2) / np.array(OZONE_PARTS)
+    share = np.log(np.clip(ratio, RATIO_LOW, RATIO_HIGH) / RATIO_LOW) / np.log(RATIO_HIGH / RATIO_LOW)
+    return np.round(share * 255).astype(np.uint8).transpose(2, 0, 1)
 
 
 def pack(cross_section: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
@@ -101,7 +129,8 @@ def main(path: Path) -> None:
         table = np.array(pool.starmap(cross_sections, states, chunksize=5))
     table = table.reshape(len(PRESSURE), len(TEMPERATURE_OFFSETS), 4, -1).transpose(2, 0, 1, 3)
     frequency = LOWEST + CELL * np.arange(table.shape[-1])
-    np.savez_compressed(path, pressure=PRESSURE * 100, temperature=temperature, frequency=frequency * 1e9, **pack(table))
+    axes = {"pressure": PRESSURE * 100, "temperature": temperature, "frequency": frequency * 1e9}
+    np.savez_compressed(path, **axes, **pack(table), ozone_ratio=ozone_ratios(temperature[:, 2]))
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 

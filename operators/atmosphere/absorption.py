@@ -6,6 +6,7 @@ temperatures. It is read once, in a few hundredths of a second.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +22,10 @@ TABLE = Path(__file__).parent / "data" / "absorption.npz"
 
 MIXING_RATIO_HIGH = 0.02
 """Volume mixing ratio of the table's second water cross-section."""
+OZONE_PARTS = np.array([2, 4, 8, 16, 34]) / 64
+"""Shares of a cell, from ozone's most opaque frequencies down."""
+RATIO_LOW, RATIO_HIGH = 1e-3, 64.0
+"""Limits of the packed ratios of ozone's cross-section in these parts to the cell's mean."""
 TEMPERATURE_MARGIN = 15.0
 """K by which a temperature may lie outside the table."""
 PRESSURE_MARGIN = 1.3
@@ -34,12 +39,15 @@ class CrossSections:
     """m2 per molecule, each (n_layer, n_frequency).
 
     Water's own pressure broadening makes its cross-section linear in the mixing ratio: ``water + mixing_ratio * water_self``.
+    Ozone's lines are narrower than a cell: ``ozone_ratio`` (n_part, n_layer, n_frequency) is its cross-section in parts of the
+    cell, `OZONE_PARTS`, over the cell's mean.
     """
 
     dry_air: Array
     water: Array
     water_self: Array
     ozone: Array
+    ozone_ratio: Array
 
 
 class AbsorptionTable:
@@ -62,6 +70,7 @@ class AbsorptionTable:
             self.frequency: Array = file["frequency"].astype(np.float64)
             self.pressure: Array = file["pressure"].astype(np.float64)
             self.temperature: Array = file["temperature"].astype(np.float64)
+            self._ozone_code = file["ozone_ratio"]
 
     @property
     def edges(self) -> Array:
@@ -107,7 +116,11 @@ class AbsorptionTable:
             for k, tap in enumerate(taps):
                 total += tap[:, None] * log[:, row, k]
         dry, water, water_high, ozone = np.exp(total) * 1e-4
-        return CrossSections(dry, water, (water_high - water) / MIXING_RATIO_HIGH, ozone)
+        code, upper = self._ozone_code[..., cells], np.clip(upper_weight, 0.0, 1.0)[:, None]
+        log_ratio = code[:, below] * (1 - upper) + code[:, below + 1] * upper
+        ratio = RATIO_LOW * np.exp(log_ratio * (math.log(RATIO_HIGH / RATIO_LOW) / 255))
+        ratio /= np.einsum("g,glf->lf", OZONE_PARTS, ratio)
+        return CrossSections(dry, water, (water_high - water) / MIXING_RATIO_HIGH, ozone, ratio)
 
     def _bracket(self, pressure: Array) -> tuple[NDArray[np.intp], Array]:
         """Index of the table's pressure below each layer, and the weight of the one above."""

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from zonda.core.errors import InputError
 from zonda.core.radiation import T_CMB, rayleigh_jeans
 
-from .absorption import absorption_table
+from .absorption import CrossSections, absorption_table
 from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission
-from .weather import check_pwv
+from .weather import PWV_MAX, check_pwv
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
@@ -50,7 +50,7 @@ class BandAtmosphere:
     profile
         The air; its water is scaled to whatever PWV is asked for.
     pwv_max
-        Largest PWV that will be asked for, m; three times the profile's own where absent.
+        Largest PWV that will be asked for, m; three times the profile's own, up to 60 mm, where absent.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class BandAtmosphere:
 
     def __init__(self, band: Band, profile: Profile, pwv_max: float | None = None) -> None:
         self.band = band
-        self.pwv_max = 3 * profile.pwv if pwv_max is None else pwv_max
+        self.pwv_max = min(3 * profile.pwv, PWV_MAX) if pwv_max is None else pwv_max
         check_pwv(self.pwv_max)
         if self.pwv_max == 0:
             raise InputError("the air is dry, so there is no water to vary", cure="give a PWV above 0 mm")
@@ -190,11 +190,11 @@ class _BandTransfer:
     """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln transmission, ln background) each."""
 
     def __init__(self, band: Band, layers: Layers) -> None:
-        weight, self._cells = _cell_weights(band)
-        frequency = absorption_table().frequency[self._cells]
-        self._weight = weight / weight.sum()
+        weight, frequency, cells = _cell_weights(band)
         self._layers = layers
-        self._cross_sections = layers.cross_sections(self._cells)
+        self._cross_sections, cell, share = layers.in_parts(_at_frequencies(layers, frequency, cells))
+        frequency = frequency[cell]
+        self._weight = weight[cell] * share / weight.sum()
         self._source = rayleigh_jeans(frequency, layers.temperature[:, None])
         self._cmb = rayleigh_jeans(frequency, T_CMB)
 
@@ -211,8 +211,10 @@ class _BandTransfer:
         return emitted, math.log(passed.sum()) - least, math.log(np.sum(passed * self._cmb)) - least
 
 
-def _cell_weights(band: Band) -> tuple[Array, slice]:
-    """Integral of the (piecewise linear) transmission over each cell of the absorption table that it touches."""
+def _cell_weights(band: Band) -> tuple[Array, Array, slice]:
+    """Integral of the (piecewise linear) transmission over each cell of the absorption table that it touches, and the mean
+    frequency of that integral: not the cell's centre where the band ends inside the cell.
+    """
     open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
     support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
     nu, transmission = band.frequency[support], band.transmission[support]
@@ -220,9 +222,33 @@ def _cell_weights(band: Band) -> tuple[Array, slice]:
     cells = table.cells(float(nu[0]), float(nu[-1]), place=f"band '{band.name}'")
     edges = table.edges[cells.start : cells.stop + 1]
     points = np.union1d(np.clip(edges, nu[0], nu[-1]), nu)
-    values = np.interp(points, nu, transmission)
-    integral = np.concatenate([[0.0], np.cumsum(np.diff(points) * (values[1:] + values[:-1]) / 2)])
-    return np.diff(np.interp(np.clip(edges, nu[0], nu[-1]), points, integral)), cells
+    values, step = np.interp(points, nu, transmission), np.diff(points)
+    cell = np.clip(np.searchsorted(edges, (points[1:] + points[:-1]) / 2) - 1, 0, len(edges) - 2)
+    offset = points - table.frequency[cells][np.append(cell, cell[-1])]  # from the centre of the cell that begins there
+    end = offset[:-1] + step
+    integral = np.bincount(cell, step * (values[1:] + values[:-1]) / 2, len(edges) - 1).astype(np.float64)
+    first = step * (offset[:-1] * (2 * values[:-1] + values[1:]) + end * (values[:-1] + 2 * values[1:])) / 6
+    moment = np.bincount(cell, first, len(edges) - 1)
+    shift = np.divide(moment, integral, out=np.zeros_like(moment), where=integral > 0)
+    return integral, table.frequency[cells] + shift, cells
+
+
+def _at_frequencies(layers: Layers, frequency: Array, cells: slice) -> CrossSections:
+    """Cross-sections at one frequency in each cell, linear between the cells' centres."""
+    centres = absorption_table().frequency
+    wide = slice(max(cells.start - 1, 0), min(cells.stop + 1, len(centres)))
+    known, centre = layers.cross_sections(wide), centres[wide]
+    low = np.clip(np.searchsorted(centre, frequency, "right") - 1, 0, len(centre) - 2)
+    upper = (frequency - centre[low]) / (centre[low + 1] - centre[low])
+    upper = np.clip(upper, 0.0, 1.0)  # of the first and the last cell of the table
+    nearest = low + (upper > 0.5)
+
+    def linear(sections: Array) -> Array:
+        return np.asarray(sections[..., low] * (1 - upper) + sections[..., low + 1] * upper)
+
+    return CrossSections(
+        linear(known.dry_air), linear(known.water), linear(known.water_self), linear(known.ozone), known.ozone_ratio[..., nearest]
+    )
 
 
 def _chebyshev_points(n: int) -> Array:

@@ -8,10 +8,11 @@ plane compressed by sin(elevation) along the mean azimuth:
 
 Frozen flow carries the field along with the wind w. For scan k, which begins at t_k,
 
-    P(t) = h [M_k (X(t) - X_k) + alpha_k] - [B_k + M_k (t - t_k)] w                                              (2)
+    P(t) = h' M_k (X(t) - X_k) + h alpha_k - [B_k + M_k (t - t_k)] w                                             (2)
     alpha_(k+1) = alpha_k + (M_k + M_(k+1)) / 2 (X_(k+1) - X_k),      B_(k+1) = B_k + M_k (t_(k+1) - t_k)        (3)
 
-so consecutive scans see the same air, continuously, although their mean lines of sight X_k differ.
+so consecutive scans see the same air, continuously, although their mean lines of sight X_k differ. The layer is a spherical
+shell, met nearer than a flat one: h' = z sin(e) with z the distance along the mean line of sight (5 % at 5 deg and 5 km).
 
 In a wide throw or field the transverse plane turns. Separations across the line of sight at azimuth phi and elevation e have
 the metric z^2 (de^2 + cos^2(e) dphi^2), which with rho = cot e = |X| is sin^2(e) drho^2 + rho^2 dphi^2: a surface of revolution.
@@ -36,6 +37,8 @@ from numpy.typing import NDArray
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
 from zonda.core.focalplane import Focalplane
+
+from .radiative_transfer import EARTH_RADIUS
 
 Floats = NDArray[np.float64]
 
@@ -161,9 +164,9 @@ class Track:
         Largest relative error of squared transverse separations at one instant, over the whole field and scan; the structure
         function, concave in the squared separation, is wrong by no more.
     drift
-        What the wind is multiplied by, (2, 2): M, or the root of the metric's mean over the scan where the plane is a cone.
+        What the wind is multiplied by, (2, 2): M, or the mean over the scan of the cone's derivative.
     drift_bound
-        Largest relative error of the squared length of the drift of any wind.
+        Largest relative error of the drift of any wind (a vector) at any azimuth of the scan.
     """
 
     matrix: Floats
@@ -186,6 +189,17 @@ class Track:
         moved = np.einsum("ab,b...->a...", self.matrix, crossings) - shift.reshape(2, *[1] * (crossings.ndim - 1))
         return np.asarray(moved, np.float64)
 
+    def effective(self, height: float) -> float:
+        """Height whose flat layer lies as far along the mean line of sight as a spherical one does, m: z sin(elevation)."""
+        sine = math.sin(self.elevation)
+        across = EARTH_RADIUS * sine
+        return (
+            sine
+            * height
+            * (2 * EARTH_RADIUS + height)
+            / (math.hypot(across, math.sqrt(2 * EARTH_RADIUS * height + height**2)) + across)
+        )
+
     def positions(self, crossings: Floats, seconds: Floats, height: float, wind: Floats) -> tuple[Floats, Floats]:
         """(across, along) the wind, m, of crossings X (2, m, n) at ``seconds`` (n,) after the start. Equation (2)."""
         return self.place(self.unroll(crossings), seconds, height, wind)
@@ -193,7 +207,7 @@ class Track:
     def place(self, unrolled: Floats, seconds: Floats, height: float, wind: Floats) -> tuple[Floats, Floats]:
         """As `positions`, of crossings that `unroll` has been applied to (they are the same for every layer)."""
         offset = height * self.alpha - self.advection @ wind
-        p = height * unrolled
+        p = self.effective(height) * unrolled
         p += offset[:, None, None] - (self.drift @ wind)[:, None, None] * seconds
         along = self.frame @ wind
         speed = float(np.hypot(*along))
@@ -222,24 +236,28 @@ def plane(observation: Observation) -> Track:
     if transverse > FLAT and level > 0:
         elevation = float(np.median(np.arcsin(boresight[2])))
         cone = Cone(a, elevation)
-        bound = cone.error(crossing(u)) if elevation < np.pi / 2 - 1e-6 else np.inf
+        highest = float(np.arcsin(boresight[2]).max()) + float(np.arctan(np.hypot(xi, eta).max()))
+        bound = cone.error(crossing(u)) if highest < np.pi / 2 else np.inf  # the tip of a cone is no place to be near
         if bound < min(transverse, flat):
-            drift = _root_of_mean_metric(boresight)
+            drift, drift_bound = _mean_drift(cone, crossing(boresight))
             there = np.eye(2) - (1 - np.sin(elevation)) * np.outer(a, a)
             return Track(
-                there, a / np.tan(elevation), nothing, no_advection, there, elevation, "cone", bound, drift,
-                _error(drift.T @ drift, boresight), cone,
+                there, a / np.tan(elevation), nothing, no_advection, there, elevation, "cone", bound, drift, drift_bound, cone,
             )  # fmt: skip
     elevation, centre = float(np.arcsin(n[2])), n[:2] / n[2]
     if transverse > max(0.5 * flat, FLAT):
+        elevation = float(np.median(np.arcsin(boresight[2])))  # the mean direction may be the zenith
         return Track(np.eye(2), centre, nothing, no_advection, np.eye(2), elevation, "horizontal", flat, np.eye(2), flat)
     return Track(matrix, centre, nothing, no_advection, matrix, elevation, "transverse", transverse, matrix, transverse)
 
 
-def _root_of_mean_metric(u: Floats) -> Floats:
-    """The symmetric matrix whose square is the mean of 1 - u_h u_h^T over directions u (3, n)."""
-    values, vectors = np.linalg.eigh(np.eye(2) - (u[:2] @ u[:2].T) / u.shape[1])
-    return np.asarray(vectors @ np.diag(np.sqrt(values)) @ vectors.T, np.float64)
+def _mean_drift(cone: Cone, crossings: Floats) -> tuple[Floats, float]:
+    """The mean D over crossings X (2, n) of the derivative J of equation (4), and the largest norm of (D - J) J^-1."""
+    h = 1e-6
+    columns = [(cone.unroll(crossings + h * e[:, None]) - cone.unroll(crossings - h * e[:, None])) / (2 * h) for e in np.eye(2)]
+    each = np.stack(columns, axis=-1).transpose(1, 0, 2)  # (n, 2, 2)
+    mean = each.mean(0)
+    return mean, float(np.linalg.norm((mean - each) @ np.linalg.inv(each), 2, axis=(1, 2)).max())
 
 
 def rim(focalplane: Focalplane, number: int = 12) -> tuple[Floats, Floats]:

@@ -6,13 +6,12 @@ The water along a line of sight is
 
 with g_l the unit-variance von Karman field of layer l (`turbulence`), seen through the near-field beam at the layer's
 distance, and p the ensemble rms. Emission and transmission of the band follow from radiative transfer at PWV (1 + y) and the
-elevation of the ray. All of it is smooth, so it is computed at nodes (`nodes`) and interpolated by `SmoothField`s.
+elevation of the ray (`response`). All of it is smooth, so it is computed at nodes (`nodes`) and interpolated.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -23,20 +22,23 @@ from pydantic import Field, PrivateAttr, model_validator
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSecond
 from zonda.core.data import Block, Data, Observation
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, PointingError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.operator import Operator
-from zonda.core.smooth import DetectorField, SmoothField
+from zonda.core.smooth import SmoothField
 
 from . import weather
 from .band import BandAtmosphere
 from .beams import GAUSSIAN_FWHM, Aperture, rayleigh_distance, widened
+from .fluctuations import AtNodes, OfDetectors, times
 from .geometry import Track, axes_at, rays, tracks
-from .nodes import LayerModel
+from .lines_of_sight import LinesOfSight
+from .nodes import LayerModel, times_with_margin
 from .path_delay import delay_per_vapour
 from .plan import Plan, make_plan
-from .radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
-from .sampling import Drifting, evaluate_layers, times_with_margin
+from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
+from .response import Response
+from .sampling import Drifting, Layers
 from .turbulence import Turbulence
 from .weather_sources import air_of
 
@@ -56,8 +58,11 @@ PLANES = {
     "horizontal": "horizontal (the throw is too wide to unroll)",
 }
 
-ROWS = 64
-"""Nodes whose radiative transfer is done at a time."""
+CERTAIN = 5.0
+"""Sigma up to which the water must lie inside the table: what is beyond is clipped, and counted."""
+
+LARGEST_DEVIATION = 8
+"""Sigma of the water that `response` covers by polynomials; beyond, it takes the slow way."""
 
 EDGE_TAPER = 10.0
 """dB: power at the rim of a tapered aperture below that at its centre, where none is given."""
@@ -84,15 +89,6 @@ class Layer:
     height: float
     amplitude: float
     wind: Floats
-
-
-@dataclass(frozen=True)
-class Fluctuations:
-    """What `AtmosphereLayers.exec` evaluates, about the means: emission [K_RJ], relative transmission, and the `outputs`."""
-
-    emission: SmoothField | DetectorField
-    transmission: SmoothField | DetectorField
-    outputs: dict[str, SmoothField | DetectorField]
 
 
 class _Provides:
@@ -141,8 +137,9 @@ class AtmosphereLayers(Operator):
     """With `beam: tapered`, dB by which the illumination's power falls from the centre to the rim; 10 where absent."""
     outputs: list[Literal["pwv", "opacity", "path_delay"]] = Field(default_factory=list)
     """Further streams to make: fluctuations of the line-of-sight water (m), of the band's opacity, of the wet path delay (m)."""
-    lattice: float = Field(0.6, gt=0, le=0.6)
-    """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used)."""
+    lattice: float | None = Field(None, gt=0, le=0.8)
+    """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used);
+    where absent that of the `fidelity`, 0.8 or 0.5."""
     tolerance: Fraction = quantity("1 %", ge=1e-4, le=1)
     """Rms error of the evaluation at nodes, as a fraction of what the focal-plane mean, subtracted, leaves of the atmosphere."""
 
@@ -169,8 +166,9 @@ class AtmosphereLayers(Operator):
         self._origin, self._source = data.scene.time, data.scene.weather
         self._tracks = dict(zip((o.name for o in data.observations), tracks(data.observations), strict=True))
 
-    def prepare(self, observation: Observation) -> Fluctuations:
-        """Draw the turbulence at the nodes; set the smooth means."""
+    def prepare(self, observation: Observation) -> AtNodes | OfDetectors:
+        """Lay out the turbulence, draw it at the nodes; set the smooth means."""
+        _check_pointing(observation)
         track = self._tracks.get(observation.name) or tracks([observation])[0]
         profile, band = self._weather(observation)
         for what, text in profile.stated:
@@ -192,40 +190,50 @@ class AtmosphereLayers(Operator):
         _means(observation, plan, band, pwv)
         parts = zip(beams, layers, plan.steps, strict=True)
         drifting = [Drifting(beam, layer.height, layer.amplitude, layer.wind, step) for beam, layer, step in parts]
-        g = evaluate_layers(observation, track, plan.nodes, plan.step, drifting)
+        n = observation.n_samples
+        first, count = times(slice(0, n), plan.step)
+        turbulence = Layers(observation, track, drifting, plan.step, first, first + count)
 
-        shares = np.array([layer.amplitude for layer in layers])
-        heights = np.array([layer.height for layer in layers])
+        shares, heights = np.array([layer.amplitude for layer in layers]), np.array([layer.height for layer in layers])
         vapour_height = float(shares @ heights / shares.sum())
         per_vapour = delay_per_vapour(np.asarray(profile.at(heights).temperature), shares)
+        path = turbulence.paths[plan.step]
+        names = ("emission", "transmission", *dict.fromkeys(self.outputs))
+        self._check_range(scale, variance, pwv)
+        y_range = self._range(scale, variance, band.pwv_max / pwv - 1)
+        response = Response(band, pwv, *y_range, path.low, path.high, vapour_height, per_vapour, names)
 
-        def values(rows: slice) -> dict[str, Floats]:
-            elevation = _elevations(observation, plan.nodes.xi[rows], plan.nodes.eta[rows], plan.step)
-            y = self._clip(observation, self._water(g[rows].astype(np.float64), scale, variance), pwv, band)
-            found = {
-                "emission": band.emission_difference(pwv, pwv * y, elevation),
-                "transmission": np.expm1(band.log_transmission_difference(pwv, pwv * y, elevation)),
-            }
-            if "opacity" in self.outputs:
-                found["opacity"] = -np.log1p(found["transmission"])
-            if self.outputs:
-                column = pwv * y * airmass(elevation, vapour_height)
-                found |= {"pwv": column, "path_delay": per_vapour * column}
-            return found
+        def water(g: Floats, own: slice) -> Floats:
+            return self._clip(observation, self._water(g, scale, variance), band.pwv_max / pwv - 1, own)
 
-        fields = _fields(plan, observation.n_samples, values, ["emission", "transmission", *dict.fromkeys(self.outputs)])
-        self._state(observation, track, plan, models, beams, pwv, scale, variance)
+        self._state(observation, track, plan, models, beams, pwv, scale, variance, path)
         if "path_delay" in self.outputs:
             observation.tally.state(self.label, "wet path delay", f"{per_vapour:.3f} times the water (non-dispersive)")
-        return Fluctuations(fields.pop("emission"), fields.pop("transmission"), fields)
+        make = AtNodes.make if plan.nodes.shape else OfDetectors
+        state = make(plan.nodes, turbulence, water, response, plan.step, n)
+        self._state_drawn(observation, state)
+        return state
 
-    def exec(self, block: Block, state: Fluctuations) -> None:
+    def collect(self, data: Data, observation: Observation, state: AtNodes | OfDetectors) -> None:
+        """Report the mean and rms of the water that was drawn while the blocks were worked on."""
+        self._state_drawn(observation, state)
+
+    def in_time_order(self, observation: Observation, state: AtNodes | OfDetectors) -> bool:
+        """Where detectors are evaluated one by one and the scan is long, all of them share the air of the moment."""
+        return not state.fits
+
+    def exec(self, block: Block, state: AtNodes | OfDetectors) -> None:
         """Add the fluctuations to the block's ``atmosphere`` and ``transmission``, and to the `outputs`."""
-        for name, field in (("atmosphere", state.emission), ("transmission", state.transmission), *state.outputs.items()):
-            if name in block.detdata:
-                block.detdata[name] += field.evaluate(block.detectors, block.samples, np.empty(block.shape, block.dtype))
-            else:
-                field.evaluate(block.detectors, block.samples, block.new(name))
+        streams: dict[str, str] = {"emission": "atmosphere", "transmission": "transmission"}
+        streams.update((name, name) for name in self.outputs)
+        made = {}
+        for name, stream in streams.items():
+            there = stream in block.detdata
+            made[name] = block.buffer(f"{self.label} {name}", block.shape) if there else block.new(stream, zero=False)
+        state.into(block.detectors, block.samples, made)
+        for name, stream in streams.items():
+            if block.detdata[stream] is not made[name]:
+                block.detdata[stream] += made[name]
 
     # ------------------------------------------------------------------------------------------------------------------------
 
@@ -267,11 +275,41 @@ class AtmosphereLayers(Operator):
         s = self._log_width(variance if self.pwv_rms_after_beam else 1.0)
         return np.expm1(s * g - s * s * variance / 2)
 
-    def _clip(self, observation: Observation, y: Floats, pwv: float, band: BandAtmosphere) -> Floats:
-        top = band.pwv_max / pwv - 1
-        clipped = np.clip(y, -1.0, top)
-        observation.tally.count(self.label, "node values of the water clipped to the table", int((clipped != y).sum()))
-        return clipped
+    def _range(self, scale: float, variance: float, top: float) -> tuple[float, float]:
+        """Fluctuations that may come up."""
+        ends = self._water(LARGEST_DEVIATION * math.sqrt(variance) * np.array([-1.0, 1.0]), scale, variance)
+        return max(float(ends[0]), -1.0), min(float(ends[1]), top)
+
+    def _check_range(self, scale: float, variance: float, pwv: float) -> None:
+        """Refuse water whose distribution the table would cut."""
+        most = pwv * (1 + float(self._water(np.array([CERTAIN * math.sqrt(variance)]), scale, variance)[0]))
+        if most > weather.PWV_MAX:
+            least = math.log(max(weather.PWV_MAX / pwv, 1.0))
+            width = CERTAIN - math.sqrt(max(CERTAIN**2 - 2 * least, 0.0))
+            fits = (weather.PWV_MAX / pwv - 1) / CERTAIN
+            fits = fits if fits < LOG_NORMAL_FROM else math.sqrt(math.expm1(width**2))
+            raise InputError(
+                f"a PWV of {pwv * 1e3:.3g} mm with a rms of {self.pwv_rms:.3g} of it reaches {most * 1e3:.3g} mm at {CERTAIN:g} "
+                f"sigma; the limit is {weather.PWV_MAX * 1e3:.0f} mm",
+                place=self.label,
+                cure=f"lower pwv_rms to {fits:.1%} or less, or the PWV",
+            )
+
+    def _clip(self, observation: Observation, y: Floats, top: float, own: slice) -> Floats:
+        count = 0
+        if y.min() < -1 or y.max() > top:
+            clipped = np.clip(y, -1.0, top)
+            count, y = int((clipped != y)[:, own].sum()), clipped
+        observation.tally.count(self.label, "values of the water clipped to the table", count)
+        return y
+
+    def _state_drawn(self, observation: Observation, state: AtNodes | OfDetectors) -> None:
+        count, total, squares = state.drawn()
+        if count:
+            mean = total / count
+            rms = math.sqrt(max(squares / count - mean**2, 0.0))
+            text = f"mean {mean:+.3%}, rms {rms:.3%} of the mean PWV, over the field and the scan"
+            observation.tally.state(self.label, "water of this realization", text)
 
     def _state(
         self,
@@ -283,11 +321,15 @@ class AtmosphereLayers(Operator):
         pwv: float,
         scale: float,
         variance: float,
+        path: LinesOfSight,
     ) -> None:
         def say(what: str, text: str) -> None:
             observation.tally.state(self.label, what, text)
 
         before, after = scale, scale * math.sqrt(variance)
+        if self.pwv_rms >= LOG_NORMAL_FROM:
+            s = self._log_width(variance if self.pwv_rms_after_beam else 1.0)
+            before, after = (math.sqrt(math.expm1(s * s * v)) for v in (1.0, variance))
         say("mean PWV", f"{pwv * 1e3:.3f} mm" + ("" if self.pwv else " (of the weather)"))
         say("PWV rms", f"{before:.3%} of the mean before the beam, {after:.3%} after it")
         say("distribution of the water", "log-normal" if self.pwv_rms >= LOG_NORMAL_FROM else "normal")
@@ -297,8 +339,12 @@ class AtmosphereLayers(Operator):
         say("PWV rms after the beam, per layer", ", ".join(parts))
         sizes = (f"{b.sigma:.3g} m / {b.spacing:g} m" for b in beams)
         say("beam sigma / lattice spacing, per layer", ", ".join(dict.fromkeys(sizes)))
+        telescope, band = observation.instrument.telescope, observation.instrument.band
+        sines = math.sin(track.elevation) / np.array([path.high, path.low])
+        ends = [widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, models[-1].distance * k) for k in (*sines, 1.0)]
+        text = f"{ends[0] / ends[2]:.3f} to {ends[1] / ends[2]:.3f} of the one used, in the highest layer"
+        say("width of the beam over the elevations of field and scan", text)
         if self.beam != "gaussian":
-            telescope, band = observation.instrument.telescope, observation.instrument.band
             far = rayleigh_distance(telescope.diameter, SPEED_OF_LIGHT / band.centre)
             beyond = sum(m.distance > far for m in models)
             say("footprint", f"{self.beam}; {beyond} of {len(models)} layers lie beyond {far:.0f} m, where beams lose their rim")
@@ -313,7 +359,7 @@ class AtmosphereLayers(Operator):
         )
         say("plane of the turbulence", f"{PLANES[track.kind]}; squared separations within {track.bound:.1%}")
         if track.kind == "cone":
-            say("wind on the unrolled cone", f"squared drifts within {track.drift_bound:.1%}")
+            say("wind on the unrolled cone", f"drifts within {track.drift_bound:.1%} at the ends of the scan")
 
 
 def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
@@ -324,9 +370,22 @@ def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
     return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance) / GAUSSIAN_FWHM
 
 
-def airmass(elevation: Floats, height: float) -> Floats:
-    """Of a spherical shell at ``height`` [m]: equation (1) of `radiative_transfer`."""
-    return np.asarray(1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64)
+def _check_pointing(observation: Observation) -> None:
+    bad = np.flatnonzero(~np.isfinite(observation.boresight_azel).all(axis=1))
+    if len(bad):
+        raise PointingError(
+            f"the boresight of sample {bad[0]} is not a number ({len(bad)} of {observation.n_samples} samples)",
+            place=observation.name,
+            cure="repair the pointing, or leave these samples out",
+        )
+    elevation = observation.elevation
+    if 0 <= elevation.min() < ELEVATION_MIN:
+        raise PointingError(
+            f"the boresight is {math.degrees(elevation.min()):.2f} deg above the horizon at sample {elevation.argmin()}; "
+            "the limits of the radiative transfer are 4.5 to 90 deg",
+            place=observation.name,
+            cure="choose a target or a time with a higher elevation",
+        )
 
 
 def _means(observation: Observation, plan: Plan, band: BandAtmosphere, pwv: float) -> None:
@@ -349,29 +408,12 @@ def _elevations(observation: Observation, xi: Floats, eta: Floats, step: int) ->
     return np.asarray(elevation, np.float64)
 
 
-def _fields(
-    plan: Plan, n_samples: int, values: Callable[[slice], dict[str, Floats]], names: list[str]
-) -> dict[str, SmoothField | DetectorField]:
-    """The named fields, from ``values`` of some nodes at a time. In float32 where every detector is a node."""
-    n_node, dtype = len(plan.nodes.xi), np.float64 if plan.nodes.shape else np.float32
-    coefficients: dict[str, NDArray[Any]] = {}
-    for start in range(0, n_node, ROWS):
-        found = values(slice(start, start + ROWS))
-        for name in names:
-            part = DetectorField.from_values(found[name], plan.step, n_samples, dtype).coefficients
-            coefficients.setdefault(name, np.empty((n_node, part.shape[1]), dtype))[start : start + ROWS] = part
-    if plan.nodes.shape is None:
-        return {name: DetectorField(c, plan.step, n_samples) for name, c in coefficients.items()}
-    weights = np.ascontiguousarray(plan.nodes.weights)
-    return {name: SmoothField(weights, c, plan.step, n_samples) for name, c in coefficients.items()}
-
-
 def _thickness(heights: Floats) -> Floats:
     return np.asarray(np.gradient(heights) if len(heights) > 1 else np.ones(1), np.float64)
 
 
 def _model(operator: AtmosphereLayers, layer: Layer, track: Track, observation: Observation) -> LayerModel:
-    distance = layer.height / math.sin(track.elevation)
+    distance = track.effective(layer.height) / math.sin(track.elevation)
     telescope, band = observation.instrument.telescope, observation.instrument.band
     if operator.beam == "gaussian":
         return LayerModel(layer.amplitude, layer.height, distance, operator.outer_scale, beam_sigma(telescope, band, distance))

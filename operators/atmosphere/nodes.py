@@ -25,6 +25,8 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.smooth import PAD
+
 from .beams import Aperture
 from .covariance import mixture
 
@@ -237,6 +239,11 @@ def layer_time_error(layer: LayerModel, speeds: Floats, delta: float, dt: float)
     share = spline_error(np.multiply.outer(speeds, dt / np.sqrt(e))).mean(0) @ w
     share += 2 * (-np.expm1(-(delta**2) / (4 * e)) @ w)
     return layer.amplitude**2 * float(share)
+
+
+def times_with_margin(n_samples: int, step: int) -> NDArray[np.int64]:
+    """Samples at which `SmoothField.from_values` wants its values."""
+    return step * np.arange(-PAD - MARGIN, -(-n_samples // step) + 2 + MARGIN, dtype=np.int64)
 
 
 def candidate_steps(n_samples: int) -> list[int]:

@@ -25,9 +25,9 @@ from .nodes import (
     layer_time_error,
     some,
     time_error,
+    times_with_margin,
 )
 from .radiative_transfer import ELEVATION_MAX
-from .sampling import times_with_margin
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +36,9 @@ SMALLEST_DIFFERENCE = 1e-5
 
 MEAN_SHARE = 0.1
 """The mean emission's error, as a share of what the fluctuation's may be: it is so smooth that this costs nothing."""
+
+WINDOWS = (16, 1 << 14)
+"""Number and length [samples] of the parts of a longer scan at which its path is looked at."""
 
 PAYS_FROM = 1 << 18
 """Points (nodes x times) from which coarser steps for single layers are worth their interpolation."""
@@ -88,10 +91,10 @@ def make_plan(
     # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the water fluctuated where none does).
     kelvin = float(band.emission(pwv, elevations[1]))
     allowed = max(MEAN_SHARE * tolerance * kelvin * max(pwv_rms, 1e-4), 1e-9)
-    mean_nodes = next(
-        (g for g in (grid(xi, eta, n) for n in GRIDS) if _mean_error(g, xi, eta, band, pwv, elevations) <= allowed),
-        grid(xi, eta, 64),
-    )
+    for size in GRIDS:
+        mean_nodes = grid(xi, eta, size)
+        if _mean_error(mean_nodes, xi, eta, band, pwv, elevations) <= allowed:
+            break
 
     velocity, quantiles = path.velocity(track), (np.arange(64) + 0.5) / 64
     drifts = ((model.height * velocity - (track.drift @ wind)[:, None]) for model, wind in zip(models, winds, strict=True))
@@ -155,7 +158,10 @@ def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, band: BandAtmosphere, pwv
 
 
 class _Path:
-    """Lines of sight of three points of the focal plane over a scan, and how well a spline in time follows them."""
+    """Lines of sight of three points of the focal plane over a scan, and how well a spline in time follows them.
+
+    Of long scans some windows are looked at, the first and the last samples among them.
+    """
 
     def __init__(self, observation: Observation, xi: Floats, eta: Floats) -> None:
         self._observation = observation
@@ -163,7 +169,10 @@ class _Path:
         points = np.array([centre, [xi.max(), eta.max()], [xi.min(), eta.max()]]).T
         self._xi: Floats = points[0] if len(xi) > 1 else xi
         self._eta: Floats = points[1] if len(xi) > 1 else eta
-        u = rays(axes(observation.boresight_azel), self._xi, self._eta)
+        n, number, length = observation.n_samples, *WINDOWS
+        starts = [0] if n <= number * length else np.linspace(0, n - length, number).astype(np.int64).tolist()
+        self._windows = [slice(start, min(n, start + length) if len(starts) > 1 else n) for start in starts]
+        u = np.concatenate([rays(axes(observation.boresight_azel[w]), self._xi, self._eta) for w in self._windows], axis=2)
         self.crossing = crossing(u)
         self.elevation = np.arcsin(u[2])
 
@@ -173,16 +182,24 @@ class _Path:
         if n == 1:
             return np.zeros((2, 1))
         at = np.unique(np.linspace(0, n - 2, number).astype(np.int64))
+        last = np.cumsum([w.stop - w.start for w in self._windows]) - 1
+        at = at[~np.isin(at, last)]  # the next sample is that of another window
         ends = track.unroll(self.crossing[:, 0, np.stack([at, at + 1])])
         return np.asarray((ends[:, 1] - ends[:, 0]) * self._observation.sample_rate, np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
         """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points."""
-        o, n = self._observation, self._observation.n_samples
-        index = times_with_margin(n, step)
-        u = rays(axes_at(o.boresight_azel, index, step), self._xi, self._eta)
-        truth = np.concatenate([self.crossing.reshape(-1, n), self.elevation])
-        values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
-        spline = SmoothField.from_values(np.eye(len(values)), values, step, n).evaluate(slice(0, len(values)), slice(0, n))
-        rms = np.sqrt(((spline - truth) ** 2).mean(1)).reshape(3, -1).max(1)
+        squares, total, done = np.zeros(9), 0, 0
+        for window in self._windows:
+            n = window.stop - window.start
+            index = window.start + times_with_margin(n, step)
+            u = rays(axes_at(self._observation.boresight_azel, index, step), self._xi, self._eta)
+            here = slice(done, done + n)
+            truth = np.concatenate([self.crossing[:, :, here].reshape(-1, n), self.elevation[:, here]])
+            values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
+            spline = SmoothField.from_values(np.eye(len(values)), values, step, n).evaluate(slice(0, len(values)), slice(0, n))
+            found = ((spline - truth) ** 2).sum(1)
+            squares[: len(found)] += found
+            total, done = total + n, done + n
+        rms = np.sqrt(squares[: 3 * len(self._xi)] / total).reshape(3, -1).max(1)
         return rms[:2], float(rms[2])

@@ -1,41 +1,53 @@
-"""Evaluation of the layers along lines of sight: in boxes of bounded memory, at a step in time of each layer's own."""
+"""Evaluation of the layers along lines of sight, at a step in time of each layer's own, from tiles of their lattices.
+
+A layer's spline coefficients are made in tiles that overlap by the three cells a cubic spline needs, so that every point is
+interpolated from one tile. Tiles are kept while there is room; any tile has the same bits whenever it is made, and a point
+the same bits in whatever company it is asked for.
+"""
 
 from __future__ import annotations
 
-import math
+import threading
 from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.columns import four_columns_at
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
-from zonda.core.smooth import PAD, DetectorField
+from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
 
-from .geometry import Track, axes_at, crossing, rays
-from .nodes import MARGIN, Nodes
-from .turbulence import Turbulence, interpolate
+from .geometry import Track
+from .lines_of_sight import LinesOfSight
+from .turbulence import Field, Turbulence
 
 Floats = NDArray[np.float64]
+Counts = NDArray[np.int64]
 
-CELLS_AT_ONCE = 1 << 22
-"""Lattice points worked on at a time: bounds the memory."""
+SQUARE, STRIP = (8, 8), (5, 10)
+"""Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the path is narrow."""
 
-TILE = 256
-"""Cells: side of a tile of spline coefficients that is kept for lines of sight which come back to it."""
+NARROW = 96
+"""Cells: a path that is narrower than this across the wind is tiled by strips."""
 
-TILES_KEPT = 2000
-"""Tiles, of 256 kB each."""
+APRON = 3
+"""Cells by which tiles overlap."""
+
+BYTES_KEPT = 512 << 20
+"""Memory of the tiles that are kept."""
 
 CELLS_IN_ALL = 2e10
 """Lattice points of one scan beyond which the run is refused."""
 
-POINTS_AT_ONCE = 1 << 20
-"""Lines of sight worked on at a time."""
+TIMES_AT_ONCE = 1024
+"""Coarse times whose tiles are held at once."""
 
-DOUBLE_UP_TO = 1 << 22
-"""Points up to which the sum of the layers is kept in float64; in float32 beyond (1e-7 of the fluctuation)."""
+_CHUNK, _RUN = 256, 8
 
 
 @dataclass(frozen=True)
@@ -49,124 +61,259 @@ class Drifting:
     step: int
 
 
-def evaluate_layers(observation: Observation, track: Track, nodes: Nodes, step: int, drifting: list[Drifting]) -> Floats:
-    """Sum of the layers at the nodes and at `times_with_margin`: (n_node, n_time), in units of the PWV's rms.
-
-    Layers that take a coarser step of their own are interpolated in time to the common one (cubic spline).
-    """
-    n_node, n_time = len(nodes.xi), len(times_with_margin(observation.n_samples, step))
-    first = int(times_with_margin(observation.n_samples, step)[0])
-    dtype = np.float64 if n_node * n_time <= DOUBLE_UP_TO else np.float32
-    out = np.zeros((n_node, n_time), dtype)
-    tiles = Tiles()
-    for own in sorted({d.step for d in drifting}):
-        ratio = own // step
-        group = [d for d in drifting if d.step == own]
-        if ratio == 1:
-            _add(observation, track, nodes, first + step * np.arange(n_time), step, group, out, tiles)
-            continue
-        coarse = first + own * (np.arange(-(-n_time // ratio) + 3 + 2 * MARGIN) - PAD - MARGIN)
-        values = np.zeros((n_node, len(coarse)), dtype)
-        _add(observation, track, nodes, coarse, own, group, values, tiles)
-        for start in range(0, n_node, 64):
-            rows = slice(start, start + 64)
-            part = DetectorField.from_values(values[rows], ratio, n_time)
-            out[rows] += part.evaluate(slice(0, len(part.coefficients)), slice(0, n_time))
-    return out
-
-
-def times_with_margin(n_samples: int, step: int) -> NDArray[np.int64]:
-    """Samples at which `SmoothField.from_values` wants its values."""
-    return step * np.arange(-PAD - MARGIN, -(-n_samples // step) + 2 + MARGIN, dtype=np.int64)
-
-
-def _add(
-    observation: Observation,
-    track: Track,
-    nodes: Nodes,
-    index: NDArray[np.int64],
-    step: int,
-    group: list[Drifting],
-    out: Floats,
-    tiles: Tiles,
-) -> None:
-    chunk = max(1, POINTS_AT_ONCE // len(nodes.xi))
-    for start in range(0, len(index), chunk):
-        now = slice(start, start + chunk)
-        seconds = float(observation.seconds[0]) + index[now] / observation.sample_rate
-        plane = track.unroll(crossing(rays(axes_at(observation.boresight_azel, index[now], step), nodes.xi, nodes.eta)))
-        for layer in group:
-            across, along = track.place(plane, seconds, layer.height, layer.wind)
-            sample(layer.field, across, along, layer.amplitude, out[:, now], tiles)
-
-
 class Tiles:
-    """Spline coefficients of wide boxes, assembled from tiles that are kept: a scan comes back to the same air."""
+    """The coefficients of several layers, as many as `BYTES_KEPT` allow. Threads may ask at the same time."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[int, int, int], NDArray[np.float32]] = OrderedDict()
-        self.made = 0
-        """Lattice points made so far."""
+        self._kept: OrderedDict[tuple[int, int, int], Future[Field]] = OrderedDict()
+        self._lock = threading.Lock()
+        self._room = BYTES_KEPT
 
-    def coefficients(self, field: Turbulence, i0: int, i1: int, j0: int, j1: int) -> NDArray[np.float32]:
-        """As `Turbulence.coefficients`."""
-        if min(i1 - i0, j1 - j0) < TILE:
-            self.made += (i1 - i0) * (j1 - j0)
-            return field.coefficients(i0, i1, j0, j1)
-        out = np.empty((i1 - i0, j1 - j0), np.float32)
-        for i in range(i0 // TILE, -(-i1 // TILE)):
-            for j in range(j0 // TILE, -(-j1 // TILE)):
-                a, b, c, d = max(i * TILE, i0), min(i * TILE + TILE, i1), max(j * TILE, j0), min(j * TILE + TILE, j1)
-                tile = self._tile(field, i, j)
-                out[a - i0 : b - i0, c - j0 : d - j0] = tile[a - i * TILE : b - i * TILE, c - j * TILE : d - j * TILE]
-        return out
+    def get(self, field: Turbulence, sides: tuple[int, int], layer: int, i: int, j: int) -> Field:
+        """Tile (i, j) of a layer: coefficients from cell (i << sides[0], j << sides[1]) on, with the apron."""
+        key, size = (layer, i, j), 4 * ((1 << sides[0]) + APRON) * ((1 << sides[1]) + APRON)
+        with self._lock:
+            tile = self._kept.get(key)
+            mine = tile is None
+            if tile is None:
+                tile = self._kept[key] = Future()
+                self._room -= size
+                while self._room < 0 and len(self._kept) > 1:
+                    _, oldest = self._kept.popitem(last=False)  # whoever works with it still holds it
+                    self._room += size if not oldest.done() else oldest.result().nbytes
+            else:
+                self._kept.move_to_end(key)
+        if mine:
+            try:
+                a, b = i << sides[0], j << sides[1]
+                made = field.coefficients(a, a + (1 << sides[0]) + APRON, b, b + (1 << sides[1]) + APRON)
+                tile.set_result(made)
+            except BaseException as error:
+                tile.set_exception(error)
+                with self._lock:
+                    self._kept.pop(key, None)
+                raise
+        return tile.result()
 
-    def _tile(self, field: Turbulence, i: int, j: int) -> NDArray[np.float32]:
-        key = (id(field), i, j)
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
-        self.made += TILE * TILE
-        tile = field.coefficients(i * TILE, (i + 1) * TILE, j * TILE, (j + 1) * TILE)
-        self._kept[key] = tile
-        if len(self._kept) > TILES_KEPT:
-            self._kept.popitem(last=False)
-        return tile
 
+class Layers:
+    """The sum of drifting layers at any focal-plane points and times of one scan, in units of the PWV's rms.
 
-def sample(field: Turbulence, across: Floats, along: Floats, amplitude: float, out: Floats, tiles: Tiles | None = None) -> None:
-    """out += amplitude x the field at (across, along) [m], each (n_node, n_time), in boxes of at most `CELLS_AT_ONCE` points.
+    Times are numbered in units of ``step``: time k is sample k step. Layers that take a coarser step of their own are
+    interpolated in time to the common one (cubic spline).
 
-    Raises `InputError` where more than `CELLS_IN_ALL` points have been made.
+    Parameters
+    ----------
+    observation, track
+        The scan and its plane.
+    drifting
+        The layers; their steps are ``step`` times powers of two.
+    step
+        Samples between times.
+    first, stop
+        Times that may be asked for.
+
+    Raises
+    ------
+    InputError
+        Where the lines of sight sweep over more than `CELLS_IN_ALL` lattice points.
+    PointingError
+        Where one is below the horizon.
     """
-    tiles = tiles or Tiles()
-    x, y = across / field.spacing, along / field.spacing
-    todo = [(slice(0, x.shape[0]), slice(0, x.shape[1]))]
-    while todo:
-        nodes, times = todo.pop()
-        px, py = x[nodes, times], y[nodes, times]
-        i0, i1 = math.floor(px.min()) - 1, math.floor(px.max()) + 3
-        j0, j1 = math.floor(py.min()) - 1, math.floor(py.max()) + 3
-        if (i1 - i0) * (j1 - j0) > CELLS_AT_ONCE and px.size > 1:
-            todo.extend(_halves(nodes, times, px, py))
-            continue
-        coefficients = tiles.coefficients(field, i0, i1, j0, j1)
-        if tiles.made > CELLS_IN_ALL:
+
+    def __init__(
+        self, observation: Observation, track: Track, drifting: Sequence[Drifting], step: int, first: int, stop: int
+    ) -> None:
+        self._drifting, self._step, self._tiles = list(drifting), step, Tiles()
+        self.paths: dict[int, LinesOfSight] = {}
+        for own in sorted({step, *(d.step for d in drifting)}):
+            low, high = (first, stop) if own == step else _coarse(first, stop, own // step)
+            self.paths[own] = LinesOfSight(observation, track, own, low, high - low)
+        self._places = [_place(track, d, self.paths[d.step].seconds) for d in self._drifting]
+        swept = [self._swept(n, observation) for n in range(len(drifting))]
+        self._sides = [STRIP if across < NARROW else SQUARE for across, _ in swept]
+        self.cells = sum(cells for _, cells in swept)
+        """Lattice points swept over, about."""
+        if self.cells > CELLS_IN_ALL:
+            worst = max(range(len(swept)), key=lambda n: swept[n][1])
+            field = drifting[worst].field
             raise InputError(
-                f"the lines of sight sweep over more than {CELLS_IN_ALL:.0e} lattice points of the turbulence "
-                f"({field.spacing:g} m for a beam of {field.sigma:.3g} m)",
+                f"the lines of sight sweep over {self.cells:.1e} lattice points of the turbulence "
+                f"({field.spacing:g} m for a beam of {field.sigma:.3g} m), the limit is {CELLS_IN_ALL:.0e}",
                 place="atmosphere",
                 cure="shorten the scans, narrow the field of view, or raise the lowest layer",
             )
-        interpolate(coefficients, i0, j0, px, py, amplitude, out[nodes, times])
+
+    @property
+    def fits(self) -> bool:
+        """Whether the tiles of the whole scan can be kept."""
+        return 4 * self.cells < BYTES_KEPT / 2
+
+    def __call__(self, xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
+        """The sum of the layers and the sine of the elevation, each (len(xi), count), from time ``first``."""
+        stop = first + count
+        total, sine = np.zeros((len(xi), count)), np.empty((len(xi), count))
+        for own, path in self.paths.items():
+            ratio = own // self._step
+            low, high = (first, stop) if ratio == 1 else _coarse(first, stop, ratio)
+            values = total if ratio == 1 else np.empty((len(xi), high - low))
+            for start in range(low, high, TIMES_AT_ONCE):
+                end = min(start + TIMES_AT_ONCE, high)
+                x, y, up = path(xi, eta, start, end - start)
+                part, boxes = np.zeros(x.shape), _boxes(x, y)
+                for n, layer in enumerate(self._drifting):
+                    if layer.step == own:
+                        self._add(n, x, y, boxes, start - path.first, part)
+                values[:, start - low : end - low] = part
+                if ratio == 1:
+                    sine[:, start - low : end - low] = up
+            if ratio > 1:
+                fine = DetectorField(spline_coefficients(values), ratio, (high - low) * ratio)
+                # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has its time -PAD.
+                offset = first - (low + SPLINE_MARGIN + PAD) * ratio
+                total += fine.evaluate(slice(0, len(xi)), slice(offset, offset + count))
+        return total, sine
+
+    def _add(self, n: int, x: Floats, y: Floats, boxes: Floats, start: int, out: Floats) -> None:
+        """out += layer ``n`` at the positions (x, y) per metre of height, at times from number ``start`` of its path."""
+        layer, sides, (matrix, i, j) = self._drifting[n], self._sides[n], self._places[n]
+        i, j = i[start : start + x.shape[1]], j[start : start + x.shape[1]]
+        low_i, high_i, low_j, high_j = _extent(matrix, boxes, i, j)
+        first_i, first_j = low_i >> sides[0], low_j >> sides[1]
+        wanted = np.zeros(((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8)
+        _mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
+        addresses, held = np.zeros(wanted.shape, np.uint64), []
+        for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
+            held.append(self._tiles.get(layer.field, sides, n, first_i + a, first_j + b))
+            addresses[a, b] = held[-1].ctypes.data
+        _interpolate(matrix, x, y, i, j, *sides, first_i, first_j, addresses, layer.amplitude, out)
+
+    def _swept(self, n: int, observation: Observation) -> tuple[int, float]:
+        """Cells across the wind, and lattice points over which the field sweeps: bounds from its rim."""
+        from .geometry import rim
+
+        path, (matrix, i, j) = self.paths[self._drifting[n].step], self._places[n]
+        xi, eta = rim(observation.focalplane)
+        sum_of_boxes, whole = 0.0, np.array([np.inf, -np.inf, np.inf, -np.inf])
+        for start in range(0, path.count, TIMES_AT_ONCE):
+            count = min(TIMES_AT_ONCE, path.count - start)
+            x, y, _ = path(xi, eta, path.first + start, count)
+            box = _extent(matrix, _boxes(x, y), i[start : start + count], j[start : start + count])
+            sum_of_boxes += (box[1] - box[0] + 40.0) * (box[3] - box[2] + 40.0)
+            whole[::2], whole[1::2] = np.minimum(whole[::2], box[::2]), np.maximum(whole[1::2], box[1::2])
+        across, along = whole[1] - whole[0], whole[3] - whole[2]
+        return int(across), min(sum_of_boxes, (across + 40) * (along + 40))
 
 
-def _halves(nodes: slice, times: slice, x: Floats, y: Floats) -> list[tuple[slice, slice]]:
-    """Cut where it makes the boxes smaller: in time, or between nodes once they spread more than the path is long."""
-    spread = np.ptp(x, axis=0).max() + np.ptp(y, axis=0).max()
-    path = np.ptp(x, axis=1).max() + np.ptp(y, axis=1).max()
-    if x.shape[1] > 1 and (path >= spread or x.shape[0] == 1):
-        middle = (times.start + times.stop) // 2
-        return [(nodes, slice(middle, times.stop)), (nodes, slice(times.start, middle))]
-    middle = (nodes.start + nodes.stop) // 2
-    return [(slice(middle, nodes.stop), times), (slice(nodes.start, middle), times)]
+def _coarse(first: int, stop: int, ratio: int) -> tuple[int, int]:
+    """Coarse times whose values make times first .. stop - 1: cells, spline neighbours and the prefilter's margin."""
+    return first // ratio - PAD - SPLINE_MARGIN, (stop - 1) // ratio + 3 + SPLINE_MARGIN
+
+
+def _place(track: Track, layer: Drifting, seconds: Floats) -> tuple[Floats, Floats, Floats]:
+    """Lattice coordinates (across, along the wind) = matrix (x, y) + (i, j) of positions per metre of height.
+
+    Equation (2) of `geometry`; matrix (4,), i and j at ``seconds``, both about 0 where the scan begins.
+    """
+    across, along = track.place(np.zeros((2, 1, len(seconds))), seconds, layer.height, layer.wind)
+    unit = np.zeros((2, 2, 1))
+    unit[0, 0] = unit[1, 1] = 1.0  # columns: the images of (1, 0) and (0, 1)
+    moved = track.place(unit, np.zeros(1), layer.height, layer.wind)
+    zero = track.place(np.zeros((2, 1, 1)), np.zeros(1), layer.height, layer.wind)
+    matrix = np.array([m[:, 0] - z[0, 0] for m, z in zip(moved, zero, strict=True)]).ravel()
+    d = layer.field.spacing
+    return matrix / d, across[0] / d, along[0] / d
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _boxes(x, y):  # type: ignore[no-untyped-def]
+    """Middles and half widths of what `_RUN` successive positions span: (n, runs, 4) x, y, half x, half y."""
+    out = np.empty((x.shape[0], (x.shape[1] + _RUN - 1) // _RUN, 4))
+    for n in range(x.shape[0]):
+        for r in range(out.shape[1]):
+            a, b = x[n, r * _RUN], y[n, r * _RUN]
+            c, d = a, b
+            for t in range(r * _RUN + 1, min((r + 1) * _RUN, x.shape[1])):
+                a, c = min(a, x[n, t]), max(c, x[n, t])
+                b, d = min(b, y[n, t]), max(d, y[n, t])
+            out[n, r, 0], out[n, r, 1], out[n, r, 2], out[n, r, 3] = (a + c) / 2, (b + d) / 2, (c - a) / 2, (d - b) / 2
+    return out
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _cells(a, b, box, first, last):  # type: ignore[no-untyped-def]
+    """First and last cells, one of rounding included, at which the 4 coefficients of a x + b y + (first .. last) begin."""
+    middle, half = a * box[0] + b * box[1], abs(a) * box[2] + abs(b) * box[3]
+    rounding = 1e-9 * (abs(middle) + half) + 1e-9
+    low, high = middle - half + min(first, last) - rounding, middle + half + max(first, last) + rounding
+    return np.int64(np.floor(low)) - 1, np.int64(np.floor(high)) - 1
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _extent(matrix, boxes, i, j):  # type: ignore[no-untyped-def]
+    """First and last cells: across low, high, along low, high. The drift (i, j) is steady, so its ends bound it."""
+    low_i = low_j = np.int64(1 << 62)
+    high_i = high_j = -low_i
+    for n in range(boxes.shape[0]):
+        for r in range(boxes.shape[1]):
+            t, last = r * _RUN, min((r + 1) * _RUN, i.size) - 1
+            a, b = _cells(matrix[0], matrix[1], boxes[n, r], i[t], i[last])
+            c, d = _cells(matrix[2], matrix[3], boxes[n, r], j[t], j[last])
+            low_i, high_i, low_j, high_j = min(low_i, a), max(high_i, b), min(low_j, c), max(high_j, d)
+    return low_i, high_i, low_j, high_j
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _mark(matrix, boxes, i, j, side_i, side_j, first_i, first_j, wanted):  # type: ignore[no-untyped-def]
+    """Set 1 where a tile is wanted; (first_i, first_j) is the first tile."""
+    for n in range(boxes.shape[0]):
+        for r in range(boxes.shape[1]):
+            t, last = r * _RUN, min((r + 1) * _RUN, i.size) - 1
+            a, b = _cells(matrix[0], matrix[1], boxes[n, r], i[t], i[last])
+            c, d = _cells(matrix[2], matrix[3], boxes[n, r], j[t], j[last])
+            for k in range(a >> side_i, (b >> side_i) + 1):
+                for m in range(c >> side_j, (d >> side_j) + 1):
+                    wanted[k - first_i, m - first_j] = 1
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _interpolate(matrix, x, y, i, j, side_i, side_j, first_i, first_j, addresses, amplitude, out):  # type: ignore[no-untyped-def]
+    """out += amplitude * the cubic B-spline whose coefficients lie at ``addresses`` (uint64, one for each tile)."""
+    a, b, c, d = matrix[0], matrix[1], matrix[2], matrix[3]
+    inside_i, inside_j = nb.int32((1 << side_i) - 1), nb.int32((1 << side_j) - 1)
+    width, columns_of_tiles = nb.int32((1 << side_j) + APRON), nb.int32(addresses.shape[1])
+    shift_i, shift_j = nb.int32(side_i), nb.int32(side_j)
+    # Cells are counted from the first tile's, in 32 bits: what the box of one call holds fits.
+    origin_i, origin_j = float(first_i << side_i), float(first_j << side_j)
+    stride, sixth = nb.uint64(width), 1 / 6
+    flat = addresses.reshape(-1)
+    tile, inside = np.empty(_CHUNK, np.int32), np.empty(_CHUNK, np.int32)
+    u, v = np.empty(_CHUNK), np.empty(_CHUNK)
+    w0, w1, w2, w3 = np.empty(_CHUNK), np.empty(_CHUNK), np.empty(_CHUNK), np.empty(_CHUNK)
+    sums = np.empty(4 * _CHUNK)
+    for n in range(x.shape[0]):
+        for start in range(0, x.shape[1], _CHUNK):
+            count = nb.uint64(min(_CHUNK, x.shape[1] - start))
+            px, py, pi, pj, row = x[n][start:], y[n][start:], i[start:], j[start:], out[n][start:]
+            for t in range(count):
+                p, q = a * px[t] + b * py[t] + pi[t], c * px[t] + d * py[t] + pj[t]
+                fp, fq = np.floor(p), np.floor(q)
+                u[t], v[t] = p - fp, q - fq
+                k, m = nb.int32(fp - 1 - origin_i), nb.int32(fq - 1 - origin_j)
+                tile[t] = nb.int32(nb.int32((k >> shift_i) * columns_of_tiles) + (m >> shift_j))
+                inside[t] = nb.int32(nb.int32((k & inside_i) * width) + (m & inside_j))
+            for t in range(count):
+                q = u[t]
+                r = 1 - q
+                w0[t], w1[t] = amplitude * (r * r * r * sixth), amplitude * (4 * sixth - q * q * (1 - q * 0.5))
+                w2[t], w3[t] = amplitude * (4 * sixth - r * r * (1 - r * 0.5)), amplitude * (q * q * q * sixth)
+            for t in range(count):
+                where = flat[nb.uint64(tile[t])] + nb.uint64(4) * nb.uint64(inside[t])
+                four_columns_at(where, stride, w0[t], w1[t], w2[t], w3[t], sums, nb.uint64(4) * t)
+            for t in range(count):
+                q = v[t]
+                r = 1 - q
+                w0[t], w1[t] = r * r * r * sixth, 4 * sixth - q * q * (1 - q * 0.5)
+                w2[t], w3[t] = 4 * sixth - r * r * (1 - r * 0.5), q * q * q * sixth
+            for t in range(count):
+                row[t] += w0[t] * sums[4 * t] + w1[t] * sums[4 * t + 1] + w2[t] * sums[4 * t + 2] + w3[t] * sums[4 * t + 3]

@@ -68,11 +68,13 @@ class Fidelity:
     """Largest error of the implied covariance, relative to the variance."""
     structure_error: float
     """Largest relative error of the implied structure function, from one cell up."""
+    lattice: float
+    """Largest spacing, in units of the beam's sigma."""
 
 
 FIDELITIES = {
-    "default": Fidelity("default", 8, 10, 0.8, 8e-4, 1e-3),
-    "fine": Fidelity("fine", 12, 12, 0.7, 1e-4, 6e-4),
+    "default": Fidelity("default", 8, 10, 0.8, 8e-4, 1e-3, 0.8),
+    "fine": Fidelity("fine", 12, 12, 0.7, 1e-4, 6e-4, 0.5),
 }
 
 
@@ -101,7 +103,8 @@ class Turbulence:
     aperture
         A footprint with a rim instead of the Gaussian (`beams`).
     lattice
-        Largest spacing, in units of sigma (of the Gaussian of equal second moment, less a sixth, behind an aperture).
+        Largest spacing, in units of sigma; that of the fidelity where absent. At most 0.5 of the sigma of the Gaussian of equal
+        second moment behind an aperture, whose rim leaves finer structure.
     fidelity
         ``default`` or ``fine``, see the table above.
 
@@ -118,7 +121,7 @@ class Turbulence:
         outer_scale: float,
         sigma: float = 0.0,
         aperture: Aperture | None = None,
-        lattice: float = 0.6,
+        lattice: float | None = None,
         fidelity: str = "default",
     ) -> None:
         sigma = aperture.sigma if aperture else sigma
@@ -127,6 +130,7 @@ class Turbulence:
             raise InputError(
                 f"outer scale {outer_scale:g} m and beam {sigma:g} m must be finite and positive", place="turbulence"
             )
+        lattice = lattice or self.fidelity.lattice
         ratio = outer_scale / sigma
         if not SMALLEST_RATIO <= ratio <= LARGEST_RATIO:
             raise InputError(
@@ -173,7 +177,7 @@ class Turbulence:
         return field
 
     def coefficients(self, i0: int, i1: int, j0: int, j1: int) -> Field:
-        """Cubic B-spline coefficients at lattice points, so that `interpolate` passes through the field. As `region`."""
+        """Cubic B-spline coefficients at lattice points, so that the spline passes through the field. As `region`."""
         h = PREFILTER
         out = np.empty((i1 - i0, j1 - j0), np.float32)
         _prefilter(self.region(i0 - h, i1 + h, j0 - h, j1 + h), _prefilter_taps(), out)
@@ -245,7 +249,7 @@ def _levels(outer_scale: float, sigma: float, lattice: float, fidelity: str) -> 
 def _aperture_levels(outer_scale: float, aperture: Aperture, lattice: float, fidelity: str) -> tuple[Level, ...]:
     """As `_levels`; the mixture beyond s_0 = sigma^2 is seen through `Aperture.gaussians`, all else by the finest level."""
     f = FIDELITIES[fidelity]
-    exponent = math.floor(math.log2(aperture.sigma * lattice / 1.2))
+    exponent = math.floor(math.log2(aperture.sigma * min(lattice, 0.5)))
     low, top = aperture.sigma**2, LARGEST_SCALE * outer_scale**2
     levels = [Level(exponent, _aperture_kernel(outer_scale, aperture, low, math.ldexp(1.0, exponent), f))]
     while low < top:
@@ -335,31 +339,47 @@ def _prefilter_taps() -> Field:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
+def _add_symmetric(row, taps, out):  # type: ignore[no-untyped-def]
+    """out[j] += taps[0] row[j + R] + sum_k taps[k] (row[j + R - k] + row[j + R + k]); R = taps.size - 1. Four taps at a time."""
+    radius, n = taps.size - 1, nb.uint64(out.size)
+    middle, weight = row[radius:], taps[0]
+    for j in range(n):
+        out[j] += weight * middle[j]
+    k = 1
+    while k + 3 <= radius:
+        a, b, c, d = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
+        a0, b0, c0, d0 = row[radius - k :], row[radius - k - 1 :], row[radius - k - 2 :], row[radius - k - 3 :]
+        a1, b1, c1, d1 = row[radius + k :], row[radius + k + 1 :], row[radius + k + 2 :], row[radius + k + 3 :]
+        for j in range(n):
+            out[j] += a * (a0[j] + a1[j]) + b * (b0[j] + b1[j]) + c * (c0[j] + c1[j]) + d * (d0[j] + d1[j])
+        k += 4
+    while k <= radius:
+        weight, left, right = taps[k], row[radius - k :], row[radius + k :]
+        for j in range(n):
+            out[j] += weight * (left[j] + right[j])
+        k += 1
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
 def _convolve(noise, kernel, out):  # type: ignore[no-untyped-def]
     """out += noise * kernel; ``noise`` has R more cells on every side, ``kernel`` is a symmetric quadrant (R + 1, R + 1)."""
     radius = kernel.shape[0] - 1
-    n = nb.uint64(out.shape[1])
     rows = np.empty(noise.shape[1], np.float32)
+    m = nb.uint64(rows.size)
     for i in range(out.shape[0]):
-        target = out[i]
         for di in range(radius + 1):
             above, below = noise[i + radius - di], noise[i + radius + di]
             if di == 0:
-                for j in range(nb.uint64(rows.size)):
+                for j in range(m):
                     rows[j] = above[j]
             else:
-                for j in range(nb.uint64(rows.size)):
+                for j in range(m):
                     rows[j] = above[j] + below[j]
-            weight = kernel[di, 0]
-            middle = rows[radius:]
-            for j in range(n):
-                target[j] += weight * middle[j]
-            for dj in range(1, radius + 1):
-                weight = kernel[di, dj]
-                if weight != 0:
-                    left, right = rows[radius - dj :], rows[radius + dj :]
-                    for j in range(n):
-                        target[j] += weight * (left[j] + right[j])
+            taps = kernel[di]
+            size = radius + 1
+            while size > 1 and taps[size - 1] == 0:  # the kernel is cut to a circle
+                size -= 1
+            _add_symmetric(rows[radius + 1 - size :], taps[:size], out[i])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
@@ -408,42 +428,17 @@ def _prefilter(field, taps, out):  # type: ignore[no-untyped-def]
     """Separable symmetric filter; ``field`` has taps.size - 1 more cells on every side than ``out``."""
     half = taps.size - 1
     row = np.empty(field.shape[1], np.float32)
+    m = nb.uint64(row.size)
     for i in range(out.shape[0]):
-        source = field[i + half]
-        for j in range(nb.uint64(row.size)):
-            row[j] = taps[0] * source[j]
-        for tap in range(1, half + 1):
-            weight = taps[tap]
-            one, two = field[i + half - tap], field[i + half + tap]
-            for j in range(nb.uint64(row.size)):
-                row[j] += weight * (one[j] + two[j])
-        target, middle = out[i], row[half:]
+        source, weight = field[i + half], taps[0]
+        for j in range(m):
+            row[j] = weight * source[j]
+        for tap in range(1, half, 2):
+            a, b = taps[tap], taps[tap + 1]
+            a0, a1, b0, b1 = field[i + half - tap], field[i + half + tap], field[i + half - tap - 1], field[i + half + tap + 1]
+            for j in range(m):
+                row[j] += a * (a0[j] + a1[j]) + b * (b0[j] + b1[j])
+        target = out[i]
         for j in range(nb.uint64(out.shape[1])):
-            target[j] = taps[0] * middle[j]
-        for tap in range(1, half + 1):
-            weight = taps[tap]
-            left, right = row[half - tap :], row[half + tap :]
-            for j in range(nb.uint64(out.shape[1])):
-                target[j] += weight * (left[j] + right[j])
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False)
-def interpolate(coefficients, i0, j0, x, y, amplitude, out):  # type: ignore[no-untyped-def]
-    """out += amplitude * field at the points (x, y) (lattice units, float64, 2-D), by cubic B-spline. Same shapes.
-
-    ``coefficients`` begin at lattice point (i0, j0) and must cover floor(x) - 1 .. floor(x) + 2, and y alike.
-    """
-    for n in range(x.shape[0]):
-        px, py, row = x[n], y[n], out[n]
-        for m in range(px.size):
-            fx, fy = np.floor(px[m]), np.floor(py[m])
-            u, v = px[m] - fx, py[m] - fy
-            i, j = np.int64(fx) - i0 - 1, np.int64(fy) - j0 - 1
-            um, vm = 1 - u, 1 - v
-            a = (um * um * um / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - um * um * (2 - um) / 2, u * u * u / 6)
-            b = (vm * vm * vm / 6, 2 / 3 - v * v * (2 - v) / 2, 2 / 3 - vm * vm * (2 - vm) / 2, v * v * v / 6)
-            total = 0.0
-            for k in range(4):
-                line = coefficients[i + k]
-                total += a[k] * (b[0] * line[j] + b[1] * line[j + 1] + b[2] * line[j + 2] + b[3] * line[j + 3])
-            row[m] += amplitude * total
+            target[j] = 0
+        _add_symmetric(row, taps, target)

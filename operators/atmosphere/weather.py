@@ -2,14 +2,15 @@
 
 Per site and pressure level the median temperature, ln(vapour density), wind and height of 15 years of ERA5 are harmonics,
 
-    x(day, hour) = sum_k c_k A_i(2 pi day / 365.25) H_j(2 pi hour / 24),   k = 3 i + j                             (1)
+    x(day, hour) = sum_k c_k A_i(2 pi day / 365.25) H_j(2 pi hour / 24),   k = 5 i + j                             (1)
 
-with A = 1, cos a, sin a, cos 2a, sin 2a, cos 3a, sin 3a and H = 1, cos b, sin b; day counts from 1 January, hour is UTC.
+with A = 1, cos a, sin a, ... cos 4a, sin 4a and H = 1, cos b, sin b, cos 2b, sin 2b; day counts from 1 January, hour is UTC.
 """
 
 from __future__ import annotations
 
 import math
+from calendar import isleap
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -23,6 +24,7 @@ from zonda.core.errors import InputError
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
 
+from .humidity import saturation_pressure
 from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT, Layers
 from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, STRATOSPHERIC_WATER, ozone, standard_column, upper_levels
 
@@ -44,8 +46,11 @@ EXTRAPOLATION_MAX = 500.0
 YEARS = (1940, 2100)
 """Years for which the climatology, of 15 recent ones, is taken: ERA5 begins with the first."""
 STACKING = 0.77
-"""Levels do not vary together: the column's ln(PWV) scatters this much of what the levels' quantiles, stacked, would give.
-ERA5's own columns ask for 0.745 at Green Bank, 0.66 at Chajnantor, 0.88 at the South Pole, in the mean over the year."""
+"""Levels do not vary together: the column's ln(PWV) scatters this much of what the levels' quantiles, stacked, would give. This
+is the mean of the sites where ERA5's own columns tell (0.6 to 0.96, `Column.column_spread`), for the others."""
+INVERSION_DEPTH = 100.0
+"""m in which an inversion on the ground falls to 1/e. Over the South Pole it is a few hundred metres deep, steepest below
+(Hudson & Brandt 2005, J. Climate 18, 1673)."""
 STRATOSPHERE_LAPSE = 2.8e-3
 """K / m above the highest climatological level, 10 hPa, as in the US Standard Atmosphere 1976 ..."""
 STRATOPAUSE_TEMPERATURE = 270.65
@@ -66,16 +71,33 @@ class Air:
 
 @dataclass(frozen=True)
 class WaterDistribution:
-    """Log-normal law of the PWV, cut at `PWV_MAX`: median [m] and standard deviation of the logarithm."""
+    """Law of the PWV: its logarithm is normal with one width below the median and another above, cut at `PWV_MAX`.
+
+    Attributes
+    ----------
+    median
+        m.
+    below, above
+        Standard deviation of ln(PWV) of the two halves; ``above`` None: the same, which is the log-normal law.
+    """
 
     median: float
-    sigma: float
+    below: float
+    above: float | None = None
+
+    @property
+    def sigma(self) -> float:
+        """Mean of the two widths."""
+        return (self.below + (self.below if self.above is None else self.above)) / 2
 
     def at(self, quantile: float) -> float:
         """PWV [m] at a quantile between 0 and 1."""
         normal, centre = NormalDist(), math.log(self.median)
-        most = normal.cdf((math.log(PWV_MAX) - centre) / self.sigma)
-        return math.exp(centre + self.sigma * normal.inv_cdf(min(max(quantile * most, 1e-300), 1 - 1e-16)))
+        above = self.below if self.above is None else self.above
+        reach = math.log(PWV_MAX) - centre
+        most = normal.cdf(reach / (above if reach > 0 else self.below))
+        deviate = normal.inv_cdf(min(max(quantile * most, 1e-300), 1 - 1e-16))
+        return min(math.exp(centre + deviate * (above if deviate > 0 else self.below)), PWV_MAX)
 
 
 @dataclass(frozen=True)
@@ -264,12 +286,13 @@ def climatology_column(site: Site, time: Instant) -> Column:
     def median(quantity: str) -> Array:
         return np.asarray(basis @ arrays[quantity].astype(np.float64))
 
-    every_pressure, ozone_ratio = (arrays[quantity].astype(np.float64) for quantity in ("pressure", "ozone"))
+    every_pressure = arrays["pressure"].astype(np.float64)
     height, temperature = median("height"), median("temperature")
     pressure = every_pressure[: len(height)]  # the highest levels have ozone only
     h2o = np.exp(median("log_vapour_density")) * VAPOUR_GAS_CONSTANT * temperature / pressure
-    annual = basis[:9:3]  # 1, cos a, sin a
-    spread = {name: annual @ arrays[f"{name}_spread"] for name in ("log_vapour_density", "wind_east", "wind_north")}
+    annual = basis[::5]  # 1, cos a, sin a, ...
+    spread = {name: annual[:3] @ arrays[f"{name}_spread"] for name in ("log_vapour_density", "wind_east", "wind_north")}
+    shares = arrays.get("column_spread")
     return Column(
         pressure=pressure,
         height=height,
@@ -278,26 +301,30 @@ def climatology_column(site: Site, time: Instant) -> Column:
         wind_east=median("wind_east"),
         wind_north=median("wind_north"),
         ozone_pressure=every_pressure,
-        ozone=ozone_ratio,
+        ozone=np.exp(annual @ arrays["log_ozone"].astype(np.float64)),
         log_vapour_spread=spread["log_vapour_density"],
         wind_east_spread=spread["wind_east"],
         wind_north_spread=spread["wind_north"],
+        column_spread=None if shares is None else (float(shares[0] @ annual[:3]), float(shares[1] @ annual[:3])),
+        ground_temperature=float(median("ground_temperature")) if "ground_temperature" in arrays else None,
         stated=f"climatology '{name}' (ERA5), {time}",
     )
 
 
 def _day_and_hour(time: Instant) -> tuple[float, float]:
-    """Days since 1 January, and the hour of the day, UTC."""
+    """Days since 1 January, stretched so that every year has 365.25 and closes, and the hour of the day, UTC."""
     moment = time.datetime
     hour = moment.hour + moment.minute / 60 + moment.second / 3600
-    return moment.timetuple().tm_yday - 1 + hour / 24, hour
+    return (moment.timetuple().tm_yday - 1 + hour / 24) * 365.25 / (365 + isleap(moment.year)), hour
 
 
 def harmonics(day: float, hour: float) -> Array:
-    """(21,) the products A_i H_j of equation (1)."""
+    """(45,) the products A_i H_j of equation (1)."""
     a, b = 2 * np.pi * day / 365.25, 2 * np.pi * hour / 24
-    annual = np.concatenate([[1.0], *([np.cos(k * a), np.sin(k * a)] for k in (1, 2, 3))])
-    return np.outer(annual, [1.0, np.cos(b), np.sin(b)]).ravel()
+    annual, diurnal = (
+        np.concatenate([[1.0], *([np.cos(k * x), np.sin(k * x)] for k in range(1, n + 1))]) for x, n in ((a, 4), (b, 2))
+    )
+    return np.outer(annual, diurnal).ravel()
 
 
 def on_heights(column: Column, site: Site) -> Profile:
@@ -334,8 +361,13 @@ def on_heights(column: Column, site: Site) -> Profile:
     top = column.temperature[-1]
     warming = np.minimum(STRATOSPHERE_LAPSE * above, max(STRATOPAUSE_TEMPERATURE - top, 0.0))
     temperature = linear(column.temperature) + lapse * below + warming
+    h2o = np.exp(linear(np.log(np.maximum(column.h2o, 1e-12))))
     mean = np.where(above > 0, (temperature + top) / 2, temperature)  # of the air between the outermost level and z
     log_pressure = linear(np.log(column.pressure)) - GRAVITY * (above + below) / (DRY_AIR_GAS_CONSTANT * mean)
+    if column.ground_temperature is not None:
+        temperature = temperature + (column.ground_temperature - temperature[0]) * np.exp(-height / INVERSION_DEPTH)
+        saturated = saturation_pressure(temperature) / np.exp(log_pressure)
+        h2o = np.where(height < 5 * INVERSION_DEPTH, np.minimum(h2o, saturated), h2o)
     if column.ozone_pressure is None or column.ozone is None:
         o3 = ozone(np.exp(log_pressure))
     else:
@@ -345,7 +377,7 @@ def on_heights(column: Column, site: Site) -> Profile:
         height=height,
         pressure=np.exp(log_pressure),
         temperature=temperature,
-        h2o=np.exp(linear(np.log(np.maximum(column.h2o, 1e-12)))),
+        h2o=h2o,
         o3=o3,
         wind_east=linear(column.wind_east),
         wind_north=linear(column.wind_north),
@@ -357,7 +389,8 @@ def on_heights(column: Column, site: Site) -> Profile:
     if log_vapour_spread is None:
         return made
     low, high = (replace(made, h2o=made.h2o * np.exp(sign * log_vapour_spread)).pwv for sign in (-1, 1))
-    return replace(made, distribution=WaterDistribution(made.pwv, STACKING * math.log(high / low) / 2))
+    stacked, shares = math.log(high / low) / 2, column.column_spread or (STACKING, STACKING)
+    return replace(made, distribution=WaterDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked))
 
 
 def _continued(column: Column) -> Column:

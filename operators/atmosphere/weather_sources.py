@@ -125,10 +125,10 @@ def _water(profile: Profile, weather: WeatherSource, seed: int, pwv: float | Non
         )
     quantile = given.quantile if given.quantile is not None else float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
     wanted = law.at(quantile)
-    text = (
-        f"PWV {wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile of a log-normal law of median {law.median * 1e3:.4g} mm"
-    )
-    return profile.scaled(wanted), text + f", sigma {law.sigma:.3g}" + ("" if given.quantile is not None else " (drawn)")
+    low, high = law.at(0.25) * 1e3, law.at(0.75) * 1e3
+    text = f"PWV {wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile{'' if given.quantile is not None else ' (drawn)'}"
+    season = f"of that season and hour: median {law.median * 1e3:.4g} mm, half the days between {low:.3g} and {high:.3g} mm"
+    return profile.scaled(wanted), f"{text} {season}"
 
 
 def _wind(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profile, str]:

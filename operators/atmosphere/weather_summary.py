@@ -55,7 +55,7 @@ def pwv_steps(air: Profile) -> list[float]:
     law = air.distribution
     low, high = (law.at(0.05), law.at(0.95)) if law is not None else (air.pwv / 3, min(3 * air.pwv, PWV_MAX))
     rounded = {float(f"{low * (high / low) ** (k / 3):.1g}") for k in range(4)}
-    return sorted(p for p in {*rounded, air.pwv} if p == air.pwv or abs(p / air.pwv - 1) > 0.05) if air.pwv > 0 else [0.0, 1e-3]
+    return sorted(p for p in {*rounded, air.pwv} if p == air.pwv or abs(p / air.pwv - 1) > 0.2) if air.pwv > 0 else [0.0, 1e-3]
 
 
 def place_lines(site: Site, time: Instant, air: Profile) -> list[str]:
@@ -95,15 +95,20 @@ def water_lines(water: WaterByMonth) -> list[str]:
 def band_lines(air: Profile, bands: Iterable[Band], elevation: float) -> list[str]:
     """Emission and transmission of bands at several PWVs and an elevation [rad]."""
     steps = pwv_steps(air)
-    lines = [f"at an elevation of {math.degrees(elevation):g} deg: emission of the air (background 0 K) and transmission"]
+    lines = [f"at an elevation of {math.degrees(elevation):g} deg: emission of the air (background 0 K), transmission, opacity"]
     for band in bands:
-        seen = BandAtmosphere(band, air, max(*steps, 1e-4) * 1.01)
+        seen = BandAtmosphere(band, air, min(max(*steps, 1e-4) * 1.01, PWV_MAX))
         lines.append(f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)")
         for pwv in steps:
             mark = "  <" if pwv == air.pwv else ""
             kelvin, passed = float(seen.emission(pwv, elevation)), float(seen.transmission(pwv, elevation))
-            lines.append(f"    PWV {_short(pwv)} mm: {kelvin:7.2f} K_RJ, {passed:.4f}{mark}")
+            opacity = float(seen.opacity(pwv, elevation))
+            lines.append(f"    PWV {_short(pwv)} mm: {kelvin:7.2f} K_RJ, {_fraction(passed)}, {opacity:.4g}{mark}")
     return lines
+
+
+def _fraction(passed: float) -> str:
+    return f"{passed:.4f}" if passed >= 1e-3 else f"{passed:.1e}"
 
 
 def _short(pwv: float) -> str:

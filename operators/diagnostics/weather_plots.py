@@ -33,11 +33,12 @@ def plot_profile(air: Profile, ax: Any = None) -> Any:
     ax.set_ylabel("height above the site [km]")
     ax.set_ylim(0, 20)
     other = ax.twiny()
-    other.plot(np.hypot(air.wind_east, air.wind_north)[low], km, color=SEQUENCE[0], label="wind [m/s]")
+    other.plot(np.hypot(air.wind_east, air.wind_north)[low], km, color=SEQUENCE[0], label="wind")
     scale = 10 ** math.floor(math.log10(20 / (air.vapour_density[0] * 1e3))) if air.vapour_density[0] > 0 else 1.0
     label = "vapour [g/m³]" if scale == 1 else f"vapour × {scale:g} [g/m³]"
-    other.plot(air.vapour_density[low] * 1e3 * scale, km, color=SEQUENCE[2], label=label)
+    other.plot(air.vapour_density[low] * 1e3 * scale, km, color=SEQUENCE[2], label="vapour")
     other.set_xlim(left=0)
+    other.set_xlabel(f"wind [m/s], {label}")
     other.legend(loc="upper right", fontsize=8)
     return ax
 
@@ -62,6 +63,8 @@ def plot_water(water: WaterByMonth, ax: Any = None) -> Any:
     ax.set_xticks(month, [name[0] for name in MONTHS])
     ax.set_ylabel("PWV [mm]")
     ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(_some_minor)
+    ax.set_xlabel("month")
     ax.legend(fontsize=6.5, ncols=2)
     return ax
 
@@ -83,16 +86,22 @@ def plot_spectrum(
             lw=1.4 if own else 0.9,
             label=f"PWV {pwv * 1e3:.3g} mm",
         )
-    top = 1.0 if which == "transmission" else ax.get_ylim()[1]
-    for k, band in enumerate(bands):
-        ax.fill_between(band.frequency / 1e9, band.transmission * top, color=SEQUENCE[(k + 3) % 7], alpha=0.2, lw=0)
-        at, side = (0.98 * top, "top") if which == "brightness" else (0.02, "bottom")
-        ax.annotate(band.name, (band.centre / 1e9, at), rotation=90, ha="center", va=side, fontsize=7)
+    for k, band in enumerate(bands):  # in the height of the picture, whatever its scale
+        place = ax.get_xaxis_transform()
+        ax.fill_between(band.frequency / 1e9, band.transmission, color=SEQUENCE[(k + 3) % 7], alpha=0.2, lw=0, transform=place)
+        at, side = (0.98, "top") if which == "brightness" else (0.02, "bottom")
+        ax.annotate(band.name, (band.centre / 1e9, at), xycoords=place, rotation=90, ha="center", va=side, fontsize=7)
     ax.set_xlim(low / 1e9, high / 1e9)
-    ax.set_ylim(0, top)
+    if which == "brightness":
+        ax.set_yscale("log")
+        ax.set_ylim(1.0, 400.0)
+        ax.yaxis.set_major_formatter("{x:g}")
+    else:
+        ax.set_ylim(0, 1)
     ax.set_xlabel("frequency [GHz]")
     ax.set_ylabel("emission [K$_\\mathrm{RJ}$]" if which == "brightness" else "transmission")
-    ax.legend(fontsize=7, loc="center left" if which == "brightness" else "lower left")
+    ax.grid(alpha=0.25, lw=0.5)
+    ax.legend(fontsize=7, loc="best")
     return ax
 
 
@@ -116,8 +125,13 @@ def weather_figure(
     return figure
 
 
+def _some_minor(value: float, _: int) -> str:
+    """2 and 5 of every decade."""
+    return f"{value:g}" if f"{value:.0e}"[0] in "25" else ""
+
+
 def _range(bands: Sequence[Band]) -> tuple[float, float]:
-    """Frequencies shown: all, or up to twice the highest band."""
+    """Frequencies shown: all, or up to 1.6 times the highest band."""
     if not bands:
         return LOWEST, HIGHEST
     return LOWEST, min(HIGHEST, 1.6 * max(float(band.frequency[-1]) for band in bands))

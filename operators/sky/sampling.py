@@ -16,7 +16,7 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from .columns import four_columns
+from zonda.core.columns import four_columns
 
 Floats = NDArray[np.floating]
 

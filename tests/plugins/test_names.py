@@ -77,6 +77,7 @@ def test_atlast_is_the_papers():
 @pytest.mark.parametrize(
     ("name", "metres", "degrees"),
     [
+        ("gbt", 100, 4.2 / 60),
         ("lmt", 50, 4 / 60),
         ("act", 6, 0.9),
         ("so_lat", 6, 7.8),

@@ -33,13 +33,14 @@ def mustang2(air):
 
 def test_band_values_are_the_spectrum_averaged_with_the_passband(air, mustang2):
     elevation = math.radians(42)
-    s = spectrum(air.layers, elevation, low=78e9, high=108e9)
-    weight = np.ones(len(s.frequency))
+    s = spectrum(air.layers, elevation, low=77e9, high=109e9)
+    frequency, weight = np.arange(78, 108.1, 0.5), np.ones(61)
     weight[[0, -1]] = 0.5  # the band begins and ends in the middle of a cell
-    average = lambda x: np.average(x, weights=weight)  # noqa: E731
-    assert mustang2.emission(PWV, elevation) == pytest.approx(average(s.brightness), rel=1e-5)
-    assert mustang2.transmission(PWV, elevation) == pytest.approx(average(np.exp(-s.slant_opacity)), rel=1e-5)
-    assert mustang2.background(PWV, elevation) == pytest.approx(average(s.cmb), rel=1e-5)
+    frequency[[0, -1]] = 78.125, 107.875
+    average = lambda x: np.average(np.interp(frequency * 1e9, s.frequency, x), weights=weight)  # noqa: E731
+    assert mustang2.emission(PWV, elevation) == pytest.approx(average(s.brightness), rel=2e-5)
+    assert mustang2.transmission(PWV, elevation) == pytest.approx(average(np.exp(-s.slant_opacity)), rel=2e-5)
+    assert mustang2.background(PWV, elevation) == pytest.approx(average(s.cmb), rel=2e-5)
     assert mustang2.opacity(PWV, elevation) == pytest.approx(-math.log(average(np.exp(-s.slant_opacity))), rel=1e-4)
 
 
@@ -107,6 +108,12 @@ def test_transmission_is_averaged_never_the_opacity(air):
     assert table.transmission(20e-3, math.pi / 2) > 1.5 * math.exp(-s.opacity.mean())
 
 
+def test_wet_air_needs_no_limit(air):
+    table = BandAtmosphere(band(78, 108), air.scaled(40e-3))
+    assert table.pwv_max == 60e-3
+    assert table.emission(60e-3, math.radians(5)) > 200
+
+
 def test_opaque_band_underflows_nowhere(air):
     table = BandAtmosphere(band(556, 558), air)
     opacity = table.opacity(table.pwv_max, math.radians(5))
@@ -137,18 +144,21 @@ def test_a_value_does_not_depend_on_its_neighbours(mustang2):
 
 
 def test_passband_is_integrated_within_cells(tmp_path):
-    weights, _ = _cell_weights(band(92.9, 93.1))
+    weights, frequency, _ = _cell_weights(band(92.9, 93.1))
     assert weights == pytest.approx([0.2e9])
-    weights, cells = _cell_weights(band(77.9, 80.3))
+    assert frequency == pytest.approx([93.0e9])
+    weights, frequency, cells = _cell_weights(band(77.9, 80.3))
     assert weights.sum() == pytest.approx(2.4e9, rel=1e-12)
     assert cells.stop - cells.start == len(weights) == 6
+    np.testing.assert_allclose(frequency, np.array([78.075, 78.5, 79, 79.5, 80, 80.275]) * 1e9)  # the middles of what is covered
     path = tmp_path / "ramp.txt"
     path.write_text("90 0\n91 1\n")
-    weights, _ = _cell_weights(Band(name="ramp", file=path))
+    weights, frequency, _ = _cell_weights(Band(name="ramp", file=path))
     # cells 90 (half), 90.5, 91 (half): integral of nu - 90 from 0 to 1/4, 1/4 to 3/4, 3/4 to 1
     np.testing.assert_allclose(weights, np.array([1 / 32, 1 / 4, 7 / 32]) * 1e9, rtol=1e-9)
+    np.testing.assert_allclose(frequency[[0, 2]], np.array([90 + 1 / 6, 90 + 37 / 42]) * 1e9, rtol=1e-12)
     path.write_text("0.1 0\n90 0\n91 1\n92 0\n2000 0\n")
-    weights, _ = _cell_weights(Band(name="padded", file=path))
+    weights, _, _ = _cell_weights(Band(name="padded", file=path))
     assert weights.sum() == pytest.approx(1e9, rel=1e-12)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,18 +14,25 @@ from pydantic import ValidationError
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import ZondaError
+from zonda.core.execution import cut
 from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-from zonda.core.smooth import DetectorField
-from zonda.operators.atmosphere import plan, sampling
+from zonda.operators.atmosphere import fluctuations, plan, sampling
 from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
+from zonda.operators.atmosphere.fluctuations import AtNodes, OfDetectors
 from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
-from zonda.operators.atmosphere.layers import AtmosphereLayers, Fluctuations, Wind, _model, _turbulence, beam_sigma
+from zonda.operators.atmosphere.layers import AtmosphereLayers, Wind, _model, _turbulence, beam_sigma
 from zonda.operators.atmosphere.nodes import differential_rms
-from zonda.operators.atmosphere.sampling import sample
 from zonda.operators.atmosphere.turbulence import Turbulence
+
+_spec = importlib.util.spec_from_file_location("direct", Path(__file__).with_name("direct.py"))
+assert _spec
+assert _spec.loader
+_direct = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(_direct)
+at_points = _direct.at_points
 
 Floats = NDArray[np.float64]
 PWV = 7.7e-3
@@ -83,10 +92,12 @@ def operator(**parameters: Any) -> AtmosphereLayers:
     return AtmosphereLayers(**{"pwv": "7.7 mm", **parameters})
 
 
-def whole(observation: Observation, state: Fluctuations, name: str = "emission", dtype: type = np.float64) -> Floats:
+def whole(observation: Observation, state: AtNodes | OfDetectors, name: str = "emission", dtype: type = np.float64) -> Floats:
     """(n_det, n_samp)."""
     n_det, n = observation.n_detectors, observation.n_samples
-    return getattr(state, name).evaluate(slice(0, n_det), slice(0, n), np.empty((n_det, n), dtype))
+    out = np.empty((n_det, n), dtype)
+    state.into(slice(0, n_det), slice(0, n), {name: out})
+    return out
 
 
 def water(op: AtmosphereLayers, observation: Observation) -> Floats:
@@ -181,7 +192,7 @@ def test_large_rms_takes_the_log_normal_map_and_keeps_mean_and_rms() -> None:
     o = observe(5.0)
     op.prepare(o)
     assert ("AtmosphereLayers", "distribution of the water", "log-normal") in list(o.tally)
-    assert o.tally.get("AtmosphereLayers", "node values of the water clipped to the table") == 0
+    assert o.tally.get("AtmosphereLayers", "values of the water clipped to the table") == 0
     covariance = np.mean(op._water(g, 1.0, 0.9) * op._water(g, 1.0, 0.9))  # exp(s^2 v) - 1 = p^2
     assert covariance == pytest.approx(0.16, rel=0.03)
 
@@ -210,13 +221,14 @@ def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: st
     for number, layer in enumerate(op._layers(profile)):
         beam = _turbulence(op, o, number, _model(op, layer, track, o))
         across, along = track.positions(crossing(u), o.seconds, layer.height, layer.wind)
-        sample(beam, across, along, layer.amplitude, g)
+        g += layer.amplitude * at_points(beam, across, along)
     elevation = np.arcsin(u[2])
     direct = band.emission_difference(PWV, PWV * op.pwv_rms * g, elevation)
     rms = np.sqrt(expected_variance(op, o)) * np.mean(band.emission_difference(PWV, 0.01 * PWV, elevation)) / 0.01
     error = whole(o, state) - direct
-    assert state.emission.step > 1
-    assert state.emission.weights.shape[1] < 61
+    assert isinstance(state, AtNodes)
+    assert state.fields["emission"].step > 1
+    assert state.fields["emission"].weights.shape[1] < 61
     assert np.sqrt(np.mean(error**2)) < 3 * np.sqrt(2) * tolerance * rms
     relative = np.expm1(band.log_transmission_difference(PWV, PWV * op.pwv_rms * g, elevation))
     assert np.sqrt(np.mean((whole(o, state, "transmission") - relative) ** 2)) < 10 * tolerance * relative.std() + 1e-7
@@ -231,25 +243,31 @@ def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: st
     assert abs(opaque - band.transmission(PWV, elevation)).max() < tolerance * 1e-2
 
 
-def test_chunks_do_not_change_bits_and_bound_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     def series() -> Floats:
         return whole(o := observe(300.0, 10.0, scan=4.0), operator(layers=2).prepare(o))
 
-    boxes: list[int] = []
-    whole_regions = Turbulence.region
+    made: list[tuple[int, int]] = []
+    coefficients = Turbulence.coefficients
 
     def watched(self: Turbulence, i0: int, i1: int, j0: int, j1: int) -> Any:
-        boxes.append((i1 - i0) * (j1 - j0))
-        return whole_regions(self, i0, i1, j0, j1)
+        made.append((i1 - i0, j1 - j0))
+        return coefficients(self, i0, i1, j0, j1)
 
-    monkeypatch.setattr(Turbulence, "region", watched)
+    monkeypatch.setattr(Turbulence, "coefficients", watched)
     expected = series()
-    once = len(boxes)
-    monkeypatch.setattr(sampling, "CELLS_AT_ONCE", 200)
-    np.testing.assert_array_equal(series(), expected)
-    assert len(boxes) > 4 * once
-    # 200 cells and the 10 on either side that the prefilter wants: at most (20 + n) (20 + m), n m <= 200.
-    assert max(boxes[once:]) <= 600 + 20 * 200
+    once = len(made)
+    for strip, kept, times in (((3, 4), 512 << 20, 1024), ((5, 5), 0, 7), ((8, 8), 1 << 20, 100)):
+        monkeypatch.setattr(sampling, "STRIP", strip)
+        monkeypatch.setattr(sampling, "BYTES_KEPT", kept)
+        monkeypatch.setattr(sampling, "TIMES_AT_ONCE", times)
+        made.clear()
+        np.testing.assert_array_equal(series(), expected)
+        assert set(made) == {((1 << strip[0]) + 3, (1 << strip[1]) + 3)}
+    monkeypatch.setattr(sampling, "STRIP", (3, 4))
+    made.clear()
+    series()
+    assert len(made) > 4 * once
     monkeypatch.setattr(sampling, "CELLS_IN_ALL", 300)
     with pytest.raises(ZondaError, match="lattice points of the turbulence"):
         series()
@@ -258,8 +276,9 @@ def test_chunks_do_not_change_bits_and_bound_the_memory(monkeypatch: pytest.Monk
 def test_the_default_job_is_compressed_by_nodes_and_steps() -> None:
     o = observe(120.0, scan=4.0)
     state = operator().prepare(o)
-    assert state.emission.weights.shape[1] <= 9
-    assert state.emission.step >= 64
+    assert isinstance(state, AtNodes)
+    assert state.fields["emission"].weights.shape[1] <= 9
+    assert state.fields["emission"].step >= 64
     said = {what: text for who, what, text in o.tally if who == "AtmosphereLayers"}
     assert "Chebyshev" in said["nodes"]
     assert "samples" in said["step in time"]
@@ -495,13 +514,14 @@ def test_the_cone_is_the_plane_to_first_order_and_wind_drifts_within_its_bound()
     for e in np.eye(2):
         moved = track.unroll((track.centre + h * e)[:, None]) - track.unroll(track.centre[:, None])
         np.testing.assert_allclose(moved[:, 0] / h, track.matrix @ e, atol=1e-4)
-    # The drift of any wind, squared, against that across the line of sight at every azimuth.
-    u = rays(axes(o.boresight_azel[::100]), np.zeros(1), np.zeros(1))[:, 0]
+    # The drift of any wind, as a vector, against that of the unrolled cone at every azimuth.
+    X = crossing(rays(axes(o.boresight_azel[::100]), np.zeros(1), np.zeros(1)))[:, 0]
     for angle in np.radians(np.arange(0, 360, 15)):
         wind = np.array([np.sin(angle), np.cos(angle)])
-        across = 1 - (wind @ u[:2]) ** 2
-        assert abs(((track.drift @ wind) ** 2).sum() / across - 1).max() < track.drift_bound
-    assert track.drift_bound < 0.5
+        true = (track.unroll(X + h * wind[:, None]) - track.unroll(X)) / h
+        wrong = np.hypot(*((track.drift @ wind)[:, None] - true)) / np.hypot(*true)
+        assert wrong.max() < track.drift_bound + 1e-4
+    assert 0.1 < track.drift_bound < 0.3
 
 
 def test_transverse_plane_measures_separations_across_the_line_of_sight() -> None:
@@ -563,9 +583,13 @@ def test_the_beam_is_that_of_the_distance_along_the_line_of_sight() -> None:
     camera = instrument(diameter="6 m", detectors=7)
     o = observe(1.0, elevation=30.0, camera=camera)
     one, *_, last = layers_of(operator(), o)
-    assert one.distance == pytest.approx(1000.0)  # 500 m / sin 30 deg
-    assert last.distance == pytest.approx(10000.0)
-    assert last.sigma == pytest.approx(beam_sigma(camera.telescope, camera.band, 10000.0))
+    assert one.distance == pytest.approx(1000.0, rel=2e-4)  # 500 m / sin 30 deg
+    # A shell of radius R + h is met at sqrt(R^2 sin^2 e + 2 R h + h^2) - R sin e: 12 m nearer than a flat layer.
+    radius = 6371000.0
+    shell = np.sqrt((radius / 2) ** 2 + 2 * radius * 5000 + 5000**2) - radius / 2
+    assert last.distance == pytest.approx(shell, rel=1e-6)
+    assert 10 < 10000 - last.distance < 14
+    assert last.sigma == pytest.approx(beam_sigma(camera.telescope, camera.band, shell))
     assert last.sigma > 1.3 * one.sigma  # far beyond the Rayleigh distance of 8.8 km the beam has widened
 
 
@@ -618,7 +642,7 @@ def test_outputs_are_the_fluctuations_along_each_line_of_sight() -> None:
 def test_outputs_are_made_only_where_asked_for() -> None:
     assert operator().provides == AtmosphereLayers.provides == {"atmosphere", "transmission"}
     o = observe(5.0)
-    assert operator().prepare(o).outputs == {}
+    assert set(operator().prepare(o).fields) == {"emission", "transmission"}
     with pytest.raises(ValidationError, match="outputs"):
         operator(outputs=["ozone"])
 
@@ -650,8 +674,8 @@ def test_wide_field_per_detector_evaluation_agrees_with_direct_evaluation() -> N
     op = operator(layers=3, tolerance="1 %")
     o = swept(50.0, 180 + 12 * np.sin(2 * np.pi * np.arange(3000) / 6000), camera)
     state = op.prepare(o)
-    assert isinstance(state.emission, DetectorField)
-    assert state.emission.step > 1
+    assert isinstance(state, OfDetectors)
+    assert state.step > 1
     direct, band, elevation = directly(op, o)
     left = direct - direct.mean(0)
     wrong = whole(o, state) - band.emission_difference(PWV, PWV * op.pwv_rms * direct, elevation)
@@ -675,19 +699,72 @@ def test_layers_take_steps_of_their_own_within_the_same_bound(monkeypatch: pytes
     assert np.sqrt(np.mean((wrong / slope) ** 2)) < 3 * 0.01 * np.sqrt(np.mean(left**2))
 
 
-def test_kept_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = instrument(detectors=19, field="10 deg", diameter="6 m")
+def test_units_and_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = instrument(detectors=37, field="10 deg", diameter="6 m")
 
     def series() -> Floats:
         o = swept(50.0, 180 + 4 * np.sin(2 * np.pi * np.arange(1000) / 500), camera)
-        return whole(o, operator(layers=1, lowest="3 km").prepare(o))
+        state = operator(layers=2, lowest="3 km").prepare(o)
+        assert isinstance(state, OfDetectors)
+        # in another order, and some of it twice
+        out = np.empty((37, 1000))
+        for detectors, samples in (
+            (slice(16, 37), slice(300, 1000)),
+            (slice(0, 37), slice(0, 500)),
+            (slice(0, 37), slice(500, 1000)),
+        ):
+            state.into(
+                detectors,
+                samples,
+                {"emission": (part := np.empty((detectors.stop - detectors.start, samples.stop - samples.start)))},
+            )
+            out[detectors, samples] = part
+        return out
 
     expected = series()
-    monkeypatch.setattr(sampling, "TILE", 64)
-    monkeypatch.setattr(sampling, "TILES_KEPT", 40)
+    monkeypatch.setattr(sampling, "SQUARE", (6, 6))
+    monkeypatch.setattr(sampling, "BYTES_KEPT", 1 << 20)
     np.testing.assert_array_equal(series(), expected)
-    monkeypatch.setattr(sampling, "POINTS_AT_ONCE", 2000)
+    monkeypatch.setattr(fluctuations, "UNIT_DETECTORS", 16)
+    monkeypatch.setattr(fluctuations, "UNIT_SAMPLES", 256)
+    monkeypatch.setattr(fluctuations, "BYTES_KEPT", 0)
     np.testing.assert_array_equal(series(), expected)
+
+
+def test_many_threads_make_the_same_units() -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    camera = instrument(detectors=37, field="10 deg", diameter="6 m")
+
+    def prepared() -> tuple[Observation, OfDetectors]:
+        o = swept(50.0, 180 + 4 * np.sin(2 * np.pi * np.arange(1000) / 500), camera)
+        state = operator(layers=2, lowest="3 km").prepare(o)
+        assert isinstance(state, OfDetectors)
+        return o, state
+
+    expected = whole(*prepared())
+    o, state = prepared()
+    with ThreadPoolExecutor(4) as pool:
+        for values in pool.map(lambda _: whole(o, state), range(8)):
+            np.testing.assert_array_equal(values, expected)
+
+
+@pytest.mark.parametrize("kept", [128 << 20, 0])
+def test_a_pipeline_gives_the_same_bits_in_any_order_of_blocks(kept: int, bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Where the units do not all fit, the executor takes blocks of all detectors in order of time, even before a filter in time.
+    from zonda.operators.filters.highpass import HighpassFilter
+
+    camera = instrument(detectors=37, field="10 deg", diameter="6 m")
+    o = swept(50.0, 180 + 4 * np.sin(2 * np.pi * np.arange(12000) / 4000), camera)
+    monkeypatch.setattr(fluctuations, "BYTES_KEPT", kept)
+    steps = [operator(layers=1, lowest="3 km")]
+    state = steps[0].prepare(o)
+    assert steps[0].in_time_order(o, state) is (kept == 0)
+    assert [
+        s.in_time_order for s in cut([*steps, HighpassFilter(frequency="0.1 Hz")], o, [steps[0].label] if kept == 0 else [])
+    ] == ([True, False] if kept == 0 else [False])
+    kept_streams = bench.run(steps, o, keep=("atmosphere",)).observations[0].detdata["atmosphere"]
+    np.testing.assert_allclose(kept_streams, whole(o, state, dtype=np.float32).astype(float), rtol=0, atol=0)
 
 
 def directly(op: AtmosphereLayers, o: Observation) -> tuple[Floats, Any, Floats]:
@@ -699,7 +776,7 @@ def directly(op: AtmosphereLayers, o: Observation) -> tuple[Floats, Any, Floats]
     for number, layer in enumerate(op._layers(profile)):
         beam = _turbulence(op, o, number, _model(op, layer, track, o))
         across, along = track.positions(crossing(u), o.seconds, layer.height, layer.wind)
-        sample(beam, across, along, layer.amplitude, g)
+        g += layer.amplitude * at_points(beam, across, along)
     return g, band, np.arcsin(u[2])
 
 

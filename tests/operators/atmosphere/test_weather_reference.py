@@ -75,6 +75,28 @@ def test_spread_of_the_water_is_era5s(name):
     assert np.mean(got) == pytest.approx(want.mean(), rel=0.2)
 
 
+@pytest.mark.parametrize("name", ["green_bank", "south_pole"])
+def test_quantiles_of_the_water_are_era5s(name):
+    """Of ERA5's own columns, relative to their median, rms over the year and the hours: 12 % at 5 and 95 %, 8 % at 29 and 71 %.
+
+    A log-normal law with one width for both sides misses 16 % at Green Bank.
+    """
+    era5, site = reference(f"weathergen_{name}.npz"), sites.create(name)
+    laws = [[profile(site, instant(d, h)).distribution for h in era5["utc_hour"]] for d in era5["year_day"]]
+    for k, limit in ((0, 0.12), (1, 0.08), (3, 0.08), (4, 0.12)):
+        want = np.log(era5["tcwv_mm"][..., k] / era5["tcwv_mm"][..., 2])
+        got = [[np.log(law.at(float(era5["quantile"][k])) / law.median) for law in row] for row in laws]
+        assert np.sqrt(np.mean((got - want) ** 2)) < limit
+
+
+def test_air_on_the_antarctic_ground_is_era5s():
+    """Within 1 K (rms over the year): the inversion, thinner than pressure levels, is there."""
+    era5, site = reference("weathergen_south_pole.npz"), sites.create("south_pole")
+    got = [[profile(site, instant(d, h)).temperature[0] for h in era5["utc_hour"]] for d in era5["year_day"]]
+    want = era5["surface_temperature_K"][..., 2]
+    assert np.sqrt(np.mean((got - want) ** 2)) < 1.0
+
+
 def test_typical_wind_has_era5s_median_speed():
     """At 96 dates and hours over Chajnantor; the vector of medians is 2 m/s slow there, the typical speed within 1 m/s (rms)."""
     era5 = reference("era5_chajnantor_quantiles.npz")
@@ -94,13 +116,13 @@ def test_typical_wind_has_era5s_median_speed():
     assert np.mean(plain) < -1.0
 
 
-@pytest.mark.parametrize(("name", "months"), [("atacama", slice(0, 12)), ("south_pole", [0, 11])])
-def test_merra2(name, months):
+@pytest.mark.parametrize("name", ["atacama", "south_pole"])
+def test_merra2(name):
     """TOAST's MERRA-2 statistics, at MERRA-2's own ground: for Atacama 588 hPa, lower and wetter than any telescope there.
 
     The site is put where our profile has that pressure. MERRA-2 and ERA5 differ by 10-20 % in dry air, so PWV is held to 25 % in
-    the mean over the year and 40 % in each month; the 10 m temperature to 3 K in the mean. At the South Pole that holds in summer
-    only: from February to November the air at 10 m lies under an inversion of 5 to 15 K, thinner than pressure levels resolve.
+    the mean over the year and 40 % in each month; the 10 m temperature to 4 K in the mean (ERA5's own is 3 K warmer than MERRA-2
+    at the South Pole).
     """
     merra = reference("toast_merra2_weather.npz")
     half = int(np.argmin(abs(merra["probability"] - 0.5)))
@@ -121,4 +143,4 @@ def test_merra2(name, months):
     ratio = np.log(pwv / truth)
     assert math.exp(abs(ratio.mean())) < 1.25
     assert np.exp(abs(ratio.mean(axis=1))).max() < 1.4
-    assert abs((cold - warm)[months].mean()) < 3
+    assert abs((cold - warm).mean()) < 4

@@ -361,7 +361,7 @@ def test_bad_era5_files(tmp_path, given, words):
 
 def test_files_that_are_not_netcdf(tmp_path):
     path = tmp_path / "era5.nc"
-    for content in (b"", b"GRIB....", b"CDF\x01", b"PK\x03\x04zip"):
+    for content in (b"", b"GRIB....", b"CDF\x01", b"PK\x03\x04zip", b"\x89HDF\r\n\x1a\n" + 30 * b"x"):
         path.write_bytes(content)
         with pytest.raises(InputError, match="cannot be read as NetCDF"):
             Era5(file=path).column(here(), NIGHT)

@@ -44,3 +44,34 @@ def four_columns(typing_context: Any, f: Any, p: Any, stride: Any, v0: Any, v1: 
         return context.get_dummy_value()
 
     return types.void(f, types.uint64, types.uint64, v0, v1, v2, v3, out, types.uint64), generate
+
+
+@intrinsic
+def four_columns_at(typing_context: Any, address: Any, stride: Any, v0: Any, v1: Any, v2: Any, v3: Any, out: Any, at: Any) -> Any:
+    """out[at + k] = sum_j v_j f[j stride + k], k = 0 .. 3, for the float32 numbers ``f`` at a memory ``address``.
+
+    ``out`` is a C array of float64, ``v_j`` float64; ``address``, ``stride``, ``at`` are uint64; nothing is checked. The
+    sums are not contracted, so that they are the same on every CPU.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place, stride, *v, out, at = arguments
+        single, double = ir.VectorType(ir.FloatType(), 4), ir.VectorType(ir.DoubleType(), 4)
+        nothing, integer = ir.Constant(double, ir.Undefined), ir.IntType(32)
+        zeros = ir.Constant(ir.VectorType(integer, 4), [0] * 4)
+
+        def spread(value: Any) -> Any:
+            return builder.shuffle_vector(builder.insert_element(nothing, value, ir.Constant(integer, 0)), nothing, zeros)
+
+        four_bytes = builder.mul(stride, ir.Constant(stride.type, 4))
+        total = None
+        for weight in v:
+            row = builder.load(builder.inttoptr(place, single.as_pointer()), align=4)
+            term = builder.fmul(spread(weight), builder.fpext(row, double))
+            total = term if total is None else builder.fadd(total, term)
+            place = builder.add(place, four_bytes)
+        first = make_array(signature.args[6])(context, builder, out).data
+        builder.store(total, builder.bitcast(builder.gep(first, [at]), double.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.void(types.uint64, types.uint64, v0, v1, v2, v3, out, types.uint64), generate

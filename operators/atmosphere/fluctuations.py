@@ -1,0 +1,162 @@
+"""The fluctuations that a block is given: from nodes over the focal plane, or of each detector where no nodes pay.
+
+At nodes everything is drawn once, before the blocks: few nodes stand for all detectors. Where each detector is its own node
+its series are made when they are asked for, a unit of detectors and samples at a time, so that a scan of any length needs
+little memory; a unit has the same bits whenever it is made.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, Floats, SmoothField, spline_coefficients
+
+from .nodes import Nodes
+from .response import Response
+from .sampling import Layers
+
+Water = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
+"""(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""
+
+UNIT_DETECTORS, UNIT_SAMPLES = 128, 8192
+"""What is made at a time."""
+
+BYTES_KEPT = 128 << 20
+"""Memory of the units that are kept: until the other detectors and operators have taken their part."""
+
+
+def times(samples: slice, step: int) -> tuple[int, int]:
+    """First time (in units of ``step``) and number of times whose values make the spline over these samples."""
+    first = samples.start // step - PAD - SPLINE_MARGIN
+    return first, -(-samples.stop // step) + 2 + SPLINE_MARGIN - first
+
+
+@dataclass(frozen=True)
+class AtNodes:
+    """Named fields (`Response.names`) interpolated from nodes."""
+
+    fields: dict[str, SmoothField]
+    sums: tuple[int, float, float]
+
+    @classmethod
+    def make(cls, nodes: Nodes, layers: Layers, water: Water, response: Response, step: int, n_samples: int) -> AtNodes:
+        """Evaluate the layers at the nodes over the whole scan."""
+        g, sine = layers(nodes.xi, nodes.eta, *times(slice(0, n_samples), step))
+        y = water(g, _own(g.shape[1]))
+        weights = np.ascontiguousarray(nodes.weights)
+        return cls(
+            {
+                name: SmoothField(weights, spline_coefficients(response(name, y, sine)), step, n_samples)
+                for name in response.names
+            },
+            _sums(y[:, _own(y.shape[1])]),
+        )
+
+    fits = True
+
+    def drawn(self) -> tuple[int, float, float]:
+        """Number of values of the water, their sum, and that of their squares."""
+        return self.sums
+
+    def into(self, detectors: slice, samples: slice, out: dict[str, Floats]) -> None:
+        """Overwrite the arrays ``out`` (n_det, n_samp), by name, with the fluctuations of a block."""
+        for name, array in out.items():
+            self.fields[name].evaluate(detectors, samples, array)
+
+
+class OfDetectors:
+    """Each detector's own series, in float32, made as they are asked for. Threads may ask at the same time."""
+
+    def __init__(self, nodes: Nodes, layers: Layers, water: Water, response: Response, step: int, n_samples: int) -> None:
+        self._xi, self._eta, self._layers, self._water, self._response = nodes.xi, nodes.eta, layers, water, response
+        self.step, self._n_samples = step, n_samples
+        self._units: OrderedDict[tuple[int, int], Future[dict[str, Floats]]] = OrderedDict()
+        self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
+        self._lock = threading.Lock()
+        self._size = 4 * UNIT_DETECTORS * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * len(response.names)
+
+    @property
+    def fits(self) -> bool:
+        """Whether all units can be kept, so that the order in which blocks are worked on does not matter."""
+        number = -(-len(self._xi) // UNIT_DETECTORS) * -(-self._n_samples // UNIT_SAMPLES)
+        return number * self._size <= BYTES_KEPT
+
+    def drawn(self) -> tuple[int, float, float]:
+        """As `AtNodes.drawn`, of what has been asked for."""
+        parts = [self._sums[key] for key in sorted(self._sums)]
+        return sum(p[0] for p in parts), math.fsum(p[1] for p in parts), math.fsum(p[2] for p in parts)
+
+    def into(self, detectors: slice, samples: slice, out: dict[str, Floats]) -> None:
+        """As `AtNodes.into`."""
+        for unit, of_detectors in _parts(detectors, UNIT_DETECTORS):
+            for number, of_samples in _parts(samples, UNIT_SAMPLES):
+                coefficients = self._unit(unit, number)
+                rows = slice(of_detectors.start - unit * UNIT_DETECTORS, of_detectors.stop - unit * UNIT_DETECTORS)
+                at = slice(of_samples.start - number * UNIT_SAMPLES, of_samples.stop - number * UNIT_SAMPLES)
+                where = (
+                    slice(of_detectors.start - detectors.start, of_detectors.stop - detectors.start),
+                    slice(of_samples.start - samples.start, of_samples.stop - samples.start),
+                )
+                for name, array in out.items():
+                    field = DetectorField(coefficients[name], self.step, UNIT_SAMPLES)
+                    part = array[where]
+                    if part.flags.c_contiguous:
+                        field.evaluate(rows, at, part)
+                    else:
+                        part[...] = field.evaluate(rows, at, np.empty(part.shape, part.dtype))
+
+    def _unit(self, unit: int, number: int) -> dict[str, Floats]:
+        key = unit, number
+        with self._lock:
+            made = self._units.get(key)
+            mine = made is None
+            if made is None:
+                made = self._units[key] = Future()
+                while len(self._units) > max(1, BYTES_KEPT // self._size):
+                    self._units.popitem(last=False)
+            else:
+                self._units.move_to_end(key)
+        if mine:
+            try:
+                made.set_result(self._make(unit, number))
+            except BaseException as error:
+                made.set_exception(error)
+                with self._lock:
+                    self._units.pop(key, None)
+                raise
+        return made.result()
+
+    def _make(self, unit: int, number: int) -> dict[str, Floats]:
+        rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)
+        samples = slice(number * UNIT_SAMPLES, min((number + 1) * UNIT_SAMPLES, self._n_samples))
+        first, count = times(samples, self.step)
+        g, sine = self._layers(self._xi[rows], self._eta[rows], first, count)
+        with self._lock:  # what is made again is not counted again
+            own = _own(count) if (unit, number) not in self._sums else slice(0, 0)
+            self._sums.setdefault((unit, number), (0, 0.0, 0.0))
+        y = self._water(g, own)
+        self._sums[unit, number] = _sums(y[:, _own(count)])
+        return {name: spline_coefficients(self._response(name, y, sine), np.float32) for name in self._response.names}
+
+
+def _sums(y: NDArray[np.float64]) -> tuple[int, float, float]:
+    return y.size, float(y.sum()), float(np.einsum("ij,ij->", y, y))
+
+
+def _own(count: int) -> slice:
+    """Columns of `times` that are not margin."""
+    return slice(PAD + SPLINE_MARGIN, count - 2 - SPLINE_MARGIN)
+
+
+def _parts(whole: slice, size: int) -> Iterator[tuple[int, slice]]:
+    """(number, part) of the units of ``size`` that a slice reaches into."""
+    for number in range(whole.start // size, -(-whole.stop // size)):
+        yield number, slice(max(whole.start, number * size), min(whole.stop, (number + 1) * size))

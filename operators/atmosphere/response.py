@@ -1,0 +1,176 @@
+"""What the band makes of a fluctuation of the water, as polynomials good for one scan: fast, and smooth.
+
+With y the relative fluctuation of the water and s the sine of the elevation,
+
+    f(y, s) = y sum_ij c_ij Y^i S^j,       Y, S in [-1, 1] over the ranges of y and s                               (1)
+
+stands for the difference of the emission [K_RJ], of the relative transmission and of the opacity from those at y = 0, fitted
+to `BandAtmosphere` at Chebyshev points. The factor y makes it exact where nothing fluctuates. Ranges too wide for
+polynomials of `_DEGREES` (strong log-normal fluctuations) are left to `BandAtmosphere` itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from .band import BandAtmosphere
+from .radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
+
+Floats = NDArray[np.float64]
+
+ERROR = 1e-6
+"""Largest error of f / y, of the largest |f / y|."""
+
+_DEGREES = ((2, 2), (3, 3), (4, 4), (5, 6), (7, 8), (10, 12), (14, 16))
+
+
+class Response:
+    """Equation (1) for one band, mean PWV [m] and scan.
+
+    Parameters
+    ----------
+    band, pwv
+        The band's atmosphere and the mean PWV.
+    y_low, y_high
+        Range of the fluctuation.
+    low, high
+        Range of the sine of the elevation.
+    vapour_height
+        Height of the water [m], for the airmass of ``pwv``.
+    delay_per_vapour
+        Path delay per line-of-sight water.
+    names
+        What will be asked for, of ``emission, transmission, opacity, pwv, path_delay``.
+
+    Raises
+    ------
+    InputError
+        Elevations outside the limits of the radiative transfer.
+    """
+
+    def __init__(
+        self,
+        band: BandAtmosphere,
+        pwv: float,
+        y_low: float,
+        y_high: float,
+        low: float,
+        high: float,
+        vapour_height: float,
+        delay_per_vapour: float,
+        names: tuple[str, ...],
+    ) -> None:
+        self.names = names
+        bottom, top = np.sin(ELEVATION_MIN) * (1 + 1e-12), np.sin(ELEVATION_MAX)
+        self._y = ((y_low + y_high) / 2, 2 / max(y_high - y_low, 1e-9))
+        low, high = max(low, bottom), min(high, top)
+        self._s = ((low + high) / 2, 2 / max(high - low, 1e-9))
+        self._range = y_low, y_high
+
+        def elevation(s: Floats) -> Floats:
+            return np.asarray(np.arcsin(np.clip(s, bottom, top)), np.float64)
+
+        def column(y: Floats, s: Floats) -> Floats:
+            return pwv * y * airmass(elevation(s), vapour_height)
+
+        def depth(y: Floats, s: Floats) -> Floats:
+            return band.log_transmission_difference(pwv, pwv * y, elevation(s))
+
+        every: dict[str, Callable[[Floats, Floats], Floats]] = {
+            "emission": lambda y, s: band.emission_difference(pwv, pwv * y, elevation(s)),
+            "transmission": lambda y, s: np.expm1(depth(y, s)),
+            "opacity": lambda y, s: -depth(y, s),
+            "pwv": column,
+            "path_delay": lambda y, s: delay_per_vapour * column(y, s),
+        }
+        self._direct = {name: every[name] for name in names}
+        self._coefficients = {name: self._fit(self._direct[name]) for name in names}
+
+    def __call__(self, name: str, y: Floats, s: Floats) -> Floats:
+        """The difference called ``name`` at fluctuations ``y`` and sines of the elevation ``s``, both (n, m)."""
+        coefficients = self._coefficients[name]
+        if coefficients is None:
+            return self._direct[name](y, s)
+        out = np.empty(y.shape)
+        beyond = _polynomials(y, s, coefficients, *self._y, *self._s, *self._range, out)
+        if beyond:  # 8 sigma
+            far = (y < self._range[0]) | (y > self._range[1])
+            out[far] = self._direct[name](y[far], s[far])
+        return out
+
+    @property
+    def exact(self) -> bool:
+        """Whether any range was too wide for polynomials."""
+        return any(c is None for c in self._coefficients.values())
+
+    def _fit(self, function: Callable[[Floats, Floats], Floats]) -> Floats | None:
+        """(n_y, n_s) power coefficients, or None."""
+
+        def over_y(y: Floats, s: Floats) -> Floats:
+            y = np.where(abs(y) < 1e-7, 1e-7, y)
+            return function(y, s) / y
+
+        grids = np.meshgrid(np.cos(np.linspace(0.1, 3.1, 23)), np.cos(np.linspace(0, 3.14, 23)), indexing="ij")
+        truth = over_y(*self._unscaled(*grids))
+        for n_y, n_s in _DEGREES:
+            a, b = (np.cos(np.pi * (np.arange(n) + 0.5) / n) for n in (n_y, n_s))
+            values = over_y(*self._unscaled(*np.meshgrid(a, b, indexing="ij")))
+            to_a, to_b = (np.linalg.inv(np.polynomial.chebyshev.chebvander(x, len(x) - 1)) for x in (a, b))
+            series = np.einsum("iu,uv,jv->ij", to_a, values, to_b)
+            if abs(np.polynomial.chebyshev.chebval2d(*grids, series) - truth).max() <= ERROR * abs(truth).max():
+                return np.ascontiguousarray(_powers(_powers(series).T).T)
+        return None
+
+    def _unscaled(self, a: Floats, b: Floats) -> tuple[Floats, Floats]:
+        return self._y[0] + a / self._y[1], self._s[0] + b / self._s[1]
+
+
+def airmass(elevation: Floats, height: float) -> Floats:
+    """Of a spherical shell at ``height`` [m]: equation (1) of `radiative_transfer`."""
+    return np.asarray(1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64)
+
+
+def _powers(series: Floats) -> Floats:
+    """Columns of Chebyshev coefficients as columns of power coefficients, lowest first."""
+    n = len(series)
+    matrix = np.zeros((n, n))
+    for k in range(n):
+        powers = np.polynomial.chebyshev.cheb2poly(np.eye(n)[k])
+        matrix[: len(powers), k] = powers
+    return np.asarray(np.einsum("ij,jk->ik", matrix, series), np.float64)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _polynomials(y, s, coefficients, y0, y_scale, s0, s_scale, y_low, y_high, out):  # type: ignore[no-untyped-def]
+    """Equation (1); the number of values of ``y`` outside its range.
+
+    S outside its range belongs to the path beyond the ends of a scan, which only feeds the margin of a spline: held at its end.
+    """
+    m = nb.uint64(y.shape[1])
+    n_y, n_s = coefficients.shape
+    a, b, inner = np.empty(y.shape[1]), np.empty(y.shape[1]), np.empty(y.shape[1])
+    beyond = 0
+    for n in range(y.shape[0]):
+        row, at, total = y[n], s[n], out[n]
+        for t in range(m):
+            a[t], b[t] = (row[t] - y0) * y_scale, min(max((at[t] - s0) * s_scale, -1.0), 1.0)
+            beyond += nb.int64(row[t] < y_low) + nb.int64(row[t] > y_high)
+        for t in range(m):
+            total[t] = 0.0
+        for i in range(n_y - 1, -1, -1):
+            last = coefficients[i, n_s - 1]
+            for t in range(m):
+                inner[t] = last
+            for j in range(n_s - 2, -1, -1):
+                term = coefficients[i, j]
+                for t in range(m):
+                    inner[t] = inner[t] * b[t] + term
+            for t in range(m):
+                total[t] = total[t] * a[t] + inner[t]
+        for t in range(m):
+            total[t] *= row[t]
+    return beyond
