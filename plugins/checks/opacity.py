@@ -11,10 +11,10 @@ import numpy as np
 
 from zonda.core.checks import Family, Measured
 from zonda.core.instrument import Band
+from zonda.operators.atmosphere.absorption import absorption_table
 from zonda.operators.atmosphere.band import BandAtmosphere
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.profile_table import read_table
-from zonda.operators.atmosphere.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather import Profile, profile
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
@@ -42,14 +42,15 @@ def _band(low: float, high: float, pwv: float = PWV) -> BandAtmosphere:
 
 @checks.add(BAND, reference="sum of e^-tau over the spectrum", limit=1e-4)
 def band_average() -> Measured:
-    """relative error of the transmission at 175 to 195 GHz through 5 mm of water at the zenith"""
+    """relative error of the transmission at 175.25 to 194.75 GHz (whole cells) through 5 mm of water at the zenith"""
     pwv = 5e-3
-    s = spectrum(_air(pwv).layers, ZENITH, low=175e9, high=195e9)
-    weight = np.ones(len(s.frequency))
-    weight[[0, -1]] = 0.5  # the band begins and ends in the middle of a cell
-    averaged = float(np.average(np.exp(-s.opacity), weights=weight))
-    naive = float(np.exp(-np.average(s.opacity, weights=weight)))
-    found = float(_band(175, 195, pwv).transmission(pwv, ZENITH))
+    layers, cells = _air(pwv).layers, absorption_table().cells(175.5e9, 194.5e9)
+    parts, cell, share = layers.in_parts(layers.cross_sections(cells))
+    assert len(np.unique(cell)) == cells.stop - cells.start == 39
+    opacity, weight = layers.opacity(parts).sum(axis=0), share
+    averaged = float(np.average(np.exp(-opacity), weights=weight))
+    naive = float(np.exp(-np.average(opacity, weights=weight)))
+    found = float(_band(175.25, 194.75, pwv).transmission(pwv, ZENITH))
     return abs(found / averaged - 1), f"<e^-tau> = {averaged:.3f}, e^-<tau> = {naive:.3f}"
 
 
@@ -130,11 +131,11 @@ def positive_water() -> Measured:
     wrong, clipped = 0, 0
     for rms in (0.8, 1.0):
         o = scan(7, 20000, radius=0)
-        data = run([AtmosphereLayers(pwv="2 mm", pwv_rms=rms, wind={"speed": "200 m/s"}, outputs=["pwv"])], o, keep=("pwv",))
-        water = 2e-3 / np.sin(o.elevation.max()) + data.observations[0].detdata["pwv"]
+        data = run([AtmosphereLayers(pwv="1 mm", pwv_rms=rms, wind={"speed": "200 m/s"}, outputs=["pwv"])], o, keep=("pwv",))
+        water = 1e-3 / np.sin(o.elevation.max()) + data.observations[0].detdata["pwv"]
         wrong += int((~(water > -1e-9)).sum())
-        clipped += data.tally.get("AtmosphereLayers", "node values of the water clipped to the table")
-    return wrong, f"{clipped} node values clipped, as the tally counts"
+        clipped += data.tally.get("AtmosphereLayers", "values of the water clipped to the table")
+    return wrong, f"{clipped} values clipped, as the tally counts"
 
 
 @checks.add(WATER, reference="an error that names the limit and the value", limit=0, unit="not refused")
