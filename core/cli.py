@@ -45,7 +45,7 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
-ELSEWHERE = {"weather": "zonda.plugins.weather_command:weather"}
+ELSEWHERE = {"doctor": "zonda.plugins.doctor_command:doctor", "weather": "zonda.plugins.weather_command:weather"}
 """Built-in commands that live with what they use, imported when they are named or listed.
 
 Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more: pluggy and the metadata.
@@ -186,8 +186,8 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 def plugins(check: bool) -> None:
     """List operators, instruments, sites and other components.
 
-    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources and hooks, each with the distribution
-    and the module that it comes from.
+    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, checks and hooks, each with the
+    distribution and the module that it comes from.
     """
     from . import hooks
     from .discovery import discover

@@ -222,15 +222,15 @@ class Pipeline:
             data.run = run
             steps = self._selected(run)
             for observation, (focalplane, flags, detector_flags) in zip(data.observations, pristine, strict=True):
-                pointing_tally, observation.tally = observation.tally, Tally()
+                before, observation.tally = observation.tally, Tally()
+                if not run:
+                    observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
                 observation.focalplane, observation.smooth = focalplane.copy(), {}
                 observation.output = data.output
                 observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
                 execution = Execution(steps, observation, settings, timer, keep if not run else ())
                 execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator)
                 data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
-                if not run:
-                    data.tally.update(pointing_tally)
             for operator in steps:
                 self._finalize(operator, data, timer, hooks)
         data.run = ""

@@ -78,7 +78,7 @@ class BandAtmosphere:
             self.error = self._check()
             if self.error < TOLERANCE:
                 break
-        if self.error > ERROR_MAX:
+        if not self.error <= ERROR_MAX:
             raise InputError(
                 f"its atmosphere cannot be interpolated to better than {self.error:.0e}, the limit is {ERROR_MAX:.0e}",
                 place=f"band '{band.name}'",
@@ -136,7 +136,8 @@ class BandAtmosphere:
             direct = np.array(self._transfer(self._pwv(x), elevations)).T
             for k in range(3):
                 difference = np.abs(self._evaluate(k, self._pwv(x), elevations) - direct[k])
-                worst = max(worst, float(np.max(difference / (direct[k] if k == 0 else 1 + np.abs(direct[k])))))
+                relative = difference / (direct[k] if k == 0 else 1 + np.abs(direct[k]))
+                worst = float(np.max([worst, *relative]))  # NaN where one is: `max` would pass over it
         return worst
 
     def _pwv(self, x: float) -> float:

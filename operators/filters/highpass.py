@@ -171,9 +171,10 @@ class HighpassPlan:
         """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s, (n_det, M + 3) each."""
         from scipy.fft import dct
 
-        amplitude = s @ self.modes.T
-        rest = s - amplitude @ self.spread_modes
-        c = amplitude @ self.modes
+        # not with BLAS, whose bits in one row depend on how many rows there are and where it stands among them
+        amplitude = np.einsum("dm,km->dk", s, self.modes)
+        rest = s - np.einsum("dk,km->dm", amplitude, self.spread_modes)
+        c = np.einsum("dk,km->dm", amplitude, self.modes)
         if self.cut:
             folded = rest[:, 1:-1].copy()
             folded[:, [0, -1]] *= 2

@@ -97,12 +97,12 @@ class SaveTOD(Operator):
 
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
         state.tod.flags, state.tod.detector_flags = observation.flags, observation.detector_flags
-        state.tod.metadata.update(_provenance(data))
+        if self.dtype == "float32":
+            observation.tally.state(self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}")
+        state.tod.metadata.update(_provenance(data), tally="\n".join(f"{who}: {what}: {v}" for who, what, v in observation.tally))
         state.writer.finish()
         publish(state.temporary, state.path)
         data.products.setdefault(data.product("tod_file"), []).append(state.path)
-        if self.dtype == "float32":
-            observation.tally.state(self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}")
 
     def discard(self, observation: Observation, state: _State) -> None:
         state.writer.close()

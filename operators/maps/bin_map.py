@@ -84,6 +84,7 @@ class BinMap(Operator):
     _grid: Grid | None = PrivateAttr(None)
     _variance: float = PrivateAttr(1.0)
     _fwhm: float = PrivateAttr(0.0)
+    _variance_unknown: bool = PrivateAttr(False)
     _middle: tuple[float, float] = PrivateAttr((0.0, 0.0))
 
     @field_validator("nside")
@@ -160,6 +161,8 @@ class BinMap(Operator):
                 raise PipelineError(
                     f"detector {bad} has NET 0, which has no inverse variance", place=self.label, cure="set weights: uniform"
                 )
+            else:
+                self._variance_unknown = True
         weight = np.rint(weight * WEIGHT) / WEIGHT  # so that the sums of w d and of w use the same w
         if weight.max(initial=0.0) > 2.0**20 or weight.min(initial=1.0) < 2.0**-20:
             raise PipelineError(
@@ -221,6 +224,13 @@ class BinMap(Operator):
                 f"two steps make the product {self.product!r}", place=self.label, cure="give one of them another product name"
             )
         product = self._product_of(halves)
+        if self.noise == "scatter":
+            alone = int(np.count_nonzero(product.hits == 1))
+            data.tally.count(self.label, "pixels with one sample, whose scatter is unknown: noise NaN", alone)
+            if self.smooth is not None:
+                data.tally.count(self.label, "of them left out of the smoothed noise, which is too low around them", alone)
+        if self.weights == "inverse_variance" and self._variance_unknown:
+            data.tally.state(self.label, "weights", "uniform: every NET is 0")
         if self.smooth is not None:
             product = product.smoothed(self._fwhm if self.smooth == "beam" else float(self.smooth))
         data.products[key] = product

@@ -113,7 +113,9 @@ class Efficiency(Operator):
             mean = state.mean.evaluate(rows, block.samples, block.buffer("Efficiency M", shape))
         streams = [have.get(name, absent) for name in ("sky", "transmission", "atmosphere", "white", "pink")]
         per_detector = [a[rows].astype(block.dtype) for a in (state.gain, state.epsilon, state.zeta)]
-        _calibrate(*streams, divisor, mean, *per_detector, instantaneous, block.dtype(OPAQUE), signal)
+        clipped = _calibrate(*streams, divisor, mean, *per_detector, instantaneous, block.dtype(OPAQUE), signal)
+        if instantaneous:
+            block.observation.tally.count(self.label, f"samples whose fluctuating e^-tau was raised to {OPAQUE:g}", clipped)
         have["signal"] = signal
         block.means.pop("signal", None)
         if state.mean is not None:
@@ -133,8 +135,12 @@ class Calibration:
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
 def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, instantaneous, opaque, out):  # type: ignore[no-untyped-def]
-    """Equation (2); absent streams have no rows. ``wet`` is x, ``divisor`` t, ``mean`` M (instantaneous only)."""
+    """Equation (2); absent streams have no rows. ``wet`` is x, ``divisor`` t, ``mean`` M (instantaneous only).
+
+    Returns how many samples of 1 + x were raised to ``opaque``.
+    """
     n_det, n = out.shape
+    clipped = 0
     one = out.dtype.type(1)
     piece = 2048
     noise, scale = np.empty(piece, out.dtype), np.empty(piece, out.dtype)
@@ -143,6 +149,10 @@ def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, i
             m = min(piece, n - begin)
             row = out[d, begin : begin + m]
             row[:] = 0
+            if instantaneous:
+                x = wet[d, begin : begin + m]
+                for t in range(m):
+                    clipped += not one + x[t] >= opaque
             if sky.shape[0]:
                 row[:] = gain[d] * sky[d, begin : begin + m]
                 if wet.shape[0] and not instantaneous:
@@ -179,6 +189,7 @@ def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, i
                 x, a = wet[d, begin : begin + m], mean[d, begin : begin + m]
                 for t in range(m):
                     row[t] -= a[t] * x[t] / max(one + x[t], opaque)
+    return clipped
 
 
 def _normals(observation: Observation, *names: str) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -156,6 +157,12 @@ class Pointing(Operator):
         error = f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every {transform.spacing:g} s)"
         observation.tally.state(self.label, "interpolation error of the pointing", error)
         observation.tally.state(self.label, "Earth orientation", transform.source)
+        if not transform.orientation_known:
+            warnings.warn(f"{self.label}: Earth orientation at {start}: {transform.source}", stacklevel=2)
+        if (wanted := self.scan_duration * rate) < 0.5:
+            observation.tally.state(
+                self.label, f"{observation.name}: shorter than a sample", f"{wanted:.2g} of one; one is taken"
+            )
         self.state(observation)
         return observation
 

@@ -167,7 +167,10 @@ class CelestialTransform:
         import erfa
 
         days, rest = divmod(self.start.nanoseconds, 86_400_000_000_000)
-        tai1, tai2 = erfa.utctai(2440587.5 + days, rest / 86_400e9)
+        year, month, day, _ = erfa.jd2cal(2440587.5, days)
+        minutes, rest = divmod(rest, 60_000_000_000)
+        # by calendar: a day that ends in a leap second has 86401 s, and ERFA counts its fractions of those
+        tai1, tai2 = erfa.utctai(*erfa.dtf2d("UTC", year, month, day, minutes // 60, minutes % 60, rest / 1e9))
         utc1, utc2 = erfa.taiutc(np.full(len(seconds), tai1), tai2 + seconds / 86400.0)
         return utc1, utc2
 

@@ -66,15 +66,18 @@ def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
     return np.asarray(abs(np.linalg.det(inverse)) / np.linalg.norm(rays, axis=2) ** 3)
 
 
-def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: Any) -> tuple[Floats, str]:
-    """The map's values in K_RJ averaged over ``band``, and the conversion as text. ``wcs``: the TAN WCS, None where resampled.
+def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: Any) -> tuple[Floats, str, int]:
+    """The map's values in K_RJ averaged over ``band``, the conversion as text, and how many pixels had no solid angle.
 
-    Jy/pixel is divided by each pixel's own solid angle. Raises InputError as `core.radiation.to_kelvin_rj`.
+    ``wcs``: the TAN WCS, None where resampled.
+
+    Jy/pixel is divided by each pixel's own solid angle; one beyond the projection has none, and its flux is
+    lost. Raises InputError as `core.radiation.to_kelvin_rj`.
     """
     beam = source.beam_solid_angle if isinstance(source, WcsMap) else None
     factor = to_kelvin_rj(source.unit, band, 1.0, spectral_index, beam)
     if source.unit != "Jy/pixel":
-        return source.values * factor, f"{factor:.6g} K_RJ per {source.unit}"
+        return source.values * factor, f"{factor:.6g} K_RJ per {source.unit}", 0
     areas: Floats
     if isinstance(source, HealpixMap):
         areas = np.full(source.values.shape, np.pi / (3 * source.nside**2))
@@ -83,6 +86,11 @@ def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: 
     else:
         areas = pixel_areas(source.wcs, (source.values.shape[0], source.values.shape[1]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.where(np.isfinite(areas) & (areas > 0), source.values * (factor / areas), 0.0)
+        placed = np.isfinite(areas) & (areas > 0)
+        values = np.where(placed, source.values * (factor / areas), 0.0)
     typical = factor / float(np.nanmedian(areas))
-    return values, f"{typical:.6g} K_RJ per Jy/pixel at the median pixel, {float(np.nanmedian(areas)):.6g} sr"
+    return (
+        values,
+        f"{typical:.6g} K_RJ per Jy/pixel at the median pixel, {float(np.nanmedian(areas)):.6g} sr",
+        int(np.count_nonzero(source.values[~placed])),
+    )

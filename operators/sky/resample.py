@@ -135,12 +135,12 @@ def _from_pixels(wcs: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return np.asarray(lon), np.asarray(lat)
 
 
-def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.bool_]]:
-    """(values, covered) of a HEALPix map on the TAN grid ``target``. A grid point is covered where its HEALPix pixel is.
+def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.bool_], int]:
+    """(values, covered, poor) of a HEALPix map on the TAN grid ``target``. A grid point is covered where its HEALPix pixel is.
 
     Each value comes from the polynomial of third degree that best fits the `NEIGHBOURS` nearest covered pixel centres in the
     tangent plane, with weights 1 / distance^4 (moving least squares): it passes through the pixel values, whatever the
-    orientation of the pixels. Where the neighbours do not determine it, it is their weighted mean.
+    orientation of the pixels. Where the neighbours do not determine it, it is their weighted mean: ``poor`` counts those.
     """
     import healpy
     from scipy.spatial import cKDTree
@@ -157,9 +157,9 @@ def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.b
     reach = float(np.arccos(np.clip((corners @ middle).min(), -1, 1))) + 6 * pixel
     near = healpy.query_disc(sky.nside, to_frame @ middle, min(reach, np.pi), nest=sky.nest)
     slot = np.flatnonzero(np.isin(sky.pixels, near, assume_unique=True))
-    values, covered = np.zeros((ny, nx)), np.zeros((ny, nx), bool)
+    values, covered, poor = np.zeros((ny, nx)), np.zeros((ny, nx), bool), 0
     if len(slot) < NEIGHBOURS:
-        return values, covered
+        return values, covered, poor
     rays = np.stack(healpy.pix2vec(sky.nside, sky.pixels[slot], nest=sky.nest), axis=1) @ to_frame
     projected = rays @ matrix.T
     front = projected[:, 2] > 0
@@ -175,13 +175,18 @@ def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.b
         at = np.stack([x.ravel(), y.ravel()], axis=1)[seen]
         flat = np.zeros(len(seen))
         for part in range(0, len(at), 16384):
-            flat[np.flatnonzero(seen)[part : part + 16384]] = _local_fit(tree, points, data, at[part : part + 16384])
+            found, undetermined = _local_fit(tree, points, data, at[part : part + 16384])
+            flat[np.flatnonzero(seen)[part : part + 16384]] = found
+            poor += undetermined
         values[first:last], covered[first:last] = flat.reshape(-1, nx), seen.reshape(-1, nx)
-    return values, covered
+    return values, covered, poor
 
 
-def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> Floats:
-    """Moving least squares of third degree at ``at`` (n, 2) from scattered ``data`` (m,) at ``points`` (m, 2)."""
+def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Floats, int]:
+    """Moving least squares of third degree at ``at`` (n, 2) from scattered ``data`` (m,) at ``points`` (m, 2).
+
+    The values (n,), and how many of them are weighted means because the fit is not determined.
+    """
     distance, index = tree.query(at, NEIGHBOURS)
     scale = distance[:, -1:]
     u, v = np.moveaxis((points[index] - at[:, None, :]) / scale[:, :, None], 2, 0)
@@ -194,4 +199,4 @@ def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> Floats:
     if poor.any():
         w2 = weight[poor] ** 2
         value[poor] = np.sum(w2 * data[index[poor]], axis=1) / np.sum(w2, axis=1)
-    return value
+    return value, int(poor.sum())

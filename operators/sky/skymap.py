@@ -34,6 +34,11 @@ GRID_MARGIN = 16
 """Points of a working grid beyond the last sample: the spline feels the grid's border by 0.27^16 = 8e-10 there."""
 
 
+ZEROED = "pixels of the input map that are NaN or infinite, taken as zero"
+LOST = "bright pixels of the input map beyond its projection, whose flux is lost"
+POOR = "grid points whose neighbours determine no third-order fit, taken as their mean"
+
+
 class SkyMap(Operator):
     """Sky signal of a FITS or HEALPix map, averaged over the band and convolved with the beam, above the atmosphere (K_RJ).
 
@@ -86,8 +91,9 @@ class SkyMap(Operator):
         tally = observation.tally
         for what, text in sky.notes.items():
             tally.state(self.label, what, text)
-        if sky.zeroed:
-            tally.count(self.label, "pixels of the input map that are NaN or infinite, taken as zero", sky.zeroed)
+        for what, number in sky.counts.items():
+            if number:
+                tally.count(self.label, what, number)
         for width, beam in zip(widths, beams, strict=True):
             _state_beam(tally, self.label, float(width), beam.convolved)
         return State(sky, beams, index)
@@ -166,24 +172,25 @@ class SkyMap(Operator):
         return observation.centre if self.centre == "target" or source.wcs is None else None
 
     def _direct(self, source: WcsMap, wcs: Any, band: Any, key: tuple[Hashable, ...]) -> Sky:
-        values, factor = kelvin(source, band, self.spectral_index, wcs)
+        values, factor, lost = kelvin(source, band, self.spectral_index, wcs)
         pixel = np.linalg.norm(np.asarray(wcs.pixel_scale_matrix), axis=0) * 3600
         notes = {
             **source.notes,
             "input map": f"TAN, {values.shape[1]} x {values.shape[0]} pixels of {pixel[0]:.6g} x {pixel[1]:.6g} arcsec",
             "conversion": factor,
         }
-        return Sky(key, values * self.scale, np.zeros((0, 0), bool), wcs, notes, source.zeroed)
+        return Sky(key, values * self.scale, np.zeros((0, 0), bool), wcs, notes, {ZEROED: source.zeroed, LOST: lost})
 
     def _resampled(self, source: WcsMap | HealpixMap, wcs: Any, band: Any, key: tuple[Hashable, ...]) -> Sky:
-        values, factor = kelvin(source, band, self.spectral_index, None)
+        values, factor, lost = kelvin(source, band, self.spectral_index, None)
         if isinstance(source, HealpixMap):
             kind = f"HEALPix of nside {source.nside}"
             scaled: WcsMap | HealpixMap = HealpixMap(values, source.pixels, source.nside, source.nest, source.frame, "K_RJ")
-            grid, covered = resample_healpix(cast(HealpixMap, scaled), wcs)
+            grid, covered, poor = resample_healpix(cast(HealpixMap, scaled), wcs)
         else:
             kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
             grid, covered = resample_image(WcsMap(values, "K_RJ", source.wcs, None), wcs)
+            poor = 0
         step = abs(float(wcs.wcs.cdelt[1])) * 3600
         notes = {
             **source.notes,
@@ -192,7 +199,8 @@ class SkyMap(Operator):
             "conversion": factor,
         }
         mask = np.zeros((0, 0), bool) if covered.all() else covered
-        return Sky(key, np.where(covered, grid * self.scale, self.outside), mask, wcs, notes, source.zeroed)
+        counts = {ZEROED: source.zeroed, LOST: lost, POOR: poor}
+        return Sky(key, np.where(covered, grid * self.scale, self.outside), mask, wcs, notes, counts)
 
     def _beam(self, sky: Sky, fwhm: float) -> Beam:
         """The map convolved with one beam; the Jacobian is that at the tangent point."""
@@ -240,7 +248,8 @@ class Sky:
     covered: NDArray[np.bool_]
     wcs: Any
     notes: dict[str, str]
-    zeroed: int
+    counts: dict[str, int]
+    """What was taken for something else, for the tally."""
 
     @property
     def nbytes(self) -> int:

@@ -74,6 +74,7 @@ def equal(a, b):
 @pytest.mark.parametrize("threads", [False, True])
 def test_what_is_written_is_what_was_there(format, threads, make_observation, data, streams, mean):
     observation = make_observation()
+    observation.tally.count("SkyMap", "samples outside the input map", 3)
     operator = SaveTOD(format=format, streams=["signal", "sky", "transmission"])
     path = write(operator, observation, data, streams, mean, threads)
     tod = load_tod(path)
@@ -95,6 +96,7 @@ def test_what_is_written_is_what_was_there(format, threads, make_observation, da
     np.testing.assert_allclose(tod.columns["net"], fp.net, rtol=1e-15)
     np.testing.assert_allclose(tod.columns["fwhm"], fp.fwhm, rtol=1e-15)
     assert tod.metadata["resolved_yaml"] == "a: 1\nb: 'é'\n"
+    assert tod.metadata["tally"] == "SkyMap: samples outside the input map: 3"
     assert tod.metadata["seed"] == 7
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 

@@ -341,3 +341,16 @@ def test_scan_too_wide_for_a_tangent_plane_is_refused(bench):
 def test_one_detector_one_sample(bench):
     product = bench.run([BinMap()], bench.observation(1, 1), {"signal": np.ones((1, 1))}).map
     assert product.hits.sum() == 1
+
+
+def test_noise_that_is_not_known_is_counted(bench):
+    signal = {"signal": np.random.default_rng(3).standard_normal((N_DET, N))}
+    run = bench.run([BinMap(noise="scatter", pixel="1 arcsec", smooth="5 arcsec")], bench.observation(N_DET, N), signal)
+    alone = int((run.map.hits == 1).sum())
+    assert alone > 10
+    assert run.tally["BinMap", "pixels with one sample, whose scatter is unknown: noise NaN"] == str(alone)
+    assert run.tally["BinMap", "of them left out of the smoothed noise, which is too low around them"] == str(alone)
+    observation = bench.observation(7, 300)
+    observation.focalplane.net[:] = 0
+    run = bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
+    assert run.tally["BinMap", "weights"] == "uniform: every NET is 0"

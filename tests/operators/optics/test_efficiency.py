@@ -169,3 +169,12 @@ def test_bits_do_not_depend_on_blocks(bench, streams):
 def test_bad_parameters(bad):
     with pytest.raises(ValueError):
         Efficiency(**bad)
+
+
+def test_an_instantaneous_calibration_that_cannot_divide_is_counted(bench, streams):
+    streams["transmission"][3, 100:130] = -1.0
+    streams["transmission"][5, 7] = np.nan
+    run = bench.run([Efficiency(calibration="instantaneous")], bench.observation(N_DET, N), streams, smooth=fields())
+    assert run.tally["Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06"] == "31"
+    mean = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=fields())
+    assert ("Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06") not in mean.tally

@@ -60,8 +60,9 @@ class Reference:
         from astropy.coordinates import AltAz, EarthLocation
         from astropy.time import Time
 
-        day, rest = divmod(start.nanoseconds, 86400 * 10**9)
-        time = Time(2440587.5 + day, rest / 86400e9, format="jd", scale="utc") + np.asarray(seconds) * u.s
+        # by calendar: days with a leap second are longer
+        date = f"{start.datetime:%Y-%m-%dT%H:%M:%S}.{start.nanoseconds % 10**9:09d}"
+        time = Time(date, scale="utc") + np.asarray(seconds) * u.s
         location = EarthLocation.from_geodetic(site.longitude * u.rad, site.latitude * u.rad, site.altitude * u.m)
         return AltAz(obstime=time, location=location, pressure=0 * u.hPa)
 

@@ -127,6 +127,19 @@ def test_jansky_per_pixel_of_another_projection(made, save):
     np.testing.assert_allclose(got, to_kelvin_rj("Jy/pixel", made.BAND, (0.5 * ARCMIN) ** 2), rtol=1e-5)
 
 
+def test_flux_beyond_a_projection_is_counted(made, save):
+    header = made.tan_header((150, 150), ra=60.0, dec=25.0, cdelt=(-1.2 * 3600, 1.2 * 3600), unit="Jy/pixel")
+    header["CTYPE1"], header["CTYPE2"] = "RA---ZEA", "DEC--ZEA"  # the sphere is a disc of 114.6 deg: the corners are off it
+    values = np.ones((150, 150))
+    values[0, :3], values[75, 75] = 0.0, 2.0
+    scan, _ = scan_about(made, 60.0, 25.0)
+    made.look(SkyMap(file=save(values, header), beam="none"), scan)
+    y, x = np.mgrid[:150, :150] - 74.5
+    beyond = (np.hypot(x, y) * np.radians(1.2) > 2) & (values != 0)
+    counted = scan.tally.get("SkyMap", "bright pixels of the input map beyond its projection, whose flux is lost")
+    assert abs(counted - beyond.sum()) < 0.05 * beyond.sum()  # by the midpoints of edges
+
+
 # ----------------------------------------------------------------------------------------------------------- HEALPix
 
 
@@ -185,10 +198,24 @@ def test_constant_healpix_is_constant(made, tmp_path):
     values[np.random.default_rng(2).random(values.size) < 0.3] = healpy.UNSEEN
     healpy.write_map(tmp_path / "c.fits", values, coord="C", column_units="K_RJ", dtype=np.float64)
     source = read_map(tmp_path / "c.fits")
-    got, covered = resample_healpix(source, tangent_wcs(1.0, 0.4, np.radians(4), np.radians(0.3)))
+    got, covered, poor = resample_healpix(source, tangent_wcs(1.0, 0.4, np.radians(4), np.radians(0.3)))
     assert 0.5 < covered.mean() < 0.9
     np.testing.assert_allclose(got[covered], 3.0, rtol=1e-9)
     assert not got[~covered].any()
+    assert poor == 0
+
+
+def test_grid_points_without_a_fit_are_counted(made, tmp_path):
+    """On a line of pixels no third-order polynomial is determined: the mean of the neighbours, and said so."""
+    ring = healpy.query_strip(512, np.pi / 2 - 1e-4, np.pi / 2 + 1e-4, inclusive=False)  # the equator, straight on the plane
+    values = np.full(12 * 512**2, healpy.UNSEEN)
+    values[ring] = 2.0
+    path = tmp_path / "line.fits"
+    healpy.write_map(path, values, coord="C", column_units="K_RJ", dtype=np.float64)
+    lon = np.radians(60.0) + np.linspace(-0.03, 0.03, 50)
+    scan = made.observation(lon, 0.0, centre=(np.radians(60), 0.0))
+    np.testing.assert_allclose(made.look(SkyMap(file=path, beam="none"), scan), 2.0)
+    assert scan.tally.get("SkyMap", "grid points whose neighbours determine no third-order fit, taken as their mean") > 0
 
 
 def test_healpix_units(made, tmp_path):

@@ -1,0 +1,112 @@
+"""Pink noise from f_min on, for any length."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from zonda.core.checks import Family, Measured
+from zonda.core.random import normals, stream_key
+from zonda.operators.noise.one_over_f import PowerLawFilter, power_law_filter
+from zonda.operators.noise.pink import Streams
+
+from .cases import PINK
+from .scenes import largest, unrefused
+
+checks = Family("noise")
+
+
+def _spectrum_error(law: PowerLawFilter, f_min: float, slope: float) -> float:
+    """Largest relative error of the response to f^-slope from f_min to the Nyquist frequency."""
+    f = np.r_[np.geomspace(f_min, 0.5, 3001), np.linspace(0.9 * 0.5 + 0.1 * f_min, 0.5, 1001)]
+    return float(abs(law.response(f) * (f / f_min) ** slope - 1).max())
+
+
+@checks.add(PINK, reference="1/f", limit=0.02)
+def spectrum() -> Measured:
+    """largest relative error of the PSD, 8 poles, from f_min = 1e-5 f_s to the Nyquist frequency"""
+    law = power_law_filter(1e-5, 1.0, 8)
+    return _spectrum_error(law, 1e-5, 1.0), f"stated {law.error:.2g}"
+
+
+@checks.add(PINK, reference="f^-slope", limit=0.08, quick=False)
+def spectrum_to_lower_frequencies() -> float:
+    """largest relative error of the PSD, 10 poles, f_min from 1e-8 to 0.3 f_s, slopes 0.5 to 3"""
+    laws = [(f, s) for f in (1e-8, 1e-5, 1e-2, 0.3) for s in (0.5, 1.0, 2.0, 3.0)]
+    return largest(*(_spectrum_error(power_law_filter(f, s, 10), f, s) for f, s in laws))
+
+
+@checks.add(PINK, reference="integral of the PSD", limit=4.5, unit="standard errors")
+def first_sample() -> Measured:
+    """variance of the very first sample of 20000 detectors"""
+    law, n = power_law_filter(1e-3, 1.0, 8), 20_000
+    streams, out = Streams(law, stream_key(5, "a"), stream_key(5, "b")), np.zeros((20_000, 1), np.float32)
+    streams.add(0, 0, np.ones_like(out), out)
+    ratio = float((out.astype(np.float64) ** 2).mean()) / law.variance
+    return abs(ratio - 1) / math.sqrt(2 / n), f"{ratio:.4f} of theory"
+
+
+@checks.add(PINK, reference="integral of the PSD", limit=4.5, unit="standard errors", quick=False)
+def a_week() -> Measured:
+    """variance of the last day of a week at 10 Hz, f_min 1 mHz, 16 detectors
+
+    Var(sample variance) = 2 int C^2 dt / T for each series, and int C^2 dt = int P^2 df (two-sided).
+    """
+    law, n_det, day = power_law_filter(1e-4, 1.0, 8), 16, 864_000
+    streams = Streams(law, stream_key(6, "a"), stream_key(6, "b"))
+    out, total = np.zeros((n_det, day), np.float32), 0.0
+    ones = np.ones_like(out)
+    for number in range(7):
+        out[...] = 0
+        streams.add(0, number * day, ones, out)
+        total = float((out.astype(np.float64) ** 2).mean())
+    f = np.r_[np.linspace(0, 1e-4, 2000, endpoint=False), np.geomspace(1e-4, 0.5, 20_000)]
+    power = law.response(f) / law.gain
+    error = math.sqrt(2 * 2 * float(np.trapezoid(power**2, f)) / (day * n_det)) / law.variance
+    return abs(total / law.variance - 1) / error, f"{total / law.variance:.4f} of theory, standard error {error:.4f}"
+
+
+@checks.add(PINK, reference="no correlation", limit=5, unit="standard errors", quick=False)
+def no_period() -> float:
+    """correlation of a first stretch of 200000 samples with the second, and with the seventh: no period, no wrap"""
+    law, n_det, day = power_law_filter(1e-2, 1.0, 8), 16, 200_000
+    streams = Streams(law, stream_key(6, "a"), stream_key(6, "b"))
+    days = []
+    for number in (0, 1, 6):
+        out = np.zeros((n_det, day), np.float32)
+        streams.add(0, number * day, np.ones_like(out), out)
+        days.append(out.astype(np.float64) / math.sqrt(law.variance))
+    f = np.r_[np.linspace(0, 1e-2, 2000, endpoint=False), np.geomspace(1e-2, 0.5, 20_000)]
+    power = law.response(f) / law.gain / law.variance
+    error = math.sqrt(2 * float(np.trapezoid(power**2, f)) / (day * n_det))  # Bartlett: sum of rho^2 over lags
+    return largest(*(float(abs((days[0] * other).mean())) / error for other in days[1:]))
+
+
+@checks.add(PINK, reference="the same filter in float64", limit=1e-3)
+def float32_states() -> float:
+    """rms error of float32 states over the rms, f_min from 1e-8 to 1e-5 f_s, slopes 1 to 3"""
+    from scipy.signal import lfilter
+
+    worst, n = 0.0, 1 << 14
+    for f_min, slope in ((1e-5, 1.0), (1e-8, 1.0), (1e-7, 2.0), (1e-5, 3.0)):
+        law = power_law_filter(f_min, slope, 8)
+        out = np.zeros((16, n), np.float32)
+        Streams(law, stream_key(7, "a"), stream_key(7, "b")).add(0, 0, np.ones_like(out), out)
+        exact = normals(stream_key(7, "a"), 0, 16 * n).reshape(n, 16).T.astype(np.float64)
+        first = law.start @ normals(stream_key(7, "b"), 0, 8 * 16).reshape(8, 16)
+        for q, z, s in zip(law.poles, law.zeros, first, strict=True):
+            exact, _ = lfilter([1, z - 1], [1, q - 1], exact, axis=1, zi=((z - q) * s)[:, None])
+        worst = largest(worst, float((out - exact).std() / exact.std()))
+    return worst
+
+
+@checks.add(PINK, reference="an error with a cure", limit=0, unit="not refused")
+def refusals() -> Measured:
+    """f_min above the Nyquist frequency, spectra that so few poles cannot follow"""
+    return unrefused(
+        [
+            (lambda: power_law_filter(0.6, 1.0, 8), "Nyquist"),
+            (lambda: power_law_filter(1e-7, 1.0, 4), "poles fit"),
+        ]
+    )

@@ -1,0 +1,160 @@
+"""Small made-up scans for the checks, run through the real pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import PrivateAttr
+
+from zonda.core.configuration.time import Instant
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import ZondaError
+from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.operator import Operator
+from zonda.core.pipeline import Pipeline
+from zonda.core.scene import Scene
+from zonda.core.site import Site
+
+Floats = NDArray[np.floating[Any]]
+
+SITE = Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="825 m", climatology="green_bank")
+START = Instant.parse("2024-11-25T07:00:00Z")
+TARGET = (75.0, 20.0)
+"""RA, Dec, deg."""
+
+
+def camera(detectors: int = 37, *, field: str = "4.2 arcmin", low: str = "78 GHz", high: str = "108 GHz") -> Instrument:
+    """A camera on a 100 m dish."""
+    return Instrument(
+        name="check", telescope=Telescope(name="dish", diameter="100 m"), band=Band(name="band", low=low, high=high),
+        detectors=detectors, field_of_view=field, fwhm="8.5 arcsec", main_beam_efficiency=0.3, illumination_efficiency=0.8,
+        net="1.7 mK s(1/2)", knee="0.5 Hz", pink_minimum_frequency="10 mHz", sample_rate="100 Hz",
+    )  # fmt: skip
+
+
+def scene(instrument: Instrument | None = None, **more: Any) -> Scene:
+    """Green Bank in a November night, the camera, a target that is up."""
+    given = {"site": SITE, "instrument": instrument or camera(), "time": START, "target": f"{TARGET[0]} deg {TARGET[1]} deg"}
+    return Scene(**{**given, "seed": 7, **more})
+
+
+def scan(
+    detectors: int = 37,
+    samples: int = 3000,
+    *,
+    azimuth: float = 150.0,
+    elevation: float = 57.0,
+    radius: float = 4.0,
+    instrument: Instrument | None = None,
+    offsets: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Observation:
+    """Circles of ``radius`` arcmin in 20 s at 100 Hz, around a direction [deg] and around `TARGET`; 0: a stare."""
+    instrument = instrument or camera(detectors)
+    plane = instrument.focalplane()
+    if offsets is not None:
+        plane.xi, plane.eta = (np.asarray(o, np.float64) for o in offsets)
+    t = np.arange(samples) / 100.0
+    reach, turn = np.radians(radius / 60), 2 * np.pi * t / 20
+    (az, el), (ra, dec) = np.radians([azimuth, elevation]), np.radians(TARGET)
+    x, y = reach * np.cos(turn), reach * np.sin(turn)
+    return Observation(
+        "scan-000", 0, SITE, instrument, plane, START, t, 100.0, _quaternions(-az - x / np.cos(el), el + y),
+        _quaternions(ra + x / np.cos(dec), dec + y), (float(ra), float(dec)), 7,
+    )  # fmt: skip
+
+
+def _quaternions(lon: Floats, lat: Floats) -> NDArray[np.float64]:
+    """Rz(lon) Ry(pi/2 - lat), (n, 4) in the order x y z w."""
+    a, b = lon / 2, (np.pi / 2 - lat) / 2
+    return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
+
+
+class Points(Operator):
+    """Points as a given scan does."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    _observation: Any = PrivateAttr(None)
+
+    def observe(self, data: Data) -> None:
+        """Append the scan."""
+        data.observations.append(self._observation)
+
+
+class Gives(Operator):
+    """Provides a given signal (n_det, n_samp)."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    _signal: Any = PrivateAttr(None)
+
+    def exec(self, block: Block, state: Any) -> None:
+        """Copy the block's part."""
+        block.new("signal")[...] = self._signal[block.detectors, block.samples]
+
+
+def run(
+    operators: list[Operator],
+    observation: Observation,
+    signal: Floats | None = None,
+    *,
+    precision: Literal["float32", "float64"] = "float64",
+    keep: tuple[str, ...] = (),
+    **settings: Any,
+) -> Data:
+    """A pipeline of operators over one made-up scan, and a made-up signal where one is given."""
+    points, gives = Points(), Gives()
+    points._observation, gives._signal = observation, signal
+    steps = [points, *([gives] if signal is not None else []), *operators]
+    return Pipeline(steps, precision=precision).run(scene(observation.instrument), keep=keep, **{"threads": 1, **settings})
+
+
+@contextmanager
+def sky_file(values: Floats, pixel: float = 1.0) -> Iterator[Path]:
+    """A FITS image (K_RJ, pixels of ``pixel`` arcsec) centred on `TARGET`, gone afterwards."""
+    from astropy.io import fits
+
+    image = fits.PrimaryHDU(np.asarray(values, np.float64))
+    ny, nx = values.shape
+    cards = {
+        "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg", "RADESYS": "ICRS", "BUNIT": "K",
+        "TEMPSCAL": "K_RJ", "CRPIX1": (nx + 1) / 2, "CRPIX2": (ny + 1) / 2, "CRVAL1": TARGET[0], "CRVAL2": TARGET[1],
+        "CDELT1": -pixel / 3600, "CDELT2": pixel / 3600,
+    }  # fmt: skip
+    image.header.update(cards)
+    with TemporaryDirectory(prefix="zonda-check-") as folder:
+        path = Path(folder) / "sky.fits"
+        image.writeto(path)
+        yield path
+
+
+def unrefused(attempts: list[tuple[Callable[[], Any], str]]) -> tuple[int, str]:
+    """How many of the attempts do not end in an error a user can mend whose text has the words; what they were."""
+    missed = []
+    for attempt, words in attempts:
+        try:
+            attempt()
+        except (ZondaError, ValueError) as err:
+            if words in str(err):
+                continue
+        missed.append(words)
+    return len(missed), ", ".join(missed)
+
+
+def largest(*figures: float) -> float:
+    """The largest; NaN where one is (`max` would pass over it)."""
+    return float(np.max(figures))
+
+
+def differing(one: Any, other: Any) -> int:
+    """How many values of two arrays are not the same bits (NaN equals NaN)."""
+    a, b = np.asarray(one), np.asarray(other)
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return max(a.size, b.size, 1)
+    same = (a == b) | ((a != a) & (b != b))
+    return int(np.count_nonzero(~same))

@@ -1,0 +1,196 @@
+"""Numerical safeguards, each broken as naive code would have it, and the check that must then fail.
+
+Compiled code that is called from Python is replaced as a whole; nothing is compiled anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zonda.core.data import Block
+from zonda.operators.atmosphere import band, covariance, turbulence
+from zonda.operators.filters import common_mode, highpass
+from zonda.operators.maps import bin_map
+from zonda.operators.noise import pink, white
+from zonda.operators.optics.efficiency import Efficiency
+from zonda.operators.pointing.transform import CelestialTransform
+from zonda.operators.sky import read
+
+Patch = pytest.MonkeyPatch
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """What is broken, the check that must fail, and how to break it."""
+
+    what: str
+    check: str
+    breaks: Callable[[Patch], None]
+
+
+def one_minus_correlation(patch: Patch) -> None:
+    patch.setattr(covariance, "structure", lambda x: 1 - covariance._tail(np.asarray(x)))
+
+
+def difference_of_covariances(patch: Patch) -> None:
+    def subtracted(r: Any, outer_scale: float, sigma: float) -> Any:
+        return covariance.beam_correlation(0.0, outer_scale, sigma) - covariance.beam_correlation(r, outer_scale, sigma)
+
+    patch.setattr(covariance, "beam_structure", subtracted)
+
+
+def weights_that_do_not_sum_to_one(patch: Patch) -> None:
+    kriging = turbulence._kriging
+    patch.setattr(turbulence, "_kriging", lambda *of: kriging(*of) * np.float32(1 - 1e-3))
+
+
+def transmission_of_the_mean_opacity(patch: Patch) -> None:
+    def mean_first(self: Any, slant: Any) -> Any:
+        opacity = float(np.average(slant.sum(axis=0), weights=self._weight))
+        return float(np.sum(self._weight * band.emission(slant, self._source))), -opacity, -opacity
+
+    patch.setattr(band._BandTransfer, "_at", mean_first)
+
+
+def exponentials_before_logarithms(patch: Patch) -> None:
+    def underflowing(self: Any, slant: Any) -> Any:
+        passed = self._weight * np.exp(-slant.sum(axis=0))
+        emitted = float(np.sum(self._weight * band.emission(slant, self._source)))
+        with np.errstate(divide="ignore"):
+            return emitted, float(np.log(passed.sum())), float(np.log(np.sum(passed * self._cmb)))
+
+    patch.setattr(band._BandTransfer, "_at", underflowing)
+
+
+def differences_by_subtraction(patch: Patch) -> None:
+    def subtracted(self: Any, which: int, pwv: Any, dpwv: Any, elevation: Any) -> Any:
+        return self._evaluate(which, np.add(pwv, dpwv), elevation) - self._evaluate(which, pwv, elevation)
+
+    patch.setattr(band.BandAtmosphere, "_difference", subtracted)
+
+
+def highpass_without_detrending(patch: Patch) -> None:
+    finished = highpass.HighpassPlan.__post_init__
+
+    def without(self: Any) -> None:
+        finished(self)
+        self.modes, self.spread_modes = 0 * self.modes, 0 * self.spread_modes
+
+    patch.setattr(highpass.HighpassPlan, "__post_init__", without)
+
+
+def gaps_that_ring(patch: Patch) -> None:
+    patch.setattr(highpass, "bridge", lambda row, gaps: row.__setitem__(gaps, np.nan_to_num(row[gaps], posinf=0.0, neginf=0.0)))
+
+
+def modes_beyond_the_rank(patch: Patch) -> None:
+    patch.setattr(common_mode.CommonModeFilter, "_choose", lambda self, found, gram, observation: self.modes)
+
+
+def dead_detectors_that_take_part(patch: Patch) -> None:
+    begin = common_mode.Gram.__init__
+
+    def all_of_them(self: Any, *arguments: Any) -> None:
+        begin(self, *arguments)
+        self.constant[:] = False
+        self.not_finite[:] = False
+
+    patch.setattr(common_mode.Gram, "__init__", all_of_them)
+
+
+def float32_whatever_the_ratio(patch: Patch) -> None:
+    patch.setattr(common_mode.CommonModeFilter, "_check_precision", lambda *arguments: None)
+
+
+def mean_emission_in_float32(patch: Patch) -> None:
+    calibrated = Efficiency.exec
+
+    def together(self: Any, block: Block, state: Any) -> None:
+        calibrated(self, block, state)
+        if mean := block.means.pop("signal", None):
+            block.detdata["signal"] += mean.evaluate(block.detectors, block.samples).astype(block.dtype)
+
+    patch.setattr(Efficiency, "exec", together)
+
+
+def nan_pixels_that_stay(patch: Patch) -> None:
+    patch.setattr(read, "_filled", lambda place, values, missing, first: int((~np.isfinite(values)).sum()))
+
+
+def nan_samples_that_count_as_zero(patch: Patch) -> None:
+    add = bin_map._add
+    patch.setattr(bin_map, "_add", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
+
+
+def sums_rounded_by_block(patch: Patch) -> None:
+    """Each block adds float32 sums, as a naive accumulator would."""
+    add = bin_map._add
+
+    def rounded(*arguments: Any) -> None:
+        add(*arguments)
+        sums = arguments[-3]
+        sums[:, bin_map.DATA] = sums[:, bin_map.DATA].astype(np.float32).astype(np.int64)
+
+    patch.setattr(bin_map, "_add", rounded)
+
+
+def noise_that_starts_again_in_each_block(patch: Patch) -> None:
+    add = white._add_normals
+    patch.setattr(white, "_add_normals", lambda key, first, start, amplitude, out: add(key, first, 0, amplitude, out))
+
+
+def pink_noise_with_a_period(patch: Patch) -> None:
+    add = pink.Streams.add
+    patch.setattr(pink.Streams, "add", lambda self, detector, sample, *rest: add(self, detector, sample % 200_000, *rest))
+
+
+def pink_noise_that_starts_from_nothing(patch: Patch) -> None:
+    first = pink.Streams._first_state
+    patch.setattr(pink.Streams, "_first_state", lambda self, number: 0 * first(self, number))
+
+
+def times_in_one_float(patch: Patch) -> None:
+    def julian_dates(self: Any, seconds: Any) -> Any:
+        utc = 2440587.5 + (self.start.nanoseconds / 1e9 + seconds) / 86400
+        return utc, np.zeros_like(utc)
+
+    patch.setattr(CelestialTransform, "_utc", julian_dates)
+
+
+def days_of_86400_seconds(patch: Patch) -> None:
+    def divided(self: Any, seconds: Any) -> Any:
+        days, rest = divmod(self.start.nanoseconds, 86_400_000_000_000)
+        return np.full(len(seconds), 2440587.5 + days), rest / 86_400e9 + seconds / 86400.0
+
+    patch.setattr(CelestialTransform, "_utc", divided)
+
+
+MUTATIONS = (
+    Mutation("1 - C by subtraction", "covariance.structure_function", one_minus_correlation),
+    Mutation("C(0) - C(r) by subtraction", "covariance.behind_a_beam", difference_of_covariances),
+    Mutation("kriging weights that do not sum to 1", "lattice.structure_function", weights_that_do_not_sum_to_one),
+    Mutation("e^-<tau> instead of <e^-tau>", "opacity.band_average", transmission_of_the_mean_opacity),
+    Mutation("logarithms of exponentials that underflow", "opacity.saturated_line", exponentials_before_logarithms),
+    Mutation("T(pwv + d) - T(pwv) instead of log1p and a recurrence", "opacity.small_differences", differences_by_subtraction),
+    Mutation("the high-pass does not detrend", "filters.elevation_drift", highpass_without_detrending),
+    Mutation("flagged samples are not bridged", "filters.gaps_and_nan", gaps_that_ring),
+    Mutation("modes are removed whatever the rank", "filters.one_or_identical", modes_beyond_the_rank),
+    Mutation("dead detectors are not flagged", "filters.useless_detectors", dead_detectors_that_take_part),
+    Mutation("float32 whatever the common mode", "filters.common_mode_in_float32", float32_whatever_the_ratio),
+    Mutation("the mean emission is part of the float32 stream", "filters.transfer", mean_emission_in_float32),
+    Mutation("NaN pixels of the input spread", "maps.nan_in_the_input_map", nan_pixels_that_stay),
+    Mutation("NaN samples are mapped as 0", "maps.nan_in_the_signal", nan_samples_that_count_as_zero),
+    Mutation("map sums rounded block by block", "determinism.blocks_in_time", sums_rounded_by_block),
+    Mutation(
+        "random numbers counted from the block's start", "determinism.blocks_in_time", noise_that_starts_again_in_each_block
+    ),
+    Mutation("1/f noise with a period", "noise.no_period", pink_noise_with_a_period),
+    Mutation("1/f noise that starts from nothing", "noise.first_sample", pink_noise_that_starts_from_nothing),
+    Mutation("the time in one float64", "pointing.exact_start", times_in_one_float),
+    Mutation("days of 86400 s", "pointing.leap_second", days_of_86400_seconds),
+)
