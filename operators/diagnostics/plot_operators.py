@@ -46,6 +46,7 @@ class Plots(Operator):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
+    optional: ClassVar[frozenset[str]] = frozenset({"map", "spectrum", "time_streams"})
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
     at_end: ClassVar[bool] = True
 

@@ -126,6 +126,7 @@ class PowerSpectrum(Operator):
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
     main_run_only: ClassVar[bool] = True
+    product_only: ClassVar[bool] = True
 
     streams: list[StreamName] | None = Field(None, min_length=1)
     """Streams to measure; where absent, `signal` and every component but `transmission` that reaches this step."""

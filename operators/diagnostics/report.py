@@ -36,7 +36,7 @@ class Report(Operator):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    optional: ClassVar[frozenset[str]] = frozenset({"pictures", "map_file", "tod_file"})
+    optional: ClassVar[frozenset[str]] = frozenset({"pictures", "map_file", "tod_file", "map", "spectrum", "time_streams"})
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
     at_end: ClassVar[bool] = True
 
@@ -67,6 +67,7 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float) -> str:
         ("scans", "Scans", _scans(data)),
         ("steps", "Steps", _steps(data)),
         ("tally", "Counted and approximated", _tally(data)),
+        ("plan", "Plan", _plan(data)),
         ("time", "Computing time", _timings(data)),
         ("provenance", "Provenance", _provenance(data)),
     ]
@@ -339,6 +340,12 @@ def _tally(data: Data) -> str:
     for run, rows in by_run.items():
         parts.append(f"<details><summary>Run {escape(run)}</summary>{_table(rows, head)}</details>")
     return f'<div class="steps">{"".join(parts)}</div>' if any(parts) else ""
+
+
+def _plan(data: Data) -> str:
+    """What was left out, dropped or coarsened, and what that may cost (`core.plan`)."""
+    head = ("effect", "decision", "error bound", "formula or reason")
+    return f'<div class="steps">{table}</div>' if (table := _table(data.provenance.get("plan", []), head)) else ""
 
 
 def _timings(data: Data) -> str:

@@ -52,6 +52,7 @@ class TimeStreams(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     main_run_only: ClassVar[bool] = True
+    product_only: ClassVar[bool] = True
 
     streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
     """Streams to keep; those absent at this step are left out and counted."""

@@ -205,12 +205,15 @@ def ascii_text(text: str) -> str:
 
 
 def _provenance_tables(data: Data) -> list[Any]:
-    """The resolved YAML (a row per line) and the tally."""
+    """The resolved YAML (a row per line), the plan and the tally."""
     from astropy.io import fits
 
     tables = []
     if text := str(data.provenance.get("resolved_yaml", "")):
         tables.append(_text_table(fits, "RESOLVED_YAML", {"LINE": text.splitlines()}))
+    if plan := data.provenance.get("plan"):
+        names = ("EFFECT", "DECISION", "BOUND", "FORMULA")
+        tables.append(_text_table(fits, "PLAN", {n: [str(r[k]) for r in plan] for k, n in enumerate(names)}))
     rows = list(data.tally)
     if rows:
         who, what, value = ([str(r[k]) for r in rows] for k in range(3))

@@ -53,6 +53,7 @@ class BinMap(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal", "boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
+    product_only: ClassVar[bool] = True
 
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Side of a pixel."""
