@@ -12,7 +12,9 @@ import click
 @click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
 @click.option("--no-prune", is_flag=True, help="Leave nothing out.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--audit", is_flag=True, help="Rerun a short slice with everything on and compare; exit status 1 where a bound fails.")
+@click.option(
+    "--audit", is_flag=True, help="Rerun a short slice with everything on and compare; exit status 1 where a bound fails."
+)
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads of the run that is planned.  [default: all]")
 def plan(
     pipeline: str,

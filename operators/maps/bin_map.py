@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -28,6 +28,10 @@ from zonda.core.tiles import TILE_SAMPLES
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
 from .map_product import MapProduct
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
 Sums = NDArray[np.int64]
 
@@ -171,6 +175,19 @@ class BinMap(Operator):
         return Binning(
             self._grid, self._grid.pointing(observation), (observation.flags == 0).astype(np.uint8), weight, noise, alike
         )
+
+    def traits(self, observation: Observation) -> Traits:
+        """Size of the pixels."""
+        from zonda.core.plan.estimate import Traits
+
+        return Traits(pixel=math.sqrt(4 * math.pi / (12 * self.nside**2)) if self.nside else self.pixel)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        n = self._n_pixels()
+        return Estimate((), Cost(0.01 + 5e-8 * n, 3e-7, 6.5e-9, bytes=n * 8.0 * 4 * 4))
 
     def exec(self, block: Block, state: Binning) -> None:
         """Add one block to this thread's sums."""
