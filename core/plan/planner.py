@@ -283,7 +283,7 @@ def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
     """Precision of the streams. Rounding is independent from sample to sample: 2^-24 / sqrt(3) of their rms."""
     rms = context.fluctuation * 2.0**-24 / math.sqrt(3.0)
     formula = "2^-24 / sqrt(3) x rms of the stream, independent between samples"
-    bound = {m: v for m, v in {"tod": rms, "map_rms": context.in_map(rms, 0.0, False)}.items()}
+    bound = context.bound(rms)
     if pipeline.precision == "float32":
         return [Effect("precision", (full("float32"),), bound, formula)]
     whole = max(o.n_samples * o.n_detectors for o in context.observations) * 4
