@@ -107,7 +107,9 @@ class Audit:
         return json.dumps({"slice": self.slice, "rows": [{**dataclasses.asdict(r), "violated": r.violated} for r in self.rows]})
 
 
-def audit(file: PipelineFile, made: Plan, *, threads: int | None = None, seconds: float = SECONDS, observations: int = 1) -> Audit:
+def audit(
+    file: PipelineFile, made: Plan, *, threads: int | None = None, seconds: float = SECONDS, observations: int = 1
+) -> Audit:
     """Compare every decision of ``made`` with the full simulation of a slice of ``file``."""
     chosen = [d for d in made.decided if d.chosen > 0]
     part = sliced(file, seconds, observations)

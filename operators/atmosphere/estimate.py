@@ -11,7 +11,7 @@ and, where what all detectors have in common is removed, at most K times what th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, ful
 from .band import BandAtmosphere, _BandTransfer
 from .geometry import tracks
 from .nodes import LayerModel, differential_rms, some
+from .plan import make_plan
 from .turbulence import FIDELITIES
 
 if TYPE_CHECKING:
@@ -32,6 +33,12 @@ if TYPE_CHECKING:
 
 SAFETY = 1.25
 """Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
+
+POINT, TRANSFER = 3e-8, 4e-7
+"""Seconds per point (node x time): of one layer, and of the radiative transfer and splines."""
+
+PAYS = 0.3
+"""Seconds of evaluation from which coarser nodes are looked for."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,7 @@ class Air:
     kelvin: float
     stretch: float
     elevations: tuple[float, float]
+    points: dict[float, float] = field(default_factory=dict)
 
     @property
     def rms(self) -> float:
@@ -91,11 +99,10 @@ def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimat
     a = air(operator, context.first)
     effects = [*_layer_effects(operator, context, a), *_resolution(operator, context, a), *_spectral(operator, context, a)]
     effects += _slopes(context, a)
-    n_det = context.first.n_detectors
-    points = sum(min(n_det, 64.0) * o.n_samples / 64 for o in context.observations) / len(context.observations)
-    cost = Cost(
-        fixed=0.03 + 2e-7 * points, per_sample=1.8e-9, once=0.45 + 0.11 * len(context.observations), bytes=40.0 * points + 30e6
-    )
+    points = _points(operator, context, a, operator.tolerance) / len(context.observations)
+    layers = len(a.layers) - len(set(operator.omit))
+    fixed = 0.02 + (POINT * layers + TRANSFER) * points
+    cost = Cost(fixed, per_sample=1.8e-9, once=0.45 + 0.11 * len(context.observations), bytes=40.0 * points + 30e6)
     return Estimate(tuple(effects), cost)
 
 
@@ -131,16 +138,23 @@ def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list
         if k in operator.omit:
             choices = [full(f"at {layer.height:.0f} m: left out by the pipeline")]
         elif not asked:
-            seconds = 0.1 / len(a.layers) * 0.1 * len(context.observations) + _point_seconds(operator, context)
+            seconds = POINT * _points(operator, context, a, operator.tolerance)
             choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound, formula=text, seconds=seconds))
         effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
     return effects
 
 
-def _point_seconds(operator: AtmosphereLayers, context: Context) -> float:
-    """Evaluating one layer along the lines of sight of the nodes."""
-    n_det = context.first.n_detectors
-    return 3e-8 * sum(min(n_det, 64.0) * o.n_samples / 64 for o in context.observations)
+def _points(operator: AtmosphereLayers, context: Context, a: Air, tolerance: float) -> float:
+    """Points (nodes x times) at which the turbulence is evaluated, all observations; as for the first one."""
+    if tolerance not in a.points:
+        o = context.first
+        track = operator._tracks.get(o.name) or tracks([o])[0]
+        variance = sum(m.amplitude**2 * v for m, v in zip(a.models, a.variances, strict=True))
+        winds = [layer.wind for layer in a.layers]
+        plan = make_plan(o, track, a.models, winds, variance, tolerance, a.band, a.pwv, operator.pwv_rms)
+        share = sum(plan.step / s for s in plan.steps) / len(plan.steps)
+        a.points[tolerance] = len(plan.nodes.xi) * o.n_samples / plan.step * share
+    return a.points[tolerance] * context.times / context.first.n_samples
 
 
 def _opacity_share(a: Air) -> float:
@@ -157,12 +171,14 @@ def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Ef
     correlated = max(_correlated(operator, context, m, layer.wind) for m, layer in zip(a.models, a.layers, strict=True))
     choices = [full(f"within {operator.tolerance:g} of what the detectors' mean leaves")]
     text = "(sqrt 2 + 0.1) tolerance x rms left after subtraction of the detectors' mean: nodes, steps in time, mean emission"
-    work = 3e-8 * len(a.layers) * sum(min(o.n_detectors, 64.0) * o.n_samples / 64 for o in context.observations)
+    now = _points(operator, context, a, operator.tolerance)
     for tolerance in (0.03, 0.1, 0.3):
         if tolerance > operator.tolerance:
             rms = 1.52 * (tolerance + operator.tolerance) * left
             bound = context.bound(rms, correlated, common=True)
-            saved = work * (1 - math.sqrt(operator.tolerance / tolerance))
+            saved = 0.0
+            if now * POINT * len(a.layers) > PAYS:
+                saved = POINT * len(a.layers) * (now - _points(operator, context, a, tolerance))
             what = f"within {tolerance:g}"
             choices.append(Choice("coarse", what, {"tolerance": tolerance}, bound=bound, formula=text, seconds=saved))
     effects = [Effect("detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text)]

@@ -45,9 +45,16 @@ LANCZOS = 2.6e-9
 """Seconds per sample of one step of the iteration, which reads the stream once."""
 
 
-def steps(residual: float, modes: int) -> float:
-    """Steps of the iteration that a residual takes where the first mode stands out, as an atmosphere's does."""
-    return modes + 1 + max(0.0, -math.log10(residual) - 2) / 4
+START = 1e-2
+"""Residual of the first vector, the detectors' mean."""
+
+
+def steps(residual: float, modes: int, context: Context) -> int:
+    """Steps that a residual takes: each lessens it by the square of the ratio of the noise's singular values to the mode's."""
+    n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
+    common = max(context.fluctuation**2 - noise**2, 0.0) * (0.03 if context.cut > 0 else 1.0)  # what a high-pass filter leaves
+    shrink = min(noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30), 0.5)
+    return modes + max(1, math.ceil(math.log(residual / START) / math.log(shrink)))
 
 
 def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estimate:
@@ -56,7 +63,7 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
     A residual r turns the mode by at most r sigma_1^2 / (sigma_1^2 - sigma_2^2) <= r / (1 - gap^2), a mode that is determined
     having sigma_2 <= gap sigma_1: equation (2) of `common_mode`, Davis & Kahan (1970).
     """
-    count = steps(operator.residual, operator.modes) if operator.method == "svd" else 1.0
+    count = steps(operator.residual, operator.modes, context) if operator.method == "svd" else 1.0
     cost = Cost(fixed=0.02, per_sample=1e-9 + LANCZOS * count)
     if operator.method == "mean":
         return Estimate((), cost)
@@ -64,7 +71,7 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
     for residual in (1e-4, 1e-3, 1e-2):
         if residual > operator.residual:
             error = context.fluctuation * math.sqrt(operator.modes) * (residual + operator.residual) / (1 - operator.gap**2)
-            saved = LANCZOS * (count - steps(residual, operator.modes)) * context.samples
+            saved = LANCZOS * (count - steps(residual, operator.modes, context)) * context.samples
             choices.append(
                 Choice(
                     "coarse",
