@@ -29,10 +29,13 @@ class Limits(Parameters):
     tod: Kelvin | None = Field(None, ge=0)
     """rms of one sample of the calibrated time stream; where absent, a tenth of its white noise."""
 
+    psd: Fraction | None = Field(None, ge=0, le=1)
+    """Of the time stream's power spectrum, relative; where absent, 10 %."""
+
     @model_validator(mode="after")
     def _something(self) -> Limits:
         if not self.model_fields_set:
-            raise ValueError("state at least one of map_rms, peak, transfer, tod; or a share of the noise, e.g. 10 %")
+            raise ValueError("state at least one of map_rms, peak, transfer, tod, psd; or a share of the noise, e.g. 10 %")
         return self
 
 
@@ -51,6 +54,7 @@ def limits(budget: Any, map_noise: float, sample_noise: float) -> dict[str, floa
             "peak": in_map if budget.peak is None else budget.peak,
             "transfer": TRANSFER if budget.transfer is None else budget.transfer,
             "tod": SHARE * sample_noise if budget.tod is None else budget.tod,
+            "psd": SHARE if budget.psd is None else budget.psd,
         }
     share = float(budget)
     if not 0 <= share <= 1:
@@ -60,4 +64,5 @@ def limits(budget: Any, map_noise: float, sample_noise: float) -> dict[str, floa
         "peak": share * map_noise,
         "transfer": TRANSFER * min(1.0, share / SHARE),
         "tod": share * sample_noise,
+        "psd": share,
     }

@@ -181,7 +181,7 @@ def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> froz
         if any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
             found.add("transfer")
     if any(o.main_run_only for o in context.operators) or context.coverage is None:
-        found.add("tod")
+        found |= {"tod", "psd"}
     return frozenset(found)
 
 

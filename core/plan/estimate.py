@@ -11,6 +11,7 @@ METRICS = {
     "peak": "largest error of the sky's brightness in the map, K",
     "transfer": "largest error of the transfer function",
     "tod": "rms error of one sample of the calibrated time stream, K",
+    "psd": "largest relative error of the time stream's power spectrum, before filters",
 }
 """What an error may be bounded in."""
 
@@ -62,8 +63,6 @@ class Effect:
         The first is what the pipeline asks for; the others are coarser, each less accurate than the one before.
     size, formula
         Upper bound of what the effect contributes (what leaving it out would cost), and where it comes from.
-    group
-        Effects of one group set the same parameter together: their settings, tuples, are joined.
     """
 
     name: str

@@ -328,8 +328,13 @@ def describe(bound: Bound, metrics: Iterable[str]) -> str:
     for metric in METRICS:
         if metric in bound and metric in metrics:
             value = bound[metric]
-            parts.append(f"{metric} {value:.1e}" if metric == "transfer" else f"{metric} {kelvin(value)}")
+            parts.append(f"{metric} {figure(metric, value)}")
     return ", ".join(parts)
+
+
+def figure(metric: str, value: float) -> str:
+    """A bound in its metric's unit."""
+    return f"{value:.1e}" if metric in ("transfer", "psd") else kelvin(value)
 
 
 def kelvin(value: float) -> str:

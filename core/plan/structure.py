@@ -51,12 +51,18 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     at_end = [o for o in pipeline.operators if o.at_end]
     rows: list[Row] = []
     wanted: set[str] = set().union(*(o.requires | o.optional for o in at_end))
+    if all(o.product_only or "boresight" in o.provides or o.provides <= STREAMS for o in pipeline.operators):
+        wanted = set().union(*(o.provides for o in pipeline.operators))  # nothing is written: the products are the output
     needed: dict[str, dict[str, str]] = {}  # by run: label -> reason
     for run in ["", *pipeline.runs]:
         steps = pipeline._selected(run)
         found, left_out = _walk(steps, wanted, {*keep})
         if run and not any(_makes_something(o, wanted) for o in steps if o.label in found):
             reason = "nothing in it makes a product" if not _anything_made(steps) else "no later step reads what it makes"
+            rows.append(Row(run, "", False, reason))
+            continue
+        if run and not any((o.requires | o.optional) & STREAMS for o in steps if o.label in found):
+            reason = "nothing in it depends on the sky, the air or the noise"
             rows.append(Row(run, "", False, reason))
             continue
         needed[run] = found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .planner import Decided, Plan, describe, kelvin
+from .planner import Decided, Plan, describe, figure, kelvin
 
 
 def rows(plan: Plan) -> list[dict[str, Any]]:
@@ -46,11 +46,13 @@ def text(plan: Plan, width: int = 150) -> str:
         lines.append(f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none")
     for metric, limit in plan.limits.items():
         spent = plan.spent[metric]
-        shown = (f"{spent:.1e}", f"{limit:.1e}") if metric == "transfer" else (kelvin(spent), kelvin(limit))
-        lines.append(f"budget for {metric}: {shown[0]} of {shown[1]} spent")
+        lines.append(f"budget for {metric}: {figure(metric, spent)} of {figure(metric, limit)} spent")
+    groups: dict[tuple[str, str], list[str]] = {}
     for row in plan.structure.rows:
-        where = f"run {row.run}: " if row.run else ""
-        lines.append(f"left out: {where}{row.operator + ': ' if row.operator else ''}{row.reason}")
+        groups.setdefault((row.run, row.reason), []).append(row.operator)
+    for (run, reason), operators in groups.items():
+        named = ", ".join(filter(None, operators))
+        lines.append(f"left out: {f'run {run}' if run else ''}{': ' if run and named else ''}{named} ({reason})")
     table = [("effect", "decision", "error bound", "if left out", "saves", "why")]
     for d in plan.decided:
         choice = d.choice

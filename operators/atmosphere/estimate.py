@@ -134,6 +134,7 @@ def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list
         bound = context.bound(rms, _correlated(operator, context, model, layer.wind), common)
         opacity = _opacity_share(a) * operator.pwv_rms * model.amplitude * math.sqrt(a.variances[k])
         bound |= context.sky_error(opacity)
+        bound["psd"] = SAFETY * (a.kelvin * model.amplitude) ** 2 * a.variances[k] / max(a.rms, 1e-30) ** 2
         choices = [full(f"at {layer.height:.0f} m")]
         if k in operator.omit:
             choices = [full(f"at {layer.height:.0f} m: left out by the pipeline")]
@@ -175,7 +176,7 @@ def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Ef
     for tolerance in (0.03, 0.1, 0.3):
         if tolerance > operator.tolerance:
             rms = 1.52 * (tolerance + operator.tolerance) * left
-            bound = context.bound(rms, correlated, common=True)
+            bound = context.bound(rms, correlated, common=True) | {"psd": (rms / max(context.noise, a.rms, 1e-30)) ** 2}
             saved = 0.0
             if now * POINT * len(a.layers) > PAYS:
                 saved = POINT * len(a.layers) * (now - _points(operator, context, a, tolerance))

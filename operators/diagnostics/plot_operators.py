@@ -89,7 +89,7 @@ def pictures(data: Data, options: Plots) -> list[Picture]:
         if isinstance(image, Image) and "/" not in name:
             made.append(_input(name, image))
     for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
-        if not name.startswith("source_free/"):
+        if not name.startswith("source_free/") and maps[name].contents == "all":
             made.append(_map(name, maps[name], options))
     for name, product in maps.items():
         if "/" not in name:

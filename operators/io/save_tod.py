@@ -126,6 +126,8 @@ def _provenance(data: Data) -> dict[str, str | int | float]:
         found["version"] = str(versions["zonda"])
     if text := data.provenance.get("resolved_yaml"):
         found["resolved_yaml"] = str(text)
+    if plan := data.provenance.get("plan"):
+        found["plan"] = "\n".join(" | ".join(map(str, row)) for row in plan)
     return found
 
 

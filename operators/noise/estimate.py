@@ -60,6 +60,7 @@ def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
         rms = sigma * factor * math.sqrt(difference(law, coarse, context, o.sample_rate, o.duration))
         common = pink.shared > 0 and not context.removes_common
         bound = context.bound(rms, correlated=_correlated(context), common=common)
+        bound["psd"] = psd_error(law, coarse, (sigma * factor) ** 2 / max(context.noise, 1e-30) ** 2)
         text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
         saved = cost.seconds(context.times, o.n_detectors) - pink_cost(poles).seconds(context.times, o.n_detectors)
         choices.append(Choice("coarse", f"{poles} poles", {"poles": poles}, bound=bound, formula=text, seconds=saved))
@@ -79,6 +80,13 @@ def difference(a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: flo
     start = 2 * np.abs(_amplitude(a, f)) ** 2 * np.minimum(1.0, 1 / (2 * np.pi * f * rate * duration))
     passed = np.array([context.response(float(x * rate)) ** 2 for x in f])
     return float(2 * np.trapezoid((delta + start) * passed, f))
+
+
+def psd_error(a: PowerLawFilter, b: PowerLawFilter, level: float) -> float:
+    """Largest relative error of the spectrum of pink plus white noise; ``level``: of unit responses over white noise."""
+    f = np.geomspace(1e-8, 0.5, 4000)
+    first, second = level * a.response(f), level * b.response(f)
+    return float((np.abs(second - first) / (1 + first)).max())
 
 
 def _amplitude(law: PowerLawFilter, f: Any) -> Any:

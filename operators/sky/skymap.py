@@ -104,7 +104,7 @@ class SkyMap(Operator):
         quaternions = np.ascontiguousarray(observation.boresight_radec[block.samples], np.float64)
         beyond = behind = 0
         if not state.beams:
-            beyond = stream.size
+            beyond, behind = stream.size, _behind(state.sky, quaternions, xi, eta)
         for number, beam in enumerate(state.beams):
             rows = np.flatnonzero(index == number)
             if rows.size:
@@ -352,6 +352,14 @@ def _reaches(observation: Observation, sky: Sky, widest: float) -> bool:
     cosine = float((rotation_matrices(observation.boresight_radec)[:, :, 2] @ centre).max())
     nearest = float(np.arccos(np.clip(cosine, -1, 1))) - float(np.arctan(observation.focalplane.radius))
     return nearest <= radius + REACH * SIGMA * widest
+
+
+def _behind(sky: Sky, quaternions: Floats, xi: Floats, eta: Floats) -> int:
+    """Samples more than 90 deg from the map's tangent point."""
+    lon, lat = np.radians(sky.wcs.wcs.crval)
+    tangent = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    along = np.einsum("nij,i->nj", rotation_matrices(quaternions), tangent)  # the tangent point in the boresight's frame
+    return int((along @ np.array([-eta, -xi, np.ones(len(xi))]) <= 0).sum())
 
 
 def _reach(observation: Observation) -> float:
