@@ -11,6 +11,7 @@ from typing import Any
 
 from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile, Step
+from ..data import Data
 from ..errors import ZondaError
 from ..execution import available_memory, available_threads
 from ..pipeline import Pipeline
@@ -273,6 +274,8 @@ def _unpruned(
     for operator in pipeline.operators:
         known = estimates.get(operator.label)
         if known is None:
+            if not (operator.at_end or operator.main_run_only):
+                operator.observe(Data(scene=scene, observations=list(context.observations)))
             operator.configure(whole.first)
             known = operator.estimate(whole)
         costs[operator.label] = known.cost
