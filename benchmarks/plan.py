@@ -92,7 +92,7 @@ def main() -> int:
     for scene in options.scenes or SCENES:
         with tempfile.TemporaryDirectory() as temporary:
             folders = [Path(temporary) / "all", Path(temporary) / "plan"]
-            launch(scene, Path(temporary) / "first", True)
+            launch(scene, Path(temporary) / "first", False)
             for folder, prune in zip(folders, (False, True), strict=True):
                 f = launch(scene, folder, prune)
                 what = "planned" if prune else "all on"

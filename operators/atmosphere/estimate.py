@@ -127,7 +127,6 @@ def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list
         "rms left of the layer after subtraction of the detectors' mean" if context.removes_common else "rms behind the beam"
     )
     effects = []
-    asked = bool(operator.outputs) or "atmosphere" in context.kept_streams or "transmission" in context.kept_streams
     for k, (layer, model) in enumerate(zip(a.layers, a.models, strict=True)):
         rms = SAFETY * left_of_layer(context, a, k)
         common = True  # detectors differ by less than they share: their errors do not average
@@ -138,7 +137,7 @@ def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list
         choices = [full(f"at {layer.height:.0f} m")]
         if k in operator.omit:
             choices = [full(f"at {layer.height:.0f} m: left out by the pipeline")]
-        elif not asked:
+        elif not operator.outputs:
             seconds = POINT * _points(operator, context, a, operator.tolerance)
             choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound, formula=text, seconds=seconds))
         effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
