@@ -19,18 +19,18 @@ from ..tiles import TILE_DETECTORS
 from .context import Context
 from .estimate import Cost
 
-REFERENCE = {"random": 3.3e-3, "stream": 3.4e-3, "python": 3.8e-3}
+REFERENCE = {"random": 1.7e-3, "stream": 2.75e-3, "python": 3.2e-3}
 """Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""
 
-STARTUP = Cost(once=2.0, kernel="python")
-"""Imports and compiled code from the cache."""
+STARTUP = Cost(once=5.0, kernel="python")
+"""Imports, compiled code from the cache, and the planning itself."""
 
 BASE = 230e6
 """Bytes of the interpreter, libraries and compiled code."""
 
 
 @cache
-def calibrate(budget: float = 0.6) -> Mapping[str, float]:
+def calibrate(budget: float = 0.3) -> Mapping[str, float]:
     """Time of each kernel relative to the reference machine. Takes about ``budget`` seconds, once per process.
 
     The least of several runs: what other programs take does not count as this machine's speed.
@@ -101,9 +101,12 @@ def predict(context: Context, costs: Mapping[str, Cost | None], threads: int, it
         each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
         seconds[label] = factors[cost.kernel] * (runs * each + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
-    held = sum(cost.bytes for cost in costs.values() if cost is not None)
+    late = {o.label for o in context.operators if o.at_end}
+    held = sum(cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
+    after = sum(cost.bytes for label, cost in costs.items() if cost is not None and label in late)
     startup = factors[STARTUP.kernel] * STARTUP.once
-    return Prediction(seconds, BASE + held + stream_bytes(context, threads, item, memory), unknown, startup, factors)
+    during = held + stream_bytes(context, threads, item, memory)
+    return Prediction(seconds, BASE + max(during, after), unknown, startup, factors)
 
 
 def stream_bytes(context: Context, threads: int, item: int, memory: int) -> float:

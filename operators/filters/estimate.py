@@ -45,7 +45,7 @@ LANCZOS = 2.6e-9
 """Seconds per sample of one step of the iteration, which reads the stream once."""
 
 
-START = 1e-2
+START = 1e-3
 """Residual of the first vector, the detectors' mean."""
 
 
