@@ -24,7 +24,8 @@ from ..data import Data, Observation
 from ..operator import Operator
 from ..pipeline import Companion
 from .context import Context
-from .estimate import Choice
+from .cost import calibrate
+from .estimate import Choice, Cost
 from .planner import Decided, Plan, plan
 from .structure import Structure
 
@@ -151,6 +152,21 @@ def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1) 
     )
     runs = {"sky_alone": Companion(only=["sky"])} if sky else {}
     return dataclasses.replace(file, steps=tuple(steps), header=file.header.model_copy(update={"runs": runs}))
+
+
+def measured(file: PipelineFile, labels: Sequence[str], seconds: float = 5.0) -> dict[str, Cost]:
+    """Cost of operators that state none, from a slice that is run twice (the first run compiles). What writes is not run."""
+    part = sliced(file, seconds)
+    part = dataclasses.replace(part, header=part.header.model_copy(update={"runs": {}}))
+    for _ in range(2):
+        data = part.pipeline().run(part.scene(), threads=1)
+    samples = sum(o.n_detectors * o.n_samples for o in data.observations)
+    found: dict[str, Cost] = {}
+    for label in labels:
+        used = sum(s for who, _, s in data.provenance["timings"] if who == label)
+        if used > 0:
+            found[label] = Cost(per_sample=used / samples / calibrate()["stream"])
+    return found
 
 
 def _on_slice(d: Decided, stated: dict[str, Decided]) -> Decided:

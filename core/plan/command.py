@@ -41,7 +41,7 @@ def plan(
     from .planner import plan as make
 
     file = load(pipeline, settings)
-    made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads)
+    made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)
     if not audit:
         import json
 

@@ -123,6 +123,7 @@ def plan(
     prune_all: bool = True,
     threads: int | None = None,
     memory: int | None = None,
+    measure: bool = False,
 ) -> Plan:
     """Plan a pipeline file.
 
@@ -134,6 +135,8 @@ def plan(
         Effects or operators to leave out, whatever that costs; their bounds are stated.
     prune_all
         False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
+    measure
+        Run a slice of a few seconds to find the cost of operators that do not state it.
 
     Raises
     ------
@@ -155,6 +158,10 @@ def plan(
     allowed = {m: v for m, v in limits(file.header.budget, context.map_noise, context.noise).items() if m in context.metrics}
     settings = threads or available_threads(), 8 if pipeline.precision == "float64" else 4, memory or available_memory() // 2
     costs = {label: estimate.cost for label, estimate in estimates.items()}
+    if measure and any(costs[o.label] is None for o in context.operators):
+        from .audit import measured
+
+        costs |= measured(file, [label for label, cost in costs.items() if cost is None])
     now = predict(context, costs, *settings)
     decided = _decide(effects, kept, forced, allowed, now, context, prune_all)
     spent = {m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed}
