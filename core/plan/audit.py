@@ -92,8 +92,8 @@ class Audit:
     def __str__(self) -> str:
         table = [("effect", "decision", "metric", "bound", "actual", "standard error", "")]
         for r in self.rows:
-            numbers = [f"{v:.2e}" for v in (r.bound, r.actual, r.error)]
-            table.append((r.effect, r.what, r.metric, *numbers, "VIOLATED" if r.violated else "holds"))
+            bound, actual, error = (f"{v:.2e}" for v in (r.bound, r.actual, r.error))
+            table.append((r.effect, r.what, r.metric, bound, actual, error, "VIOLATED" if r.violated else "holds"))
         widths = [max(len(row[k]) for row in table) for k in range(6)]
         lines = [f"audit of {self.slice}"]
         lines += ["  ".join([*(c.ljust(w) for c, w in zip(r, widths, strict=False)), r[6]]).rstrip() for r in table]

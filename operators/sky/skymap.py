@@ -351,7 +351,7 @@ def _reaches(observation: Observation, sky: Sky, widest: float) -> bool:
     radius = max(float(np.arccos(np.clip(r @ centre, -1, 1))) for r in rim)
     cosine = float((rotation_matrices(observation.boresight_radec)[:, :, 2] @ centre).max())
     nearest = float(np.arccos(np.clip(cosine, -1, 1))) - float(np.arctan(observation.focalplane.radius))
-    return nearest <= radius + REACH * SIGMA * widest
+    return bool(nearest <= radius + REACH * SIGMA * widest)
 
 
 def _behind(sky: Sky, quaternions: Floats, xi: Floats, eta: Floats) -> int:
