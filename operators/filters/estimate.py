@@ -31,6 +31,7 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
         if q < operator.oversampling:
             error = context.fluctuation * (q**-4 + operator.oversampling**-4)
             bound = context.bound(error, 1 / operator.frequency, common=True)
+            bound |= context.sky_error(q**-4 + operator.oversampling**-4)
             saved = 2e-8 * (knots - q * operator.frequency * o.duration) * o.n_detectors * len(context.observations)
             text = "rms of the stream x (q^-4 + q_full^-4), q knots per cycle of the cut"
             choices.append(
@@ -70,14 +71,15 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
     choices = [full(f"residual {operator.residual:g}")]
     for residual in (1e-4, 1e-3, 1e-2):
         if residual > operator.residual:
-            error = context.fluctuation * math.sqrt(operator.modes) * (residual + operator.residual) / (1 - operator.gap**2)
+            share = math.sqrt(operator.modes) * (residual + operator.residual) / (1 - operator.gap**2)
+            bound = context.bound(share * context.fluctuation, _slow(context), common=True)
             saved = LANCZOS * (count - steps(residual, operator.modes, context)) * context.samples
             choices.append(
                 Choice(
                     "coarse",
                     f"residual {residual:g}",
                     {"residual": residual},
-                    bound=context.bound(error, _slow(context), common=True),
+                    bound=bound | context.sky_error(share),
                     formula="rms of the stream x residual / (1 - gap^2)",
                     seconds=saved,
                 )
