@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,7 +20,7 @@ from .structure import Structure, selected
 DEEP = 0.9
 """Quantile of the hits over the covered map: its deeper part has the least noise, so what holds there holds everywhere."""
 
-CELLS, POINTS, DETECTORS = 48, 4096, 64
+CELLS, POINTS, DETECTORS = 32, 4096, 96
 """Hits are counted on CELLS x CELLS cells from at most POINTS instants and DETECTORS detectors of each scan."""
 
 
@@ -70,6 +70,8 @@ class Context:
     traits: dict[str, Traits] = field(default_factory=dict)
     coverage: Coverage | None = None
     metrics: frozenset[str] = frozenset()
+    limits: dict[str, float] = field(default_factory=dict)
+    """The budget by metric: a coarser form whose bound alone exceeds it need not be looked into."""
     kept_streams: frozenset[str] = frozenset()
     """Streams that some operator saves, measures or draws besides ``signal``."""
 
@@ -148,6 +150,10 @@ class Context:
     def bound(self, tod: float, correlated: float = 0.0, common: bool = False) -> dict[str, float]:
         """Bound on map and stream from an error of rms ``tod`` in the stream."""
         return {"tod": tod, "map_rms": self.in_map(tod, correlated, common)}
+
+    def affords(self, bound: Mapping[str, float]) -> bool:
+        """Whether a bound alone is within the budget."""
+        return all(v <= self.limits[m] for m, v in bound.items() if m in self.limits)
 
     def sky_error(self, share: float) -> dict[str, float]:
         """Bound on peak and transfer function from a relative error of the sky's signal."""

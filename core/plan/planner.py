@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -143,6 +144,7 @@ def plan(
     ZondaError
         For a name that is not in the plan, or a budget that is not a number from 0 to 1.
     """
+    begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
     labels = [o.label for o in pipeline.operators]
     everything = Structure(tuple(labels), tuple(pipeline.runs), ())
@@ -150,12 +152,13 @@ def plan(
     structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
     structure = dataclasses.replace(structure, operators=tuple(k for k in structure.operators if k not in operators_dropped))
     context = look(pipeline, scene, structure)
+    allowed = {m: v for m, v in limits(file.header.budget, context.map_noise, context.noise).items() if m in context.metrics}
+    context.limits = allowed
     estimates = {o.label: o.estimate(context) for o in context.operators}
     effects = [Decided(label, e, 0) for label, estimate in estimates.items() for e in estimate.effects]
     effects += [Decided("pipeline", e, 0) for e in _of_pipeline(pipeline, context)]
     kept, forced = _named(keep, effects, labels), _named(drop, effects, labels)
     _check_droppable(drop, effects, labels)
-    allowed = {m: v for m, v in limits(file.header.budget, context.map_noise, context.noise).items() if m in context.metrics}
     settings = threads or available_threads(), 8 if pipeline.precision == "float64" else 4, memory or available_memory() // 2
     costs = {label: estimate.cost for label, estimate in estimates.items()}
     if measure and any(costs[o.label] is None for o in context.operators):
@@ -168,6 +171,8 @@ def plan(
     noise = (context.noise, context.map_noise, context.coverage.hits if context.coverage else 0.0)
     prediction = _saving(now, decided, context)
     unpruned = _unpruned(pipeline, scene, structure, everything, context, estimates, now, settings)
+    planning = time.process_time() - begin
+    prediction, unpruned = (dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned))
     return Plan(structure, tuple(decided), allowed, spent, noise, prediction, unpruned, context, prune_all)
 
 

@@ -11,6 +11,7 @@ and, where what all detectors have in common is removed, at most K times what th
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -34,8 +35,11 @@ if TYPE_CHECKING:
 SAFETY = 1.25
 """Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
 
-POINT, TRANSFER = 3e-8, 4e-7
-"""Seconds per point (node x time): of one layer, and of the radiative transfer and splines."""
+POINT, TRANSFER, LATTICE = 3e-8, 5e-7, 2e-7
+"""Seconds per point (node x time) of one layer and of the radiative transfer and splines; per lattice point."""
+
+FIRST = 0.8
+"""Seconds that the first choice of nodes and steps takes more: compiled code, tables."""
 
 PAYS = 0.3
 """Seconds of evaluation from which coarser nodes are looked for."""
@@ -58,6 +62,7 @@ class Air:
     stretch: float
     elevations: tuple[float, float]
     points: dict[float, float] = field(default_factory=dict)
+    planning: dict[str, float] = field(default_factory=dict)
 
     @property
     def rms(self) -> float:
@@ -102,7 +107,9 @@ def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimat
     points = _points(operator, context, a, operator.tolerance) / len(context.observations)
     layers = len(a.layers) - len(set(operator.omit))
     fixed = 0.02 + (POINT * layers + TRANSFER) * points
-    cost = Cost(fixed, per_sample=1.8e-9, once=0.45 + 0.11 * len(context.observations), bytes=40.0 * points + 30e6)
+    nodes = max(a.planning["seconds"] - FIRST, 0.11)
+    once = 0.45 + nodes * len(context.observations)  # companions use the same plan
+    cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=1.8e-9, once=once, bytes=40.0 * points + 30e6)
     return Estimate(tuple(effects), cost)
 
 
@@ -151,10 +158,26 @@ def _points(operator: AtmosphereLayers, context: Context, a: Air, tolerance: flo
         track = operator._tracks.get(o.name) or tracks([o])[0]
         variance = sum(m.amplitude**2 * v for m, v in zip(a.models, a.variances, strict=True))
         winds = [layer.wind for layer in a.layers]
+        start = time.thread_time()
         plan = make_plan(o, track, a.models, winds, variance, tolerance, a.band, a.pwv, operator.pwv_rms)
+        a.planning.setdefault("seconds", time.thread_time() - start)
         share = sum(plan.step / s for s in plan.steps) / len(plan.steps)
         a.points[tolerance] = len(plan.nodes.xi) * o.n_samples / plan.step * share
     return a.points[tolerance] * context.times / context.first.n_samples
+
+
+def _cells(operator: AtmosphereLayers, o: Observation, a: Air) -> float:
+    """Lattice points that one scan sweeps over: (throw x distance) x (height of the field x distance + drift) / spacing^2."""
+    field = 2 * o.focalplane.radius
+    across = float(np.ptp(np.unwrap(o.azimuth))) * math.cos(a.elevations[0]) + field
+    along = a.elevations[1] - a.elevations[0] + field
+    total = 0.0
+    for k, (layer, model) in enumerate(zip(a.layers, a.models, strict=True)):
+        spacing = 0.75 * operator.lattice * model.sigma  # a power of two metres
+        drift = float(np.hypot(*layer.wind)) * o.duration
+        sides = (across * model.distance + drift) / spacing + 30, along * model.distance / spacing + 30
+        total += sides[0] * sides[1] * (k not in operator.omit)
+    return total
 
 
 def _opacity_share(a: Air) -> float:
@@ -177,7 +200,7 @@ def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Ef
             rms = 1.52 * (tolerance + operator.tolerance) * left
             bound = context.bound(rms, correlated, common=True) | {"psd": (rms / max(context.noise, a.rms, 1e-30)) ** 2}
             saved = 0.0
-            if now * POINT * len(a.layers) > PAYS:
+            if now * POINT * len(a.layers) > PAYS and context.affords(bound):
                 saved = POINT * len(a.layers) * (now - _points(operator, context, a, tolerance))
             what = f"within {tolerance:g}"
             choices.append(Choice("coarse", what, {"tolerance": tolerance}, bound=bound, formula=text, seconds=saved))
