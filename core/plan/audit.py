@@ -117,15 +117,21 @@ def audit(
     whole = Structure(tuple(o.label for o in part.pipeline().operators), tuple(part.runs), ())
     whole_plan = plan(part, prune_all=False)
     words = f"the first {seconds:g} s of {observations} scan{'s' if observations > 1 else ''}"
-    if not chosen:
+    fewer = tuple(label for label in whole.operators if label in made.structure.operators or label == "Slice")
+    if not chosen and fewer == whole.operators:
         return Audit((), words)
     stated = {d.name: d for d in whole_plan.decided}
-    same = [_on_slice(d, stated) for d in chosen]
+    same = [s for d in chosen if (s := _on_slice(d, stated)) is not None]
     reference = _run(dataclasses.replace(whole_plan, structure=whole).apply(part), whole_plan.context, threads)
     rows: list[Checked] = []
     for d in same:
         one = dataclasses.replace(whole_plan, structure=whole, decided=(d,))
         rows += _compare(d.name, d.choice, reference, _run(one.apply(part), whole_plan.context, threads), whole_plan.context)
+    if fewer != whole.operators and reference.map is not None:
+        bare = dataclasses.replace(whole_plan, structure=dataclasses.replace(whole, operators=fewer), decided=())
+        result = dataclasses.replace(_run(bare.apply(part), whole_plan.context, threads), signal=[], sky=None)
+        nothing = Choice("dropped", "what no output depends on", bound={"map_rms": 0.0})
+        rows += _compare("structure", nothing, reference, result, whole_plan.context)
     if len(same) > 1:
         together = dataclasses.replace(whole_plan, structure=whole, decided=tuple(same))
         result = _run(together.apply(part), whole_plan.context, threads)
@@ -169,11 +175,11 @@ def measured(file: PipelineFile, labels: Sequence[str], seconds: float = 5.0) ->
     return found
 
 
-def _on_slice(d: Decided, stated: dict[str, Decided]) -> Decided:
-    """The same choice with the bound that holds for the slice."""
-    mine = stated[d.name]
-    numbers = [k for k, c in enumerate(mine.effect.choices) if c.what == d.choice.what]
-    return dataclasses.replace(mine, chosen=numbers[0])
+def _on_slice(d: Decided, stated: dict[str, Decided]) -> Decided | None:
+    """The same choice with the bound that holds for the slice; None where the slice has no such choice."""
+    mine = stated.get(d.name)
+    numbers = [] if mine is None else [k for k, c in enumerate(mine.effect.choices) if c.what == d.choice.what]
+    return dataclasses.replace(mine, chosen=numbers[0]) if mine is not None and numbers else None
 
 
 @dataclass(frozen=True)
@@ -184,11 +190,13 @@ class _Result:
 
 
 def _run(file: PipelineFile, context: Context, threads: int | None) -> _Result:
-    data = file.pipeline().run(file.scene(), threads=threads, keep=["signal"])
+    made = any("signal" in s.operator.provides for s in file.steps)
+    data = file.pipeline().run(file.scene(), threads=threads, keep=["signal"] if made else ())
     maps = [k for k, v in data.products.items() if hasattr(v, "hits") and hasattr(v, "signal")]
     main = next((data.products[k] for k in maps if "/" not in k), None)
     sky = next((data.products[k] for k in maps if k.startswith("sky_alone/")), None)
-    return _Result([o.detdata["signal"][o.detector_flags == 0][:, o.flags == 0] for o in data.observations], main, sky)
+    kept = [o for o in data.observations if "signal" in o.detdata]
+    return _Result([o.detdata["signal"][o.detector_flags == 0][:, o.flags == 0] for o in kept], main, sky)
 
 
 def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: Context) -> list[Checked]:
@@ -199,7 +207,7 @@ def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: 
             rows.append(Checked(name, choice.what, metric, choice.bound[metric] + rounding, actual, error))
 
     scale = ROUNDING * _rms([float((s * s).mean()) for s in full.signal])
-    if all(a.shape == b.shape for a, b in zip(full.signal, other.signal, strict=True)):
+    if [a.shape for a in full.signal] == [b.shape for b in other.signal]:
         squares = [
             float((p * p).mean())
             for a, b in zip(full.signal, other.signal, strict=True)

@@ -86,3 +86,29 @@ def _command(capsys, *arguments):
     status = cli.main([str(a) for a in arguments])
     said = capsys.readouterr()
     return status, said.out, said.err
+
+
+def test_what_no_output_depends_on_is_audited(tmp_path):
+    """A component that the sum does not read is left out: the map is the same."""
+    (tmp_path / "hits.yaml").write_text(
+        """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+operators:
+  - PointingDaisy: {scan_duration: 5 s}
+  - WhiteNoise
+  - Efficiency
+  - HighpassFilter: {frequency: 1 Hz}
+  - BinMap
+  - CommonModeFilter
+  - SaveMap
+"""
+    )
+    file = zonda.load(str(tmp_path / "hits.yaml"))
+    made = zonda.plan(file, threads=1)
+    assert "CommonModeFilter" not in made.structure.operators
+    found = audit(file, made, threads=1, seconds=5.0)
+    assert [(r.effect, r.metric, r.actual) for r in found.rows if r.effect == "structure"] == [("structure", "map_rms", 0.0)]
+    assert not found.violated
