@@ -25,7 +25,7 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
     """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
     o = context.first
     knots = operator.oversampling * operator.frequency * o.duration
-    cost = Cost(fixed=0.02 + 2e-8 * knots * o.n_detectors, per_time=2e-7, per_sample=3.1e-9, bytes=64.0 * o.n_samples)
+    cost = Cost(fixed=0.02 + 2e-8 * knots * o.n_detectors, per_time=5e-8, per_sample=3.1e-9, bytes=64.0 * o.n_samples)
     choices = [full(f"{operator.oversampling:g} knots per cycle of the cut")]
     for q in (16.0, 12.0, 8.0):
         if q < operator.oversampling:
@@ -42,7 +42,7 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
     return Estimate((effect,), cost)
 
 
-LANCZOS = 2.6e-9
+LANCZOS = 1.8e-9
 """Seconds per sample of one step of the iteration, which reads the stream once."""
 
 
