@@ -217,4 +217,4 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     area = max(float((xs[1] - xs[0]) * (ys[1] - ys[0])), pixel**2)
     hits = counts[counts > 0] * min(1.0, pixel**2 / area)
     speed = float(np.median(np.concatenate(speeds))) if speeds else 0.0
-    return Coverage(float(np.quantile(hits, DEEP)), pixel, speed)
+    return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed)

@@ -22,6 +22,9 @@ from .cost import Prediction, predict
 from .estimate import METRICS, Bound, Choice, Cost, Effect, Estimate, full
 from .structure import Structure, prune, selected
 
+LARGEST_RATIO = 1e5
+"""Of a stream's rms to its noise up to which float32 is thought of where the pipeline asks for float64."""
+
 LEAST_SAVING = 0.005
 """Share of the predicted time that a decision must save to be worth an error."""
 
@@ -301,6 +304,9 @@ def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
     bound = context.bound(rms)
     if pipeline.precision == "float32":
         return [Effect("precision", (full("float32"),), bound, formula)]
+    carries_mean = context.cut == 0 and any("atmosphere" in o.provides for o in context.operators)
+    if carries_mean or context.fluctuation > LARGEST_RATIO * context.noise:  # the filters refuse float32 there
+        return [Effect("precision", (full("float64"),), bound, formula)]
     whole = max(o.n_samples * o.n_detectors for o in context.observations) * 4
     seconds = 4e-9 * context.samples
     single = Choice("coarse", "float32", {"precision": "float32"}, bound=bound, formula=formula, seconds=seconds, bytes=whole)
