@@ -45,7 +45,11 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
-ELSEWHERE = {"doctor": "zonda.plugins.doctor_command:doctor", "weather": "zonda.plugins.weather_command:weather"}
+ELSEWHERE = {
+    "doctor": "zonda.plugins.doctor_command:doctor",
+    "plan": "zonda.core.plan.command:plan",
+    "weather": "zonda.plugins.weather_command:weather",
+}
 """Built-in commands that live with what they use, imported when they are named or listed.
 
 Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more: pluggy and the metadata.
@@ -125,30 +129,54 @@ _set = click.option(
 )
 
 
+_keep = click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full, see `zonda plan`.")
+_drop = click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
+_no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything in full.")
+
+
 @zonda.command()
 @_pipeline
 @_set
+@_keep
+@_drop
+@_no_prune
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
 @click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
 def run(
-    pipeline: str, settings: tuple[str, ...], output: Path | None, threads: int | None, memory: int | None, verbose: bool
+    pipeline: str,
+    settings: tuple[str, ...],
+    keep: tuple[str, ...],
+    drop: tuple[str, ...],
+    no_prune: bool,
+    output: Path | None,
+    threads: int | None,
+    memory: int | None,
+    verbose: bool,
 ) -> None:
     """Run a pipeline file, or a shipped pipeline by its name.
 
-    The products are in the folder that the last line names.
+    What its outputs do not depend on is left out, and effects are dropped or coarsened while the errors stay within the budget
+    (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
     """
     from .compiled import ensure_cache, one_blas_thread
 
     one_blas_thread()
     ensure_cache()
-    from .files import write_text
+    from .files import check_output_folder, write_text
+    from .plan import table
+    from .plan.planner import plan
 
     file = _load(pipeline, settings)
     folder = file.output if output is None else output
+    check_output_folder(folder)  # before anything is worked out
+    made = plan(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
+    click.echo(table.line(made), err=True)
+    file = made.apply(file)
     resolved = file.resolved_yaml()
-    provenance = {"resolved_yaml": resolved, "command": _command(pipeline, settings)}
+    command = _command(pipeline, settings, keep, drop, no_prune)
+    provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
     write_text(folder / "resolved.yaml", resolved)
     counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
@@ -159,11 +187,15 @@ def run(
     click.echo(f"{folder}/")
 
 
-def _command(pipeline: str, settings: tuple[str, ...]) -> str:
+def _command(
+    pipeline: str, settings: tuple[str, ...], keep: tuple[str, ...] = (), drop: tuple[str, ...] = (), no_prune: bool = False
+) -> str:
     """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
     import shlex
 
-    return shlex.join(["zonda", "run", pipeline, *(part for text in settings for part in ("--set", text))])
+    options = [("--set", settings), ("--keep", keep), ("--drop", drop)]
+    parts = [part for option, texts in options for text in texts for part in (option, text)]
+    return shlex.join(["zonda", "run", pipeline, *parts, *(["--no-prune"] if no_prune else [])])
 
 
 @zonda.command()

@@ -10,6 +10,8 @@ from .configuration.parameters import Parameters
 
 if TYPE_CHECKING:
     from .data import Block, Data, Observation, Stream
+    from .plan.context import Context
+    from .plan.estimate import Estimate, Traits
 
 API_VERSION = 1
 """Version of the contract below; a plugin written for another one is refused with a message that says so."""
@@ -44,6 +46,9 @@ class Operator(Parameters):
         True for operators left out of companion runs (spectra, saved time streams).
     at_end
         True for operators that only act in `finalize` (plots, reports): they run once, after all companion runs.
+    product_only
+        True for operators that only make products in memory (map makers, spectra): a plan leaves them out of a run from a file
+        where no later step reads what they provide.
     """
 
     zonda_api: ClassVar[int] = API_VERSION
@@ -53,6 +58,7 @@ class Operator(Parameters):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
     main_run_only: ClassVar[bool] = False
     at_end: ClassVar[bool] = False
+    product_only: ClassVar[bool] = False
 
     name: str | None = None
     """Label of this step in messages, products and random streams; the class name where absent."""
@@ -96,6 +102,24 @@ class Operator(Parameters):
 
     def finalize(self, data: Data) -> None:
         """Finish products."""
+
+    def traits(self, observation: Observation) -> Traits:
+        """What other operators' bounds need to know of this one (noise, pixels, filters); see `core.plan`.
+
+        Called after `configure`, before anything is prepared; ``observation`` has its pointing.
+        """
+        from .plan.estimate import Traits
+
+        return Traits()
+
+    def estimate(self, context: Context) -> Estimate:
+        """Upper bounds on what this operator's effects contribute, coarser forms of them, and what it costs; see `core.plan`.
+
+        Without it the planner leaves the operator as it is and says that its cost is not counted.
+        """
+        from .plan.estimate import Estimate
+
+        return Estimate()
 
     def __repr__(self) -> str:
         given = ", ".join(f"{k}={getattr(self, k)!r}" for k in sorted(self.model_fields_set))

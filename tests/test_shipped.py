@@ -101,7 +101,10 @@ def test_the_run_tells_of_losses_alone(tmp_path, capsys):
     said = capsys.readouterr()
     assert said.out == f"{tmp_path / 'out'}/\n"
     assert "samples binned" not in said.err
-    assert all(line.startswith("SkyMap: samples outside the input map: ") for line in said.err.splitlines())
+    first, *rest = said.err.splitlines()
+    assert first.startswith("about ")
+    assert " of CPU time and " in first
+    assert all(line.startswith("SkyMap: samples outside the input map: ") for line in rest)
 
 
 def test_output_is_a_file(tmp_path, capsys):

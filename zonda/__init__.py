@@ -26,6 +26,7 @@ _WHERE = {
     "Pipeline": "zonda.core.pipeline",
     "ZondaError": "zonda.core.errors",
     "load": "zonda.core.configuration.pipeline_file",
+    "plan": "zonda.core.plan.planner",
     "hookimpl": "zonda.core.hooks",
 }
 
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Telescope as Telescope
     from zonda.core.operator import Operator as Operator
     from zonda.core.pipeline import Pipeline as Pipeline
+    from zonda.core.plan.planner import plan as plan
     from zonda.core.scene import Scene as Scene
     from zonda.core.site import Site as Site
 

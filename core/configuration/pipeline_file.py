@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
@@ -14,6 +14,7 @@ from .. import registry
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
 from ..pipeline import Companion, Pipeline, check_order
+from ..plan.budget import Limits
 from ..scene import Scene
 from ..weather import WeatherSource, resolve
 from . import overrides as settings
@@ -21,7 +22,8 @@ from . import yaml_places
 from .diagnostics import ConfigurationError, Diagnostic, nearest
 from .explain import explain
 from .locate import locate, read
-from .parameters import Parameters
+from .parameters import Parameters, quantity
+from .units import Fraction
 from .yaml_places import Document, Source, Span
 
 P = TypeVar("P", bound=Parameters)
@@ -44,6 +46,8 @@ class Header(Parameters):
     """Companion runs, e.g. noiseless: {only: [sky]} or source_free: {without: [sky]}."""
     precision: Literal["float32", "float64"] = "float32"
     """Type of the time streams."""
+    budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
+    """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
     outputs: Path | None = None
     """Folder for products, relative to the working directory; where absent, out/<name>."""
 

@@ -44,6 +44,8 @@ from .weather_sources import air_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
     from .weather import Profile
 
@@ -137,6 +139,8 @@ class AtmosphereLayers(Operator):
     """With `beam: tapered`, dB by which the illumination's power falls from the centre to the rim; 10 where absent."""
     outputs: list[Literal["pwv", "opacity", "path_delay"]] = Field(default_factory=list)
     """Further streams to make: fluctuations of the line-of-sight water (m), of the band's opacity, of the wet path delay (m)."""
+    omit: list[int] = Field(default_factory=list)
+    """Layers that are left out, the lowest is 0; the others stay as they are (their shares, their air)."""
     lattice: float | None = Field(None, gt=0, le=0.8)
     """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used);
     where absent that of the `fidelity`, 0.8 or 0.5."""
@@ -155,6 +159,8 @@ class AtmosphereLayers(Operator):
         of_many = {"highest", "weights"} & self.model_fields_set
         if self.layers == 1 and of_many:
             raise ValueError(f"{sorted(of_many)[0]} needs several layers; a single one lies at lowest")
+        if any(not 0 <= k < self.layers for k in self.omit):
+            raise ValueError(f"omit names layers 0 to {self.layers - 1}, the lowest first")
         if isinstance(self.wind, list) and len(self.wind) != self.layers:
             raise ValueError(f"wind lists {len(self.wind)} winds for {self.layers} layers")
         if self.edge_taper is not None and self.beam != "tapered":
@@ -190,6 +196,7 @@ class AtmosphereLayers(Operator):
         _means(observation, plan, band, pwv)
         parts = zip(beams, layers, plan.steps, strict=True)
         drifting = [Drifting(beam, layer.height, layer.amplitude, layer.wind, step) for beam, layer, step in parts]
+        drifting = [d for k, d in enumerate(drifting) if k not in self.omit]
         n = observation.n_samples
         first, count = times(slice(0, n), plan.step)
         kind = np.float64 if plan.nodes.shape else np.float32
@@ -222,6 +229,18 @@ class AtmosphereLayers(Operator):
     def in_time_order(self, observation: Observation, state: AtNodes | OfDetectors) -> bool:
         """Where detectors are evaluated one by one and the scan is long, all of them share the air of the moment."""
         return not state.fits
+
+    def traits(self, observation: Observation) -> Traits:
+        """rms of the fluctuation."""
+        from .estimate import atmosphere_traits
+
+        return atmosphere_traits(self, observation)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Layers, their resolution, the spectrum of the air, slopes with elevation."""
+        from .estimate import atmosphere_estimate
+
+        return atmosphere_estimate(self, context)
 
     def exec(self, block: Block, state: AtNodes | OfDetectors) -> None:
         """Add the fluctuations to the block's ``atmosphere`` and ``transmission``, and to the `outputs`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +22,10 @@ from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 from .plots import SHOWN, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
 from .power_spectrum import Spectrum
 from .time_streams import TimeStream
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
 
 LARGEST = 1500
 """Pixels of an image's longer side in a picture; larger images are thinned out."""
@@ -46,6 +50,7 @@ class Plots(Operator):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
+    optional: ClassVar[frozenset[str]] = frozenset({"map", "spectrum", "time_streams"})
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
     at_end: ClassVar[bool] = True
 
@@ -59,6 +64,12 @@ class Plots(Operator):
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        return Estimate((), Cost(once=3.0 + 0.25 * len(context.observations), bytes=60e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
@@ -78,7 +89,7 @@ def pictures(data: Data, options: Plots) -> list[Picture]:
         if isinstance(image, Image) and "/" not in name:
             made.append(_input(name, image))
     for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
-        if not name.startswith("source_free/"):
+        if not name.startswith("source_free/") and maps[name].contents == "all":
             made.append(_map(name, maps[name], options))
     for name, product in maps.items():
         if "/" not in name:

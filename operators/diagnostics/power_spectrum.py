@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,10 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.operators.io.streams import StreamsAsked
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
 
 Floats = NDArray[np.float64]
 StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
@@ -126,6 +130,7 @@ class PowerSpectrum(Operator):
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
     main_run_only: ClassVar[bool] = True
+    product_only: ClassVar[bool] = True
 
     streams: list[StreamName] | None = Field(None, min_length=1)
     """Streams to measure; where absent, `signal` and every component but `transmission` that reaches this step."""
@@ -133,6 +138,12 @@ class PowerSpectrum(Operator):
     """Number of detectors averaged, chosen evenly among those not flagged."""
     segment: Seconds = quantity("128 s", gt=0)
     """Length of Welch's segments (at most the scan): the inverse of the frequency resolution."""
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        return Estimate((), Cost(0.02, 0.0, 1.3e-8 * min(1.0, self.detectors / context.first.n_detectors) * 14))
 
     def prepare(self, observation: Observation) -> _State:
         usable = np.flatnonzero(observation.detector_flags == 0)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from html import escape
 from importlib import resources
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -24,6 +24,10 @@ from zonda.operators.io.save_map import output_folder
 
 from .plot_operators import Picture, Plots, pictures
 
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
+
 _WIDE = 1000
 """Pictures wider than this many pixels take a whole row."""
 
@@ -36,7 +40,7 @@ class Report(Operator):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    optional: ClassVar[frozenset[str]] = frozenset({"pictures", "map_file", "tod_file"})
+    optional: ClassVar[frozenset[str]] = frozenset({"pictures", "map_file", "tod_file", "map", "spectrum", "time_streams"})
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
     at_end: ClassVar[bool] = True
 
@@ -46,6 +50,12 @@ class Report(Operator):
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        return Estimate((), Cost(once=0.35, bytes=10e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
@@ -67,6 +77,7 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float) -> str:
         ("scans", "Scans", _scans(data)),
         ("steps", "Steps", _steps(data)),
         ("tally", "Counted and approximated", _tally(data)),
+        ("plan", "Plan", _plan(data)),
         ("time", "Computing time", _timings(data)),
         ("provenance", "Provenance", _provenance(data)),
     ]
@@ -339,6 +350,12 @@ def _tally(data: Data) -> str:
     for run, rows in by_run.items():
         parts.append(f"<details><summary>Run {escape(run)}</summary>{_table(rows, head)}</details>")
     return f'<div class="steps">{"".join(parts)}</div>' if any(parts) else ""
+
+
+def _plan(data: Data) -> str:
+    """What was left out, dropped or coarsened, and what that may cost (`core.plan`)."""
+    head = ("effect", "decision", "error bound", "formula or reason")
+    return f'<div class="steps">{table}</div>' if (table := _table(data.provenance.get("plan", []), head)) else ""
 
 
 def _timings(data: Data) -> str:

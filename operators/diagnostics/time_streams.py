@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.operators.io.streams import StreamsAsked
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
 
 Floats = NDArray[np.float64]
 
@@ -52,6 +56,7 @@ class TimeStreams(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     main_run_only: ClassVar[bool] = True
+    product_only: ClassVar[bool] = True
 
     streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
     """Streams to keep; those absent at this step are left out and counted."""
@@ -68,6 +73,12 @@ class TimeStreams(Operator):
                 place=self.label,
                 cure="choose another one",
             )
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        return Estimate((), Cost(0.005))
 
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -26,6 +26,10 @@ from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
 from zonda.core.tiles import TILE_SAMPLES
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.float64]
 
@@ -131,6 +135,18 @@ class CommonModeFilter(Operator):
                 place=place,
                 cure="set precision: float64",
             )
+
+    def traits(self, observation: Observation) -> Traits:
+        """It removes what is common."""
+        from zonda.core.plan.estimate import Traits
+
+        return Traits(removes_common=observation.n_detectors > 1)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Residual of the modes."""
+        from .estimate import common_mode_estimate
+
+        return common_mode_estimate(self, context)
 
     def exec(self, block: Block, state: Modes) -> None:
         """Equation (1) on one block."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -30,6 +30,10 @@ from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.floating]
 
@@ -88,6 +92,18 @@ class HighpassFilter(Operator):
         if plan.cut == 0:
             tally.state(self.label, f"{observation.name} is shorter than 1/frequency", "only the mean and a line are removed")
         return plan
+
+    def traits(self, observation: Observation) -> Traits:
+        """What passes."""
+        from .estimate import highpass_traits
+
+        return highpass_traits(self, observation)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Knots of the coarse series."""
+        from .estimate import highpass_estimate
+
+        return highpass_estimate(self, context)
 
     def exec(self, block: Block, state: HighpassPlan) -> None:
         """Filter the block's rows in place."""

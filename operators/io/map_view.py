@@ -15,7 +15,7 @@ from zonda.operators.maps.map_product import MapProduct
 Floats = NDArray[np.floating]
 
 PLANES = ("signal", "hits", "weights", "noise", "half_difference")
-"""Planes a map product may have; `signal` always."""
+"""Planes a map product may have; `signal` always, but for a map of hits alone."""
 
 
 @dataclass
@@ -54,7 +54,8 @@ class MapView:
     @classmethod
     def of(cls, name: str, product: MapProduct) -> MapView:
         """The planes that a product has."""
-        planes = {k: np.asarray(getattr(product, k)) for k in PLANES if getattr(product, k) is not None}
+        has = PLANES if product.contents == "all" else ("hits",)
+        planes = {k: np.asarray(getattr(product, k)) for k in has if getattr(product, k) is not None}
         weight = "K-2" if product.weighting == "inverse_variance" else ""
         units = {"signal": "K", "noise": "K", "half_difference": "K", "weights": weight, "hits": ""}
         pixels = product.pixels if product.pixels is not None else np.zeros(0, np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -16,6 +16,10 @@ from zonda.core.files import atomic_path, check_output_folder, product_path
 from zonda.core.operator import Operator
 
 from .map_view import MapView, NoiseFigure, maps_of, noise_figures, noise_sources
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
 
 _MEANING = {
     "signal": "brightness",
@@ -51,6 +55,12 @@ class SaveMap(Operator):
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        return Estimate((), Cost(once=0.12 * (1 + max(context.runs.values(), default=1)), bytes=20e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
@@ -205,12 +215,15 @@ def ascii_text(text: str) -> str:
 
 
 def _provenance_tables(data: Data) -> list[Any]:
-    """The resolved YAML (a row per line) and the tally."""
+    """The resolved YAML (a row per line), the plan and the tally."""
     from astropy.io import fits
 
     tables = []
     if text := str(data.provenance.get("resolved_yaml", "")):
         tables.append(_text_table(fits, "RESOLVED_YAML", {"LINE": text.splitlines()}))
+    if plan := data.provenance.get("plan"):
+        names = ("EFFECT", "DECISION", "BOUND", "FORMULA")
+        tables.append(_text_table(fits, "PLAN", {n: [str(r[k]) for r in plan] for k, n in enumerate(names)}))
     rows = list(data.tally)
     if rows:
         who, what, value = ([str(r[k]) for r in rows] for k in range(3))

@@ -6,7 +6,7 @@ import os
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,10 @@ from . import fits_table, toast_hdf5
 from .save_map import no_output_folder, output_folder
 from .streams import StreamsAsked
 from .time_ordered_data import TimeOrderedData
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
 
 _FORMATS: dict[str, Any] = {"hdf5": toast_hdf5, "fits": fits_table}
 
@@ -61,6 +65,12 @@ class SaveTOD(Operator):
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        return Estimate((), Cost(0.1, 0.0, 6e-9 * len(self.streams or ["signal"])))
 
     def prepare(self, observation: Observation) -> _State:
         if observation.output is None:
@@ -116,6 +126,8 @@ def _provenance(data: Data) -> dict[str, str | int | float]:
         found["version"] = str(versions["zonda"])
     if text := data.provenance.get("resolved_yaml"):
         found["resolved_yaml"] = str(text)
+    if plan := data.provenance.get("plan"):
+        found["plan"] = "\n".join(" | ".join(map(str, row)) for row in plan)
     return found
 
 

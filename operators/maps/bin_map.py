@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -28,6 +28,10 @@ from zonda.core.tiles import TILE_SAMPLES
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
 from .map_product import MapProduct
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
 Sums = NDArray[np.int64]
 
@@ -48,11 +52,19 @@ DATA, HITS, WEIGHTS, NOISE = range(4)
 OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
 
 
+class _Requires:
+    """What a `BinMap` reads: no signal where only the hits are wanted."""
+
+    def __get__(self, operator: BinMap | None, owner: type) -> frozenset[str]:
+        return frozenset({"boresight"} if operator is not None and operator.contents == "hits" else {"signal", "boresight"})
+
+
 class BinMap(Operator):
     """Average the samples in each pixel, equation (1), into a FITS image (TAN) or a HEALPix map."""
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal", "boresight"})
+    requires: ClassVar[Any] = _Requires()
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
+    product_only: ClassVar[bool] = True
 
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Side of a pixel."""
@@ -74,6 +86,8 @@ class BinMap(Operator):
     """Weigh samples alike, or by the inverse variance that follows from each detector's NET."""
     noise: Literal["net", "scatter"] = "net"
     """Noise of each pixel: from the detectors' NET, or from the scatter of its samples."""
+    contents: Literal["all", "hits"] = "all"
+    """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
     half_difference: bool = True
     """Keep even and odd scans apart and make a noise map of their difference (needs two scans)."""
     smooth: Angle | Literal["beam"] | None = None
@@ -153,7 +167,7 @@ class BinMap(Operator):
         net = observation.focalplane.net
         variance = net**2 * observation.sample_rate / self._variance  # of one sample, in reference units
         weight = np.ones(len(net))
-        if self.weights == "inverse_variance":
+        if self.weights == "inverse_variance" and self.contents == "all":
             if (net > 0).all():
                 weight = 1 / variance
             elif (net != net[0]).any():
@@ -174,11 +188,28 @@ class BinMap(Operator):
             self._grid, self._grid.pointing(observation), (observation.flags == 0).astype(np.uint8), weight, noise, alike
         )
 
+    def traits(self, observation: Observation) -> Traits:
+        """Size of the pixels."""
+        from zonda.core.plan.estimate import Traits
+
+        return Traits(pixel=math.sqrt(4 * math.pi / (12 * self.nside**2)) if self.nside else self.pixel)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        n = self._n_pixels()
+        return Estimate((), Cost(0.01 + 5e-8 * n, 3e-7, 6.5e-9, bytes=n * 8.0 * 4 * 4))
+
     def exec(self, block: Block, state: Binning) -> None:
         """Add one block to this thread's sums."""
         sums, dropped, largest = state.of_thread()
         plane, observation = block.observation.focalplane, block.observation
-        signal = block.total("signal") if "signal" in block.means else block.detdata["signal"]
+        if self.contents == "hits":
+            signal = block.buffer("nothing", block.shape)
+            signal.fill(0)
+        else:
+            signal = block.total("signal") if "signal" in block.means else block.detdata["signal"]
         begin, rows = block.samples.start, block.detectors
         xi, eta, use = plane.xi[rows], plane.eta[rows], observation.detector_flags[rows] == 0
         for start in range(begin, block.samples.stop, TILE_SAMPLES):
@@ -246,7 +277,9 @@ class BinMap(Operator):
         hits = total[:, HITS]
         noise = self._noise_of(total, signal, weight)
         half = None
-        if self.half_difference and len(halves.scans) >= 2:
+        if self.contents == "hits":
+            signal, noise, weight = np.full_like(signal, np.nan), np.full_like(noise, np.nan), hits.astype(np.float64)
+        elif self.half_difference and len(halves.scans) >= 2:
             (even, w_even), (odd, w_odd) = _mean(halves.sums[0]), _mean(halves.sums[1])
             with np.errstate(invalid="ignore", divide="ignore"):
                 half = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
@@ -257,7 +290,7 @@ class BinMap(Operator):
         arrays = [a[keep].reshape(shape if isinstance(grid, TangentGrid) else -1) for a in arrays]
         common: dict[str, Any] = {
             "frame": self.frame, "weighting": self.weights, "noise_from": self.noise, "fwhm": self._fwhm, "scans": halves.scans,
-            "centre": self._middle, "half_difference": arrays[4] if half is not None else None,
+            "centre": self._middle, "half_difference": arrays[4] if half is not None else None, "contents": self.contents,
         }  # fmt: skip
         if isinstance(grid, TangentGrid):
             header = grid.wcs.to_header(relax=True)

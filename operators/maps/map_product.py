@@ -70,6 +70,8 @@ class MapProduct:
     fwhm: float = 0.0
     smoothed_by: float = 0.0
     scans: list[str] = field(default_factory=list)
+    contents: Literal["all", "hits"] = "all"
+    """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
 
     @property
     def wcs(self) -> Any:

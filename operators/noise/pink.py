@@ -26,6 +26,8 @@ from .one_over_f import PowerLawFilter, power_law_filter
 
 if TYPE_CHECKING:
     from zonda.core.data import Block, Data, Observation
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.floating[Any]]
 
@@ -102,6 +104,18 @@ class PinkNoise(Operator):
             ones, state.common = np.ones((1, observation.n_samples), np.float32), np.zeros((1, observation.n_samples), np.float32)
             common.add(0, 0, ones, state.common)
         return state
+
+    def traits(self, observation: Observation) -> Traits:
+        """rms of one sample."""
+        from .estimate import pink_traits
+
+        return pink_traits(self, observation)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Poles of the filter."""
+        from .estimate import pink_estimate
+
+        return pink_estimate(self, context)
 
     def exec(self, block: Block, state: Any) -> None:
         """Add noise to ``pink``."""

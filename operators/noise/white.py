@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from zonda.core.data import Block, Data, Observation
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
 _SCHEMA = {
     "anyOf": [{"type": "string"}, {"type": "object", "properties": {"name": {"type": "string"}}, "required": ["name"]}],
@@ -71,6 +73,20 @@ class WhiteNoise(Operator):
         """Stream key; the amplitude follows with the first block."""
         level: NoiseLevel = observation.resolved["noise levels"][self.label]
         return _State(level, observation.key(self.label))
+
+    def traits(self, observation: Observation) -> Traits:
+        """White noise of one sample."""
+        from .estimate import white_traits
+
+        return white_traits(observation.resolved["noise levels"][self.label], observation)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost: there is no coarser form of it."""
+        from zonda.core.plan.estimate import Estimate
+
+        from .estimate import WHITE
+
+        return Estimate((), WHITE)
 
     def exec(self, block: Block, state: Any) -> None:
         """Add noise to ``white``."""

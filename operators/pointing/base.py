@@ -23,6 +23,8 @@ from .transform import CelestialTransform, unit_vectors
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
 
 Floats = NDArray[np.float64]
 
@@ -98,6 +100,12 @@ class Pointing(Operator):
 
     def state(self, observation: Observation) -> None:
         """Tell the tally what else should be known of this scan."""
+
+    def estimate(self, context: Context) -> Estimate:
+        """What the pointing carries exactly, and what it leaves out."""
+        from .estimate import pointing_estimate
+
+        return pointing_estimate(self, context)
 
     # -- the scans --
 

@@ -7,7 +7,7 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,10 @@ from .placement import kelvin, placed
 from .read import HealpixMap, WcsMap, read_map
 from .resample import resample_healpix, resample_image, tangent_wcs
 from .sampling import sample
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.float64]
 
@@ -82,11 +86,11 @@ class SkyMap(Operator):
         return self
 
     def prepare(self, observation: Observation) -> State:
-        fwhm = np.full(observation.n_detectors, self.fwhm) if self.fwhm is not None else observation.focalplane.fwhm
-        widths, index = (np.zeros(1), np.zeros(len(fwhm), np.int64)) if self.beam == "none" else distinct(fwhm)
-        widest = float(widths.max(initial=0.0))
-        finest = float(widths.min(initial=np.inf))
-        sky = self._sky(observation, widest, finest)
+        widths, index = self._widths(observation)
+        sky = self._sky(observation, float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)))
+        if not _reaches(observation, sky, float(widths.max(initial=0.0))):
+            observation.tally.state(self.label, f"{observation.name}: not convolved", "no detector reaches the input map")
+            return State(sky, [], index)
         beams = [self._memory.get((*sky.key, "beam", w), lambda w=w: self._beam(sky, float(w))) for w in widths]  # type: ignore[misc]
         tally = observation.tally
         for what, text in sky.notes.items():
@@ -105,6 +109,8 @@ class SkyMap(Operator):
         xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
         quaternions = np.ascontiguousarray(observation.boresight_radec[block.samples], np.float64)
         beyond = behind = 0
+        if not state.beams:
+            beyond, behind = stream.size, _behind(state.sky, quaternions, xi, eta)
         for number, beam in enumerate(state.beams):
             rows = np.flatnonzero(index == number)
             if rows.size:
@@ -136,6 +142,30 @@ class SkyMap(Operator):
         key = "input" if first is None or first.header.get("OPERATOR") == self.label else f"input.{self.label}"
         if key not in data.products:
             data.products[key] = state.sky.image(self.label)
+
+    def traits(self, observation: Observation) -> Traits:
+        """Largest brightness of the map before the beam."""
+        from zonda.core.plan.estimate import Traits
+
+        widths, _ = self._widths(observation)
+        sky = self._sky(observation, float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)))
+        if not _reaches(observation, sky, float(widths.max(initial=0.0))):
+            return Traits(peak=abs(self.outside))
+        return Traits(peak=float(np.nanmax(np.abs(sky.values - self.outside), initial=0.0)))
+
+    def estimate(self, context: Context) -> Estimate:
+        """Beam, sampling, chromaticity."""
+        from .estimate import sky_estimate
+
+        widths, _ = self._widths(context.first)
+        widest, finest = float(widths.max(initial=0.0)), float(widths.min(initial=np.inf))
+        skies = [(o, self._sky(o, widest, finest)) for o in context.observations]
+        return sky_estimate(self, context, skies[0][1], any(_reaches(o, sky, widest) for o, sky in skies))
+
+    def _widths(self, observation: Observation) -> tuple[Floats, NDArray[np.int64]]:
+        """Distinct beams [rad] and the number of each detector's."""
+        fwhm = np.full(observation.n_detectors, self.fwhm) if self.fwhm is not None else observation.focalplane.fwhm
+        return (np.zeros(1), np.zeros(len(fwhm), np.int64)) if self.beam == "none" else distinct(fwhm)
 
     def _sky(self, observation: Observation, widest: float, finest: float) -> Sky:
         """The map in K_RJ on a TAN grid, from memory where it is there."""
@@ -317,6 +347,28 @@ def _on_grid(covered: NDArray[np.bool_], convolved: Convolved) -> NDArray[np.uin
     in_x, in_y = (x >= 0) & (x < covered.shape[1]), (y >= 0) & (y < covered.shape[0])
     whole[np.ix_(in_y, in_x)] = covered[np.ix_(y[in_y], x[in_x])]
     return whole
+
+
+def _reaches(observation: Observation, sky: Sky, widest: float) -> bool:
+    """Whether any detector comes within the beam's reach of the map."""
+    ny, nx = sky.values.shape
+    corners = [[-0.5, -0.5], [-0.5, ny - 0.5], [nx - 0.5, -0.5], [nx - 0.5, ny - 0.5], [(nx - 1) / 2, (ny - 1) / 2]]
+    lon, lat = np.radians(sky.wcs.celestial.wcs_pix2world(corners, 0).T)
+    if not np.isfinite([lon, lat]).all():
+        return True
+    *rim, centre = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]).T
+    radius = max(float(np.arccos(np.clip(r @ centre, -1, 1))) for r in rim)
+    cosine = float((rotation_matrices(observation.boresight_radec)[:, :, 2] @ centre).max())
+    nearest = float(np.arccos(np.clip(cosine, -1, 1))) - float(np.arctan(observation.focalplane.radius))
+    return bool(nearest <= radius + REACH * SIGMA * widest)
+
+
+def _behind(sky: Sky, quaternions: Floats, xi: Floats, eta: Floats) -> int:
+    """Samples more than 90 deg from the map's tangent point."""
+    lon, lat = np.radians(sky.wcs.wcs.crval)
+    tangent = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    along = np.einsum("nij,i->nj", rotation_matrices(quaternions), tangent)  # the tangent point in the boresight's frame
+    return int((along @ np.array([-eta, -xi, np.ones(len(xi))]) <= 0).sum())
 
 
 def _reach(observation: Observation) -> float:

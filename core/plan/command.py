@@ -1,0 +1,55 @@
+"""``zonda plan``. Only click is imported with this module."""
+
+from __future__ import annotations
+
+import click
+
+
+@click.command()
+@click.argument("pipeline", metavar="FILE_OR_NAME")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
+@click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full.")
+@click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
+@click.option("--no-prune", is_flag=True, help="Leave nothing out.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option(
+    "--audit", is_flag=True, help="Rerun a short slice with everything on and compare; exit status 1 where a bound fails."
+)
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads of the run that is planned.  [default: all]")
+def plan(
+    pipeline: str,
+    settings: tuple[str, ...],
+    keep: tuple[str, ...],
+    drop: tuple[str, ...],
+    no_prune: bool,
+    as_json: bool,
+    audit: bool,
+    threads: int | None,
+) -> None:
+    """Show what of a scene is worth simulating, what it costs, and what leaving out the rest may cost.
+
+    Each effect has a bound on the error that its coarser form adds to the products, with its formula. They are dropped or
+    coarsened, the cheapest first, while the bounds add up to no more than the budget: a tenth of the noise, or the file's
+    `budget:`.
+    """
+    from ..compiled import ensure_cache, one_blas_thread
+
+    one_blas_thread()
+    ensure_cache()
+    from ..configuration.pipeline_file import load
+    from . import table
+    from .planner import plan as make
+
+    file = load(pipeline, settings)
+    made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)
+    if not audit:
+        import json
+
+        click.echo(json.dumps(table.as_dict(made), indent=2) if as_json else table.text(made))
+        return
+    from .audit import audit as compare
+
+    found = compare(file, made, threads=threads)
+    click.echo(found.json() if as_json else str(found))
+    if found.violated:
+        raise click.exceptions.Exit(1)

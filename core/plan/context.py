@@ -1,0 +1,220 @@
+"""What the bounds are judged by: the scan, the noise of the products, the filters on the way to them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data import Data, Observation
+from ..operator import Operator
+from ..pipeline import Pipeline
+from ..projection import rotation_matrices
+from ..scene import Scene
+from .estimate import Traits
+from .structure import Structure, selected
+
+DEEP = 0.9
+"""Quantile of the hits over the covered map: its deeper part has the least noise, so what holds there holds everywhere."""
+
+CELLS, POINTS, DETECTORS = 32, 4096, 96
+"""Hits are counted on CELLS x CELLS cells from at most POINTS instants and DETECTORS detectors of each scan."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How the scans cover the map.
+
+    Attributes
+    ----------
+    hits
+        Samples per pixel in the deep part of the map (quantile `DEEP`).
+    pixel
+        Side of a pixel, rad.
+    speed
+        Median speed of the boresight on the sky, rad/s.
+    """
+
+    hits: float
+    pixel: float
+    speed: float
+
+
+@dataclass
+class Context:
+    """Everything an `Operator.estimate` may look at.
+
+    Attributes
+    ----------
+    scene, observations
+        Observations have their pointing, and efficiencies and noise levels where those are given.
+    operators
+        Those that take part, in order, labelled.
+    runs
+        Number of runs (main and companions) in which each takes part, by label.
+    traits
+        By label.
+    coverage
+        None: no map is made.
+    metrics
+        Which errors matter (see `estimate.METRICS`).
+    """
+
+    scene: Scene
+    observations: list[Observation]
+    operators: list[Operator]
+    runs: dict[str, int]
+    traits: dict[str, Traits] = field(default_factory=dict)
+    coverage: Coverage | None = None
+    metrics: frozenset[str] = frozenset()
+    limits: dict[str, float] = field(default_factory=dict)
+    """The budget by metric: a coarser form whose bound alone exceeds it need not be looked into."""
+    kept_streams: frozenset[str] = frozenset()
+    """Streams that some operator saves, measures or draws besides ``signal``."""
+
+    @property
+    def first(self) -> Observation:
+        """The first observation."""
+        return self.observations[0]
+
+    @property
+    def noise(self) -> float:
+        """White noise of one sample of the calibrated stream, K: (sum of squares)^(1/2) over the operators."""
+        return math.sqrt(sum(t.noise**2 for t in self.traits.values()))
+
+    @property
+    def fluctuation(self) -> float:
+        """Largest rms of one sample's fluctuation, all components, K."""
+        return math.sqrt(sum(t.rms**2 + t.noise**2 + (t.peak or 0.0) ** 2 for t in self.traits.values()))
+
+    @property
+    def peak(self) -> float:
+        """Largest brightness of the sky, K; 0 where there is none."""
+        return sum(t.peak or 0.0 for t in self.traits.values())
+
+    @property
+    def map_noise(self) -> float:
+        """White noise of a map pixel in the deep part, K: sigma / sqrt(hits)."""
+        return self.noise / math.sqrt(self.coverage.hits) if self.coverage else 0.0
+
+    @property
+    def removes_common(self) -> bool:
+        """Whether what all detectors have in common is removed."""
+        return any(t.removes_common for t in self.traits.values())
+
+    @property
+    def samples(self) -> int:
+        """Detectors x samples of all observations."""
+        return sum(o.n_detectors * o.n_samples for o in self.observations)
+
+    @property
+    def times(self) -> int:
+        """Samples of all observations."""
+        return sum(o.n_samples for o in self.observations)
+
+    def response(self, frequency: float) -> float:
+        """Amplitude that the filters pass at a frequency, Hz."""
+        return math.prod(t.response(frequency) for t in self.traits.values() if t.response)
+
+    @property
+    def cut(self) -> float:
+        """Frequency below which the filters pass less than a tenth, Hz; 0: there is none."""
+        grid = np.geomspace(1e-4, 0.5 * self.first.sample_rate, 400)
+        passed = [f for f in grid if self.response(float(f)) >= 0.1]
+        return 0.0 if not passed or passed[0] == grid[0] else float(passed[0])
+
+    def in_map(self, tod: float, correlated: float, common: bool) -> float:
+        """Map rms of an error of rms ``tod`` in the stream, K.
+
+        The mean of H samples whose errors have correlation rho has the variance tod^2 sum_ij rho_ij / H^2 <= tod^2 c / H, c
+        the number of samples that err together: those of one passage through the pixel, and those that fall in it within the
+        correlation time. ``correlated``: integral of |rho| over time, s. ``common``: all detectors err alike.
+        """
+        if self.coverage is None:
+            return 0.0
+        o, cover = self.first, self.coverage
+        passage = o.sample_rate * cover.pixel / max(cover.speed, 1e-12)
+        share = cover.hits / max(self.samples, 1)  # of all samples that fall in one pixel
+        if common:
+            # while the focal plane covers the pixel, every detector may pass it
+            area = math.pi * max(o.focalplane.radius, cover.pixel) ** 2
+            rate = max(o.n_detectors * cover.pixel**2 / area, o.n_detectors * share) * o.sample_rate
+        else:
+            rate = share * o.sample_rate
+        together = min(min(passage, correlated * o.sample_rate) + rate * correlated, cover.hits)
+        return tod * math.sqrt(min(1.0, max(together, 1.0) / max(cover.hits, 1.0)))
+
+    def bound(self, tod: float, correlated: float = 0.0, common: bool = False) -> dict[str, float]:
+        """Bound on map and stream from an error of rms ``tod`` in the stream."""
+        return {"tod": tod, "map_rms": self.in_map(tod, correlated, common)}
+
+    def affords(self, bound: Mapping[str, float]) -> bool:
+        """Whether a bound alone is within the budget."""
+        return all(v <= self.limits[m] for m, v in bound.items() if m in self.limits)
+
+    def sky_error(self, share: float) -> dict[str, float]:
+        """Bound on peak and transfer function from a relative error of the sky's signal."""
+        return {"peak": share * self.peak, "transfer": share}
+
+
+def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
+    """Point the telescope and gather what the bounds need. ``pipeline`` is the planner's own copy."""
+    operators = [o for o in pipeline.operators if o.label in structure.operators]
+    data = Data(scene=scene)
+    for operator in operators:
+        if not (operator.at_end or operator.main_run_only):
+            operator.observe(data)
+    for operator in operators:
+        operator.configure(data.observations[0])
+    runs = selected(pipeline, structure)
+    streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.main_run_only))
+    context = Context(scene, data.observations, operators, runs, kept_streams=streams)
+    context.traits = {o.label: o.traits(data.observations[0]) for o in operators}
+    pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
+    if pixels:
+        context.coverage = cover(data.observations, min(pixels))
+    context.metrics = _metrics(pipeline, structure, context)
+    return context
+
+
+def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> frozenset[str]:
+    found = set()
+    if context.coverage is not None:
+        found |= {"map_rms", "peak"}
+        if any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
+            found.add("transfer")
+    if any(o.main_run_only for o in context.operators) or context.coverage is None:
+        found |= {"tod", "psd"}
+    return frozenset(found)
+
+
+def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
+    """Hits per pixel of side ``pixel`` [rad] and scan speed, from a thinned set of instants and detectors."""
+    points: list[NDArray[np.float64]] = []
+    weights: list[NDArray[np.float64]] = []
+    speeds = []
+    centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
+    for o in observations:
+        times = np.unique(np.linspace(0, o.n_samples - 1, min(POINTS, o.n_samples)).astype(int))
+        rows = np.unique(np.linspace(0, o.n_detectors - 1, min(DETECTORS, o.n_detectors)).astype(int))
+        turn = centre.T @ rotation_matrices(o.boresight_radec[times])
+        plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
+        looking = turn @ plane  # (time, 3, detector)
+        front = looking[:, 2] > 0.1
+        points.append(np.array([looking[:, 0][front] / looking[:, 2][front], looking[:, 1][front] / looking[:, 2][front]]))
+        weights.append(np.full(points[-1].shape[1], o.n_samples * o.n_detectors / (len(times) * len(rows))))
+        if o.n_samples > 1:
+            at = times[:-1]
+            ends = rotation_matrices(o.boresight_radec[np.stack([at, at + 1], 1).ravel()])[:, :, 2].reshape(-1, 2, 3)
+            speeds.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * o.sample_rate)
+    where, weight = np.concatenate(points, axis=1), np.concatenate(weights)
+    reach = np.maximum(np.ptp(where, axis=1), pixel)
+    cells = np.maximum(1, np.minimum(CELLS, np.floor(reach / pixel))).astype(int)
+    counts, xs, ys = np.histogram2d(where[0], where[1], bins=list(cells), weights=weight)
+    area = max(float((xs[1] - xs[0]) * (ys[1] - ys[0])), pixel**2)
+    hits = counts[counts > 0] * min(1.0, pixel**2 / area)
+    speed = float(np.median(np.concatenate(speeds))) if speeds else 0.0
+    return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed)

@@ -1,0 +1,128 @@
+"""CPU time and memory before they are spent.
+
+An operator states its cost on a reference machine as seconds = a + b N_t + c N_det N_t (`estimate.Cost`). What this machine
+needs follows from three kernels that are run for a fraction of a second and compared with their times there: random numbers,
+streams through memory, and the interpreter with small arrays.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+
+from ..execution import SCRATCH_STREAMS
+from ..tiles import TILE_DETECTORS
+from .context import Context
+from .estimate import Cost
+
+REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
+"""Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""
+
+STARTUP = Cost(once=1.8, kernel="python")
+"""Imports and compiled code from the cache; planning is measured."""
+
+BASE = 230e6
+"""Bytes of the interpreter, libraries and compiled code."""
+
+
+@cache
+def calibrate(budget: float = 0.3) -> Mapping[str, float]:
+    """Time of each kernel relative to the reference machine. Takes about ``budget`` seconds, once per process.
+
+    The least of several runs: what other programs take does not count as this machine's speed.
+    """
+    from ..random import normals, stream_key
+
+    key, array = stream_key(1, "calibration"), np.linspace(0.0, 1.0, 1 << 16, dtype=np.float32)
+    other, small = np.empty_like(array), np.arange(64.0)
+
+    def draw() -> None:
+        normals(key, 0, 1 << 20)
+
+    def stream() -> None:
+        for _ in range(64):  # from the cache, as the blocks of a run
+            np.multiply(array, np.float32(1.0001), out=other)
+            np.add(other, array, out=other)
+
+    def python() -> None:
+        for _ in range(1500):
+            np.einsum("i,i->", small, small)
+
+    kernels: dict[str, Callable[[], None]] = {"random": draw, "stream": stream, "python": python}
+    for kernel in kernels.values():
+        kernel()
+    best = dict.fromkeys(kernels, np.inf)
+    until = time.process_time() + budget
+    while time.process_time() < until:
+        for name, kernel in kernels.items():  # in turn, so that a busy moment does not spoil one of them
+            start = time.process_time()
+            kernel()
+            best[name] = min(best[name], time.process_time() - start)
+    return {name: seconds / REFERENCE[name] for name, seconds in best.items()}
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """CPU seconds by operator, memory, and the operators whose cost nobody stated."""
+
+    seconds: Mapping[str, float]
+    bytes: float
+    unknown: tuple[str, ...] = ()
+    startup: float = 0.0
+    factors: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def total(self) -> float:
+        """CPU seconds of the whole run."""
+        return self.startup + sum(self.seconds.values())
+
+
+def predict(context: Context, costs: Mapping[str, Cost | None], threads: int, item: int, memory: int) -> Prediction:
+    """Of one run of the pipeline and its companions.
+
+    Parameters
+    ----------
+    costs
+        By label of the operators that take part; None: unknown.
+    threads, memory
+        As in `Settings`.
+    item
+        Bytes of one sample of a stream.
+    """
+    factors = calibrate()
+    seconds = {}
+    for label, cost in costs.items():
+        if cost is None:
+            continue
+        runs = context.runs.get(label, 1) or 1
+        each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
+        seconds[label] = factors[cost.kernel] * (runs * each + cost.once)
+    unknown = tuple(label for label, cost in costs.items() if cost is None)
+    late = {o.label for o in context.operators if o.at_end}
+    held = sum(cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
+    after = sum(cost.bytes for label, cost in costs.items() if cost is not None and label in late)
+    startup = factors[STARTUP.kernel] * STARTUP.once
+    during = held + stream_bytes(context, threads, item, memory)
+    return Prediction(seconds, BASE + max(during, after), unknown, startup, factors)
+
+
+def stream_bytes(context: Context, threads: int, item: int, memory: int) -> float:
+    """Streams kept whole between segments, and the blocks of the threads (see `core.execution`)."""
+    from ..execution import cut
+
+    longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
+    steps = [o for o in context.operators if not o.at_end and "boresight" not in o.provides]
+    segments = cut(steps, longest)
+    whole = longest.n_samples * longest.n_detectors * item
+    streams = sum(1 for k in range(1, len(segments)) if k == 1)
+    kept = sum(1 for name in context.kept_streams) if len(segments) > 1 else 0
+    held = (streams + kept) * whole if whole <= memory // 2 else 0.0
+    rows = min(TILE_DETECTORS, longest.n_detectors)
+    columns = longest.n_samples if any(s.span == "time" for s in segments) else min(longest.n_samples, 1 << 16)
+    blocks = threads * (SCRATCH_STREAMS + 2) * rows * columns * item
+    pointing = sum(o.n_samples * (4 + 4 + 1) * 8 for o in context.observations)
+    return held + min(blocks, memory // 2) + pointing

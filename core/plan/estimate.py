@@ -1,0 +1,145 @@
+"""What an operator tells the planner: how large its effects are, what coarser forms would err by, what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+METRICS = {
+    "map_rms": "rms error of a map pixel, K",
+    "peak": "largest error of the sky's brightness in the map, K",
+    "transfer": "largest error of the transfer function",
+    "tod": "rms error of one sample of the calibrated time stream, K",
+    "psd": "largest relative error of the time stream's power spectrum, before filters",
+}
+"""What an error may be bounded in."""
+
+Bound = Mapping[str, float]
+"""Upper bounds by metric; a metric that is absent is not touched."""
+
+Decision = Literal["full", "coarse", "dropped", "not simulated"]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One way to carry out an effect.
+
+    Attributes
+    ----------
+    decision, what
+        Kind, and in a few words what it is (``6 poles``).
+    settings
+        Parameters of the operator (or of the pipeline: ``precision``) that bring it about.
+    leave_out
+        The operator does not run at all.
+    bound
+        Error against the effect as the pipeline asks for it.
+    formula
+        Where the bound comes from.
+    seconds, bytes
+        CPU time that it saves [reference s, see `cost`] and memory [B], against the effect as the pipeline asks for it.
+    """
+
+    decision: Decision
+    what: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    leave_out: bool = False
+    bound: Bound = field(default_factory=dict)
+    formula: str = ""
+    seconds: float = 0.0
+    bytes: float = 0.0
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Something that the sky, the air, the telescope or the arithmetic does to the products.
+
+    Attributes
+    ----------
+    name
+        Unique in its operator: ``poles``, ``layer 9``.
+    choices
+        The first is what the pipeline asks for; the others are coarser, each less accurate than the one before.
+    size, formula
+        Upper bound of what the effect contributes (what leaving it out would cost), and where it comes from.
+    """
+
+    name: str
+    choices: tuple[Choice, ...]
+    size: Bound = field(default_factory=dict)
+    formula: str = ""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """CPU seconds on the reference machine (`cost.REFERENCE`) of one run over one observation, and memory.
+
+    Attributes
+    ----------
+    fixed, per_time, per_sample
+        seconds = fixed + per_time N_t + per_sample N_det N_t.
+    once
+        Seconds for the whole run, whatever the observations and companion runs (pictures, files).
+    bytes
+        Held at the same time as the streams.
+    kernel
+        Which calibration kernel scales it: ``random``, ``stream`` or ``python``.
+    """
+
+    fixed: float = 0.0
+    per_time: float = 0.0
+    per_sample: float = 0.0
+    once: float = 0.0
+    bytes: float = 0.0
+    kernel: Literal["random", "stream", "python"] = "stream"
+
+    def seconds(self, n_times: int, n_detectors: int) -> float:
+        """Of one observation in one run."""
+        return self.fixed + self.per_time * n_times + self.per_sample * n_times * n_detectors
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An operator's effects and its cost; ``cost`` None: unknown, the planner says so."""
+
+    effects: tuple[Effect, ...] = ()
+    cost: Cost | None = None
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What other operators' bounds need to know of an operator.
+
+    Attributes
+    ----------
+    noise
+        Adds this much white noise: rms of one sample of the calibrated stream, K.
+    rms
+        Adds a fluctuation of at most this rms to the calibrated stream, K (the smooth mean apart).
+    peak
+        Adds a sky of at most this brightness, K; None: it adds no sky, or does not know.
+    pixel
+        Makes a map with pixels of this side, rad.
+    response
+        Amplitude that passes at a frequency [Hz]; None: all.
+    removes_common
+        Removes what all detectors have in common.
+    """
+
+    noise: float = 0.0
+    rms: float = 0.0
+    peak: float | None = None
+    pixel: float = 0.0
+    response: Callable[[float], float] | None = None
+    removes_common: bool = False
+
+
+def full(what: str, **more: Any) -> Choice:
+    """The first choice of an effect: as the pipeline asks for it."""
+    return Choice("full", what, **more)
+
+
+def not_simulated(name: str, what: str, bound: Bound, formula: str) -> Effect:
+    """An effect that nature has and zonda leaves out, with a bound on what that costs."""
+    return Effect(name, (Choice("not simulated", what, bound=bound, formula=formula),), bound, formula)

@@ -1,0 +1,366 @@
+"""`zonda plan`: what a scene calls for, what each effect costs, and what is left out or coarsened within an error budget."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from ..configuration.diagnostics import nearest
+from ..configuration.pipeline_file import PipelineFile, Step
+from ..data import Data
+from ..errors import ZondaError
+from ..execution import available_memory, available_threads
+from ..pipeline import Pipeline
+from .budget import limits
+from .context import Context, look
+from .cost import Prediction, predict
+from .estimate import METRICS, Bound, Choice, Cost, Effect, Estimate, full
+from .structure import Structure, prune, selected
+
+LARGEST_RATIO = 1e5
+"""Of a stream's rms to its noise up to which float32 is thought of where the pipeline asks for float64."""
+
+LEAST_SAVING = 0.005
+"""Share of the predicted time that a decision must save to be worth an error."""
+
+
+@dataclass(frozen=True)
+class Decided:
+    """An effect with the choice that was made and why. ``operator``: a label, or ``pipeline``."""
+
+    operator: str
+    effect: Effect
+    chosen: int
+    reason: str = ""
+
+    @property
+    def choice(self) -> Choice:
+        """What is done."""
+        return self.effect.choices[self.chosen]
+
+    @property
+    def name(self) -> str:
+        """As ``--keep`` and ``--drop`` take it."""
+        return f"{self.operator}.{self.effect.name}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is done about each effect; the errors it adds, what is allowed; the time and memory it will take.
+
+    Attributes
+    ----------
+    structure
+        What runs at all.
+    decided
+        One for each effect.
+    limits, spent
+        By metric: the budget, and the sum of the bounds of what was dropped or coarsened.
+    noise
+        White noise: rms of one sample and of a map pixel (0: no map), K; samples per pixel in the deep part of the map.
+    prediction, unpruned
+        With the plan, and with everything on.
+    """
+
+    structure: Structure
+    decided: tuple[Decided, ...]
+    limits: Mapping[str, float]
+    spent: Mapping[str, float]
+    noise: tuple[float, float, float]
+    prediction: Prediction
+    unpruned: Prediction
+    context: Context
+    pruned: bool = True
+
+    def apply(self, file: PipelineFile) -> PipelineFile:
+        """The pipeline that is run: an ordinary one, with parameters changed and operators left out."""
+        labels = [o.label for o in Pipeline(file.operators, runs=file.runs).operators]
+        settings = self.settings()
+        left_out = {d.operator for d in self.decided if d.choice.leave_out}
+        steps, kept = [], []
+        for label, step in zip(labels, file.steps, strict=True):
+            if label in left_out or label not in self.structure.operators:
+                continue
+            update = settings.get(label, {})
+            steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
+            kept.append(label)
+        runs = {name: run for name, run in file.runs.items() if name in self.structure.runs}
+        header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **settings.get("pipeline", {})})
+        return dataclasses.replace(file, header=header, steps=tuple(_same_labels(steps, kept)))
+
+    def settings(self) -> dict[str, dict[str, Any]]:
+        """Changed parameters by operator. Lists that several effects set are joined."""
+        found: dict[str, dict[str, Any]] = {}
+        for d in self.decided:
+            for key, value in d.choice.settings.items():
+                mine = found.setdefault(d.operator, {})
+                mine[key] = [*mine.get(key, []), *value] if isinstance(value, list) else value
+        return found
+
+    @cached_property
+    def coarsened(self) -> tuple[Decided, ...]:
+        """What is not simulated in full although the pipeline asks for it."""
+        return tuple(d for d in self.decided if d.chosen > 0)
+
+    def __str__(self) -> str:
+        from .table import text
+
+        return text(self)
+
+    def _repr_html_(self) -> str:
+        from ..data import html_table
+        from .table import rows
+
+        return html_table("Plan", [(f"{r['operator']}.{r['effect']}", f"{r['decision']}: {r['what']}") for r in rows(self)])
+
+
+def plan(
+    file: PipelineFile,
+    *,
+    keep: Sequence[str] = (),
+    drop: Sequence[str] = (),
+    prune_all: bool = True,
+    threads: int | None = None,
+    memory: int | None = None,
+    measure: bool = False,
+) -> Plan:
+    """Plan a pipeline file.
+
+    Parameters
+    ----------
+    keep
+        Effects or operators that stay as the pipeline asks for them (``poles``, ``PinkNoise.poles``, ``PinkNoise``).
+    drop
+        Effects or operators to leave out, whatever that costs; their bounds are stated.
+    prune_all
+        False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
+    measure
+        Run a slice of a few seconds to find the cost of operators that do not state it.
+
+    Raises
+    ------
+    ZondaError
+        For a name that is not in the plan, or a budget that is not a number from 0 to 1.
+    """
+    begin = time.process_time()
+    pipeline, scene = file.pipeline(), file.scene()
+    labels = [o.label for o in pipeline.operators]
+    everything = Structure(tuple(labels), tuple(pipeline.runs), ())
+    operators_dropped = [name for name in drop if name in labels]
+    structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
+    structure = dataclasses.replace(structure, operators=tuple(k for k in structure.operators if k not in operators_dropped))
+    context = look(pipeline, scene, structure)
+    allowed = {m: v for m, v in limits(file.header.budget, context.map_noise, context.noise).items() if m in context.metrics}
+    context.limits = allowed
+    estimates = {o.label: o.estimate(context) for o in context.operators}
+    effects = [Decided(label, e, 0) for label, estimate in estimates.items() for e in estimate.effects]
+    effects += [Decided("pipeline", e, 0) for e in _of_pipeline(pipeline, context)]
+    kept, forced = _named(keep, effects, labels), _named(drop, effects, labels)
+    _check_droppable(drop, effects, labels)
+    settings = threads or available_threads(), 8 if pipeline.precision == "float64" else 4, memory or available_memory() // 2
+    costs = {label: estimate.cost for label, estimate in estimates.items()}
+    if measure and any(costs[o.label] is None for o in context.operators):
+        from .audit import measured
+
+        costs |= measured(file, [label for label, cost in costs.items() if cost is None])
+    now = predict(context, costs, *settings)
+    decided = _decide(effects, kept, forced, allowed, now, context, prune_all)
+    spent = {m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed}
+    noise = (context.noise, context.map_noise, context.coverage.hits if context.coverage else 0.0)
+    prediction = _saving(now, decided, context)
+    unpruned = _unpruned(pipeline, scene, structure, everything, context, estimates, now, settings)
+    planning = time.process_time() - begin
+    prediction, unpruned = (dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned))
+    return Plan(structure, tuple(decided), allowed, spent, noise, prediction, unpruned, context, prune_all)
+
+
+def _decide(
+    effects: list[Decided],
+    kept: set[str],
+    forced: set[str],
+    allowed: Mapping[str, float],
+    now: Prediction,
+    context: Context,
+    prune_all: bool,
+) -> list[Decided]:
+    """Largest saving for the share of the budget that it takes, first; sums of bounds stay within the budget."""
+    chosen = {d.name: (len(d.effect.choices) - 1 if d.name in forced else 0) for d in effects}
+    by_name = {d.name: d for d in effects}
+    left = {m: allowed[m] - sum(_bound(d, chosen[d.name], m) for d in effects if d.name in forced) for m in allowed}
+    worth = LEAST_SAVING * now.total
+    while prune_all:
+        best: tuple[float, str, int] | None = None
+        for name, d in by_name.items():
+            if name in kept or name in forced:
+                continue
+            for k in range(chosen[name] + 1, len(d.effect.choices)):
+                saved = _seconds(d, k, now, context) - _seconds(d, chosen[name], now, context)
+                more = {m: _bound(d, k, m) - _bound(d, chosen[name], m) for m in left}
+                if saved < worth or any(not extra <= left[m] for m, extra in more.items()):
+                    continue
+                share = max((extra / allowed[m] for m, extra in more.items() if extra > 0), default=0.0)
+                merit = saved / max(share, 1e-9)
+                if best is None or merit > best[0]:
+                    best = (merit, name, k)
+        if best is None:
+            break
+        _, name, k = best
+        d = by_name[name]
+        left = {m: v - _bound(d, k, m) + _bound(d, chosen[name], m) for m, v in left.items()}
+        chosen[name] = k
+    return [dataclasses.replace(d, chosen=chosen[d.name], reason=_why(d, chosen, kept, forced, left, worth, now, context,
+                                                                      prune_all)) for d in effects]  # fmt: skip
+
+
+def _bound(d: Decided, k: int, metric: str) -> float:
+    value = d.effect.choices[k].bound.get(metric, 0.0) if k else 0.0
+    return value if value == value else math.inf  # a bound that is not a number allows nothing
+
+
+def _seconds(d: Decided, k: int, now: Prediction, context: Context) -> float:
+    """CPU seconds that a choice saves on this machine, all runs."""
+    runs = max(context.runs.get(d.operator, 1), 1)
+    return d.effect.choices[k].seconds * runs * max(now.factors.values(), default=1.0)
+
+
+def _why(
+    d: Decided,
+    chosen: Mapping[str, int],
+    kept: set[str],
+    forced: set[str],
+    left: Mapping[str, float],
+    worth: float,
+    now: Prediction,
+    context: Context,
+    prune_all: bool,
+) -> str:
+    k, choices = chosen[d.name], d.effect.choices
+    if choices[0].decision == "not simulated":
+        over = [m for m, v in choices[0].bound.items() if m in context.metrics and v > left.get(m, math.inf)]
+        return f"may exceed what is left of the budget for {' and '.join(over)}" if over else "within the budget"
+    if d.name in forced:
+        return "--drop"
+    if d.name in kept:
+        return "--keep"
+    if k > 0:
+        return "within the budget"
+    if not prune_all:
+        return "--no-prune"
+    if len(choices) == 1:
+        return ""
+    if max(_seconds(d, j, now, context) for j in range(1, len(choices))) < worth:
+        return "leaving it out would save nothing"
+    return "a coarser form would exceed the budget"
+
+
+def _saving(now: Prediction, decided: Iterable[Decided], context: Context) -> Prediction:
+    seconds, memory = dict(now.seconds), now.bytes
+    for d in decided:
+        saved = _seconds(d, d.chosen, now, context) if d.chosen else 0.0
+        if d.choice.leave_out:
+            saved = seconds.get(d.operator, 0.0)
+        if d.operator in seconds:
+            seconds[d.operator] = max(seconds[d.operator] - saved, 0.0)
+        memory -= d.choice.bytes if d.chosen else 0.0
+    return dataclasses.replace(now, seconds=seconds, bytes=memory)
+
+
+def _unpruned(
+    pipeline: Pipeline,
+    scene: Any,
+    structure: Structure,
+    everything: Structure,
+    context: Context,
+    estimates: Mapping[str, Estimate],
+    now: Prediction,
+    settings: tuple[int, int, int],
+) -> Prediction:
+    """What the pipeline would take with everything on."""
+    if structure.operators == everything.operators and structure.runs == everything.runs:
+        return now
+    runs = selected(pipeline, everything)
+    whole = dataclasses.replace(context, operators=list(pipeline.operators), runs=runs)
+    costs: dict[str, Cost | None] = {}
+    for operator in pipeline.operators:
+        known = estimates.get(operator.label)
+        if known is None:
+            if not (operator.at_end or operator.main_run_only):
+                operator.observe(Data(scene=scene, observations=list(context.observations)))
+            operator.configure(whole.first)
+            known = operator.estimate(whole)
+        costs[operator.label] = known.cost
+    return predict(whole, costs, *settings)
+
+
+def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
+    """Precision of the streams. Rounding is independent from sample to sample: 2^-24 / sqrt(3) of their rms."""
+    rms = context.fluctuation * 2.0**-24 / math.sqrt(3.0)
+    formula = "2^-24 / sqrt(3) x rms of the stream, independent between samples"
+    bound = context.bound(rms)
+    if pipeline.precision == "float32":
+        return [Effect("precision", (full("float32"),), bound, formula)]
+    carries_mean = context.cut == 0 and any("atmosphere" in o.provides for o in context.operators)
+    if carries_mean or context.fluctuation > LARGEST_RATIO * context.noise:  # the filters refuse float32 there
+        return [Effect("precision", (full("float64"),), bound, formula)]
+    whole = max(o.n_samples * o.n_detectors for o in context.observations) * 4
+    seconds = 4e-9 * context.samples
+    single = Choice("coarse", "float32", {"precision": "float32"}, bound=bound, formula=formula, seconds=seconds, bytes=whole)
+    return [Effect("precision", (full("float64"), single), bound, formula)]
+
+
+def _named(names: Sequence[str], effects: Sequence[Decided], labels: Sequence[str]) -> set[str]:
+    """Full names of the effects that ``names`` mean. Raises ZondaError for one that means none."""
+    found: set[str] = set()
+    for name in names:
+        mine = {d.name for d in effects if name in (d.name, d.effect.name, d.operator)}
+        if not mine and name not in labels:
+            options = [*dict.fromkeys([*(d.effect.name for d in effects), *(d.name for d in effects), *labels])]
+            cure = nearest(name, options) or f"choose from: {', '.join(dict.fromkeys(d.effect.name for d in effects))}"
+            raise ZondaError(f"the plan has no effect or operator {name!r}", place="zonda plan", cure=cure)
+        found |= mine
+    return found
+
+
+def _check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Sequence[str]) -> None:
+    for name in drop:
+        mine = [d for d in effects if name in (d.name, d.effect.name)]
+        if mine and name not in labels and all(len(d.effect.choices) == 1 for d in mine):
+            what = "is not simulated" if mine[0].choice.decision == "not simulated" else "has no coarser form"
+            raise ZondaError(f"{name!r} cannot be dropped: it {what}", place="zonda plan", cure="leave out --drop for it")
+
+
+def _same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
+    """Steps named so that each keeps its label, on which its random numbers depend, though a namesake is left out."""
+    named = []
+    for step, label, new in zip(steps, labels, Pipeline([s.operator for s in steps]).operators, strict=True):
+        same = new.label == label
+        named.append(step if same else Step(step.key, step.operator.model_copy(update={"name": label})))
+    return named
+
+
+def describe(bound: Bound, metrics: Iterable[str]) -> str:
+    """A bound in the products' units, the metrics that matter only."""
+    parts = []
+    for metric in METRICS:
+        if metric in bound and metric in metrics:
+            value = bound[metric]
+            parts.append(f"{metric} {figure(metric, value)}")
+    return ", ".join(parts)
+
+
+def figure(metric: str, value: float) -> str:
+    """A bound in its metric's unit."""
+    return f"{value:.1e}" if metric in ("transfer", "psd") else kelvin(value)
+
+
+def kelvin(value: float) -> str:
+    """A temperature with two figures and a unit that reads well."""
+    for factor, unit in ((1.0, "K"), (1e3, "mK"), (1e6, "uK"), (1e9, "nK")):
+        if abs(value) * factor >= 1:
+            return f"{value * factor:.3g} {unit}"
+    return f"{value * 1e9:.1g} nK" if value else "0 K"

@@ -1,0 +1,114 @@
+"""A plan as text, as JSON, and in short for headers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .planner import Decided, Plan, describe, figure, kelvin
+
+
+def rows(plan: Plan) -> list[dict[str, Any]]:
+    """One row per effect: operator, effect, decision, what, bound, formula, size, saved seconds, reason."""
+    return [_row(plan, d) for d in plan.decided]
+
+
+def _row(plan: Plan, d: Decided) -> dict[str, Any]:
+    choice = d.choice
+    metrics = plan.context.metrics
+    bound = {k: float(v) for k, v in choice.bound.items() if k in metrics}
+    runs = max(plan.context.runs.get(d.operator, 1), 1)
+    return {
+        "operator": d.operator,
+        "effect": d.effect.name,
+        "decision": choice.decision,
+        "what": choice.what,
+        "settings": {k: _plain(v) for k, v in choice.settings.items()},
+        "bound": bound,
+        "formula": choice.formula or d.effect.formula,
+        "size": {k: float(v) for k, v in d.effect.size.items() if k in metrics},
+        "saved_seconds": round(choice.seconds * runs, 4) if d.chosen else 0.0,
+        "reason": d.reason,
+    }
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, (int, float, str, bool, list, type(None))) else str(value)
+
+
+def text(plan: Plan, width: int = 150) -> str:
+    """The table for a terminal."""
+    lines = []
+    metrics = plan.context.metrics
+    sample, pixel, hits = plan.noise
+    if pixel:
+        lines.append(f"noise: {kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part), {kelvin(sample)} per sample")
+    else:
+        lines.append(f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none")
+    for metric, limit in plan.limits.items():
+        spent = plan.spent[metric]
+        lines.append(f"budget for {metric}: {figure(metric, spent)} of {figure(metric, limit)} spent")
+    groups: dict[tuple[str, str], list[str]] = {}
+    for row in plan.structure.rows:
+        groups.setdefault((row.run, row.reason), []).append(row.operator)
+    for (run, reason), operators in groups.items():
+        named = ", ".join(filter(None, operators))
+        lines.append(f"left out: {f'run {run}' if run else ''}{': ' if run and named else ''}{named} ({reason})")
+    table = [("effect", "decision", "error bound", "if left out", "saves", "why")]
+    for d in plan.decided:
+        choice = d.choice
+        saves = choice.seconds * max(plan.context.runs.get(d.operator, 1), 1) if d.chosen else 0.0
+        error = describe(choice.bound, metrics) if d.chosen or choice.decision == "not simulated" else ""
+        size = describe(d.effect.size, metrics) if choice.decision != "not simulated" else ""
+        formula = choice.formula or d.effect.formula
+        why = "; ".join(filter(None, (d.reason, formula)))
+        decision = choice.decision if choice.decision == choice.what else f"{choice.decision}: {choice.what}"
+        table.append((d.name, decision, error, size, f"{saves:.2g} s" if saves >= 0.01 else "", why))
+    widths = [max(len(r[k]) for r in table) for k in range(5)]
+    lines.append("")
+    for r in table:
+        lines.append("  ".join([*(c.ljust(w) for c, w in zip(r[:5], widths, strict=True)), r[5]]).rstrip())
+    lines += ["", line(plan)]
+    return "\n".join(lines)
+
+
+def line(plan: Plan) -> str:
+    """The prediction in one line."""
+    p, u = plan.prediction, plan.unpruned
+    words = f"about {_time(p.total)} of CPU time and {p.bytes / 1e9:.2g} GB"
+    if u.total - p.total > 0.01 * u.total:
+        words += f" (everything on: {_time(u.total)}, {u.bytes / 1e9:.2g} GB)"
+    if p.unknown:
+        words += f", not counting {', '.join(p.unknown)}"
+    return words
+
+
+def _time(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def as_dict(plan: Plan) -> dict[str, Any]:
+    """Everything, as JSON takes it."""
+    p, u = plan.prediction, plan.unpruned
+    sample, pixel, hits = plan.noise
+    return {
+        "noise": {"sample": sample, "map_pixel": pixel, "samples_per_pixel": hits},
+        "budget": {m: {"limit": v, "spent": plan.spent[m]} for m, v in plan.limits.items()},
+        "left_out": [{"run": r.run, "operator": r.operator, "reason": r.reason} for r in plan.structure.rows],
+        "effects": rows(plan),
+        "prediction": {"cpu_seconds": p.total, "bytes": p.bytes, "by_operator": dict(p.seconds), "unknown": list(p.unknown)},
+        "everything_on": {"cpu_seconds": u.total, "bytes": u.bytes},
+    }
+
+
+def short(plan: Plan) -> list[tuple[str, str, str, str]]:
+    """For headers: (effect, decision, bound, formula), what is left out by structure first."""
+    found = []
+    for row in plan.structure.rows:
+        name = f"run {row.run}" + (f": {row.operator}" if row.operator else "") if row.run else row.operator
+        found.append((name, "left out", "", row.reason))
+    for d in plan.decided:
+        bound = describe(d.choice.bound, plan.context.metrics) if d.chosen or d.choice.decision == "not simulated" else ""
+        found.append((d.name, f"{d.choice.decision}: {d.choice.what}", bound, d.choice.formula or d.effect.formula))
+    return found

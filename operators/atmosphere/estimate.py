@@ -1,0 +1,268 @@
+"""Bounds and costs of the atmosphere's effects, see `core.plan`.
+
+Of a layer l with share a_l, variance s_l^2 behind the beam, and the band's emission T(PWV), one calibrated sample has the rms
+
+    K a_l s_l,    K = p PWV dT/dPWV epsilon / (zeta <e^-tau>)                                                     (1)
+
+and, where what all detectors have in common is removed, at most K times what their differences from the mean leave of it
+(`nodes.differential_rms`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zonda.core.instrument import Band
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+
+from .band import BandAtmosphere, _BandTransfer
+from .geometry import tracks
+from .nodes import LayerModel, differential_rms, some
+from .plan import make_plan
+from .turbulence import FIDELITIES
+
+if TYPE_CHECKING:
+    from zonda.core.data import Observation
+    from zonda.core.plan.context import Context
+
+    from .layers import AtmosphereLayers, Layer
+
+SAFETY = 1.25
+"""Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
+
+POINT, TRANSFER, LATTICE = 3e-8, 5e-7, 2e-7
+"""Seconds per point (node x time) of one layer and of the radiative transfer and splines; per lattice point."""
+
+FIRST = 0.8
+"""Seconds that the first choice of nodes and steps takes more: compiled code, tables."""
+
+PAYS = 0.3
+"""Seconds of evaluation from which coarser nodes are looked for."""
+
+
+@dataclass(frozen=True)
+class Air:
+    """What `AtmosphereLayers` knows of one observation before it draws anything.
+
+    ``kelvin``: K of equation (1). ``variances`` s_l^2. ``stretch`` of distances along the elevation.
+    """
+
+    band: BandAtmosphere
+    profile: Any
+    pwv: float
+    layers: list[Layer]
+    models: list[LayerModel]
+    variances: list[float]
+    kelvin: float
+    stretch: float
+    elevations: tuple[float, float]
+    points: dict[float, float] = field(default_factory=dict)
+    planning: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def rms(self) -> float:
+        """Of one calibrated sample, K."""
+        return self.kelvin * math.sqrt(sum(m.amplitude**2 * v for m, v in zip(self.models, self.variances, strict=True)))
+
+
+def air(operator: AtmosphereLayers, observation: Observation) -> Air:
+    """See `Air`."""
+    from .layers import _model, _turbulence
+
+    track = operator._tracks.get(observation.name) or tracks([observation])[0]
+    profile, band = operator._weather(observation)
+    pwv = operator.pwv or profile.pwv
+    layers = operator._layers(profile)
+    models = [_model(operator, layer, track, observation) for layer in layers]
+    variances = [_turbulence(operator, observation, n, m).variance for n, m in enumerate(models)]
+    low, high = float(observation.elevation.min()), float(observation.elevation.max())
+    plane = observation.focalplane
+    step = 1e-3
+    slope = float(band.emission_difference(pwv, pwv * step, low)) / step
+    share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max()) / max(
+        float(band.transmission(pwv, low)), 1e-6
+    )
+    scale = operator.pwv_rms
+    if operator.pwv_rms_after_beam:
+        scale /= math.sqrt(sum(m.amplitude**2 * v for m, v in zip(models, variances, strict=True)))
+    stretch = 1 / math.sin(track.elevation) if track.kind == "horizontal" else 1.0
+    return Air(band, profile, pwv, layers, models, variances, scale * abs(slope) * share, stretch, (low, high))
+
+
+def atmosphere_traits(operator: AtmosphereLayers, observation: Observation) -> Traits:
+    """rms of the fluctuation."""
+    return Traits(rms=air(operator, observation).rms)
+
+
+def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimate:
+    """Layers, their resolution, the band's spectrum, ozone, slopes with elevation."""
+    a = air(operator, context.first)
+    effects = [*_layer_effects(operator, context, a), *_resolution(operator, context, a), *_spectral(operator, context, a)]
+    effects += _slopes(context, a)
+    points = _points(operator, context, a, operator.tolerance) / len(context.observations)
+    layers = len(a.layers) - len(set(operator.omit))
+    fixed = 0.02 + (POINT * layers + TRANSFER) * points
+    nodes = max(a.planning["seconds"] - FIRST, 0.11)
+    once = 0.1 + nodes * len(context.observations)  # companions use the same plan
+    cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=1.8e-9, once=once, bytes=40.0 * points + 30e6)
+    return Estimate(tuple(effects), cost)
+
+
+def left_of_layer(context: Context, a: Air, k: int) -> float:
+    """rms of layer k in one calibrated sample after the common mode is gone, K."""
+    model = a.models[k]
+    if not context.removes_common:
+        return a.kelvin * model.amplitude * math.sqrt(a.variances[k])
+    xi, eta = some(context.first.focalplane.xi, context.first.focalplane.eta)
+    return a.kelvin * differential_rms(xi, eta, [model], a.stretch)
+
+
+def _correlated(operator: AtmosphereLayers, context: Context, model: LayerModel, wind: Any) -> float:
+    """Integral of the correlation over time, s: the beam or what of the outer scale the filters pass, over the wind's speed."""
+    speed = max(float(np.hypot(*wind)), 0.1)
+    slow = max(4 * model.sigma, min(operator.outer_scale, 20 * model.sigma)) / speed
+    return min(slow, 1 / context.cut) if context.cut > 0 else slow
+
+
+def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effect]:
+    text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) a_l x " + (
+        "rms left of the layer after subtraction of the detectors' mean" if context.removes_common else "rms behind the beam"
+    )
+    effects = []
+    for k, (layer, model) in enumerate(zip(a.layers, a.models, strict=True)):
+        rms = SAFETY * left_of_layer(context, a, k)
+        common = True  # detectors differ by less than they share: their errors do not average
+        bound = context.bound(rms, _correlated(operator, context, model, layer.wind), common)
+        opacity = _opacity_share(a) * operator.pwv_rms * model.amplitude * math.sqrt(a.variances[k])
+        bound |= context.sky_error(opacity)
+        bound["psd"] = SAFETY * (a.kelvin * model.amplitude) ** 2 * a.variances[k] / max(a.rms, 1e-30) ** 2
+        choices = [full(f"at {layer.height:.0f} m")]
+        if k in operator.omit:
+            choices = [full(f"at {layer.height:.0f} m: left out by the pipeline")]
+        elif not operator.outputs:
+            seconds = POINT * _points(operator, context, a, operator.tolerance)
+            choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound, formula=text, seconds=seconds))
+        effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
+    return effects
+
+
+def _points(operator: AtmosphereLayers, context: Context, a: Air, tolerance: float) -> float:
+    """Points (nodes x times) at which the turbulence is evaluated, all observations; as for the first one."""
+    if tolerance not in a.points:
+        o = context.first
+        track = operator._tracks.get(o.name) or tracks([o])[0]
+        variance = sum(m.amplitude**2 * v for m, v in zip(a.models, a.variances, strict=True))
+        winds = [layer.wind for layer in a.layers]
+        start = time.thread_time()
+        plan = make_plan(o, track, a.models, winds, variance, tolerance, a.band, a.pwv, operator.pwv_rms)
+        a.planning.setdefault("seconds", time.thread_time() - start)
+        share = sum(plan.step / s for s in plan.steps) / len(plan.steps)
+        a.points[tolerance] = len(plan.nodes.xi) * o.n_samples / plan.step * share
+    return a.points[tolerance] * context.times / context.first.n_samples
+
+
+def _cells(operator: AtmosphereLayers, o: Observation, a: Air) -> float:
+    """Lattice points that one scan sweeps over: (throw x distance) x (height of the field x distance + drift) / spacing^2."""
+    field = 2 * o.focalplane.radius
+    across = float(np.ptp(np.unwrap(o.azimuth))) * math.cos(a.elevations[0]) + field
+    along = a.elevations[1] - a.elevations[0] + field
+    total = 0.0
+    for k, (layer, model) in enumerate(zip(a.layers, a.models, strict=True)):
+        spacing = 0.75 * _lattice(operator) * model.sigma  # a power of two metres
+        drift = float(np.hypot(*layer.wind)) * o.duration
+        sides = (across * model.distance + drift) / spacing + 30, along * model.distance / spacing + 30
+        total += sides[0] * sides[1] * (k not in operator.omit)
+    return total
+
+
+def _lattice(operator: AtmosphereLayers) -> float:
+    return operator.lattice or FIDELITIES[operator.fidelity].lattice
+
+
+def _opacity_share(a: Air) -> float:
+    """d ln <e^-tau> / d ln PWV."""
+    step = 1e-3
+    return abs(float(a.band.log_transmission_difference(a.pwv, a.pwv * step, a.elevations[0]))) / step
+
+
+def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effect]:
+    """Nodes and steps in time; lattice; fidelity."""
+    xi, eta = some(context.first.focalplane.xi, context.first.focalplane.eta)
+    left = a.kelvin * differential_rms(xi, eta, a.models, a.stretch)
+    left = max(left, 0.01 * a.rms if len(xi) == 1 else 0.0)
+    correlated = max(_correlated(operator, context, m, layer.wind) for m, layer in zip(a.models, a.layers, strict=True))
+    choices = [full(f"within {operator.tolerance:g} of what the detectors' mean leaves")]
+    text = "(sqrt 2 + 0.1) tolerance x rms left after subtraction of the detectors' mean: nodes, steps in time, mean emission"
+    now = _points(operator, context, a, operator.tolerance)
+    for tolerance in (0.03, 0.1, 0.3):
+        if tolerance > operator.tolerance:
+            rms = 1.52 * (tolerance + operator.tolerance) * left
+            bound = context.bound(rms, correlated, common=True) | {"psd": (rms / max(context.noise, a.rms, 1e-30)) ** 2}
+            saved = 0.0
+            if now * POINT * len(a.layers) > PAYS and context.affords(bound):
+                saved = POINT * len(a.layers) * (now - _points(operator, context, a, tolerance))
+            what = f"within {tolerance:g}"
+            choices.append(Choice("coarse", what, {"tolerance": tolerance}, bound=bound, formula=text, seconds=saved))
+    effects = [Effect("detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text)]
+    fidelity = FIDELITIES[operator.fidelity]
+    seen = left if context.removes_common else a.rms
+    wrong = context.bound(0.5 * fidelity.structure_error * seen, correlated, True)
+    text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
+    effects.append(Effect("turbulence lattice", (full(f"{operator.fidelity}, {_lattice(operator):g} of the beam"),), wrong, text))
+    return effects
+
+
+def _spectral(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effect]:
+    """The band's spectrum and ozone: what the fluctuation would be off by, by radiative transfer at one frequency, without O3."""
+    band, layers = context.first.instrument.band, a.profile.layers
+    middle = Band(name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz")
+    seen = a.rms
+    if context.removes_common:
+        xi, eta = some(context.first.focalplane.xi, context.first.focalplane.eta)
+        seen = a.kelvin * differential_rms(xi, eta, a.models, a.stretch)
+    correlated = max(_correlated(operator, context, m, layer.wind) for m, layer in zip(a.models, a.layers, strict=True))
+    elevation = a.elevations[0]
+    right = _slope(_BandTransfer(band, layers), a.pwv, elevation)
+    one = _slope(_BandTransfer(middle, layers), a.pwv, elevation)
+    clear = _slope(_BandTransfer(band, replace(layers, o3=np.zeros_like(layers.o3))), a.pwv, elevation)
+    effects = []
+    for name, what, other in (
+        ("spectral resolution", "the band, in cells of 0.5 GHz", one),
+        ("ozone", "the profile's", clear),
+    ):
+        share = abs(other / right - 1)
+        text = "|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer " + (
+            "at the band's centre alone" if other is one else "without ozone"
+        )
+        effects.append(Effect(name, (full(what),), context.bound(share * seen, correlated, True), text))
+    return effects
+
+
+def _slope(transfer: _BandTransfer, pwv: float, elevation: float) -> float:
+    """dT/dPWV over <e^-tau>."""
+    (low, log_t, _), (high, _, _) = transfer(pwv * 0.99, [elevation])[0], transfer(pwv * 1.01, [elevation])[0]
+    return (high - low) / (0.02 * pwv) / math.exp(log_t)
+
+
+def _slopes(context: Context, a: Air) -> list[Effect]:
+    """Emission and opacity over the elevations of the scan. The high-pass filter takes the mean emission out analytically."""
+    low, high = max(a.elevations[0], math.radians(4.5)), a.elevations[1]
+    for o in context.observations:
+        low, high = min(low, float(o.elevation.min())), max(high, float(o.elevation.max()))
+    emission = abs(float(a.band.emission(a.pwv, low) - a.band.emission(a.pwv, high)))
+    opacity = abs(float(a.band.log_transmission(a.pwv, low) - a.band.log_transmission(a.pwv, high)))
+    plane = context.first.focalplane
+    share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max()) / float(a.band.transmission(a.pwv, low))
+    size = context.bound(emission * share, context.first.duration, True)
+    gone = "removed analytically by the high-pass filter" if context.cut > 0 else "in float64 beside the stream"
+    noise = context.bound(opacity / 2 * context.noise)
+    return [
+        Effect("mean emission with elevation", (full(gone),), size, "difference of the band's emission over the elevations seen"),
+        Effect("opacity with elevation", (full("calibrated at the current elevation"),), noise | context.sky_error(opacity),
+               "difference of the opacity over the elevations seen, x half the noise, x the sky"),
+    ]  # fmt: skip

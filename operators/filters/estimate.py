@@ -1,0 +1,93 @@
+"""Bounds and costs of the filters, see `core.plan`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+
+if TYPE_CHECKING:
+    from zonda.core.data import Observation
+    from zonda.core.plan.context import Context
+
+    from .common_mode import CommonModeFilter
+    from .highpass import HighpassFilter
+
+
+def highpass_traits(operator: HighpassFilter, observation: Observation) -> Traits:
+    """A brick wall; a scan shorter than one cycle loses only a line."""
+    cut = operator.frequency if observation.duration * operator.frequency >= 1 else 0.0
+    return Traits(response=lambda f: float(f >= cut))
+
+
+def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
+    """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
+    o = context.first
+    knots = operator.oversampling * operator.frequency * o.duration
+    cost = Cost(fixed=0.02 + 2e-8 * knots * o.n_detectors, per_time=5e-8, per_sample=3.1e-9, bytes=64.0 * o.n_samples)
+    choices = [full(f"{operator.oversampling:g} knots per cycle of the cut")]
+    for q in (16.0, 12.0, 8.0):
+        if q < operator.oversampling:
+            error = context.fluctuation * (q**-4 + operator.oversampling**-4)
+            bound = context.bound(error, 1 / operator.frequency, common=True)
+            bound |= context.sky_error(q**-4 + operator.oversampling**-4)
+            saved = 2e-8 * (knots - q * operator.frequency * o.duration) * o.n_detectors * len(context.observations)
+            text = "rms of the stream x (q^-4 + q_full^-4), q knots per cycle of the cut"
+            choices.append(
+                Choice("coarse", f"{q:g} knots per cycle", {"oversampling": q}, bound=bound, formula=text, seconds=saved)
+            )
+    size = context.bound(context.fluctuation, o.duration, common=True)
+    effect = Effect("high-pass decimation", tuple(choices), size, "rms of the stream: its low part removed wrongly altogether")
+    return Estimate((effect,), cost)
+
+
+LANCZOS = 1.8e-9
+"""Seconds per sample of one step of the iteration, which reads the stream once."""
+
+
+START = 1e-3
+"""Residual of the first vector, the detectors' mean."""
+
+
+def steps(residual: float, modes: int, context: Context) -> int:
+    """Steps that a residual takes: each lessens it by the square of the ratio of the noise's singular values to the mode's."""
+    n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
+    common = max(context.fluctuation**2 - noise**2, 0.0) * (0.03 if context.cut > 0 else 1.0)  # what a high-pass filter leaves
+    shrink = min(noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30), 0.5)
+    return modes + max(1, math.ceil(math.log(residual / START) / math.log(shrink)))
+
+
+def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estimate:
+    """Residual of the modes.
+
+    A residual r turns the mode by at most r sigma_1^2 / (sigma_1^2 - sigma_2^2) <= r / (1 - gap^2), a mode that is determined
+    having sigma_2 <= gap sigma_1: equation (2) of `common_mode`, Davis & Kahan (1970).
+    """
+    count = steps(operator.residual, operator.modes, context) if operator.method == "svd" else 1.0
+    cost = Cost(fixed=0.02, per_sample=1e-9 + LANCZOS * count)
+    if operator.method == "mean":
+        return Estimate((), cost)
+    choices = [full(f"residual {operator.residual:g}")]
+    for residual in (1e-4, 1e-3, 1e-2):
+        if residual > operator.residual:
+            share = math.sqrt(operator.modes) * (residual + operator.residual) / (1 - operator.gap**2)
+            bound = context.bound(share * context.fluctuation, _slow(context), common=True)
+            saved = LANCZOS * (count - steps(residual, operator.modes, context)) * context.samples
+            choices.append(
+                Choice(
+                    "coarse",
+                    f"residual {residual:g}",
+                    {"residual": residual},
+                    bound=bound | context.sky_error(share),
+                    formula="rms of the stream x residual / (1 - gap^2)",
+                    seconds=saved,
+                )
+            )
+    size = context.bound(context.fluctuation, _slow(context), common=True)
+    effect = Effect("common-mode residual", tuple(choices), size, "rms of the stream: no common mode removed at all")
+    return Estimate((effect,), cost)
+
+
+def _slow(context: Context) -> float:
+    return 1 / context.cut if context.cut > 0 else context.first.duration

@@ -1,0 +1,116 @@
+"""Bounds and costs of the detectors' noise, see `core.plan`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zonda.core.errors import ZondaError
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+
+from .level import NoiseLevel, announced
+from .models import FixedNet
+from .one_over_f import PowerLawFilter, power_law_filter
+
+if TYPE_CHECKING:
+    from zonda.core.data import Observation
+    from zonda.core.plan.context import Context
+
+    from .pink import PinkNoise
+
+WHITE = Cost(per_sample=3.3e-9, kernel="random")
+
+
+def pink_cost(poles: int) -> Cost:
+    """The kernel takes poles four at a time."""
+    return Cost(fixed=0.01, per_sample=3.4e-9 + 1.5e-9 * math.ceil(poles / 4), kernel="random")
+
+
+def white_traits(level: NoiseLevel, observation: Observation) -> Traits:
+    """rms of one calibrated sample, the quietest detector's; a level at the detector is taken behind a clear sky."""
+    net = float(np.min(level.sky_net(observation)))
+    return Traits(noise=net * math.sqrt(observation.sample_rate))
+
+
+def pink_traits(pink: PinkNoise, observation: Observation) -> Traits:
+    """rms of one calibrated sample."""
+    law, sigma, factor = _law(pink, observation, pink.poles)
+    return Traits(rms=0.0 if law is None else sigma * factor * math.sqrt(law.gain * law.variance))
+
+
+def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
+    """Poles of the recursive filter."""
+    o = context.first
+    law, sigma, factor = _law(pink, o, pink.poles)
+    cost = pink_cost(pink.poles)
+    if law is None:
+        return Estimate((), Cost(per_sample=0.3e-9))
+    whole = sigma * factor * math.sqrt(law.gain * law.variance)
+    choices = [full(f"{pink.poles} poles")]
+    for poles in (12, 8, 4):
+        if poles >= pink.poles:
+            continue
+        try:
+            coarse, _, _ = _law(pink, o, poles)
+        except ZondaError:
+            break
+        assert coarse is not None
+        rms = sigma * factor * math.sqrt(difference(law, coarse, context, o.sample_rate, o.duration))
+        common = pink.shared > 0 and not context.removes_common
+        bound = context.bound(rms, correlated=_correlated(context), common=common)
+        bound["psd"] = psd_error(law, coarse, (sigma * factor) ** 2 / max(context.noise, 1e-30) ** 2)
+        text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
+        saved = cost.seconds(context.times, o.n_detectors) - pink_cost(poles).seconds(context.times, o.n_detectors)
+        choices.append(Choice("coarse", f"{poles} poles", {"poles": poles}, bound=bound, formula=text, seconds=saved))
+    size = context.bound(whole, correlated=o.duration)
+    return Estimate((Effect("poles", tuple(choices), size, "rms of the pink noise before filters"),), cost)
+
+
+def difference(a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float) -> float:
+    """Variance of the difference of two filters' outputs for the same white noise of unit variance, after the filters R.
+
+    2 int_0^(1/2) |sqrt(g_a) H_a - sqrt(g_b) H_b|^2 R^2 df, in logarithmic steps. The stationary first states are drawn
+    independently: what they differ by dies out within 1 / (2 pi f) at a frequency f, which adds
+    2 S(f) R^2 / (2 pi f T) to the integrand's spectrum S.
+    """
+    f = np.geomspace(1e-3 / (duration * rate), 0.5, 4000)
+    delta = np.abs(_amplitude(a, f) - _amplitude(b, f)) ** 2
+    start = 2 * np.abs(_amplitude(a, f)) ** 2 * np.minimum(1.0, 1 / (2 * np.pi * f * rate * duration))
+    passed = np.array([context.response(float(x * rate)) ** 2 for x in f])
+    return float(2 * np.trapezoid((delta + start) * passed, f))
+
+
+def psd_error(a: PowerLawFilter, b: PowerLawFilter, level: float) -> float:
+    """Largest relative error of the spectrum of pink plus white noise; ``level``: of unit responses over white noise."""
+    f = np.geomspace(1e-8, 0.5, 4000)
+    first, second = level * a.response(f), level * b.response(f)
+    return float((np.abs(second - first) / (1 + first)).max())
+
+
+def _amplitude(law: PowerLawFilter, f: Any) -> Any:
+    """sqrt(g) H, complex, of equation (1) of `one_over_f`."""
+    back = np.exp(-2j * np.pi * f)
+    top = np.prod(1 - (1 - law.zeros[:, None]) * back, axis=0)
+    return math.sqrt(law.gain) * top / np.prod(1 - (1 - law.poles[:, None]) * back, axis=0)
+
+
+def _correlated(context: Context) -> float:
+    """Integral of |rho| of noise that the high-pass filter has freed of what is slower than its cut."""
+    return 1 / context.cut if context.cut > 0 else context.first.duration
+
+
+def _law(pink: PinkNoise, observation: Observation, poles: int) -> tuple[PowerLawFilter | None, float, float]:
+    """(filter, white rms of one calibrated sample [K], (f_knee / f_min)^(slope / 2)); no filter where the knee is 0."""
+    instrument, rate = observation.instrument, observation.sample_rate
+    knee = instrument.knee if pink.knee is None else pink.knee
+    slope = pink.slope or instrument.slope
+    f_min = pink.minimum_frequency or instrument.pink_minimum_frequency
+    if knee == 0:
+        return None, 0.0, 0.0
+    level = announced(observation)
+    if pink.net is not None:
+        level = NoiseLevel(FixedNet.of(pink.net, pink.reference), np.ones(observation.n_detectors))
+    sigma = float(np.max(level.sky_net(observation))) * math.sqrt(rate)
+    return power_law_filter(f_min / rate, slope, poles), sigma, (knee / f_min) ** (slope / 2)

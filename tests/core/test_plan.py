@@ -1,0 +1,369 @@
+"""The planner: what it chooses, what it says, what it refuses; and every bound against the error itself."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import zonda
+from zonda.core import cli
+from zonda.core.configuration.diagnostics import ConfigurationError
+from zonda.core.data import Data
+from zonda.core.errors import ZondaError
+from zonda.core.plan import table
+from zonda.core.plan.audit import audit
+from zonda.core.plan.budget import Limits, limits
+from zonda.core.plan.context import Context, Coverage, cover
+from zonda.core.plan.cost import Prediction
+from zonda.core.plan.estimate import Choice, Effect, full
+from zonda.core.plan.planner import Decided, _decide, kelvin
+
+SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
+
+
+@pytest.fixture(scope="module")
+def file():
+    return zonda.load("mustang2_cluster", overrides=SHORT)
+
+
+@pytest.fixture(scope="module")
+def made(file):
+    return zonda.plan(file, threads=1)
+
+
+# ---- choosing
+
+
+def decide(effects, allowed, seconds=10.0, **options):
+    context = Context(None, [], [], {}, metrics=frozenset(allowed))  # type: ignore[arg-type]
+    now = Prediction({"A": seconds}, 0.0, factors={"stream": 1.0})
+    settings = {"kept": set(), "forced": set(), "prune_all": True} | options
+    found = _decide([Decided("A", e, 0) for e in effects], settings["kept"], settings["forced"], allowed, now, context,
+                    settings["prune_all"])  # fmt: skip
+    return {d.effect.name: d for d in found}
+
+
+def effect(name, *coarser):
+    choices = [Choice("coarse", f"{name} {k}", {"k": k}, bound={"map_rms": b}, seconds=s) for k, (b, s) in enumerate(coarser)]
+    return Effect(name, (full("in full"), *choices))
+
+
+def test_the_largest_saving_for_its_error_first_and_within_the_budget():
+    found = decide([effect("dear", (0.9, 1.0)), effect("cheap", (0.2, 1.0)), effect("other", (0.75, 2.0))], {"map_rms": 1.0})
+    assert {name: d.chosen for name, d in found.items()} == {"dear": 0, "cheap": 1, "other": 1}
+    assert found["dear"].reason == "a coarser form would exceed the budget"
+
+
+def test_the_coarsest_choice_that_fits():
+    assert decide([effect("one", (0.1, 1.0), (0.5, 2.0), (2.0, 5.0))], {"map_rms": 1.0})["one"].chosen == 2
+
+
+def test_no_saving_no_error():
+    found = decide([effect("free", (0.1, 0.001))], {"map_rms": 1.0})["free"]
+    assert found.chosen == 0
+    assert found.reason == "leaving it out would save nothing"
+
+
+def test_a_budget_of_nothing_takes_what_costs_nothing():
+    found = decide([effect("exact", (0.0, 1.0)), effect("error", (1e-30, 1.0))], {"map_rms": 0.0})
+    assert found["exact"].chosen == 1
+    assert found["error"].chosen == 0
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_bound_that_is_not_a_number_allows_nothing(bad):
+    assert decide([effect("one", (bad, 5.0))], {"map_rms": 1.0})["one"].chosen == 0
+
+
+def test_every_metric_has_its_own_budget():
+    choice = Choice("dropped", "gone", bound={"map_rms": 0.1, "transfer": 0.1}, seconds=1.0)
+    found = decide([Effect("one", (full("x"), choice))], {"map_rms": 1.0, "transfer": 0.01})
+    assert found["one"].chosen == 0
+
+
+def test_keep_drop_and_no_prune():
+    one = effect("one", (0.1, 1.0), (3.0, 2.0))
+    assert decide([one], {"map_rms": 1.0}, kept={"A.one"})["one"].chosen == 0
+    assert decide([one], {"map_rms": 1.0}, forced={"A.one"})["one"].chosen == 2
+    assert decide([one], {"map_rms": 1.0}, prune_all=False)["one"].chosen == 0
+
+
+def test_what_is_dropped_by_hand_takes_of_the_budget():
+    found = decide([effect("one", (0.9, 1.0)), effect("two", (0.5, 1.0))], {"map_rms": 1.0}, forced={"A.one"})
+    assert found["two"].chosen == 0
+
+
+# ---- budgets
+
+
+def test_limits():
+    assert limits(0.1, 2.0, 30.0) == {"map_rms": 0.2, "peak": 0.2, "transfer": 0.01, "tod": 3.0, "psd": 0.1}
+    stated = limits(Limits(map_rms="3 uK"), 2.0, 30.0)
+    assert stated["map_rms"] == stated["peak"] == pytest.approx(3e-6)
+    assert stated["transfer"] == 0.01
+    for bad in (-0.1, 1.1, math.nan, math.inf):
+        with pytest.raises(ZondaError, match="share of the noise from 0 to 1"):
+            limits(bad, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("-5 %", "must be at least"),
+        (".nan", "budget"),
+        ("200 %", "must be at most"),
+        ("{map_rms: 3 s}", "temperature"),
+        ("{map_rms: -3 uK}", "must be at least"),
+        ("{map: 3 uK}", "map_rms"),
+        ("{}", "state at least one"),
+    ],
+)
+def test_a_wrong_budget_is_refused_at_its_place(text, words):
+    with pytest.raises(ConfigurationError) as caught:
+        zonda.load("mustang2_cluster", overrides=[f"budget={text}"])
+    assert words in str(caught.value)
+    assert "budget" in str(caught.value)
+
+
+def test_a_budget_in_the_file(file):
+    stated = zonda.load("mustang2_cluster", overrides=[*SHORT, "budget={map_rms: 3 uK, transfer: 0.1 %}"])
+    found = zonda.plan(stated, threads=1)
+    assert found.limits["map_rms"] == pytest.approx(3e-6)
+    assert found.limits["transfer"] == pytest.approx(1e-3)
+    nothing = zonda.plan(zonda.load("mustang2_cluster", overrides=[*SHORT, "budget=0 %"]), threads=1)
+    assert all(d.chosen == 0 for d in nothing.decided)
+
+
+# ---- names
+
+
+@pytest.mark.parametrize(("name", "near"), [("pols", "poles"), ("PinkNois", "PinkNoise"), ("ozon", "ozone")])
+@pytest.mark.parametrize("option", ["keep", "drop"])
+def test_an_unknown_name_is_answered_with_the_nearest(file, option, name, near):
+    with pytest.raises(ZondaError) as caught:
+        zonda.plan(file, threads=1, **{option: [name]})
+    assert f"'{near}'" in caught.value.cure
+    assert name in str(caught.value)
+
+
+def test_what_cannot_be_dropped(file):
+    with pytest.raises(ZondaError, match="cannot be dropped: it is not simulated"):
+        zonda.plan(file, threads=1, drop=["refraction"])
+    with pytest.raises(ZondaError, match="cannot be dropped: it has no coarser form"):
+        zonda.plan(file, threads=1, drop=["ozone"])
+
+
+def test_an_operator_may_be_dropped(file):
+    found = zonda.plan(file, threads=1, drop=["PinkNoise"]).apply(file)
+    assert "PinkNoise" not in [s.key for s in found.steps]
+
+
+# ---- what comes of it
+
+
+def test_within_the_budget(made):
+    for metric, limit in made.limits.items():
+        assert made.spent[metric] <= limit
+    assert {"map_rms", "peak", "transfer", "tod", "psd"} == set(made.limits)
+
+
+def test_what_runs_is_an_ordinary_pipeline(file):
+    planned = zonda.plan(file, threads=1, drop=["poles", "layer 9", "layer 8"]).apply(file)
+    text = planned.resolved_yaml()
+    from zonda.core.configuration.pipeline_file import parse
+
+    again = parse(text, name="again", folder=None)
+    assert [o.model_dump() for o in again.operators] == [o.model_dump() for o in planned.operators]
+    assert {s.key: s.operator for s in planned.steps}["PinkNoise"].poles == 4
+    assert sorted({s.key: s.operator for s in planned.steps}["AtmosphereLayers"].omit) == [8, 9]
+    assert all(d.chosen == 0 for d in zonda.plan(again, threads=1).decided), "a planned file is not planned further"
+
+
+def test_a_namesake_left_out_does_not_change_the_random_numbers():
+    text = """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+operators:
+  - PointingStare: {scan_duration: 2 s}
+  - WhiteNoise: {net: 1 mK s(1/2)}
+  - WhiteNoise: {net: 2 mK s(1/2)}
+  - Efficiency
+  - BinMap
+"""
+    from zonda.core.configuration.pipeline_file import parse
+
+    file = parse(text)
+    planned = zonda.plan(file, threads=1, drop=["WhiteNoise"]).apply(file)
+    assert [o.label for o in planned.pipeline().operators] == ["PointingStare", "WhiteNoise.2", "Efficiency", "BinMap"]
+
+
+def test_the_table_and_json(made):
+    shown = str(made)
+    for words in ("noise: ", "budget for map_rms", "AtmosphereLayers.layer 3", "not simulated", "of CPU time and"):
+        assert words in shown
+    data = json.loads(json.dumps(table.as_dict(made)))
+    assert len(data["effects"]) == len(made.decided)
+    assert data["prediction"]["cpu_seconds"] > 0
+    assert all(len(row) == 4 for row in table.short(made))
+    covered = {d.effect.name for d in made.decided}
+    assert covered >= {
+        "layer 0", "detector nodes and time steps", "turbulence lattice", "spectral resolution", "ozone", "refraction",
+        "opacity with elevation", "mean emission with elevation", "sky rotation", "aberration", "beam convolution",
+        "sampling order", "poles", "high-pass decimation", "common-mode residual", "sample integration", "time stamps",
+        "coordinate precision", "precision", "beam chromaticity",
+    }  # fmt: skip
+    assert all(d.choice.formula or d.effect.formula for d in made.decided)
+    for d in made.decided:
+        for bound in (d.effect.size, *(c.bound for c in d.effect.choices)):
+            assert all(math.isfinite(v) and v >= 0 for v in bound.values()), d.name
+
+
+def test_units():
+    assert [kelvin(v) for v in (2.0, 3.14159e-3, 2e-6, 4e-9, 0.0)] == ["2 K", "3.14 mK", "2 uK", "4 nK", "0 K"]
+
+
+def test_no_noise_no_budget():
+    file = zonda.load("mustang2_cluster", overrides=[*SHORT, "WhiteNoise.net=0 K s(1/2)"])
+    found = zonda.plan(file, threads=1)
+    assert found.limits["map_rms"] == 0
+    assert found.spent["map_rms"] == 0
+
+
+# ---- prediction of the noise
+
+
+def test_hits_and_speed_of_a_real_scan(file):
+    scene = file.scene()
+    data = zonda.Pipeline(file.operators[:1] + file.operators[3:4] + file.operators[5:6] + [zonda.BinMap(pixel="4 arcsec")])
+    product = data.run(scene, threads=1)
+    pixel = math.radians(4 / 3600)
+    found = cover(product.observations, pixel)
+    hits = product.products["map"].hits
+    # pixels of the deepest tenth, on patches of 4 x 4 about as wide as the cells of the estimate
+    n = hits.shape[0] // 4 * 4, hits.shape[1] // 4 * 4
+    patches = hits[: n[0], : n[1]].reshape(n[0] // 4, 4, n[1] // 4, 4).mean((1, 3))
+    deep = np.quantile(patches[patches > 0], 0.9)
+    assert found.hits == pytest.approx(deep, rel=0.15)
+    o = product.observations[0]
+    speed = np.hypot(np.diff(o.dec), np.diff(np.unwrap(o.ra)) * np.cos(o.dec[1:])) * o.sample_rate
+    assert found.speed == pytest.approx(np.median(speed), rel=0.05)
+
+
+def test_errors_average_down_no_further_than_their_correlation():
+    context = Context(None, [], [], {})  # type: ignore[arg-type]
+    data = Data(zonda.load("mustang2_cluster", overrides=SHORT).scene())
+    zonda.PointingDaisy(scan_duration="10 s").observe(data)
+    context.observations = data.observations
+    context.coverage = Coverage(400.0, 1e-5, 1e-3)
+    free = context.in_map(1.0, 0.0, common=False)
+    assert 1 / 20 <= free <= 1
+    alone, together = (context.in_map(1.0, 5.0, common=c) for c in (False, True))
+    assert free <= alone <= together <= 1.0
+    assert context.in_map(1.0, 1e9, common=True) == 1.0
+    context.coverage = None
+    assert context.in_map(1.0, 1.0, common=True) == 0.0
+
+
+# ---- the command
+
+
+def command(capsys, *arguments):
+    status = cli.main([str(a) for a in arguments])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+SET = [a for s in SHORT for a in ("--set", s)]
+
+
+def test_command(capsys):
+    status, out, _ = command(capsys, "plan", "mustang2_cluster", *SET, "--keep", "poles")
+    assert status == 0
+    assert "PinkNoise.poles" in out
+    assert "--keep" in out
+    status, out, _ = command(capsys, "plan", "mustang2_cluster", *SET, "--json", "--no-prune")
+    assert all(e["decision"] in ("full", "not simulated") for e in json.loads(out)["effects"])
+
+
+def test_command_refuses(capsys):
+    status, _, err = command(capsys, "plan", "mustang2_cluster", *SET, "--keep", "pols")
+    assert status == 2
+    assert "did you mean 'poles'?" in err
+    assert "Traceback" not in err
+    status, _, err = command(capsys, "run", "mustang2_cluster", *SET, "--drop", "ozone", "--output", "/nonexistent/x")
+    assert status == 2
+
+
+def test_products_carry_the_plan(tmp_path, capsys):
+    from astropy.io import fits
+
+    status, _, err = command(capsys, "run", "mustang2_cluster", *SET, "--drop", "poles", "--output", tmp_path)
+    assert status == 0
+    assert "of CPU time and" in err
+    with fits.open(tmp_path / "map.fits") as hdus:
+        rows = {str(r["EFFECT"]): str(r["DECISION"]) for r in hdus["PLAN"].data}
+    assert rows["PinkNoise.poles"] == "coarse: 4 poles"
+    page = (tmp_path / "report.html").read_text()
+    assert "PinkNoise.poles" in page
+    assert "coarse: 4 poles" in page
+
+
+def test_a_map_of_hits_alone(tmp_path, capsys):
+    from astropy.io import fits
+
+    (tmp_path / "hits.yaml").write_text(
+        """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+runs: {without_air: {without: [atmosphere]}}
+operators:
+  - PointingDaisy: {scan_duration: 5 s}
+  - AtmosphereLayers: {pwv: 5 mm}
+  - WhiteNoise
+  - Efficiency
+  - BinMap: {contents: hits}
+  - SaveMap
+"""
+    )
+    file = zonda.load(str(tmp_path / "hits.yaml"))
+    planned = zonda.plan(file, threads=1).apply(file)
+    assert [s.key for s in planned.steps] == ["PointingDaisy", "BinMap", "SaveMap"]
+    status, _, _ = command(capsys, "run", tmp_path / "hits.yaml", "--output", tmp_path / "out")
+    assert status == 0
+    with fits.open(tmp_path / "out" / "map.fits") as hdus:
+        assert hdus[0].name == "HITS"
+        hits = hdus[0].data
+    whole = file.pipeline().run(file.scene(), output=tmp_path / "all", threads=1)
+    np.testing.assert_array_equal(hits, whole.products["map"].hits)
+
+
+@pytest.mark.parametrize(
+    ("steps", "coarse"),
+    [
+        ("[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, CommonModeFilter, BinMap]", False),
+        ("[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, HighpassFilter, CommonModeFilter, BinMap]", True),
+    ],
+)
+def test_float64_is_not_taken_away_where_the_mean_emission_needs_it(steps, coarse):
+    """Tens of kelvin in the stream of a common-mode filter: float32 would be refused there."""
+    from zonda.core.configuration.pipeline_file import parse
+
+    head = "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h +20d\nprecision: float64\n"
+    file = parse(head + "operators: " + steps.replace("[", "[{PointingDaisy: {scan_duration: 20 s}}, ", 1))
+    made = zonda.plan(file, threads=1)
+    row = next(d for d in made.decided if d.effect.name == "precision")
+    assert len(row.effect.choices) == 1 + coarse
+    planned = made.apply(file)
+    assert planned.header.precision == ("float32" if row.chosen else "float64")
+    planned.pipeline().run(file.scene(), threads=1)
+    if coarse:
+        found = audit(file, zonda.plan(file, threads=1, drop=["precision"]), threads=1, seconds=20.0)
+        assert not found.violated, str(found)
+        assert any(r.effect == "pipeline.precision" and r.actual > 0 for r in found.rows)

@@ -1,0 +1,114 @@
+"""Every coarser form of every effect of the shipped pipeline against its bound: the same random numbers, in full and coarse."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+import zonda
+from zonda.core import cli
+from zonda.core.plan.audit import Audit, Checked, audit
+
+SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
+SET = [a for s in SHORT for a in ("--set", s)]
+
+
+@pytest.fixture(scope="module")
+def file():
+    return zonda.load("mustang2_cluster", overrides=SHORT)
+
+
+@pytest.fixture(scope="module")
+def made(file):
+    return zonda.plan(file, threads=1)
+
+
+@pytest.fixture(scope="module")
+def everything_coarse(file):
+    plain = zonda.plan(file, prune_all=False, threads=1)
+    names = [d.name for d in plain.decided if len(d.effect.choices) > 1]
+    made = zonda.plan(file, drop=names, threads=1)
+    return audit(file, made, threads=1, seconds=40.0)
+
+
+def test_every_bound_of_the_shipped_pipeline_holds(everything_coarse):
+    assert not everything_coarse.violated, str(everything_coarse)
+    checked = {row.effect for row in everything_coarse.rows}
+    assert len([c for c in checked if ".layer" in c]) == 10
+    assert {"PinkNoise.poles", "SkyMap.beam convolution", "HighpassFilter.high-pass decimation", "all together"} <= checked
+
+
+def test_the_errors_are_there(everything_coarse):
+    """An audit that compared a run with itself would hold too: most coarser forms do make a difference."""
+    actual = {(r.effect, r.metric): r.actual for r in everything_coarse.rows}
+    for name in ("PinkNoise.poles", "AtmosphereLayers.layer 3", "HighpassFilter.high-pass decimation"):
+        assert actual[name, "tod"] > 0, name
+    assert actual["SkyMap.beam convolution", "peak"] > 0
+    # layers do not come out a hundred times smaller than they are bounded: the bound is one on what is there
+    for k in range(10):
+        bound = next(r.bound for r in everything_coarse.rows if r.effect == f"AtmosphereLayers.layer {k}" and r.metric == "tod")
+        assert bound < 100 * actual[f"AtmosphereLayers.layer {k}", "tod"]
+
+
+def test_the_shipped_plan_holds(file, made):
+    found = audit(file, made, threads=1, seconds=30.0)
+    assert not found.violated, str(found)
+
+
+def test_a_violated_bound_is_seen(file, made):
+    """The same audit with a bound a thousand times too small."""
+    plain = zonda.plan(file, drop=["poles"], threads=1)
+    whole = audit(file, plain, threads=1, seconds=20.0)
+    tight = Audit(tuple(dataclasses.replace(r, bound=r.bound / 1000) for r in whole.rows), "test")
+    assert tight.violated
+    assert "VIOLATED" in str(tight)
+    assert json.loads(tight.json())["rows"][0]["violated"]
+    assert Checked("a", "b", "tod", 1.0, 1.5, 0.2).violated
+    assert not Checked("a", "b", "tod", 1.0, 1.5, 0.3).violated, "within two standard errors"
+    assert Checked("a", "b", "tod", 1.0, math.nan, 0.0).violated
+
+
+def test_command_audit(capsys, monkeypatch):
+    status, out, _ = _command(capsys, "plan", "mustang2_cluster", *SET, "--drop", "poles", "--audit", "--threads", "1")
+    assert status == 0
+    assert "0 violated" in out
+    bad = Audit((Checked("a", "b", "tod", 1.0, 9.0, 0.1),), "test")
+    monkeypatch.setattr("zonda.core.plan.audit.audit", lambda *a, **k: bad)
+    status, out, _ = _command(capsys, "plan", "mustang2_cluster", *SET, "--audit")
+    assert status == 1
+    assert "VIOLATED" in out
+
+
+def _command(capsys, *arguments):
+    status = cli.main([str(a) for a in arguments])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def test_what_no_output_depends_on_is_audited(tmp_path):
+    """A component that the sum does not read is left out: the map is the same."""
+    (tmp_path / "hits.yaml").write_text(
+        """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+operators:
+  - PointingDaisy: {scan_duration: 5 s}
+  - WhiteNoise
+  - Efficiency
+  - HighpassFilter: {frequency: 1 Hz}
+  - BinMap
+  - CommonModeFilter
+  - SaveMap
+"""
+    )
+    file = zonda.load(str(tmp_path / "hits.yaml"))
+    made = zonda.plan(file, threads=1)
+    assert "CommonModeFilter" not in made.structure.operators
+    found = audit(file, made, threads=1, seconds=5.0)
+    assert [(r.effect, r.metric, r.actual) for r in found.rows if r.effect == "structure"] == [("structure", "map_rms", 0.0)]
+    assert not found.violated
