@@ -45,7 +45,10 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
-ELSEWHERE = {"weather": "zonda.plugins.weather_command:weather"}
+ELSEWHERE = {
+    "accuracy": "zonda.core.accuracy.command:accuracy",
+    "weather": "zonda.plugins.weather_command:weather",
+}
 """Built-in commands that live with what they use, imported when they are named or listed.
 
 Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more: pluggy and the metadata.
@@ -132,8 +135,15 @@ _set = click.option(
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
 @click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
+@click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")
 def run(
-    pipeline: str, settings: tuple[str, ...], output: Path | None, threads: int | None, memory: int | None, verbose: bool
+    pipeline: str,
+    settings: tuple[str, ...],
+    output: Path | None,
+    threads: int | None,
+    memory: int | None,
+    verbose: bool,
+    verify: bool,
 ) -> None:
     """Run a pipeline file, or a shipped pipeline by its name.
 
@@ -146,6 +156,14 @@ def run(
     from .files import write_text
 
     file = _load(pipeline, settings)
+    target = file.header.accuracy
+    if target is not None:
+        from .accuracy.store import settings_for
+
+        choice = settings_for(file, target.target, target.metric)
+        click.echo(f"accuracy: {choice.reason}", err=True)
+        settings = (*settings, *choice.overrides)
+        file = _load(pipeline, settings)
     folder = file.output if output is None else output
     resolved = file.resolved_yaml()
     provenance = {"resolved_yaml": resolved, "command": _command(pipeline, settings)}
@@ -156,6 +174,13 @@ def run(
     for who, what, value in data.tally:
         if verbose or (who, what) in lost:
             click.echo(f"{who}: {what}: {value}", err=True)
+    if verify:
+        from .accuracy.verify import achieved
+
+        metric = target.metric if target else "map_rms"
+        error = achieved(file, pipeline, settings, metric, threads, data)
+        wanted = f" (target {100 * target.target:g} %)" if target else ""
+        click.echo(f"error of {metric} against the tightest knobs: {100 * error:.2g} %{wanted}", err=True)
     click.echo(f"{folder}/")
 
 

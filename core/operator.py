@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import PrivateAttr
 
 from .configuration.parameters import Parameters
+from .knobs import Knob
 
 if TYPE_CHECKING:
     from .data import Block, Data, Observation, Stream
@@ -44,6 +45,8 @@ class Operator(Parameters):
         True for operators left out of companion runs (spectra, saved time streams).
     at_end
         True for operators that only act in `finalize` (plots, reports): they run once, after all companion runs.
+    knobs
+        The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
     """
 
     zonda_api: ClassVar[int] = API_VERSION
@@ -53,6 +56,7 @@ class Operator(Parameters):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
     main_run_only: ClassVar[bool] = False
     at_end: ClassVar[bool] = False
+    knobs: ClassVar[tuple[Knob, ...]] = ()
 
     name: str | None = None
     """Label of this step in messages, products and random streams; the class name where absent."""
