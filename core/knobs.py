@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Any, cast
+
+from pydantic import BaseModel, TypeAdapter
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,12 @@ class Knob:
     ladder: tuple[str | int | float, ...]
     approximates: str
     redraws: bool = False
+
+    def values(self, model: type[BaseModel]) -> list[Any]:
+        """The ladder as values of the model's field. Raises pydantic's ValidationError for one that the field refuses."""
+        field = model.model_fields[self.parameter]
+        adapter: TypeAdapter[Any] = TypeAdapter(cast(Any, Annotated[field.annotation, self.parameter, *field.metadata]))
+        return [adapter.validate_python(value) for value in self.ladder]
 
 
 PRECISION = Knob("precision", ("float32", "float64"), "rounding of the time streams")

@@ -2,15 +2,15 @@
 
 The search begins with every knob at its tightest and relaxes one knob at a time, that with the best saving per added error as
 the knobs alone predict it; each joint setting is then measured, never added up. While the measured error stays within what is
-allowed the step is kept; a step that exceeds it is undone and not tried again from there. When nothing more may be relaxed the
-search goes on beyond the target, so that the front shows what more error would buy. It measures at most one setting per rung:
-the sum of the ladders, not their product.
+allowed the step is kept; a step that exceeds it is undone and not tried again. When nothing more may be relaxed it tries
+exchanges: one knob relaxed further and others tightened to pay for it. Then it goes on beyond the target, so that the front shows
+what more error would buy. It measures about one setting per rung: the sum of the ladders, not their product.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from .settings import Setting
@@ -49,27 +49,65 @@ def point(bench: Bench, setting: Setting, reference: Setting) -> Point:
 
 def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[Point]:
     """Every joint setting that was tried, in order; the first is the reference. ``allowed``: error that a kept step may reach."""
-    reference = found.reference
     turning = [a for a in found.alone if not a.knob.redraws and not a.inert]
-    points = [point(bench, reference, reference)]
-    here, refused = dict(reference), set[tuple[str, str]]()
-    limit = allowed
+    points: list[Point] = []
+
+    def tried(setting: Setting) -> Point:
+        points.append(point(bench, setting, found.reference))
+        return points[-1]
+
+    best = _relaxed(turning, tried(found.reference), allowed, tried, lambda: len(points) < most)
     while len(points) < most:
-        options = [s for s in _steps(turning, here) if (s.key, s.value) not in refused]
+        exchange = _exchange(turning, best, allowed)
+        if exchange is None or any(p.setting == exchange for p in points):
+            break
+        now = tried(exchange)
+        if now.error > allowed:
+            break
+        best = now
+    _relaxed(turning, best, math.inf, tried, lambda: len(points) < most)
+    return points
+
+
+def _relaxed(
+    turning: Sequence[Alone], here: Point, limit: float, tried: Callable[[Setting], Point], may_go_on: Callable[[], bool]
+) -> Point:
+    """Relax one knob after the other while the measured error stays within ``limit``; the point that is reached."""
+    refused: set[tuple[str, str]] = set()
+    while may_go_on():
+        options = [s for s in _steps(turning, here.setting) if (s.key, s.value) not in refused]
         if not options:
-            if math.isinf(limit):
-                break
-            limit = math.inf  # beyond the target, to draw the rest of the front
-            refused.clear()
-            continue
+            break
         best = max(options, key=lambda s: s.saving / max(s.error, 1e-12))
-        tried = point(bench, here | {best.key: best.value}, reference)
-        points.append(tried)
-        if tried.error <= limit:
-            here = tried.setting
+        now = tried(here.setting | {best.key: best.value})
+        if now.error <= limit:
+            here = now
         else:
             refused.add((best.key, best.value))
-    return points
+    return here
+
+
+def _exchange(turning: Sequence[Alone], here: Point, allowed: float) -> Setting | None:
+    """The setting that saves most, as predicted: one knob relaxed, and others tightened until the error is allowed again."""
+    best, most = None, 0.0
+    for step in _steps(turning, here.setting):
+        setting, error, saving = here.setting | {step.key: step.value}, here.error + step.error, step.saving
+        while error > allowed:
+            ways = [t for a in turning if a.knob.key != step.key for t in _tighter(a, setting)]
+            if not ways:
+                break
+            way = max(ways, key=lambda t: -t.error / max(-t.saving, 1e-12))
+            setting, error, saving = setting | {way.key: way.value}, error + way.error, saving + way.saving
+        if error <= allowed and saving > max(most, here.spread):
+            best, most = setting, saving
+    return best
+
+
+def _tighter(alone: Alone, here: Setting) -> list[_Step]:
+    """Finer values of a knob than here that lower its error; savings and errors are negative."""
+    at = alone.rung(here[alone.knob.key])
+    finer = [r for r in alone.rungs[alone.rungs.index(at) + 1 :] if r.error is not None and r.error < (at.error or 0.0)]
+    return [_Step(alone.knob.key, r.value, at.own - r.own, (r.error or 0.0) - (at.error or 0.0)) for r in finer]
 
 
 def _steps(turning: Sequence[Alone], here: Setting) -> list[_Step]:

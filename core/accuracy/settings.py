@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
-
-from pydantic import TypeAdapter
+from typing import TYPE_CHECKING, Any
 
 from ..configuration import yaml_places
 from ..configuration.diagnostics import nearest
@@ -124,10 +122,9 @@ def _knob(knob: Knob, key: str, step: str, present: str, given: bool) -> Pipelin
 
 def _on_ladder(knob: Knob, operator: Operator) -> str:
     """The rung that the operator stands on, as text; empty where it stands between two."""
-    field = type(operator).model_fields[knob.parameter]
-    adapter: TypeAdapter[Any] = TypeAdapter(Annotated[field.annotation, *field.metadata])
     present = getattr(operator, knob.parameter)
-    return next((text(v) for v in knob.ladder if adapter.validate_python(v) == present), "")
+    values = knob.values(type(operator))
+    return next((text(rung) for rung, value in zip(knob.ladder, values, strict=True) if value == present), "")
 
 
 def _names(file: PipelineFile) -> list[str]:
