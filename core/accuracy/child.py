@@ -8,6 +8,7 @@ import resource
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,26 +25,28 @@ def work(request: Request) -> Measured:
     """Run the pipeline as often as asked; raises `ZondaError` where it fails."""
     from numba.core.event import install_recorder
 
-    from .measure import REST, Measured
+    from .measure import Measured
     from .metrics import get
 
     metric = get(request.metric)
     first_seed = request.seeds[0]
-    start = time.process_time()
+    start, memory = time.process_time(), 0
     with install_recorder("numba:compile") as compiled:
         data, instrumented = run(request, metric, first_seed, timed=request.repeats > 0)
     first = time.process_time() - start
     timings: list[dict[str, float]] = []
+    yardstick: list[float] = []
     for _ in range(request.repeats):
         del data
         start = time.process_time()
         data, instrumented = run(request, metric, first_seed, timed=True)
-        used = time.process_time() - start
-        row: dict[str, float] = {}
-        for label, _, seconds in data.provenance["timings"]:
-            row[label] = row.get(label, 0.0) + seconds
-        timings.append(row | {REST: max(0.0, used - sum(row.values()))})
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        timings.append(by_step(data, time.process_time() - start))
+        if not yardstick:
+            memory = peak_memory()  # before the yardstick takes any
+        if request.yardstick:
+            start = time.process_time()
+            run(replace(request, overrides=request.yardstick), metric, first_seed, timed=True)
+            yardstick.append(time.process_time() - start)
     if not instrumented:
         data, _ = run(request, metric, first_seed, timed=False)
     found = [metric.measure(data)]
@@ -53,7 +56,22 @@ def work(request: Request) -> Measured:
         found.append(metric.measure(data))
     labels = dict.fromkeys(label for row in timings for label in row)
     steps = {label: tuple(row.get(label, 0.0) for row in timings) for label in labels}
-    return Measured(tuple(found), steps, first, memory, bool(compiled.buffer))
+    return Measured(tuple(found), steps, tuple(yardstick), first, memory, bool(compiled.buffer))
+
+
+def by_step(data: Data, used: float) -> dict[str, float]:
+    """CPU seconds of a run by the label of its steps."""
+    from .measure import REST
+
+    row: dict[str, float] = {}
+    for label, _, seconds in data.provenance["timings"]:
+        row[label] = row.get(label, 0.0) + seconds
+    return row | {REST: max(0.0, used - sum(row.values()))}
+
+
+def peak_memory() -> int:
+    """Largest resident memory of this process so far, bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def run(request: Request, metric: Metric, seed: int | None, timed: bool) -> tuple[Data, bool]:
@@ -83,7 +101,7 @@ def main(ask: str, answer: str) -> int:
     from .measure import Request
 
     given: dict[str, Any] = json.loads(Path(ask).read_text())
-    given |= {key: tuple(given[key]) for key in ("overrides", "seeds")}
+    given |= {key: tuple(given[key]) for key in ("overrides", "yardstick", "seeds")}
     request = Request(**given)
     result: Any
     try:

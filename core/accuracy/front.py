@@ -43,8 +43,8 @@ class _Step:
 
 def point(bench: Bench, setting: Setting, reference: Setting) -> Point:
     """Measure a joint setting."""
-    measured = bench.measure(setting)
-    return Point(setting, bench.error(setting, reference), measured.seconds(), measured.spread(), measured.memory)
+    error = bench.error(setting, reference)
+    return Point(setting, error, *bench.seconds(setting), bench.measure(setting).memory)
 
 
 def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[Point]:

@@ -1,8 +1,10 @@
 """One setting measured: in a process of its own, so that peak memory and first-call costs are that setting's.
 
-A process loads the pipeline file with the setting's overrides and runs it 1 + repeats times. The first run pays for compiled
-code, imports and caches and is reported apart; the others read the pipeline anew: what an operator object keeps is made again.
-Operators that act at the end of a run (pictures, reports, files of maps) are left out: they cost the same at every setting.
+A process loads the pipeline file with the setting's overrides and runs it once: that run pays for imports, compiled code and
+caches and is reported apart. Then the setting and the yardstick (all knobs at their tightest) run in turn, each time from the
+file anew, so what an operator object keeps is made again. Costs are ratios to the yardstick's run beside it: what other programs
+on the machine do to both cancels. Operators that act at the end of a run (pictures, reports, files of maps) are left out: they
+cost the same at every setting.
 """
 
 from __future__ import annotations
@@ -26,11 +28,22 @@ REST = "(rest)"
 
 @dataclass(frozen=True)
 class Request:
-    """What a process is to do: pipeline and overrides, metric, seeds whose metric is wanted (none: the file's), timed runs."""
+    """What a process is to do.
+
+    Attributes
+    ----------
+    pipeline, overrides, yardstick
+        Path or shipped name; overrides of the setting, and of the setting that it is timed against.
+    metric, seeds
+        What to measure, at which seeds (None: the file's).
+    repeats, threads
+        Timed runs of each, and threads of every run.
+    """
 
     pipeline: str
     overrides: tuple[str, ...]
     metric: str
+    yardstick: tuple[str, ...] = ()
     seeds: tuple[int | None, ...] = (None,)
     repeats: int = 3
     threads: int = 1
@@ -46,6 +59,8 @@ class Measured:
         What the metric measured, by seed.
     steps
         CPU seconds of each step (label), one for each timed run; `REST` is what else the process used.
+    yardstick
+        CPU seconds of the yardstick's run beside each; empty: none ran.
     first
         CPU seconds of the first run, compilation and caches included.
     memory
@@ -56,19 +71,21 @@ class Measured:
 
     found: tuple[Any, ...]
     steps: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    yardstick: tuple[float, ...] = ()
     first: float = 0.0
     memory: int = 0
     compiled: bool = False
 
-    def seconds(self, step: str = "") -> float:
-        """CPU seconds of a step, or of all: the sum over steps of the median over runs."""
-        chosen = [self.steps.get(step, (0.0,))] if step else list(self.steps.values())
-        return sum(statistics.median(s) for s in chosen)
+    def cost(self, step: str = "") -> tuple[float, float]:
+        """CPU time of a step, or of all, in units of the yardstick's run beside it: (median, half the range) over the runs.
 
-    def spread(self, step: str = "") -> float:
-        """Half the range over runs, added in quadrature over steps: how far `seconds` may be trusted."""
+        Medians are added over steps, and half ranges in quadrature: a run that was disturbed in one step counts in the others.
+        """
         chosen = [self.steps.get(step, (0.0,))] if step else list(self.steps.values())
-        return float(sum(((max(s) - min(s)) / 2) ** 2 for s in chosen) ** 0.5)
+        units = self.yardstick or (1.0,) * max((len(s) for s in chosen), default=0)
+        ratios = [[seconds / unit for seconds, unit in zip(s, units, strict=False)] for s in chosen]
+        middle = sum(statistics.median(r) for r in ratios)
+        return middle, sum(((max(r) - min(r)) / 2) ** 2 for r in ratios) ** 0.5
 
 
 def measure(request: Request) -> Measured:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError
 from ..files import write_text
 from .front import Point, cheapest
+from .metrics import get
 from .settings import Setting, knobs_of, overrides
 from .sweep import tightest
 
@@ -150,8 +151,9 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
     """The knobs with which this pipeline meets ``target`` at least cost, by its stored front; else all at their tightest.
 
     Knobs that the file states are left as they are. The errors of a front are measured on the scans it was made with; what this
-    run has is measured by ``zonda run --verify``.
+    run has is measured by ``zonda run --verify``. Raises `RegistryError` for a metric that is not there.
     """
+    get(metric)
     knobs = knobs_of(file)
     known = {k.key for k in knobs}
     given = [k.key for k in knobs if k.given]

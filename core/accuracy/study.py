@@ -11,7 +11,7 @@ from .front import Point, cheapest, pareto, point, search
 from .measure import Measured, Request, measure
 from .metrics import get
 from .settings import PipelineKnob, Setting, overrides, shortened
-from .sweep import Bench, Run, Sweep, sweep
+from .sweep import Bench, Run, Sweep, sweep, tightest
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
@@ -46,10 +46,10 @@ class Setup:
         if not self.target > 0:
             raise InputError(f"the target must be above 0, got {100 * self.target:g} %", place="--target", cure="e.g. 1 %")
 
-    def run(self, setting: Setting, seeds: Sequence[int | None]) -> Measured:
+    def run(self, setting: Setting, seeds: Sequence[int | None], yardstick: Setting) -> Measured:
         """Measure a setting in a process of its own."""
-        given = (*self.settings, *overrides(self.shorter), *overrides(setting))
-        return measure(Request(self.pipeline, given, self.metric, tuple(seeds), self.repeats, self.threads))
+        mine, other = ((*self.settings, *overrides(self.shorter), *overrides(s)) for s in (setting, yardstick))
+        return measure(Request(self.pipeline, mine, self.metric, other, tuple(seeds), self.repeats, self.threads))
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def study(
     metric.check(file.operators, file.runs)
     if not knobs:
         raise InputError("no step declares a knob", place=file.place, cure="docs/accuracy.md says how an operator does")
-    bench = Bench(run or setup.run, metric, setup.seeds, say)
+    bench = Bench(run or setup.run, metric, tightest(knobs), setup.seeds, say)
     found = sweep(bench, knobs)
     reference = bench.measure(found.reference)
     present = point(bench, {k.key: k.present for k in knobs if not k.redraws}, found.reference)

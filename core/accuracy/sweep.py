@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise
@@ -13,8 +14,8 @@ from .measure import Measured
 from .metrics import Metric
 from .settings import PipelineKnob, Setting
 
-Run = Callable[[Setting, Sequence[int | None]], Measured]
-"""Measures a setting; the metric of the first seed is timed, that of the others only measured."""
+Run = Callable[[Setting, Sequence[int | None], Setting], Measured]
+"""Measures a setting at some seeds, timing it (at the first) beside the setting that is its yardstick."""
 
 
 class Bench:
@@ -24,6 +25,8 @@ class Bench:
     ----------
     run
         Measures.
+    yardstick
+        The setting that all are timed beside: costs are ratios to its runs, so that the load of the machine cancels.
     metric
         Compares.
     seeds
@@ -33,9 +36,14 @@ class Bench:
     """
 
     def __init__(
-        self, run: Run, metric: Metric, seeds: Sequence[int | None] = (None,), say: Callable[[str], None] = lambda what: None
+        self,
+        run: Run,
+        metric: Metric,
+        yardstick: Setting,
+        seeds: Sequence[int | None] = (None,),
+        say: Callable[[str], None] = lambda what: None,
     ) -> None:
-        self.run, self.metric, self.seeds, self.say = run, metric, tuple(seeds), say
+        self.run, self.metric, self.yardstick, self.seeds, self.say = run, metric, yardstick, tuple(seeds), say
         self._done: dict[frozenset[tuple[str, str]], Measured] = {}
 
     def measure(self, setting: Setting, all_seeds: bool = False) -> Measured:
@@ -43,8 +51,16 @@ class Bench:
         key, wanted = frozenset(setting.items()), self.seeds if all_seeds else self.seeds[:1]
         if key not in self._done or len(self._done[key].found) < len(wanted):
             self.say(f"{len(self._done) + 1}: {' '.join(f'{k}={v}' for k, v in setting.items()) or 'as in the file'}")
-            self._done[key] = self.run(setting, wanted)
+            self._done[key] = self.run(setting, wanted, self.yardstick)
         return self._done[key]
+
+    def seconds(self, setting: Setting, step: str = "") -> tuple[float, float]:
+        """CPU seconds of a setting, or of one of its steps, and their spread, on the scale of the yardstick's own runs."""
+        measured = self.measure(self.yardstick)
+        totals = [sum(run) for run in zip(*measured.steps.values(), strict=True)] + list(measured.yardstick)
+        scale = statistics.median(totals) if measured.yardstick else 1.0
+        middle, spread = self.measure(setting).cost(step)
+        return scale * middle, scale * spread
 
     def error(self, setting: Setting, reference: Setting) -> float:
         """Of a setting against a reference with the same random numbers."""
@@ -161,6 +177,12 @@ def sweep(bench: Bench, knobs: Sequence[PipelineKnob]) -> Sweep:
 def _alone(bench: Bench, knob: PipelineKnob, others: Setting) -> Alone:
     reference = others | {knob.key: knob.tightest}
     rungs: list[Rung] = []
+
+    def rung(value: str, error: float, resolution: float) -> Rung:
+        setting = others | {knob.key: value}
+        total, own = bench.seconds(setting), bench.seconds(setting, knob.step)
+        return Rung(value, error, resolution, *total, bench.measure(setting).memory, *own)
+
     for value in knob.ladder[:-1]:
         setting = others | {knob.key: value}
         try:
@@ -168,10 +190,11 @@ def _alone(bench: Bench, knob: PipelineKnob, others: Setting) -> Alone:
         except ZondaError as err:
             rungs.append(Rung(value, None, note=f"refused: {err.message}".splitlines()[0]))
             continue
-        rungs.append(_rung(knob, value, bench.measure(setting), error, resolution))
+        rungs.append(rung(value, error, resolution))
         if error == 0 and not knob.redraws and len(rungs) == 1:
             break  # the coarsest changes no bit: nor will the others
-    rungs.append(_rung(knob, knob.tightest, bench.measure(reference, all_seeds=knob.redraws), 0.0, 0.0))
+    bench.measure(reference, all_seeds=knob.redraws)
+    rungs.append(rung(knob.tightest, 0.0, 0.0))
     good = [others | {knob.key: r.value} for r in rungs if r.error is not None]
     compare = (lambda a, b: bench.mean_error(a, b)[0]) if knob.redraws else bench.error
     steps = tuple(compare(a, b) for a, b in pairwise(good))
@@ -183,35 +206,32 @@ def _paired(bench: Bench) -> Callable[[Setting, Setting], tuple[float, float]]:
     return lambda setting, reference: (bench.error(setting, reference), 0.0)
 
 
-def _rung(knob: PipelineKnob, value: str, measured: Measured, error: float, resolution: float) -> Rung:
-    total = measured.seconds(), measured.spread()
-    own = (measured.seconds(knob.step), measured.spread(knob.step)) if knob.step else total
-    return Rung(value, error, resolution, *total, measured.memory, *own)
-
-
 def convergence(steps: Sequence[float], resolutions: Sequence[float] = ()) -> tuple[float, str]:
     """What the last rung is wrong by, from the errors between neighbours, coarse to fine; and what that rests on.
 
-    With d and d' the last two steps that change anything, and r = max(d / d', 0.1) < 1, what is left is the rest of a geometric
-    series (Richardson's estimate on a ladder of equal ratios),
+    With d the last step that changes anything, d' the last larger one before it and r = max(d / d', 0.1), what is left is the rest
+    of a geometric series (Richardson's estimate on a ladder of equal ratios),
 
         left = d r / (1 - r);                                                                               (2)
 
-    where r >= 1, or there is one step only, the last step itself is given, and that it is no bound.
+    where no step before was larger, or there is one only, the last step itself is given, and that it is no bound.
     """
     if steps and len(resolutions) > 1 and 0 < steps[-1] <= 2 * resolutions[-2]:
         return 2 * resolutions[-2], "the last step is not resolved: twice its standard error"
     changing = [step for step in steps if step > 0]
     if not changing:
         return 0.0, "no rung changes anything"
-    last = changing[-1]
-    if len(changing) < 2:
-        return last, f"one step changes anything, by {last:.2g}: that step, not a bound"
-    ratio = last / changing[-2]
-    if ratio >= 1:
-        return last, f"not converging (the last step is {ratio:.2g} times the one before): the last step, not a bound"
+    last, earlier = changing[-1], changing[:-1]
+    if not earlier:
+        return last, f"one step changes anything, by {100 * last:.2g} %: that step, not a bound"
+    larger = [step for step in earlier if step > last]
+    if not larger:
+        return last, f"not converging (the last step, {100 * last:.2g} %, is the largest): that step, not a bound"
+    ratio = last / larger[-1]
     used = max(ratio, 0.1)
-    return last * used / (1 - used), f"the last step is {last:.2g}, {ratio:.2g} times the one before: the rest of that series"
+    return last * used / (
+        1 - used
+    ), f"the last step is {100 * last:.2g} %, {ratio:.2g} times the one before: the rest of that series"
 
 
 def differences(setting: Mapping[str, str], reference: Mapping[str, str]) -> Setting:

@@ -37,8 +37,9 @@ def _heading(study: Study) -> Iterator[str]:
         yield f"shortened scans: {shorter}. Per-scan costs weigh more, slow modes and coverage less than in whole scans."
     yield (
         f"CPU seconds are medians of {setup.repeats} runs on {setup.threads} thread{'s' if setup.threads > 1 else ''}, "
-        "± half their range; steps that act at the end (pictures, reports, files) are left out."
+        "± half their range, each against a run of the reference beside it;"
     )
+    yield ("steps that act at the end (pictures, reports, files) are left out.")
     yield (
         f"reference, all knobs at their tightest: {_cost(reference.seconds, reference.spread)} CPU s, "
         f"{_megabytes(reference.memory)} ({study.first:.1f} s the first time, with imports and caches); "

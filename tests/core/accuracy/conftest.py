@@ -10,6 +10,7 @@ import pytest
 from zonda.core.accuracy.measure import Measured
 from zonda.core.accuracy.metrics import Metric
 from zonda.core.accuracy.settings import PipelineKnob
+from zonda.core.accuracy.sweep import Bench, tightest
 
 
 @dataclass
@@ -32,10 +33,14 @@ class Toy:
     def seconds(self, setting):
         return 1 + sum(b * int(setting[f"Step{i}.n"]) for i, b in enumerate(self.costs))
 
-    def run(self, setting, seeds):
+    def run(self, setting, seeds, yardstick):
         self.calls += 1
         steps = {f"Step{i}": (b * int(setting[f"Step{i}.n"]),) * 3 for i, b in enumerate(self.costs)}
-        return Measured(tuple(self.value(setting, s) for s in seeds), steps | {"(rest)": (1.0, 1.0, 1.0)}, 2.0, 10**8)
+        found = tuple(self.value(setting, s) for s in seeds)
+        return Measured(found, steps | {"(rest)": (1.0,) * 3}, (self.seconds(yardstick),) * 3, 2.0, 10**8)
+
+    def bench(self, metric, run=None):
+        return Bench(run or self.run, metric, tightest(self.knobs()))
 
     def all_settings(self):
         for values in product(self.ladder, repeat=len(self.errors)):

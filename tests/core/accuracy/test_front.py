@@ -3,13 +3,13 @@
 import pytest
 
 from zonda.core.accuracy.front import Point, cheapest, pareto, search
-from zonda.core.accuracy.sweep import Bench, sweep
+from zonda.core.accuracy.sweep import sweep
 
 SETTINGS = 125
 
 
 def searched(toy, metric, target):
-    bench = Bench(toy.run, metric)
+    bench = toy.bench(metric)
     found = sweep(bench, toy.knobs())
     return search(bench, found, target - found.left), found
 
@@ -51,12 +51,12 @@ def test_joint_errors_are_measured_not_added(toy, metric):
 
 
 def test_a_saving_within_the_noise_is_none(toy, metric):
-    def run(setting, seeds):
-        measured = toy.run(setting, seeds)
+    def run(setting, seeds, yardstick):
+        measured = toy.run(setting, seeds, yardstick)
         measured.steps["Step0"] = tuple(t + d for t, d in zip(measured.steps["Step0"], (-1.0, 0.0, 1.0), strict=True))
         return measured
 
-    bench = Bench(run, metric)
+    bench = toy.bench(metric, run)
     found = sweep(bench, toy.knobs())
     assert all(p.setting["Step0.n"] == "32" for p in search(bench, found, 0.1))
 

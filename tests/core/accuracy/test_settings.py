@@ -38,7 +38,11 @@ def test_keys_are_those_of_set(twice):
     file = zonda.load(twice)
     knobs = {k.key: k for k in knobs_of(file)}
     assert {"PinkNoise.1.poles", "drift.poles", "PinkNoise.3.poles"} <= set(knobs)
-    assert [knobs[k].step for k in ("PinkNoise.1.poles", "drift.poles", "PinkNoise.3.poles")] == ["PinkNoise", "drift", "PinkNoise.2"]
+    assert [knobs[k].step for k in ("PinkNoise.1.poles", "drift.poles", "PinkNoise.3.poles")] == [
+        "PinkNoise",
+        "drift",
+        "PinkNoise.2",
+    ]
     assert (knobs["PinkNoise.1.poles"].present, knobs["PinkNoise.1.poles"].given) == ("7", True)
     assert (knobs["drift.poles"].present, knobs["drift.poles"].given) == ("8", False)
     assert (knobs["HighpassFilter.oversampling"].present, knobs["precision"].present) == ("48", "float64")

@@ -30,7 +30,7 @@ LAW = {"HighpassFilter.oversampling": (10.0, 0.05), "CommonModeFilter.residual":
 """Errors and costs of the toy measurement below."""
 
 
-def toy_run(setting, seeds):
+def toy_run(setting, seeds, yardstick):
     """A map whose difference from the reference is known: no process, no scan."""
     import numpy as np
 
@@ -41,7 +41,7 @@ def toy_run(setting, seeds):
     signal = np.full((4, 4), 1 + 0.1 * coarse + loose)
     seconds = {"HighpassFilter": (1 / coarse,) * 3, "CommonModeFilter": (-float(np.log10(loose)),) * 3}
     product = {"signal": signal, "weights": np.ones((4, 4)), "noise": np.ones((4, 4))}
-    return Measured((product,) * len(seeds), seconds, 1.0, 10**8)
+    return Measured((product,) * len(seeds), seconds, (), 1.0, 10**8)
 
 
 @pytest.fixture
@@ -81,7 +81,13 @@ def test_a_front_holds_for_its_own_pipeline(made):
     path, file, found = made
     store.save(found, file)
     same = ["seed=6", "HighpassFilter.oversampling=12", "BinMap.pixel=2 arcsec", "name=other"]
-    other = ["HighpassFilter.frequency=0.2 Hz", "target=06h +20d", "PinkNoise.knee=3 Hz", "site=chajnantor", "time=2024-11-26T07:00"]
+    other = [
+        "HighpassFilter.frequency=0.2 Hz",
+        "target=06h +20d",
+        "PinkNoise.knee=3 Hz",
+        "site=chajnantor",
+        "time=2024-11-26T07:00",
+    ]
     for change in same:
         assert store.fingerprint(zonda.load(path, overrides=[change])) == store.fingerprint(file)
     for change in other:

@@ -9,7 +9,7 @@ from zonda.core.errors import ZondaError
 
 
 def test_errors_follow_the_law(toy, metric):
-    found = sweep(Bench(toy.run, metric), toy.knobs())
+    found = sweep(toy.bench(metric), toy.knobs())
     best = toy.value(found.reference)
     for number, alone in enumerate(found.alone):
         assert [r.value for r in alone.rungs] == list(toy.ladder)
@@ -24,7 +24,7 @@ def test_what_is_left_is_what_is_left(toy, metric):
 
     Steps are relative to the finer of two neighbours, whose values differ by a / 16^2 = 0.4 %.
     """
-    found = sweep(Bench(toy.run, metric), toy.knobs())
+    found = sweep(toy.bench(metric), toy.knobs())
     for a, alone in zip(toy.errors, found.alone, strict=True):
         assert alone.left == pytest.approx(a / 32**2 / toy.value(found.reference), rel=0.01)
     assert found.left == pytest.approx(sum(a.left for a in found.alone))
@@ -37,6 +37,7 @@ def test_what_is_left_is_what_is_left(toy, metric):
         ((1.0, 1e-9), 1e-9 / 9, "rest of that series"),  # no ratio below a tenth is believed
         ((1.0, 0.25, 0.0), 0.25 / 3, "rest of that series"),  # a step that changes no bit says nothing
         ((0.1, 0.1), 0.1, "not converging"),
+        ((0.4, 1e-8, 0.1), 0.1 / 3, "rest of that series"),  # a small step before a larger one says nothing either
         ((0.1,), 0.1, "not a bound"),
         ((0.0, 0.0), 0.0, "no rung changes"),
         ((), 0.0, "no rung changes"),
@@ -56,7 +57,7 @@ def test_a_step_within_its_standard_error_shows_nothing():
 
 def test_an_inert_knob_costs_one_run(toy, metric):
     toy.errors = (1.0, 0.0, 0.02)
-    found = sweep(Bench(toy.run, metric), toy.knobs())
+    found = sweep(toy.bench(metric), toy.knobs())
     assert [a.inert for a in found.alone] == [False, True, False]
     assert toy.calls == 1 + 4 + 1 + 4
 
@@ -65,14 +66,14 @@ def test_a_knob_that_redraws_is_compared_by_means_over_seeds(toy, metric):
     """The summary is the value plus noise that the two rungs share up to one part in a hundred: what is shared cancels."""
     random = np.random.default_rng(0).standard_normal((40, 2))
 
-    def run(setting, seeds):
+    def run(setting, seeds, yardstick):
         own = random[list(seeds), 0] + 0.01 * random[list(seeds), 1] * (setting["Step0.n"] == "2")
         return Measured(tuple(toy.value(setting) + 0.05 * x for x in own), {"Step0": (1.0,)})
 
     toy.errors, toy.costs = (0.4,), (1.0,)
     knobs = toy.knobs(redraws=True)
     assert tightest(knobs) == {}
-    bench = Bench(run, metric, seeds=range(40))
+    bench = Bench(run, metric, {"Step0.n": "32"}, seeds=range(40))
     coarse, fine = {"Step0.n": "2"}, {"Step0.n": "32"}
     error, resolution = bench.mean_error(coarse, fine)
     shift = 0.4 * (1 / 4 - 1 / 32**2)
@@ -83,19 +84,19 @@ def test_a_knob_that_redraws_is_compared_by_means_over_seeds(toy, metric):
 
 
 def test_refused_rungs_are_kept_with_the_reason(toy, metric):
-    def run(setting, seeds):
+    def run(setting, seeds, yardstick):
         if setting["Step1.n"] == "2":
             raise ZondaError("2 points cannot hold this")
-        return toy.run(setting, seeds)
+        return toy.run(setting, seeds, yardstick)
 
-    alone = sweep(Bench(run, metric), toy.knobs()).alone[1]
+    alone = sweep(toy.bench(metric, run), toy.knobs()).alone[1]
     assert alone.rungs[0].error is None
     assert "2 points cannot hold this" in alone.rungs[0].note
     assert alone.rungs[1].error > 0
 
 
 def test_settings_are_measured_once(toy, metric):
-    bench = Bench(toy.run, metric)
+    bench = toy.bench(metric)
     sweep(bench, toy.knobs())
     calls = toy.calls
     sweep(bench, toy.knobs())
@@ -103,11 +104,31 @@ def test_settings_are_measured_once(toy, metric):
 
 
 def test_the_same_again(toy, metric):
-    assert sweep(Bench(toy.run, metric), toy.knobs()) == sweep(Bench(toy.run, metric), toy.knobs())
+    assert sweep(toy.bench(metric), toy.knobs()) == sweep(toy.bench(metric), toy.knobs())
 
 
 def test_medians_and_spread():
     measured = Measured((1.0,), {"a": (1.0, 5.0, 1.2), "b": (0.1, 0.1, 0.1)})
-    assert measured.seconds() == pytest.approx(1.3)  # one slow run does not count
-    assert measured.spread() == pytest.approx(2.0)
-    assert measured.seconds("b") == pytest.approx(0.1)
+    assert measured.cost() == pytest.approx((1.3, 2.0))  # one slow run does not count
+    assert measured.cost("b") == pytest.approx((0.1, 0.0))
+
+
+def test_the_load_of_the_machine_cancels():
+    """Runs that take three times as long while the yardstick beside them does, too, cost the same."""
+    measured = Measured((1.0,), {"a": (1.0, 3.0, 1.0), "b": (0.5, 1.5, 0.5)}, yardstick=(2.0, 6.0, 2.0))
+    assert measured.cost() == pytest.approx((0.75, 0.0))
+
+
+def test_seconds_are_on_the_scale_of_the_yardsticks_own_runs(toy, metric):
+    """The second half of the measurements is made while the machine is four times slower."""
+
+    def run(setting, seeds, yardstick):
+        measured = toy.run(setting, seeds, yardstick)
+        slow = 4.0 if toy.calls > 6 else 1.0
+        steps = {k: tuple(slow * t for t in v) for k, v in measured.steps.items()}
+        return Measured(measured.found, steps, tuple(slow * t for t in measured.yardstick))
+
+    for alone in sweep(toy.bench(metric, run), toy.knobs()).alone:
+        for rung in alone.rungs:
+            setting = {k.key: "32" for k in toy.knobs()} | {alone.knob.key: rung.value}
+            assert rung.seconds == pytest.approx(toy.seconds(setting))
