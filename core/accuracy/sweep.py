@@ -209,8 +209,8 @@ def _paired(bench: Bench) -> Callable[[Setting, Setting], tuple[float, float]]:
 def convergence(steps: Sequence[float], resolutions: Sequence[float] = ()) -> tuple[float, str]:
     """What the last rung is wrong by, from the errors between neighbours, coarse to fine; and what that rests on.
 
-    With d the last step that changes anything, d' the last larger one before it and r = max(d / d', 0.1), what is left is the rest
-    of a geometric series (Richardson's estimate on a ladder of equal ratios),
+    With d the last step that changes anything, d' the last larger one before it and r = max(d / d', 0.1), what is left is the
+    rest of a geometric series (Richardson's estimate on a ladder of equal ratios),
 
         left = d r / (1 - r);                                                                               (2)
 
