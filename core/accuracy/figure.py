@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .study import Study
+from .sweep import Alone
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#666666")
 """Okabe & Ito 2008: told apart by colour-blind eyes."""
@@ -25,41 +26,22 @@ def draw(study: Study, ax: Any = None) -> Any:
     bottom = smallest / 4
     ax.set_yscale("log")
     ax.set_xscale("log")
-    shown = [a for a in study.sweep.alone if not a.knob.redraws and not a.inert]
-    for number, alone in enumerate(shown):
-        colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-        rungs = [r for r in alone.rungs if r.error is not None]
-        x, y = [r.seconds for r in rungs], [max(r.error or 0.0, bottom) for r in rungs]
-        ax.plot(x, y, color=colour, lw=0.9, alpha=0.7, zorder=2)
-        for r, e in zip(rungs, y, strict=True):
-            ax.errorbar(
-                r.seconds, e, xerr=r.spread, color=colour, marker=marker, ms=5, mfc=colour if r.error else "none", zorder=2
-            )
-        ax.plot([], [], color=colour, marker=marker, ms=5, lw=0.9, label=f"{alone.knob.key} alone")
-    front = study.front
-    x, y = [p.seconds for p in front], [max(p.error, bottom) for p in front]
-    ax.errorbar(
-        x, y, xerr=[p.spread for p in front], color="black", marker=".", ms=7, lw=1.8, capsize=2, label="joint front", zorder=3
-    )
+    for number, alone in enumerate(a for a in study.sweep.alone if not a.knob.redraws and not a.inert):
+        _line(ax, alone, COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)], bottom)
+    front, present, chosen = study.front, study.present, study.chosen
+    x, y, spread = [p.seconds for p in front], [max(p.error, bottom) for p in front], [p.spread for p in front]
+    ax.errorbar(x, y, xerr=spread, color="black", marker=".", ms=7, lw=1.8, elinewidth=0.8, label="joint front", zorder=4)
     ax.plot(
-        study.present.seconds, max(study.present.error, bottom), "s", ms=10, mfc="none", mec="black", label="the file's setting"
+        present.seconds, max(present.error, bottom), "s", ms=10, mfc="none", mec="black", label="the file's setting", zorder=5
     )
-    if study.chosen:
-        ax.plot(
-            study.chosen.seconds,
-            max(study.chosen.error, bottom),
-            "*",
-            ms=16,
-            color="#E69F00",
-            mec="black",
-            label="chosen",
-            zorder=4,
-        )
+    if chosen:
+        ax.plot(chosen.seconds, max(chosen.error, bottom), "*", ms=15, color="#E69F00", mec="black", label="chosen", zorder=5)
     ax.axhline(study.setup.target, color="black", lw=1, ls="--", label=f"target {100 * study.setup.target:.3g} %")
     for value, style, name in ((study.floor, ":", "instrument noise"), (study.scatter, "-.", "realization scatter")):
         if value:
             ax.axhline(value, color="#666666", lw=1, ls=style, label=name)
     ax.set_ylim(bottom=bottom)
+    ax.text(0.01, 0.01, "hollow on this edge: the reference's bits", transform=ax.transAxes, fontsize=7, color="#666666")
     _axes(ax, study)
     return ax
 
@@ -70,6 +52,17 @@ def save(study: Study, path: Any) -> None:
 
     with atomic_path(path) as temporary:
         draw(study).figure.savefig(temporary)
+
+
+def _line(ax: Any, alone: Alone, colour: str, marker: str, bottom: float) -> None:
+    """One knob alone, coarse to fine."""
+    rungs = [r for r in alone.rungs if r.error is not None]
+    errors = [max(r.error or 0.0, bottom) for r in rungs]
+    seconds, spread = [r.seconds for r in rungs], [r.spread for r in rungs]
+    ax.errorbar(seconds, errors, xerr=spread, color=colour, lw=0.9, elinewidth=0.6, alpha=0.6, zorder=2)
+    for x, y, r in zip(seconds, errors, rungs, strict=True):
+        ax.plot(x, y, marker, color=colour, ms=5, mfc=colour if r.error else "white", zorder=3, clip_on=False)
+    ax.plot([], [], color=colour, marker=marker, ms=5, lw=0.9, label=f"{alone.knob.key} alone")
 
 
 def _axes(ax: Any, study: Study) -> None:
@@ -83,4 +76,4 @@ def _axes(ax: Any, study: Study) -> None:
     ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
     ax.grid(True, which="major", color="#dddddd", lw=0.6)
-    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, markerscale=0.8)

@@ -19,6 +19,8 @@ Setting = dict[str, str]
 """Values by key, both as ``--set`` takes them: {"PinkNoise.poles": "8"}."""
 
 QUICK_SECONDS, QUICK_SCANS = 30.0, 2
+LENGTH = ("scan_duration", "scans")
+"""Parameters of pointing steps that say how long is observed: what `shortened` changes."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Fronts as files: what `accuracy: 1 %` in a pipeline chooses from, and a regression test of the errors.
 
 The front of ``pipelines/my.yaml`` for the metric ``peak`` is ``pipelines/fronts/my.peak.json``. It holds for the pipeline it was
-made of: a fingerprint of scene and steps, without seed and knobs, is compared.
+made of: a fingerprint of scene and steps, without seed, knobs and the length of the scans, is compared.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from ..errors import InputError
 from ..files import write_text
 from .front import Point, cheapest
 from .metrics import get
-from .settings import Setting, knobs_of, overrides
+from .settings import LENGTH, Setting, knobs_of, overrides
 from .sweep import tightest
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
+    from ..operator import Operator
     from .study import Study
 
 FORMAT = 1
@@ -51,15 +52,14 @@ class Choice:
 
 
 def fingerprint(file: PipelineFile) -> str:
-    """Of everything that can change a front: scene without its seed, steps without their knobs and without what acts at the end.
-
-    Files count by name and size, parameters at their defaults not at all.
+    """Of what a front belongs to: the scene without its seed, the steps without their knobs, the length of the scans and what
+    acts at the end. Files count by name and size, parameters at their defaults not at all.
     """
     scene = file.scene()
     described: list[Any] = [
         {k: repr(getattr(scene, k)) for k in type(scene).model_fields if k != "seed"},
         [
-            (step.key, _described(step.operator, {knob.parameter for knob in step.operator.knobs}))
+            (step.key, _described(step.operator, {*(k.parameter for k in step.operator.knobs), *_length(step.operator)}))
             for step in file.steps
             if not step.operator.at_end
         ],
@@ -176,6 +176,10 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
         reason += f"; as the file states: {' '.join(kept)}"
         error = None
     return Choice(overrides(setting), error, reason)
+
+
+def _length(operator: Operator) -> tuple[str, ...]:
+    return LENGTH if "boresight" in operator.provides else ()
 
 
 def _described(value: Any, without: Iterable[str] = ()) -> dict[str, Any]:

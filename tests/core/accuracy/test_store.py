@@ -77,12 +77,19 @@ def test_the_chosen_setting_meets_the_target(made):
 
 
 def test_a_front_holds_for_its_own_pipeline(made):
-    """Seed and knobs do not matter, everything else does."""
+    """Seed, knobs and the length of the scans do not matter, everything else does."""
     path, file, found = made
     store.save(found, file)
-    same = ["seed=6", "HighpassFilter.oversampling=12", "BinMap.pixel=2 arcsec", "name=other"]
+    same = [
+        "seed=6",
+        "HighpassFilter.oversampling=12",
+        "BinMap.pixel=2 arcsec",
+        "name=other",
+        "PointingDaisy.scan_duration=1 min",
+    ]
     other = [
         "HighpassFilter.frequency=0.2 Hz",
+        "PointingDaisy.speed=1 arcmin/s",
         "target=06h +20d",
         "PinkNoise.knee=3 Hz",
         "site=chajnantor",
