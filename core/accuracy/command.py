@@ -29,7 +29,7 @@ NOT_MET = 1
 @click.option("--knob", "knobs", multiple=True, metavar="NAME", help="Turn only this one, e.g. PinkNoise.poles; may be repeated.")
 @click.option("--quick", is_flag=True, help="Shorten the scans to at most two of 30 s.")
 @click.option("--duration", metavar="TIME", help="Length of each scan, e.g. '2 min'.")
-@click.option("--repeats", default=3, show_default=True, type=click.IntRange(1, 100), help="Timed runs of each setting.")
+@click.option("--repeats", default=3, show_default=True, type=click.IntRange(2, 100), help="Timed runs of each setting.")
 @click.option("--seeds", default=4, show_default=True, type=click.IntRange(1, 1000), help="For scatter, and knobs that redraw.")
 @click.option("--threads", default=1, show_default=True, type=click.IntRange(min=1), metavar="N", help="Threads of each run.")
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: out/accuracy/NAME.METRIC]")

@@ -121,7 +121,7 @@ def test_no_setting_meets_the_target(toy_file, tmp_path, capsys):
         "--metric",
         "integral",
         "--repeats",
-        "1",
+        "2",
         "--seeds",
         "1",
         "--target",
