@@ -46,6 +46,7 @@ class Bytes(click.ParamType[int]):
 
 
 ELSEWHERE = {
+    "accuracy": "zonda.core.accuracy.command:accuracy",
     "doctor": "zonda.plugins.doctor_command:doctor",
     "plan": "zonda.core.plan.command:plan",
     "weather": "zonda.plugins.weather_command:weather",
@@ -144,6 +145,7 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
 @click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
+@click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")
 def run(
     pipeline: str,
     settings: tuple[str, ...],
@@ -154,6 +156,7 @@ def run(
     threads: int | None,
     memory: int | None,
     verbose: bool,
+    verify: bool,
 ) -> None:
     """Run a pipeline file, or a shipped pipeline by its name.
 
@@ -169,6 +172,14 @@ def run(
     from .plan.planner import plan
 
     file = _load(pipeline, settings)
+    target = file.header.accuracy
+    if target is not None:
+        from .accuracy.store import settings_for
+
+        choice = settings_for(file, target.target, target.metric)
+        click.echo(f"accuracy: {choice.reason}", err=True)
+        settings = (*settings, *choice.overrides)
+        file = _load(pipeline, settings)
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
     made = plan(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
@@ -184,6 +195,13 @@ def run(
     for who, what, value in data.tally:
         if verbose or (who, what) in lost:
             click.echo(f"{who}: {what}: {value}", err=True)
+    if verify:
+        from .accuracy.verify import achieved
+
+        metric = target.metric if target else "map_rms"
+        error = achieved(file, pipeline, settings, metric, threads, data)
+        wanted = f" (target {100 * target.target:g} %)" if target else ""
+        click.echo(f"error of {metric} against the tightest knobs: {100 * error:.2g} %{wanted}", err=True)
     click.echo(f"{folder}/")
 
 
@@ -218,7 +236,7 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 def plugins(check: bool) -> None:
     """List operators, instruments, sites and other components.
 
-    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, checks and hooks, each with the
+    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, checks, metrics and hooks, each with the
     distribution and the module that it comes from.
     """
     from . import hooks

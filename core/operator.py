@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import PrivateAttr
 
 from .configuration.parameters import Parameters
+from .knobs import Knob
 
 if TYPE_CHECKING:
     from .data import Block, Data, Observation, Stream
@@ -49,6 +50,8 @@ class Operator(Parameters):
     product_only
         True for operators that only make products in memory (map makers, spectra): a plan leaves them out of a run from a file
         where no later step reads what they provide.
+    knobs
+        The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
     """
 
     zonda_api: ClassVar[int] = API_VERSION
@@ -59,6 +62,7 @@ class Operator(Parameters):
     main_run_only: ClassVar[bool] = False
     at_end: ClassVar[bool] = False
     product_only: ClassVar[bool] = False
+    knobs: ClassVar[tuple[Knob, ...]] = ()
 
     name: str | None = None
     """Label of this step in messages, products and random streams; the class name where absent."""

@@ -235,12 +235,13 @@ sites = Registry("site", "zonda.sites", "zonda.core.site:Site")
 bands = Registry("band", "zonda.bands", "zonda.core.instrument:Band")
 noise_models = Registry("noise model", "zonda.noise_models")
 checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
+metrics = Registry("metric", "zonda.metrics", classes=True)  # classes, or functions of `Data`: core.accuracy.metrics
 weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True)
 
 steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
 
-registries = (operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, checks)
+registries = (operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, checks, metrics)
 
 
 def refresh() -> None:

@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from .configuration.time import Instant
 from .data import Block, Data, Observation
@@ -71,6 +72,18 @@ def check_parameters_survive_text(operator: Operator) -> None:
     assert again.model_dump() == operator.model_dump(), f"{text} reads back as {again!r}"
 
 
+def check_knobs(operator: Operator) -> None:
+    """Knobs turn parameters that exist, on ladders of at least two values that these accept."""
+    for knob in operator.knobs:
+        assert knob.parameter in type(operator).model_fields, f"knob {knob.parameter} is not a parameter"
+        assert len(knob.ladder) >= 2, f"knob {knob.parameter} needs a ladder of at least two values"
+        try:
+            values = knob.values(type(operator))
+        except ValidationError as err:
+            raise AssertionError(f"knob {knob.parameter}: {err}") from None
+        assert len(set(map(repr, values))) == len(values), f"knob {knob.parameter} has two equal rungs"
+
+
 def check_declared_streams(operator: Operator) -> None:
     """`exec` reads only what is declared as required or optional, makes only what is provided, and changes nothing else."""
     if operator.at_end or "boresight" in operator.provides:
@@ -122,6 +135,7 @@ def check_finite(operator: Operator) -> None:
 CHECKS: tuple[Callable[[Operator], None], ...] = (
     check_parameters_are_documented,
     check_parameters_survive_text,
+    check_knobs,
     check_declared_streams,
     check_same_bits,
     check_finite,

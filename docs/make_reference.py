@@ -43,6 +43,9 @@ def page() -> str:
                 if name != "name":
                     text = " ".join((field.description or "").split()).replace("|", "\\|")
                     lines.append(f"| `{name}` | {default(field)} | {text} |")
+            for knob in cls.knobs:
+                ladder = ", ".join(f"`{value}`" for value in knob.ladder)
+                lines += ["", f"Knob ([accuracy](accuracy.md)): `{knob.parameter}`, {ladder}: {knob.approximates}."]
     return "\n".join(lines) + "\n"
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from .. import registry
 from ..errors import PipelineError, ZondaError
@@ -31,6 +31,20 @@ P = TypeVar("P", bound=Parameters)
 EXAMPLE = "write at least: site, instrument, time, and operators (a list of steps); `zonda pipelines` lists examples"
 
 
+class Accuracy(Parameters):
+    """What the knobs are chosen for."""
+
+    target: Fraction = Field(gt=0, le=1)
+    """Largest error of the metric."""
+    metric: str = "map_rms"
+    """A metric of `zonda accuracy`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _target_alone(cls, value: Any) -> Any:
+        return value if isinstance(value, dict | Accuracy) else {"target": value}
+
+
 class Header(Parameters):
     """Top level of a pipeline file, without its scene and its operators."""
 
@@ -46,6 +60,9 @@ class Header(Parameters):
     """Companion runs, e.g. noiseless: {only: [sky]} or source_free: {without: [sky]}."""
     precision: Literal["float32", "float64"] = "float32"
     """Type of the time streams."""
+    accuracy: Accuracy | None = None
+    """Error that the result may have from its approximations, e.g. 1 %, or {target: 1 %, metric: peak}: `zonda run` then takes
+    the cheapest setting of the knobs that a stored front of `zonda accuracy` shows to meet it, else the tightest."""
     budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
     """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
     outputs: Path | None = None

@@ -24,6 +24,7 @@ from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSec
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, PointingError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
+from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.smooth import SmoothField
 
@@ -111,6 +112,12 @@ class AtmosphereLayers(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[Any] = _Provides()
+    knobs: ClassVar[tuple[Knob, ...]] = (
+        Knob("tolerance", ("30 %", "10 %", "3 %", "1 %", "0.3 %", "0.1 %"), "layers evaluated at nodes of field and time"),
+        Knob("lattice", (0.6, 0.3, 0.15), "turbulence interpolated between the points of its lattice"),
+        Knob("fidelity", ("default", "fine"), "covariance of the turbulence by compact kernels", redraws=True),
+        Knob("layers", (5, 10, 20), "thin sheets for a continuous atmosphere", redraws=True),
+    )
 
     pwv: Metres | None = Field(None, gt=0, le=weather.PWV_MAX)
     """Mean precipitable water vapour at zenith; where absent, that of the scene's `weather` (by default the climatology's median

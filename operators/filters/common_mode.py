@@ -23,6 +23,7 @@ from pydantic import Field, model_validator
 
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
+from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
 from zonda.core.tiles import TILE_SAMPLES
@@ -52,6 +53,7 @@ class CommonModeFilter(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+    knobs: ClassVar[tuple[Knob, ...]] = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
 
     modes: int = Field(1, ge=1, le=100)
     """How many modes to remove."""

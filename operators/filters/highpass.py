@@ -29,6 +29,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
+from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class HighpassFilter(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
+    knobs: ClassVar[tuple[Knob, ...]] = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
     frequency: Hertz = quantity("0.08 Hz", gt=0)
     """Cut: everything slower is removed."""

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
 from zonda.core.errors import InputError
+from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import fill_normals, normals
 from zonda.core.smooth import SmoothField
@@ -48,6 +49,9 @@ class PinkNoise(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"pink"})
+    knobs: ClassVar[tuple[Knob, ...]] = (
+        Knob("poles", (4, 6, 8, 12, 16), "power law by a filter of few poles (their first states are drawn anew)", redraws=True),
+    )
 
     net: KelvinRootSecond | None = Field(None, ge=0)
     """White level that the knee refers to; None: that of `WhiteNoise`, or the instrument's where there is none."""

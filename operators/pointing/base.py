@@ -15,6 +15,7 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
+from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 
 from .limits import check_elevation, check_motion
@@ -50,6 +51,9 @@ class Pointing(Operator):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    knobs: ClassVar[tuple[Knob, ...]] = (
+        Knob("interpolation_error", (0.1, 0.01, 1e-3, 1e-4), "celestial transformation interpolated between nodes in time"),
+    )
 
     target: Target | None = None
     """Centre of the scans; the scene's target where absent."""

@@ -5,7 +5,8 @@ The image is a brightness T_j at the pixel centres r_j, each standing for its pi
     (T * B)(r) = sum_j A T_j B(r - r_j)                                                                         (1)
 
 with B of unit integral. Equation (1) is evaluated on a grid of step (pixel / q), q >= 1, such that the FWHM has at least
-`PIXELS_PER_FWHM` steps: the image is set on every q-th point and multiplied in Fourier space by the analytic transform of B,
+`PIXELS_PER_FWHM` steps (or as many as asked for): the image is set on every q-th point and multiplied in Fourier space by the
+analytic transform of B,
 
     exp(-2 pi^2 k C k),   C = sigma^2 (J^T J)^-1,   sigma = FWHM / sqrt(8 ln 2)                                 (2)
 
@@ -68,7 +69,9 @@ class Convolved:
     coarse: bool
 
 
-def convolve(values: Floats, jacobian: Floats, fwhm: float, outside: float) -> Convolved:
+def convolve(
+    values: Floats, jacobian: Floats, fwhm: float, outside: float, pixels_per_fwhm: float = PIXELS_PER_FWHM
+) -> Convolved:
     """Equations (1) and (2) for ``values`` (ny, nx), ``jacobian`` J (2, 2) [rad per pixel] and ``fwhm`` [rad]; 0: no beam."""
     from scipy import fft
     from scipy.ndimage import spline_filter
@@ -76,7 +79,7 @@ def convolve(values: Floats, jacobian: Floats, fwhm: float, outside: float) -> C
     covariance = (SIGMA * fwhm) ** 2 * np.linalg.inv(jacobian.T @ jacobian)  # pixel^2
     width = np.sqrt(np.diag(covariance))  # sigma in pixels along (x, y)
     across = fwhm / np.linalg.norm(jacobian, axis=0)  # pixels per FWHM along (x, y)
-    qx, qy = (int(np.ceil(PIXELS_PER_FWHM / a - 1e-9)) if SMOOTH_BELOW <= a < PIXELS_PER_FWHM else 1 for a in across)
+    qx, qy = (int(np.ceil(pixels_per_fwhm / a - 1e-9)) if SMOOTH_BELOW <= a < pixels_per_fwhm else 1 for a in across)
     pad_x, pad_y = (int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy)))
     rows, columns = values.shape
     ny, nx = fft.next_fast_len(rows * qy + 2 * pad_y, True), fft.next_fast_len(columns * qx + 2 * pad_x, True)

@@ -18,11 +18,12 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Kelvin
 from zonda.core.data import Block, Data, Observation
+from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.projection import pixel_matrix, rotation_matrices
 
 from ..maps.image import Image
-from .beam import REACH, SIGMA, Convolved, convolve, distinct
+from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct
 from .placement import kelvin, placed
 from .read import HealpixMap, WcsMap, read_map
 from .resample import resample_healpix, resample_image, tangent_wcs
@@ -48,11 +49,12 @@ class SkyMap(Operator):
 
     A TAN image is used on its own pixels; other projections and HEALPix maps are first interpolated (third order) onto a
     TAN grid about the observation. The smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at
-    least 4 pixels per FWHM: within 0.3 % of the peak of a point source.
+    least `pixels_per_fwhm` points per FWHM: with 4 within 0.3 % of the peak of a point source.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+    knobs: ClassVar[tuple[Knob, ...]] = (Knob("pixels_per_fwhm", (2, 3, 4, 6, 8), "sky interpolated by splines between points"),)
 
     file: InputPath
     """FITS image (with or without a celestial WCS) or HEALPix table. A relative path starts at the pipeline file's folder."""
@@ -74,6 +76,8 @@ class SkyMap(Operator):
     """Factor on the whole map (not on `outside`)."""
     spectral_index: float = 0.0
     """Slope of the flux density, S ~ frequency^index, within the band; for maps in Jy/pixel, Jy/beam and MJy/sr."""
+    pixels_per_fwhm: float = Field(PIXELS_PER_FWHM, ge=2, le=16)
+    """Fewest points per FWHM between which the convolved map is interpolated; a finer input is used on its own pixels."""
 
     _memory: Memory = PrivateAttr(default_factory=lambda: Memory())
 
@@ -87,11 +91,13 @@ class SkyMap(Operator):
 
     def prepare(self, observation: Observation) -> State:
         widths, index = self._widths(observation)
-        sky = self._sky(observation, float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)))
-        if not _reaches(observation, sky, float(widths.max(initial=0.0))):
+        widest, finest = float(widths.max(initial=0.0)), float(widths.min(initial=np.inf))
+        sky = self._sky(observation, widest, finest)
+        if not _reaches(observation, sky, widest):
             observation.tally.state(self.label, f"{observation.name}: not convolved", "no detector reaches the input map")
             return State(sky, [], index)
-        beams = [self._memory.get((*sky.key, "beam", w), lambda w=w: self._beam(sky, float(w))) for w in widths]  # type: ignore[misc]
+        key = (*sky.key, "beam", self.pixels_per_fwhm)
+        beams = [self._memory.get((*key, w), lambda w=w: self._beam(sky, float(w))) for w in widths]  # type: ignore[misc]
         tally = observation.tally
         for what, text in sky.notes.items():
             tally.state(self.label, what, text)
@@ -183,7 +189,7 @@ class SkyMap(Operator):
         ra, dec = observation.centre
         radius = _reach(observation) + REACH * SIGMA * widest
         pixel = _pixel(source)
-        step = float(np.clip(finest / 4, pixel / 4, pixel if isinstance(source, WcsMap) else pixel / 1.5))
+        step = float(np.clip(finest / self.pixels_per_fwhm, pixel / 4, pixel if isinstance(source, WcsMap) else pixel / 1.5))
         radius = float(
             step * 1.1 ** np.ceil(np.log(radius / step + GRID_MARGIN) / np.log(1.1))
         )  # scans of nearly one size share a grid
@@ -235,7 +241,7 @@ class SkyMap(Operator):
     def _beam(self, sky: Sky, fwhm: float) -> Beam:
         """The map convolved with one beam; the Jacobian is that at the tangent point."""
         jacobian = np.radians(np.asarray(sky.wcs.pixel_scale_matrix, np.float64))
-        convolved = convolve(sky.values, jacobian, fwhm, self.outside)
+        convolved = convolve(sky.values, jacobian, fwhm, self.outside, self.pixels_per_fwhm)
         return Beam(convolved, convolved.to_grid @ pixel_matrix(sky.wcs), _on_grid(sky.covered, convolved))
 
 

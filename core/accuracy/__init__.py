@@ -1,0 +1,1 @@
+"""Error against cost for the user's own pipeline: `zonda accuracy`."""

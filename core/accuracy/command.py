@@ -1,0 +1,142 @@
+"""``zonda accuracy``: what accuracy costs in time, for the user's own pipeline and metric. Imports click alone."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from ..configuration.pipeline_file import PipelineFile
+
+NOT_MET = 1
+"""Exit status where no setting meets the target, or a stored front does not hold any more."""
+
+
+@click.command()
+@click.argument("pipeline", metavar="FILE_OR_NAME")
+@click.option(
+    "--metric",
+    default="map_rms",
+    show_default=True,
+    metavar="NAME",
+    help="map_rms, peak, transfer, psd, structure, or a plugin's.",
+)
+@click.option("--target", default="1 %", show_default=True, metavar="ERROR", help="Error that the metric may have.")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value of the file, as for `zonda run`.")
+@click.option("--knob", "knobs", multiple=True, metavar="NAME", help="Turn only this one, e.g. PinkNoise.poles; may be repeated.")
+@click.option("--quick", is_flag=True, help="Shorten the scans to at most two of 30 s.")
+@click.option("--duration", metavar="TIME", help="Length of each scan, e.g. '2 min'.")
+@click.option("--repeats", default=3, show_default=True, type=click.IntRange(2, 100), help="Timed runs of each setting.")
+@click.option("--seeds", default=4, show_default=True, type=click.IntRange(1, 1000), help="For scatter, and knobs that redraw.")
+@click.option("--threads", default=1, show_default=True, type=click.IntRange(min=1), metavar="N", help="Threads of each run.")
+@click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: out/accuracy/NAME.METRIC]")
+@click.option("--store", is_flag=True, help="Keep the front beside the pipeline file, for `accuracy: 1 %` in it.")
+@click.option(
+    "--check", "check", is_flag=True, help="Measure the errors of the stored front again; exit status 1 where one grew."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+def accuracy(
+    pipeline: str,
+    metric: str,
+    target: str,
+    settings: tuple[str, ...],
+    knobs: tuple[str, ...],
+    quick: bool,
+    duration: str | None,
+    repeats: int,
+    seeds: int,
+    threads: int,
+    output: Path | None,
+    store: bool,
+    check: bool,
+    as_json: bool,
+) -> int:
+    """Show what accuracy costs in time: error against CPU seconds and memory.
+
+    Every knob that the pipeline's operators declare is turned alone and jointly, with the same random numbers, and compared with
+    all knobs at their tightest. Prints the tables, draws the work-precision diagram and writes the cheapest setting that meets
+    the target.
+    """
+    from ..configuration.pipeline_file import load
+    from ..configuration.units import Unit
+    from .metrics import get
+    from .settings import knobs_of
+    from .study import setup_for, study
+
+    file = load(pipeline, settings)
+    get(metric)
+    wanted = _fraction(target, Unit(""))
+    if check:
+        return _retest(file, pipeline, metric)
+    turned = knobs_of(file, knobs)
+    setup = setup_for(
+        file, pipeline, settings, metric, wanted, duration=duration, quick=quick, repeats=repeats, seeds=seeds, threads=threads
+    )
+    from ..files import check_output_folder, product_path, write_text
+
+    folder = product_path("out/accuracy", f"{file.header.name}.{metric}") if output is None else output
+    check_output_folder(folder)
+    found = study(file, setup, turned, say=_progress if sys.stderr.isatty() else lambda what: None)
+    _clear()
+
+    from . import store as stored
+    from .figure import save
+    from .fragment import fragment
+    from .table import lines, percent
+
+    text = "\n".join(lines(found))
+    write_text(folder / "accuracy.txt", text + "\n")
+    stored.save(found, file, folder / "front.json")
+    save(found, folder / "work_precision.png")
+    if found.chosen:
+        heading = (
+            f"{file.header.name}: {metric} within {percent(found.chosen.error + found.sweep.left)}, measured by zonda accuracy"
+        )
+        write_text(folder / "fragment.yaml", fragment(found.chosen.setting, heading))
+    if as_json:
+        import json
+
+        click.echo(json.dumps(stored.as_json(found, file), indent=2))
+    else:
+        click.echo(text)
+        click.echo(f"\n{folder}/")
+    if store:
+        click.echo(f"stored: {stored.save(found, file)}", err=as_json)
+    return 0 if found.chosen else NOT_MET
+
+
+def _retest(file: PipelineFile, pipeline: str, metric: str) -> int:
+    from .settings import overrides
+    from .store import path_for, read
+    from .table import percent
+    from .verify import retest
+
+    results = retest(read(path_for(file, metric)), file, pipeline)
+    for result in results:
+        verdict = "ok" if result.good else "GREW"
+        click.echo(
+            f"{verdict:>4}  {percent(result.stored):>9} -> {percent(result.now):>9}  {' '.join(overrides(result.setting))}"
+        )
+    return 0 if all(r.good for r in results) else NOT_MET
+
+
+def _fraction(text: str, unit: Any) -> float:
+    from pydantic_core import PydanticCustomError
+
+    try:
+        return float(unit.parse(text))
+    except (PydanticCustomError, ValueError) as err:
+        message = err.message() if isinstance(err, PydanticCustomError) else f"expected a fraction such as '1 %', got {text!r}"
+        raise click.BadParameter(message, param_hint="--target") from None
+
+
+def _progress(what: str) -> None:
+    click.echo(f"\r\033[K{what[:100]}", nl=False, err=True)
+
+
+def _clear() -> None:
+    if sys.stderr.isatty():
+        click.echo("\r\033[K", nl=False, err=True)

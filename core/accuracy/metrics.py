@@ -1,0 +1,80 @@
+"""What may be wrong: a metric turns the products of a run into numbers, and two runs into one relative error.
+
+A metric is a subclass of `Metric` in the entry-point group ``zonda.metrics``, or just a function there that takes a `Data` and
+returns a number or an array: its error is then |m - m0| / |m0| (Euclidean norms).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import registry
+
+if TYPE_CHECKING:
+    from ..data import Data
+    from ..operator import Operator
+    from ..pipeline import Companion
+
+Floats = NDArray[np.float64]
+
+
+class Metric:
+    """Base of metrics. `measure` is required; the rest has defaults for a metric that is a number or an array.
+
+    Class attributes
+    ----------------
+    says
+        What the error is, half a line.
+    needs_end
+        True where `measure` reads products of operators that act at the end of a run (``at_end``); they are left out otherwise.
+    """
+
+    says: ClassVar[str] = "|m - m0| / |m0|"
+    needs_end: ClassVar[bool] = False
+
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Companion]) -> None:
+        """Raise `PipelineError` where a pipeline of these steps and companion runs cannot have this metric."""
+
+    def steps(self, operators: list[Operator]) -> list[Operator]:
+        """The steps to measure with: more than the pipeline's own where the metric needs more. They are not timed."""
+        return operators
+
+    def measure(self, data: Data) -> Any:
+        """What this run is judged by; anything that can be pickled."""
+        raise NotImplementedError
+
+    def error(self, found: Any, reference: Any) -> float:
+        """Relative error of one run against another with the same random numbers; 0 only where they are alike."""
+        a, b = self.summary(found), self.summary(reference)
+        size = float(np.linalg.norm(b))
+        return float(np.linalg.norm(a - b)) / size if size > 0 else float(np.any(a != b))
+
+    def summary(self, found: Any) -> Floats:
+        """(n,) numbers whose means over seeds are compared where the random numbers differ."""
+        return np.atleast_1d(np.asarray(found, np.float64)).ravel()
+
+    def floor(self, reference: Any) -> float | None:
+        """The instrument's noise in units of the error; None where it has no meaning."""
+        return None
+
+
+class OfFunction(Metric):
+    """A plain function of `Data`."""
+
+    def __init__(self, function: Callable[[Data], Any]) -> None:
+        self.function = function
+
+    def measure(self, data: Data) -> Floats:
+        return np.asarray(self.function(data), np.float64)
+
+
+def get(name: str) -> Metric:
+    """The metric of that name. Raises `RegistryError` with the nearest name where there is none."""
+    found = registry.metrics.get(name)
+    if isinstance(found, type) and issubclass(found, Metric):
+        return found()
+    return found if isinstance(found, Metric) else OfFunction(found)

@@ -1,0 +1,196 @@
+"""Fronts as files: what `accuracy: 1 %` in a pipeline chooses from, and a regression test of the errors.
+
+The front of ``pipelines/my.yaml`` for the metric ``peak`` is ``pipelines/fronts/my.peak.json``. It holds for the pipeline it was
+made of: a fingerprint of scene and steps, without seed, knobs and the length of the scans, is compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError
+from ..files import write_text
+from .front import Point, cheapest
+from .metrics import get
+from .settings import LENGTH, Setting, knobs_of, overrides
+from .sweep import tightest
+
+if TYPE_CHECKING:
+    from ..configuration.pipeline_file import PipelineFile
+    from ..operator import Operator
+    from .study import Study
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Front:
+    """A stored front: its points, what the reference is itself wrong by, and what it was measured on."""
+
+    metric: str
+    fingerprint: str
+    left: float
+    points: tuple[Point, ...]
+    shorter: Setting
+    reference: Setting
+    seed: int
+    version: str
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Overrides to run with, the error they were measured to have (None: not known), and why they were chosen."""
+
+    overrides: tuple[str, ...]
+    error: float | None
+    reason: str
+
+
+def fingerprint(file: PipelineFile) -> str:
+    """Of what a front belongs to: the scene without its seed, the steps without their knobs, the length of the scans and what
+    acts at the end. Files count by name and size, parameters at their defaults not at all.
+    """
+    scene = file.scene()
+    described: list[Any] = [
+        {k: repr(getattr(scene, k)) for k in type(scene).model_fields if k != "seed"},
+        [
+            (step.key, _described(step.operator, {*(k.parameter for k in step.operator.knobs), *_length(step.operator)}))
+            for step in file.steps
+            if not step.operator.at_end
+        ],
+    ]
+    return hashlib.blake2b(json.dumps(described, sort_keys=True).encode(), digest_size=8).hexdigest()
+
+
+def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
+    """The whole study as plain values: the stored file, and what ``--json`` prints."""
+    from ..pipeline import versions
+
+    setup = study.setup
+    return {
+        "format": FORMAT,
+        "pipeline": file.header.name,
+        "fingerprint": fingerprint(file),
+        "metric": setup.metric,
+        "says": study.says,
+        "target": setup.target,
+        "seed": file.scene().seed,
+        "shorter": setup.shorter,
+        "settings": list(setup.settings),
+        "repeats": setup.repeats,
+        "threads": setup.threads,
+        "versions": versions(),
+        "noise_floor": study.floor,
+        "realization_scatter": study.scatter,
+        "reference": study.sweep.reference,
+        "reference_error": study.sweep.left,
+        "first_run_seconds": study.first,
+        "alone": [
+            {
+                "knob": a.knob.key,
+                "approximates": a.knob.approximates,
+                "redraws": a.knob.redraws,
+                "rungs": [asdict(r) for r in a.rungs],
+                "left": a.left,
+                "how": a.how,
+            }
+            for a in study.sweep.alone
+        ],
+        "points": [asdict(p) for p in study.points],
+        "front": [asdict(p) for p in study.front],
+        "present": asdict(study.present),
+        "chosen": asdict(study.chosen) if study.chosen else None,
+    }
+
+
+def path_for(file: PipelineFile, metric: str) -> Path:
+    """Where the front of this pipeline file is, or would be."""
+    place = Path(file.place)
+    return place.parent / "fronts" / f"{place.stem}.{metric}.json"
+
+
+def save(study: Study, file: PipelineFile, path: Path | None = None) -> Path:
+    """Write the study where `settings_for` looks for it, or to ``path``; its path."""
+    path = path or path_for(file, study.setup.metric)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return write_text(path, json.dumps(_rounded(as_json(study, file)), indent=1) + "\n")
+
+
+def read(path: Path) -> Front:
+    """A stored front. Raises InputError where it cannot be read or is of another format."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if values["format"] != FORMAT:
+            raise InputError(
+                f"is a front of format {values['format']}, not {FORMAT}",
+                place=str(path),
+                cure="make it anew: zonda accuracy --store",
+            )
+        points = tuple(Point(**p) for p in values["points"])
+        return Front(
+            values["metric"],
+            values["fingerprint"],
+            values["reference_error"],
+            points,
+            values["shorter"],
+            values["reference"],
+            values["seed"],
+            values["versions"].get("zonda", "?"),
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as err:
+        cure = "make it anew: zonda accuracy PIPELINE --store"
+        raise InputError(f"is not a stored front ({type(err).__name__}: {err})", place=str(path), cure=cure) from None
+
+
+def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> Choice:
+    """The knobs with which this pipeline meets ``target`` at least cost, by its stored front; else all at their tightest.
+
+    Knobs that the file states are left as they are. The errors of a front are measured on the scans it was made with; what this
+    run has is measured by ``zonda run --verify``. Raises `RegistryError` for a metric that is not there.
+    """
+    get(metric)
+    knobs = knobs_of(file)
+    known = {k.key for k in knobs}
+    given = [k.key for k in knobs if k.given]
+    path = path_for(file, metric)
+    why, point = f"no stored front of {metric} for this pipeline ({path})", None
+    if path.is_file():
+        front = read(path)
+        if front.fingerprint != fingerprint(file) or not front.reference.keys() <= known:
+            why = f"the stored front of {metric} ({path}) is of other steps or another scene"
+        elif (point := cheapest(front.points, target, front.left)) is None:
+            why = f"no point of the stored front of {metric} meets {100 * target:g} %"
+    if point is not None:
+        setting = {k: v for k, v in point.setting.items() if k not in given}
+        error = point.error + front.left
+        reason = f"stored front of {metric}: {100 * error:.2g} % with {' '.join(overrides(setting)) or 'the knobs as they are'}"
+    else:
+        setting = {k: v for k, v in tightest(knobs).items() if k not in given}
+        error, reason = None, f"{why}: the knobs are at their tightest; `zonda accuracy {file.header.name} --store` makes one"
+    if kept := [f"{k.key}={k.present}" for k in knobs if k.given and not k.redraws]:
+        reason += f"; as the file states: {' '.join(kept)}"
+        error = None
+    return Choice(overrides(setting), error, reason)
+
+
+def _length(operator: Operator) -> tuple[str, ...]:
+    return LENGTH if "boresight" in operator.provides else ()
+
+
+def _described(value: Any, without: Iterable[str] = ()) -> dict[str, Any]:
+    fields = value.model_dump(exclude_defaults=True, exclude=set(without))
+    return {k: [v.name, v.stat().st_size] if isinstance(v, Path) else repr(v) for k, v in fields.items()}
+
+
+def _rounded(value: Any) -> Any:
+    """Figures to 6 digits: more would only make every stored file differ."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return [_rounded(v) for v in value] if isinstance(value, list | tuple) else value

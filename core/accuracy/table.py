@@ -1,0 +1,133 @@
+"""A study as lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from .fragment import arguments
+from .front import Point
+from .study import Study
+from .sweep import Alone, Rung, differences
+
+
+def lines(study: Study, width: int = 130) -> Iterator[str]:
+    """The whole report, top down: what was measured, each knob alone, the joint front, the recommendation."""
+    yield from _heading(study)
+    for alone in study.sweep.alone:
+        yield ""
+        yield from _alone(alone)
+    yield ""
+    yield from _front(study, width)
+    yield ""
+    yield from _recommended(study)
+
+
+def percent(value: float | None) -> str:
+    """Two digits, three from 100 % on."""
+    if value is None:
+        return "-"
+    return f"{100 * value:.{3 if abs(value) >= 1 else 2}g} %"
+
+
+def _heading(study: Study) -> Iterator[str]:
+    setup, reference = study.setup, study.points[0]
+    yield f"error of {setup.metric}: {study.says}"
+    if setup.shorter:
+        shorter = ", ".join(f"{k} = {v}" for k, v in setup.shorter.items())
+        yield f"shortened scans: {shorter}. Per-scan costs weigh more, slow modes and coverage less than in whole scans."
+    yield (
+        f"CPU seconds are medians of {setup.repeats} runs on {setup.threads} thread{'s' if setup.threads > 1 else ''}, "
+        "± half their range, each against a run of the reference beside it;"
+    )
+    yield ("steps that act at the end (pictures, reports, files) are left out.")
+    yield (
+        f"reference, all knobs at their tightest: {_cost(reference.seconds, reference.spread)} CPU s, "
+        f"{_megabytes(reference.memory)} ({study.first:.1f} s the first time, with imports and caches); "
+        f"its own error by its last steps: {percent(study.sweep.left)}"
+    )
+    floor = "none" if study.floor is None else percent(study.floor)
+    yield f"instrument noise in units of the error: {floor}; realization scatter: {percent(study.scatter)}"
+    if study.sweep.left > setup.target:
+        yield f"the reference is not known to better than {percent(study.sweep.left)}: no setting can be shown to meet the target"
+
+
+def _alone(alone: Alone) -> Iterator[str]:
+    knob = alone.knob
+    yield f"{knob.key}: {knob.approximates}"
+    if alone.inert:
+        yield "  changes nothing here: the coarsest value gives the same bits as the tightest"
+        return
+    yield f"  {'value':>10}  {'error':>17}  {'CPU s':>15}  {'saved in its step':>18}  {'memory':>8}"
+    last = alone.rungs[-1]
+    for rung in alone.rungs:
+        mark = "  <- file" if rung.value == knob.present else ""
+        if rung.error is None:
+            yield f"  {rung.value:>10}  {rung.note}{mark}"
+            continue
+        saved = "" if rung is last else f"{last.own - rung.own:+.3f} ± {(last.own_spread**2 + rung.own_spread**2) ** 0.5:.3f}"
+        yield (
+            f"  {rung.value:>10}  {_error(rung):>17}  {_cost(rung.seconds, rung.spread):>15}  {saved:>18}  "
+            f"{_megabytes(rung.memory):>8}{mark}"
+        )
+    yield f"  what is left at {knob.tightest}: {percent(alone.left)} ({alone.how})"
+    if knob.redraws:
+        yield "  draws other random numbers: change of the mean over seeds ± its standard error; stays as in the file below"
+
+
+def _front(study: Study, width: int) -> Iterator[str]:
+    yield f"joint front ({len(study.points)} joint settings measured)"
+    yield f"  {'error':>9}  {'CPU s':>15}  {'memory':>8}  what differs from the tightest"
+    for point in study.front:
+        yield f"  {_point(point)}  {_short(_pairs(point, study), width - 42)}{_marks(point, study)}"
+    if study.present not in study.front:
+        yield f"  {_point(study.present)}  {_short(_pairs(study.present, study), width - 42)}{_marks(study.present, study)}"
+
+
+def _recommended(study: Study) -> Iterator[str]:
+    target, left = study.setup.target, study.sweep.left
+    if study.chosen is None:
+        yield f"no setting is shown to meet {percent(target)}"
+        return
+    chosen, reference = study.chosen, study.points[0]
+    ratio = reference.seconds / chosen.seconds if chosen.seconds else float("nan")
+    yield (
+        f"cheapest setting within {percent(target)}: {percent(chosen.error)} (+ {percent(left)} of the reference), "
+        f"{_cost(chosen.seconds, chosen.spread)} CPU s, {ratio:.2g} times cheaper than the tightest"
+    )
+    yield f"  {arguments(chosen.setting)}"
+
+
+def _marks(point: Point, study: Study) -> str:
+    words = [
+        name
+        for name, p in (("tightest", study.points[0]), ("file", study.present), ("chosen", study.chosen))
+        if p and p.setting == point.setting
+    ]
+    return f"  <- {', '.join(words)}" if words else ""
+
+
+def _pairs(point: Point, study: Study) -> Iterable[str]:
+    return [f"{k}={v}" for k, v in differences(point.setting, study.sweep.reference).items()]
+
+
+def _short(pairs: Iterable[str], width: int) -> str:
+    text = " ".join(pairs)
+    return text if len(text) <= width else text[: width - 3] + "..."
+
+
+def _point(point: Point) -> str:
+    return f"{percent(point.error):>9}  {_cost(point.seconds, point.spread):>15}  {_megabytes(point.memory):>8}"
+
+
+def _error(rung: Rung) -> str:
+    if rung.error is None:
+        return "-"
+    return percent(rung.error) + (f" ± {percent(rung.resolution)}" if rung.resolution else "")
+
+
+def _cost(seconds: float, spread: float) -> str:
+    return f"{seconds:.3g} ± {spread:.2g}"
+
+
+def _megabytes(memory: int) -> str:
+    return f"{memory / 1e6:.0f} MB"

@@ -1,0 +1,79 @@
+"""The error that a run has reached, measured against all knobs at their tightest; and a stored front tested again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError
+from .measure import Request, measure
+from .metrics import get
+from .settings import knobs_of, overrides
+from .store import Front, fingerprint
+from .sweep import tightest
+
+if TYPE_CHECKING:
+    from ..configuration.pipeline_file import PipelineFile
+    from ..data import Data
+
+SLACK = 0.2
+"""By how much an error may exceed the stored one, relative: bits differ between CPUs, and the small errors with them."""
+SMALLEST = 1e-5
+"""Errors below this are not told apart."""
+
+
+@dataclass(frozen=True)
+class Retest:
+    """A point of a stored front and its error now."""
+
+    setting: dict[str, str]
+    stored: float
+    now: float
+
+    @property
+    def good(self) -> bool:
+        return self.now <= self.stored * (1 + SLACK) + SMALLEST
+
+
+def achieved(
+    file: PipelineFile,
+    pipeline: str,
+    settings: Sequence[str],
+    metric: str,
+    threads: int | None = None,
+    data: Data | None = None,
+) -> float:
+    """Error of this pipeline's own setting against its knobs at their tightest, same scans and seed.
+
+    ``data``: of a run of it, which saves one of the two runs where the metric needs no step of its own.
+    """
+    measures = get(metric)
+    measures.check(file.operators, file.runs)
+    reference = overrides(tightest(knobs_of(file)))
+
+    def found(given: Sequence[str]) -> Any:
+        return measure(Request(pipeline, tuple(given), metric, repeats=0, threads=threads or 1)).found[0]
+
+    enough = data is not None and len(measures.steps(list(file.operators))) == len(file.operators)
+    own = measures.measure(data) if data is not None and enough else found(settings)
+    return measures.error(own, found((*settings, *reference)))
+
+
+def retest(front: Front, file: PipelineFile, pipeline: str, points: int | None = None) -> list[Retest]:
+    """Measure the errors of a stored front again (of the ``points`` with the largest errors): errors only, never times.
+
+    Raises InputError where the front is of another pipeline.
+    """
+    if front.fingerprint != fingerprint(file):
+        cure = "make it anew: zonda accuracy PIPELINE --store"
+        raise InputError("the stored front is of other steps or another scene", place=file.place, cure=cure)
+    metric = get(front.metric)
+    base = (*overrides(front.shorter), f"seed={front.seed}")
+
+    def found(setting: dict[str, str]) -> Any:
+        return measure(Request(pipeline, (*base, *overrides(setting)), front.metric, repeats=0)).found[0]
+
+    reference = found(front.reference)
+    chosen = sorted((p for p in front.points if p.error > 0), key=lambda p: -p.error)[:points]
+    return [Retest(p.setting, p.error, metric.error(found(p.setting), reference)) for p in chosen]

@@ -1,0 +1,161 @@
+"""The built-in metrics against what their equations say, on products made by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from astropy.wcs import WCS
+
+from zonda.core import registry
+from zonda.core.accuracy import metrics
+from zonda.core.errors import InputError
+from zonda.operators.diagnostics.power_spectrum import Spectrum
+from zonda.operators.maps.image import Image
+from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
+
+ARCSEC = np.pi / 648000
+PIXEL, FWHM = 4.0, 12.0  # arcsec
+SIDE = 128
+
+
+def wcs(side, pixel):
+    made = WCS(naxis=2)
+    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = ["RA---TAN", "DEC--TAN"], [75, 20], [side / 2 + 0.5] * 2
+    made.wcs.cdelt, made.wcs.cunit = [-pixel / 3600, pixel / 3600], ["deg", "deg"]
+    return made.to_header()
+
+
+def product(signal, noise=0.1, weights=None, **other):
+    values = np.asarray(signal, float)
+    weights = np.ones(values.shape) if weights is None else weights
+    return MapProduct(
+        values, np.full(values.shape, 50), weights, np.full(values.shape, noise), None, wcs(len(values), PIXEL),
+        np.radians((75, 20)), PIXEL * ARCSEC, fwhm=FWHM * ARCSEC, **other,
+    )  # fmt: skip
+
+
+def data(runs=None, observations=(), **products):
+    named = {name.replace("__", "/"): p for name, p in products.items()}
+    return SimpleNamespace(products=named, provenance={"runs": runs or {}}, observations=list(observations))
+
+
+def blob(size=20.0, amplitude=1.0):
+    """A Gaussian of FWHM `size` arcsec."""
+    y, x = (np.indices((SIDE, SIDE)) - (SIDE - 1) / 2) * PIXEL
+    return amplitude * np.exp(-(x**2 + y**2) / 2 / (size / FWHM_PER_SIGMA) ** 2)
+
+
+def test_all_are_registered():
+    assert set(registry.metrics) >= {"map_rms", "peak", "transfer", "psd", "structure"}
+    for name in ("map_rms", "peak", "transfer", "psd", "structure"):
+        assert metrics.get(name).says
+
+
+def test_map_rms_is_the_difference_in_units_of_the_noise():
+    metric = metrics.get("map_rms")
+    random = np.random.default_rng(1)
+    signal, weights = random.standard_normal((16, 16)), random.uniform(1, 2, (16, 16))
+    change = 0.01 * random.standard_normal((16, 16))
+    signal[0, 0] = np.nan  # a pixel without hits
+    reference = metric.measure(data(map=product(signal, 0.1, weights)))
+    found = metric.measure(data(map=product(signal + change, 0.1, weights)))
+    use = np.isfinite(signal)
+    expected = np.sqrt((weights * change**2)[use].sum() / weights[use].sum()) / 0.1
+    assert metric.error(found, reference) == pytest.approx(expected)
+    assert metric.error(reference, reference) == 0
+    assert metric.floor(reference) == 1
+    bound = abs(metric.summary(found) - metric.summary(reference))[0]
+    assert bound <= metric.error(found, reference)
+    unknown = metric.measure(data(map=product(signal, np.nan, weights)))
+    assert metric.floor(unknown) is None
+    rms = np.sqrt((weights * signal**2)[use].sum() / weights[use].sum())
+    assert metric.error(found, unknown) == pytest.approx(expected * 0.1 / rms)
+    with pytest.raises(InputError, match="size depends"):
+        metric.error(metric.measure(data(map=product(signal[:8, :8]))), reference)
+
+
+def test_peak_of_the_sky_alone():
+    """A Gaussian of 20 arcsec under a beam of 12: the peak falls by 20^2 / (20^2 + 12^2); no pixel's centre lies on it."""
+    metric = metrics.get("peak")
+    runs = {"noiseless": {"only": ["sky"]}, "free": {"without": ["sky"]}}
+    noisy = product(np.random.default_rng(0).standard_normal((SIDE, SIDE)))
+
+    def measured(amplitude):
+        return metric.measure(data(runs, map=noisy, noiseless__map=product(blob(amplitude=amplitude))))
+
+    reference = measured(-2.0)  # a decrement
+    beside = np.exp(-(2 * (PIXEL / 2) ** 2) / 2 / (np.sqrt(544) / FWHM_PER_SIGMA) ** 2)
+    assert reference[0] == pytest.approx(-2 * 400 / 544 * beside, rel=1e-3)
+    assert metric.error(measured(-2.02), reference) == pytest.approx(0.01)
+    # white noise of 0.1 per pixel under a beam of sigma pixels: 0.1 / sqrt(4 pi sigma^2)
+    sigma = FWHM / FWHM_PER_SIGMA / PIXEL
+    assert metric.floor(reference) == pytest.approx(0.1 / np.sqrt(4 * np.pi) / sigma / abs(reference[0]), rel=0.01)
+
+
+def test_transfer_of_a_map_that_lost_half():
+    metric = metrics.get("transfer")
+    runs = {"noiseless": {"only": ["sky"]}}
+    image = Image(blob(16.0), wcs(SIDE, PIXEL))
+    beam = np.hypot(16.0, FWHM)
+    seen = blob(beam, (16.0 / beam) ** 2)
+
+    def measured(factor):
+        return metric.measure(data(runs, map=product(seen), noiseless__map=product(factor * seen), input=image))
+
+    half, whole = measured(0.5), measured(1.0)
+    assert whole[0] == pytest.approx(1, abs=0.01)
+    assert half[0] == pytest.approx(0.5, abs=0.01)
+    assert metric.error(half, whole) == pytest.approx(0.5, abs=0.01)
+    assert 0 < metric.floor(whole) < 1
+
+
+def test_psd_is_relative_in_every_bin():
+    metric = metrics.get("psd")
+    f = np.arange(1, 2001) * 0.01
+
+    def measured(psd):
+        return metric.measure(data(spectrum=Spectrum(f, {"signal": psd}, 50.0, 1.0, "PowerSpectrum", 16)))
+
+    law = 1 + 1 / f
+    reference = measured(law)
+    assert metric.error(measured(1.02 * law), reference) == pytest.approx(0.02)
+    top = measured(law * np.where(f > 2, 1.1, 1.0))  # a third of the bins, as ln(20 / 2) / ln(2000)
+    assert metric.error(top, reference) == pytest.approx(0.1 * np.sqrt(np.log(10) / np.log(2000)), rel=0.1)
+    assert 0 < metric.floor(reference) < 1 / np.sqrt(50)
+    with pytest.raises(InputError, match="streams include signal"):
+        metric.measure(data())
+
+
+def test_structure_function_of_white_noise():
+    """Independent samples of variance v: every value is 2 v; the error of 2 % more amplitude is 4 %."""
+    metric = metrics.get("structure")
+    random = np.random.default_rng(3)
+    stream = np.sqrt(0.5) * random.standard_normal((12, 4096))
+    names = [f"d{k}" for k in range(12)]
+    plane = SimpleNamespace(names=names, xi=random.uniform(-1, 1, 12), eta=random.uniform(-1, 1, 12))
+
+    def measured(values):
+        trace = SimpleNamespace(streams={"atmosphere": values}, names=names)
+        return metric.measure(data(observations=[SimpleNamespace(focalplane=plane)], **{"accuracy-structure": trace}))
+
+    found = measured(stream)
+    # a mean over >= 12 x 3072 squares of variance 2 (2 v)^2, correlated over two lags: 1.5 %; five sigma
+    assert found == pytest.approx(1.0, rel=0.08)
+    assert metric.error(measured(1.02 * stream), found) == pytest.approx(1.02**2 - 1)
+
+
+def test_the_atmosphere_is_traced_behind_the_sum():
+    import zonda
+
+    steps = zonda.load("mustang2_cluster").operators
+    more = metrics.get("structure").steps(steps)
+    at = [type(o).__name__ for o in more].index("Efficiency") + 1
+    assert more[at].streams == ["atmosphere"]
+    assert [*more[:at], *more[at + 1 :]] == steps
+
+
+def test_a_plain_function():
+    metric = metrics.OfFunction(lambda d: d.products["x"])
+    assert metric.error(metric.measure(data(x=[3.0, 4.0])), metric.measure(data(x=[0.0, 5.0]))) == pytest.approx(np.sqrt(10) / 5)
+    assert metric.error(np.zeros(2), np.zeros(2)) == 0
+    assert metric.floor(np.ones(1)) is None
