@@ -184,7 +184,7 @@ def run(
     check_output_folder(folder)  # before anything is worked out
     made = plan(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
     click.echo(table.line(made), err=True)
-    file = made.apply(file)
+    whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
     command = _command(pipeline, settings, keep, drop, no_prune)
     provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
@@ -199,7 +199,7 @@ def run(
         from .accuracy.verify import achieved
 
         metric = target.metric if target else "map_rms"
-        error = achieved(file, pipeline, settings, metric, threads, data)
+        error = achieved(file, pipeline, settings, metric, threads, data if len(file.steps) == whole else None)
         wanted = f" (target {100 * target.target:g} %)" if target else ""
         click.echo(f"error of {metric} against the tightest knobs: {100 * error:.2g} %{wanted}", err=True)
     click.echo(f"{folder}/")
@@ -236,8 +236,8 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 def plugins(check: bool) -> None:
     """List operators, instruments, sites and other components.
 
-    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, checks, metrics and hooks, each with the
-    distribution and the module that it comes from.
+    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, checks, metrics and hooks, each with
+    the distribution and the module that it comes from.
     """
     from . import hooks
     from .discovery import discover

@@ -90,7 +90,7 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: set[str]) -> tuple[
             reason = "asked for with --keep"
         elif readers:
             reason = f"read by {', '.join(readers)}"
-        elif made and made <= STREAMS:
+        elif made and made <= STREAMS and type(operator).finalize is Operator.finalize:
             left_out[operator.label] = f"no step that is needed reads {' or '.join(sorted(made))}"
             continue
         elif operator.product_only and not made & wanted:
