@@ -236,8 +236,8 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 def plugins(check: bool) -> None:
     """List operators, instruments, sites and other components.
 
-    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, checks, metrics and hooks, each with
-    the distribution and the module that it comes from.
+    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, spectra, checks, metrics and hooks,
+    each with the distribution and the module that it comes from.
     """
     from . import hooks
     from .discovery import discover

@@ -234,6 +234,7 @@ instruments = Registry("instrument", "zonda.instruments", "zonda.core.instrument
 sites = Registry("site", "zonda.sites", "zonda.core.site:Site")
 bands = Registry("band", "zonda.bands", "zonda.core.instrument:Band")
 noise_models = Registry("noise model", "zonda.noise_models")
+spectra = Registry("spectra", "zonda.spectra")
 checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
 metrics = Registry("metric", "zonda.metrics", classes=True)  # classes, or functions of `Data`: core.accuracy.metrics
 weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True)
@@ -241,7 +242,7 @@ weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.cor
 steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
 
-registries = (operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, checks, metrics)
+registries = (operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics)
 
 
 def refresh() -> None:

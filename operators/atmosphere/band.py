@@ -12,6 +12,7 @@ are then polynomials in u and v. The transmission is averaged over the band, nev
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from zonda.core.errors import InputError
 from zonda.core.radiation import T_CMB, rayleigh_jeans
 
-from .absorption import CrossSections, absorption_table
+from .absorption import AbsorptionTable, CrossSections
 from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission
 from .weather import PWV_MAX, check_pwv
 
@@ -64,13 +65,15 @@ class BandAtmosphere:
         which the message names.
     """
 
-    def __init__(self, band: Band, profile: Profile, pwv_max: float | None = None) -> None:
+    def __init__(
+        self, band: Band, profile: Profile, pwv_max: float | None = None, spectra: AbsorptionTable | None = None
+    ) -> None:
         self.band = band
         self.pwv_max = min(3 * profile.pwv, PWV_MAX) if pwv_max is None else pwv_max
         check_pwv(self.pwv_max)
         if self.pwv_max == 0:
             raise InputError("the air is dry, so there is no water to vary", cure="give a PWV above 0 mm")
-        self._transfer = _BandTransfer(band, profile.layers)
+        self._transfer = _BandTransfer(band, replace(profile.layers, spectra=spectra))
         self._v_max = -math.log(math.sin(ELEVATION_MIN))
         for n_u, n_v, ratio in GRIDS:
             self._scale, self._u_max = self.pwv_max / ratio, math.log1p(ratio)
@@ -190,7 +193,7 @@ class _BandTransfer:
     """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln transmission, ln background) each."""
 
     def __init__(self, band: Band, layers: Layers) -> None:
-        weight, frequency, cells = _cell_weights(band)
+        weight, frequency, cells = _cell_weights(band, layers.table)
         self._layers = layers
         self._cross_sections, cell, share = layers.in_parts(_at_frequencies(layers, frequency, cells))
         frequency = frequency[cell]
@@ -211,14 +214,13 @@ class _BandTransfer:
         return emitted, math.log(passed.sum()) - least, math.log(np.sum(passed * self._cmb)) - least
 
 
-def _cell_weights(band: Band) -> tuple[Array, Array, slice]:
+def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Array, Array, slice]:
     """Integral of the (piecewise linear) transmission over each cell of the absorption table that it touches, and the mean
     frequency of that integral: not the cell's centre where the band ends inside the cell.
     """
     open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
     support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
     nu, transmission = band.frequency[support], band.transmission[support]
-    table = absorption_table()
     cells = table.cells(float(nu[0]), float(nu[-1]), place=f"band '{band.name}'")
     edges = table.edges[cells.start : cells.stop + 1]
     points = np.union1d(np.clip(edges, nu[0], nu[-1]), nu)
@@ -235,7 +237,7 @@ def _cell_weights(band: Band) -> tuple[Array, Array, slice]:
 
 def _at_frequencies(layers: Layers, frequency: Array, cells: slice) -> CrossSections:
     """Cross-sections at one frequency in each cell, linear between the cells' centres."""
-    centres = absorption_table().frequency
+    centres = layers.table.frequency
     wide = slice(max(cells.start - 1, 0), min(cells.stop + 1, len(centres)))
     known, centre = layers.cross_sections(wide), centres[wide]
     low = np.clip(np.searchsorted(centre, frequency, "right") - 1, 0, len(centre) - 2)

@@ -219,7 +219,7 @@ def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Ef
 
 def _spectral(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effect]:
     """The band's spectrum and ozone: what the fluctuation would be off by, by radiative transfer at one frequency, without O3."""
-    band, layers = context.first.instrument.band, a.profile.layers
+    band, layers = context.first.instrument.band, replace(a.profile.layers, spectra=operator._table())
     middle = Band(name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz")
     seen = a.rms
     if context.removes_common:

@@ -29,6 +29,7 @@ from zonda.core.operator import Operator
 from zonda.core.smooth import SmoothField
 
 from . import weather
+from .absorption import AbsorptionTable
 from .band import BandAtmosphere
 from .beams import GAUSSIAN_FWHM, Aperture, rayleigh_distance, widened
 from .fluctuations import AtNodes, OfDetectors, times
@@ -146,6 +147,8 @@ class AtmosphereLayers(Operator):
     """With `beam: tapered`, dB by which the illumination's power falls from the centre to the rim; 10 where absent."""
     outputs: list[Literal["pwv", "opacity", "path_delay"]] = Field(default_factory=list)
     """Further streams to make: fluctuations of the line-of-sight water (m), of the band's opacity, of the wet path delay (m)."""
+    spectra: str = "am"
+    """Cross-sections of the air: a registered table of them (`zonda plugins`); am's in cells of 0.5 GHz by default."""
     omit: list[int] = Field(default_factory=list)
     """Layers that are left out, the lowest is 0; the others stay as they are (their shares, their air)."""
     lattice: float | None = Field(None, gt=0, le=0.8)
@@ -268,13 +271,25 @@ class AtmosphereLayers(Operator):
         """One weather for the run: the scene's at its start."""
         time: Instant = self._origin or observation.start
         band: Band = observation.instrument.band
-        key = (repr(observation.site), time, self.pwv, repr(band), repr(self._source), observation.seed)
+        key = (repr(observation.site), time, self.pwv, repr(band), repr(self._source), observation.seed, self.spectra)
         if key not in self._air:
             profile = air_of(self._source, observation.site, time, observation.seed, self.pwv)
             rise = math.exp(7 * self._log_width(1.0)) if self.pwv_rms >= LOG_NORMAL_FROM else 1 + 8 * self.pwv_rms
             largest = min((self.pwv or profile.pwv) * max(rise, 1.05), weather.PWV_MAX)
-            self._air[key] = profile, BandAtmosphere(band, profile, largest)
+            self._air[key] = profile, BandAtmosphere(band, profile, largest, self._table())
         return self._air[key]
+
+    def _table(self) -> AbsorptionTable:
+        from zonda.core.registry import spectra
+
+        table = spectra.create(self.spectra)
+        if not isinstance(table, AbsorptionTable):
+            raise InputError(
+                f"spectra {self.spectra!r} is {type(table).__name__}, not an AbsorptionTable",
+                place=self.label,
+                cure="choose another table, or mend the plugin (docs/plugins.md)",
+            )
+        return table
 
     def _layers(self, profile: Profile) -> list[Layer]:
         heights = np.linspace(self.lowest, self.highest, self.layers)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.radiation import BOLTZMANN, T_CMB, rayleigh_jeans
 
-from .absorption import OZONE_PARTS, CrossSections, absorption_table
+from .absorption import OZONE_PARTS, AbsorptionTable, CrossSections, absorption_table
 
 Array = NDArray[np.float64]
 
@@ -63,6 +63,13 @@ class Layers:
     h2o: Array
     o3: Array
     height: Array
+    spectra: AbsorptionTable | None = None
+    """Cross-sections; where absent, `absorption_table`."""
+
+    @property
+    def table(self) -> AbsorptionTable:
+        """The cross-sections of these layers."""
+        return self.spectra or absorption_table()
 
     @property
     def molecules(self) -> Array:
@@ -87,7 +94,7 @@ class Layers:
     def cross_sections(self, cells: slice = slice(None)) -> CrossSections:
         """Of each layer at its mean pressure and temperature (they do not depend on the water)."""
         pressure, temperature = (self.pressure[1:] + self.pressure[:-1]) / 2, (self.temperature[1:] + self.temperature[:-1]) / 2
-        return absorption_table().cross_sections(pressure, temperature, cells)
+        return self.table.cross_sections(pressure, temperature, cells)
 
     def opacity(self, cross_sections: CrossSections) -> Array:
         """(n, n_frequency) vertical opacity of each layer, neper."""
@@ -191,7 +198,7 @@ def spectrum(
     InputError
         Elevation, frequency, pressure or temperature outside the limits, which the message names.
     """
-    table = absorption_table()
+    table = layers.table
     edges = table.edges
     cells = table.cells(edges[0] if low is None else low, edges[-1] if high is None else high)
     frequency, airmass = table.frequency[cells], layers.airmass(elevation, plane_parallel=plane_parallel)[:, None]

@@ -180,6 +180,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "edge_taper": ({"beam": "tapered"}, {"edge_taper": 20.0}),
         "outputs": ({}, {"outputs": ["pwv", "opacity", "path_delay"]}),
         "omit": ({}, {"omit": [0]}),
+        "spectra": ({}, {"spectra": "none such"}),
         "lattice": ({}, {"lattice": 0.15}),
         "tolerance": ({}, {"tolerance": "0.01 %"}),
     },
@@ -307,6 +308,7 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 REFUSALS = {
     ("BinMap", "projection"): "'TAN'",
     ("SkyMap", "missing"): "NaN",
+    ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
     ("SaveMap", "overwrite"): "is there already",
 }
 """What a changed parameter is answered with, where it is not another result."""

@@ -9,6 +9,7 @@ from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.radiation import rayleigh_jeans
 from zonda.core.site import Site
+from zonda.operators.atmosphere.absorption import absorption_table
 from zonda.operators.atmosphere.band import BandAtmosphere, _cell_weights, _chebyshev
 from zonda.operators.atmosphere.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather import profile
@@ -144,21 +145,21 @@ def test_a_value_does_not_depend_on_its_neighbours(mustang2):
 
 
 def test_passband_is_integrated_within_cells(tmp_path):
-    weights, frequency, _ = _cell_weights(band(92.9, 93.1))
+    weights, frequency, _ = _cell_weights(band(92.9, 93.1), absorption_table())
     assert weights == pytest.approx([0.2e9])
     assert frequency == pytest.approx([93.0e9])
-    weights, frequency, cells = _cell_weights(band(77.9, 80.3))
+    weights, frequency, cells = _cell_weights(band(77.9, 80.3), absorption_table())
     assert weights.sum() == pytest.approx(2.4e9, rel=1e-12)
     assert cells.stop - cells.start == len(weights) == 6
     np.testing.assert_allclose(frequency, np.array([78.075, 78.5, 79, 79.5, 80, 80.275]) * 1e9)  # the middles of what is covered
     path = tmp_path / "ramp.txt"
     path.write_text("90 0\n91 1\n")
-    weights, frequency, _ = _cell_weights(Band(name="ramp", file=path))
+    weights, frequency, _ = _cell_weights(Band(name="ramp", file=path), absorption_table())
     # cells 90 (half), 90.5, 91 (half): integral of nu - 90 from 0 to 1/4, 1/4 to 3/4, 3/4 to 1
     np.testing.assert_allclose(weights, np.array([1 / 32, 1 / 4, 7 / 32]) * 1e9, rtol=1e-9)
     np.testing.assert_allclose(frequency[[0, 2]], np.array([90 + 1 / 6, 90 + 37 / 42]) * 1e9, rtol=1e-12)
     path.write_text("0.1 0\n90 0\n91 1\n92 0\n2000 0\n")
-    weights, _, _ = _cell_weights(Band(name="padded", file=path))
+    weights, _, _ = _cell_weights(Band(name="padded", file=path), absorption_table())
     assert weights.sum() == pytest.approx(1e9, rel=1e-12)
 
 

@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.radiation import rayleigh_jeans
 from zonda.core.site import Site
-from zonda.operators.atmosphere.absorption import TABLE, absorption_table
+from zonda.operators.atmosphere.absorption import TABLE, AbsorptionTable, CrossSections, absorption_table
 from zonda.operators.atmosphere.band import _BandTransfer
 from zonda.operators.atmosphere.radiative_transfer import EARTH_RADIUS, Layers, emission, spectrum
 from zonda.operators.atmosphere.weather import profile
@@ -237,3 +238,34 @@ def test_limits_are_named():
     deep = Layers(np.array([3e5, 1e5]), np.full(2, 280.0), np.zeros(1), np.zeros(1), np.array([0.0, 1e4]))
     with pytest.raises(InputError, match=r"pressure of 2000 hPa is above .* limit of 1158\.7 hPa"):
         spectrum(deep, ZENITH)
+
+
+class Thin(AbsorptionTable):
+    """Half of everything."""
+
+    def cross_sections(self, pressure, temperature, cells=slice(None)):
+        k = super().cross_sections(pressure, temperature, cells)
+        return CrossSections(k.dry_air / 2, k.water / 2, k.water_self / 2, k.ozone / 2, k.ozone_ratio)
+
+
+def test_spectra_are_plugins(monkeypatch):
+    import zonda
+    from zonda.core.errors import ZondaError
+    from zonda.core.registry import instruments, sites, spectra
+
+    monkeypatch.setitem(spectra._registered, "thin", lambda: Thin(TABLE))
+    monkeypatch.setitem(spectra._registered, "wrong", lambda: "no table")
+    observation = SimpleNamespace(
+        site=sites.create("green_bank"), start=Instant.parse("2024-11-25T07:00:00Z"), seed=1, name="scan",
+        instrument=instruments.create("mustang2"),
+    )  # fmt: skip
+    depths = {}
+    for name in ("am", "thin"):
+        _, band = zonda.AtmosphereLayers(pwv="5 mm", spectra=name)._weather(observation)
+        depths[name] = float(band.opacity(5e-3, 1.0))
+    # the band's mean of e^-tau is not linear in tau: a little more than half
+    assert depths["thin"] / depths["am"] == pytest.approx(0.5, abs=0.02)
+    with pytest.raises(ZondaError, match="'wrong' is str, not an AbsorptionTable"):
+        zonda.AtmosphereLayers(pwv="5 mm", spectra="wrong")._weather(observation)
+    with pytest.raises(ZondaError, match="unknown spectra 'thim'"):
+        zonda.AtmosphereLayers(pwv="5 mm", spectra="thim")._weather(observation)
