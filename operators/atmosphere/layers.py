@@ -155,7 +155,8 @@ class AtmosphereLayers(Operator):
     """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used);
     where absent that of the `fidelity`, 0.8 or 0.5."""
     tolerance: Fraction = quantity("1 %", ge=1e-4, le=1)
-    """Rms error of the evaluation at nodes, as a fraction of what the focal-plane mean, subtracted, leaves of the atmosphere."""
+    """Rms error of the evaluation at nodes over the field, and of that at steps in time, each as a fraction of what the
+    focal-plane mean, subtracted, leaves of the atmosphere (without nodes: of the steps alone, 1.4 times as much)."""
 
     _origin: Any = PrivateAttr(None)
     _source: Any = PrivateAttr(None)
@@ -395,7 +396,8 @@ class AtmosphereLayers(Operator):
         steps = f"{min(plan.steps)}" if len(set(plan.steps)) == 1 else f"{min(plan.steps)} to {max(plan.steps)}, by layer,"
         say("step in time", f"{steps} samples; expected rms error {plan.time_error:.1e} of the fluctuation")
         say("nodes and step of the mean emission", f"{plan.mean_nodes}; {plan.mean_step} samples")
-        say("error allowed", f"{plan.tolerance:.1e} of the fluctuation each, for nodes and for the step")
+        both = "each, for nodes and for the step" if plan.nodes.shape else "x sqrt(2) for the step"
+        say("error allowed", f"{plan.tolerance:.1e} of the fluctuation {both}")
         say(
             "differential signal", f"{plan.differential:.1e} of the fluctuation is left after subtraction of the focal-plane mean"
         )

@@ -76,6 +76,7 @@ def make_plan(
 ) -> Plan:
     """The coarsest nodes and steps that keep each error below ``tolerance`` of what the focal-plane mean, subtracted, leaves.
 
+    Where the detectors are the nodes, the steps in time may err by both shares, sqrt(2) of it.
     ``variance`` is that of the sum of the layers after the beam. The mean emission may be wrong by `MEAN_SHARE` of that.
     """
     xi, eta = observation.focalplane.xi, observation.focalplane.eta
@@ -111,11 +112,12 @@ def make_plan(
             tried[step] = [float(abs(stretched * m.height).max()) for m in models], delta_el
         return tried[step]
 
+    late_allowed = tolerance * rms * (1.0 if nodes.shape else math.sqrt(2.0))
     mean_step = next(s for s in candidates if s == 1 or slope * path_errors(s)[1] <= allowed)
     step, late = 1, 0.0
     for candidate in candidates[:-1]:
         late = time_error(models, speeds, path_errors(candidate)[0], candidate / observation.sample_rate)
-        if late <= tolerance * rms:
+        if late <= late_allowed:
             step = candidate
             break
         late = 0.0
@@ -131,7 +133,7 @@ def make_plan(
         spent = late**2
         while True:  # double the step that saves most for the error it adds
             more = {k: (layer_error(k, 2 * s) - layer_error(k, s)) for k, s in enumerate(steps) if 2 * s <= candidates[0]}
-            fits = [k for k, error in more.items() if spent + error <= (tolerance * rms) ** 2]
+            fits = [k for k, error in more.items() if spent + error <= late_allowed**2]
             if not fits:
                 break
             best = min(fits, key=lambda k: (max(more[k], 0.0) * steps[k], k))

@@ -787,9 +787,10 @@ def test_turning_a_wide_throw_and_the_wind_together_changes_nothing(angle: float
         op = operator(layers=2, wind={"speed": "12 m/s", "direction": f"{40 + turn} deg"}, tolerance="5 %")
         return whole(o, op.prepare(o))
 
-    one = series(0.0)
-    # But for the path beyond the ends of the scan, which is extrapolated by components.
-    np.testing.assert_allclose(series(angle), one, atol=1e-4 * one.std())
+    one, two = series(0.0), series(angle)
+    np.testing.assert_allclose(two[:, 64:-64], one[:, 64:-64], atol=2e-6 * one.std())  # float32 splines
+    # The path beyond the ends of the scan is extrapolated by components: felt within some steps, far less than the tolerance.
+    np.testing.assert_allclose(two, one, atol=5e-3 * one.std())
 
 
 @pytest.mark.parametrize("direction", [0.0, 90.0, 180.0, 45.0])
