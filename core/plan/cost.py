@@ -22,7 +22,7 @@ from .estimate import Cost
 REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
 """Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""
 
-STARTUP = Cost(once=1.8, kernel="python")
+STARTUP = Cost(once=1.4, kernel="python")
 """Imports and compiled code from the cache; planning is measured."""
 
 BASE = 230e6

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 SAFETY = 1.25
 """Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
 
-POINT, TRANSFER, LATTICE = 3e-8, 5e-7, 2e-7
+POINT, TRANSFER, LATTICE = 1.2e-8, 6e-8, 4e-8
 """Seconds per point (node x time) of one layer and of the radiative transfer and splines; per lattice point."""
 
 FIRST = 0.8
@@ -109,7 +109,7 @@ def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimat
     fixed = 0.02 + (POINT * layers + TRANSFER) * points
     nodes = max(a.planning["seconds"] - FIRST, 0.11)
     once = 0.1 + nodes * len(context.observations)  # companions use the same plan
-    cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=1.8e-9, once=once, bytes=40.0 * points + 30e6)
+    cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=0.9e-9, once=once, bytes=40.0 * points + 30e6)
     return Estimate(tuple(effects), cost)
 
 
