@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import textwrap
 from typing import Any
 
 from .planner import Decided, Plan, describe, figure, kelvin
@@ -35,8 +37,9 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, (int, float, str, bool, list, type(None))) else str(value)
 
 
-def text(plan: Plan, width: int = 150) -> str:
-    """The table for a terminal."""
+def text(plan: Plan, width: int | None = None) -> str:
+    """The table for a terminal of ``width`` columns; of this one where absent."""
+    width = width or max(80, min(shutil.get_terminal_size((120, 50)).columns, 140))
     lines = []
     metrics = plan.context.metrics
     sample, pixel, hits = plan.noise
@@ -52,23 +55,36 @@ def text(plan: Plan, width: int = 150) -> str:
         groups.setdefault((row.run, row.reason), []).append(row.operator)
     for (run, reason), operators in groups.items():
         named = ", ".join(filter(None, operators))
-        lines.append(f"left out: {f'run {run}' if run else ''}{': ' if run and named else ''}{named} ({reason})")
-    table = [("effect", "decision", "error bound", "if left out", "saves", "why")]
+        left_out = f"left out: {f'run {run}' if run else ''}{': ' if run and named else ''}{named} ({reason})"
+        lines += textwrap.wrap(left_out, width, subsequent_indent="    ")
+    lines += ["", *_effects(plan, metrics, width), "", line(plan)]
+    return "\n".join(lines)
+
+
+def _effects(plan: Plan, metrics: frozenset[str], width: int) -> list[str]:
+    """Under each operator and its predicted time: what is done about an effect, what that or leaving it out adds, and why."""
+    lines: list[str] = []
+    column = max((len(d.effect.name) for d in plan.decided), default=0) + 2
+    operator = formula = ""
     for d in plan.decided:
         choice = d.choice
-        saves = choice.seconds * max(plan.context.runs.get(d.operator, 1), 1) if d.chosen else 0.0
-        error = describe(choice.bound, metrics) if d.chosen or choice.decision == "not simulated" else ""
-        size = describe(d.effect.size, metrics) if choice.decision != "not simulated" else ""
-        formula = choice.formula or d.effect.formula
-        why = "; ".join(filter(None, (d.reason, formula)))
+        if d.operator != operator:
+            operator, formula = d.operator, ""
+            seconds = plan.prediction.seconds.get(operator)
+            lines.append(operator + (f"  {_time(seconds)} of CPU time" if seconds is not None else ""))
         decision = choice.decision if choice.decision == choice.what else f"{choice.decision}: {choice.what}"
-        table.append((d.name, decision, error, size, f"{saves:.2g} s" if saves >= 0.01 else "", why))
-    widths = [max(len(r[k]) for r in table) for k in range(5)]
-    lines.append("")
-    for r in table:
-        lines.append("  ".join([*(c.ljust(w) for c, w in zip(r[:5], widths, strict=True)), r[5]]).rstrip())
-    lines += ["", line(plan)]
-    return "\n".join(lines)
+        lines.append(f"  {d.effect.name:<{column}}{decision}")
+        added = d.chosen > 0 or choice.decision == "not simulated"
+        bounds = describe(choice.bound if added else d.effect.size, metrics)
+        saves = choice.seconds * max(plan.context.runs.get(d.operator, 1), 1) if d.chosen else 0.0
+        notes = [f"{'error within' if added else 'without it'} {bounds}" if bounds else ""]
+        notes += [f"saves {saves:.2g} s" if saves >= 0.01 else "", d.reason]
+        new = choice.formula or d.effect.formula
+        notes.append(new if new != formula else "")
+        formula = new
+        indent = " " * (column + 2)
+        lines += textwrap.wrap("; ".join(filter(None, notes)), width, initial_indent=indent, subsequent_indent=indent)
+    return lines
 
 
 def line(plan: Plan) -> str:
