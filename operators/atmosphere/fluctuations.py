@@ -21,13 +21,19 @@ from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, Floats, SmoothF
 
 from .nodes import Nodes
 from .response import Response
-from .sampling import Layers
+from .sampling import TIMES_AT_ONCE, Layers
 
 Water = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
 """(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""
 
 UNIT_DETECTORS, UNIT_SAMPLES = 128, 16384
 """What is made at a time."""
+
+POINTS_AT_ONCE = 1 << 19
+"""Nodes x times that are worked on at a time, where nodes serve."""
+
+AHEAD = 8
+"""Units in time that a thread may be ahead of what it was asked for."""
 
 BYTES_KEPT = 128 << 20
 """Memory of the units that are kept: until the other detectors and operators have taken their part."""
@@ -48,17 +54,23 @@ class AtNodes:
 
     @classmethod
     def make(cls, nodes: Nodes, layers: Layers, water: Water, response: Response, step: int, n_samples: int) -> AtNodes:
-        """Evaluate the layers at the nodes over the whole scan."""
-        g, sine = layers(nodes.xi, nodes.eta, *times(slice(0, n_samples), step))
-        y = water(g, _own(g.shape[1]))
-        weights = np.ascontiguousarray(nodes.weights)
-        return cls(
-            {
-                name: SmoothField(weights, spline_coefficients(response(name, y, sine)), step, n_samples)
-                for name in response.names
-            },
-            _sums(y[:, _own(y.shape[1])]),
-        )
+        """Evaluate the layers at the nodes over the whole scan, a part of it at a time."""
+        n_node, weights = len(nodes.xi), np.ascontiguousarray(nodes.weights)
+        width = -(-n_samples // step) + 3
+        coefficients = {name: np.empty((n_node, width)) for name in response.names}
+        sums = []
+        part = step * max(TIMES_AT_ONCE, POINTS_AT_ONCE // n_node)
+        for start in range(0, n_samples, part):
+            g, sine = layers(nodes.xi, nodes.eta, *times(slice(start, min(start + part, n_samples)), step))
+            own = _own(g.shape[1])
+            y = water(g, own)
+            sums.append(_sums(y[:, own]))
+            first = start // step
+            for name, whole in coefficients.items():
+                made = spline_coefficients(response(name, y, sine))
+                whole[:, first : first + made.shape[1]] = made
+        fields = {name: SmoothField(weights, c, step, n_samples) for name, c in coefficients.items()}
+        return cls(fields, (sum(n for n, _, _ in sums), math.fsum(t for _, t, _ in sums), math.fsum(q for _, _, q in sums)))
 
     fits = True
 
@@ -81,7 +93,7 @@ class OfDetectors:
         self._units: OrderedDict[tuple[int, int], Future[dict[str, Floats]]] = OrderedDict()
         self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
         self._lock = threading.Lock()
-        self._size = 4 * UNIT_DETECTORS * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * len(response.names)
+        self._size = 4 * min(UNIT_DETECTORS, len(nodes.xi)) * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * len(response.names)
 
     @property
     def fits(self) -> bool:
@@ -114,25 +126,36 @@ class OfDetectors:
                         part[...] = field.evaluate(rows, at, np.empty(part.shape, part.dtype))
 
     def _unit(self, unit: int, number: int) -> dict[str, Floats]:
-        key = unit, number
-        with self._lock:
-            made = self._units.get(key)
-            mine = made is None
-            if made is None:
-                made = self._units[key] = Future()
-                while len(self._units) > max(1, BYTES_KEPT // self._size):
-                    self._units.popitem(last=False)
-            else:
-                self._units.move_to_end(key)
-        if mine:
+        """The coefficients of a unit. A thread that would wait for another to make it makes one that comes later instead."""
+        room = max(1, BYTES_KEPT // self._size)
+        while True:
+            with self._lock:
+                wanted = self._units.get((unit, number))
+                key: tuple[int, int] | None = None
+                if wanted is None:
+                    key = unit, number
+                else:
+                    self._units.move_to_end((unit, number))
+                    if not wanted.done():
+                        stop = min(number + min(AHEAD, room), -(-self._n_samples // UNIT_SAMPLES))
+                        key = next(((unit, k) for k in range(number + 1, stop) if (unit, k) not in self._units), None)
+                if key is not None:
+                    mine: Future[dict[str, Floats]] = Future()
+                    self._units[key] = mine
+                    while len(self._units) > room:
+                        self._units.popitem(last=False)  # whoever waits for it still holds it
+            if key is None:
+                assert wanted is not None
+                return wanted.result()
             try:
-                made.set_result(self._make(unit, number))
+                mine.set_result(self._make(*key))
             except BaseException as error:
-                made.set_exception(error)
+                mine.set_exception(error)
                 with self._lock:
                     self._units.pop(key, None)
                 raise
-        return made.result()
+            if key == (unit, number):
+                return mine.result()
 
     def _make(self, unit: int, number: int) -> dict[str, Floats]:
         rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)

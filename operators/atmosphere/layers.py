@@ -392,9 +392,11 @@ class AtmosphereLayers(Operator):
             beyond = sum(m.distance > far for m in models)
             say("footprint", f"{self.beam}; {beyond} of {len(models)} layers lie beyond {far:.0f} m, where beams lose their rim")
         say("turbulence covariance", f"within {beams[0].fidelity.error:.1%} of the variance ({self.fidelity})")
-        say("nodes", f"{plan.nodes}; expected rms error {plan.focal_plane_error:.1e} of the fluctuation")
-        steps = f"{min(plan.steps)}" if len(set(plan.steps)) == 1 else f"{min(plan.steps)} to {max(plan.steps)}, by layer,"
-        say("step in time", f"{steps} samples; expected rms error {plan.time_error:.1e} of the fluctuation")
+        error = f"; expected rms error {plan.focal_plane_error:.1e} of the fluctuation" if plan.nodes.shape else ""
+        say("nodes", f"{plan.nodes}{error}")
+        several = len(set(plan.steps)) > 1
+        steps = f"{min(plan.steps)} to {max(plan.steps)} samples, by layer" if several else f"{min(plan.steps)} samples"
+        say("step in time", f"{steps}; expected rms error {plan.time_error:.1e} of the fluctuation")
         say("nodes and step of the mean emission", f"{plan.mean_nodes}; {plan.mean_step} samples")
         both = "each, for nodes and for the step" if plan.nodes.shape else "x sqrt(2) for the step"
         say("error allowed", f"{plan.tolerance:.1e} of the fluctuation {both}")

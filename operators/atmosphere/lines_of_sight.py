@@ -31,6 +31,9 @@ Floats = NDArray[np.float64]
 _ERROR = 1e-9
 """Of a polynomial in equation (1): micrometres at a layer some kilometres away."""
 
+_WORST = 1e-4
+"""What such a polynomial may err by in wide fields near the horizon, where none reaches `_ERROR`; beyond, a scan is refused."""
+
 _DEGREES = (4, 6, 8, 11, 15, 20, 28, 40)
 
 _WIDER = 0.05
@@ -131,10 +134,17 @@ class LinesOfSight:
             return np.asarray(np.sin(2 * k * np.arctan(t)) / t, np.float64)
 
         low, high = (math.sqrt(1 - v * v) for v in (self.high, self.low))
-        q, at_q = min((_polynomial(of_horizontal, low, high), _polynomial(of_up, self.low, self.high)), key=lambda p: len(p[0]))
+        ways = _polynomial(of_horizontal, low, high), _polynomial(of_up, self.low, self.high)
+        q, at_q, error = min(ways, key=lambda way: (max(way[2], _ERROR), len(way[0])))
+        if not error <= _WORST:
+            raise PointingError(
+                f"lines of sight so close to the horizon or the zenith are laid out to {error:.0e} of the height at best",
+                place="atmosphere",
+                cure="raise or lower the target, or choose a smaller field of view",
+            )
         by_up = at_q[0] == (self.low + self.high) / 2
-        c, at_t = _polynomial(cosine, 0.0, max(largest * largest, 1e-6))
-        s, _ = _polynomial(sine_over, 0.0, max(largest * largest, 1e-6))
+        c, at_t, _ = _polynomial(cosine, 0.0, max(largest * largest, 1e-6))
+        s, _, _ = _polynomial(sine_over, 0.0, max(largest * largest, 1e-6))
         return q, c, s, np.array([*at_q, *at_t, float(by_up)])
 
 
@@ -153,19 +163,17 @@ def _about_the_boresight(linear: Floats, cone: Cone) -> tuple[Floats, Floats]:
     return rows, np.stack([one * c - two * s, one * s + two * c])
 
 
-def _polynomial(function: Callable[[Floats], Floats], low: float, high: float) -> tuple[Floats, tuple[float, float]]:
-    """Coefficients, highest first, in z = (x - m) w, and (m, w): to `_ERROR` of the function over [low, high].
-
-    `geometry.plane` takes the cone only where the longest of `_DEGREES` suffices.
-    """
+def _polynomial(function: Callable[[Floats], Floats], low: float, high: float) -> tuple[Floats, tuple[float, float], float]:
+    """Coefficients, highest first, in z = (x - m) w, (m, w), and the error: `_ERROR` over [low, high], or more."""
     middle, half = (low + high) / 2, max((high - low) / 2, 1e-12)
     for degree in _DEGREES:
         series = np.polynomial.Chebyshev.interpolate(lambda z: function(middle + half * z), degree)
         z = np.linspace(-1, 1, 4 * degree + 3)
         truth = function(middle + half * z)
-        if abs(series(z) - truth).max() <= _ERROR:
+        error = float(abs(series(z) - truth).max())
+        if error <= _ERROR:
             break
-    return np.asarray(np.polynomial.chebyshev.cheb2poly(series.coef)[::-1], np.float64).copy(), (middle, 1 / half)
+    return np.asarray(np.polynomial.chebyshev.cheb2poly(series.coef)[::-1], np.float64).copy(), (middle, 1 / half), error
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -79,7 +79,9 @@ class Nodes:
     """(along xi, along eta), or None where the detectors are the nodes."""
 
     def __str__(self) -> str:
-        return f"{self.shape[0]} x {self.shape[1]} Chebyshev" if self.shape else f"the {len(self.xi)} detectors"
+        return (
+            f"{self.shape[0]} x {self.shape[1]} Chebyshev" if self.shape else f"none: each of {len(self.xi)} detectors by itself"
+        )
 
 
 def chebyshev(low: float, high: float, n: int) -> Floats:

@@ -4,9 +4,10 @@ With y the relative fluctuation of the water and s the sine of the elevation,
 
     f(y, s) = y sum_ij c_ij Y^i S^j,       Y, S in [-1, 1] over the ranges of y and s                               (1)
 
-stands for the difference of the emission [K_RJ], of the relative transmission and of the opacity from those at y = 0, fitted
-to `BandAtmosphere` at Chebyshev points. The factor y makes it exact where nothing fluctuates. Ranges too wide for
-polynomials of `_DEGREES` (strong log-normal fluctuations) are left to `BandAtmosphere` itself.
+stands for the difference of the emission [K_RJ] and of the opacity from those at y = 0, fitted to `BandAtmosphere` at Chebyshev
+points; the relative transmission, which spans decades in opaque bands, is expm1 of minus the latter. The factor y makes it
+exact where nothing fluctuates. Ranges too wide for polynomials of `_DEGREES` (strong log-normal fluctuations) are left to
+`BandAtmosphere` itself.
 """
 
 from __future__ import annotations
@@ -82,16 +83,18 @@ class Response:
 
         every: dict[str, Callable[[Floats, Floats], Floats]] = {
             "emission": lambda y, s: band.emission_difference(pwv, pwv * y, elevation(s)),
-            "transmission": lambda y, s: np.expm1(depth(y, s)),
             "opacity": lambda y, s: -depth(y, s),
             "pwv": column,
             "path_delay": lambda y, s: delay_per_vapour * column(y, s),
         }
-        self._direct = {name: every[name] for name in names}
-        self._coefficients = {name: self._fit(self._direct[name]) for name in names}
+        needed = dict.fromkeys("opacity" if name == "transmission" else name for name in names)
+        self._direct = {name: every[name] for name in needed}
+        self._coefficients = {name: self._fit(self._direct[name]) for name in needed}
 
     def __call__(self, name: str, y: Floats, s: Floats) -> Floats:
         """The difference called ``name`` at fluctuations ``y`` and sines of the elevation ``s``, both (n, m)."""
+        if name == "transmission":
+            return np.asarray(np.expm1(-self("opacity", y, s)), np.float64)
         coefficients = self._coefficients[name]
         if coefficients is None:
             return self._direct[name](y, s)

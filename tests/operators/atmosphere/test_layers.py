@@ -258,6 +258,8 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
     expected = series()
     once = len(made)
     for strip, kept, times in (((3, 4), 512 << 20, 1024), ((5, 5), 0, 7), ((8, 8), 1 << 20, 100)):
+        monkeypatch.setattr(fluctuations, "TIMES_AT_ONCE", times)
+        monkeypatch.setattr(fluctuations, "POINTS_AT_ONCE", times)
         monkeypatch.setattr(sampling, "STRIP", strip)
         monkeypatch.setattr(sampling, "BYTES_KEPT", kept)
         monkeypatch.setattr(sampling, "TIMES_AT_ONCE", times)
@@ -747,6 +749,37 @@ def test_many_threads_make_the_same_units() -> None:
     with ThreadPoolExecutor(4) as pool:
         for values in pool.map(lambda _: whole(o, state), range(8)):
             np.testing.assert_array_equal(values, expected)
+
+
+def test_a_thread_that_would_wait_makes_what_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    import threading
+
+    camera = instrument(detectors=37, field="10 deg", diameter="6 m")
+    o = swept(50.0, 180 + 4 * np.sin(2 * np.pi * np.arange(1000) / 500), camera)
+    expected = whole(o, operator(layers=1, lowest="3 km").prepare(o))
+    monkeypatch.setattr(fluctuations, "UNIT_SAMPLES", 256)
+    state = operator(layers=1, lowest="3 km").prepare(o)
+    begun, later, real = threading.Event(), threading.Event(), OfDetectors._make
+
+    def slow(self: OfDetectors, unit: int, number: int) -> Any:
+        if number == 0:
+            begun.set()
+            assert later.wait(60), "nobody made another unit meanwhile"
+        else:
+            later.set()
+        return real(self, unit, number)
+
+    monkeypatch.setattr(OfDetectors, "_make", slow)
+    found: list[Floats] = []
+    threads = [threading.Thread(target=lambda: found.append(whole(o, state))) for _ in range(2)]
+    threads[0].start()
+    assert begun.wait(60)
+    threads[1].start()
+    for thread in threads:
+        thread.join()
+    for values in found:
+        np.testing.assert_array_equal(values, expected)
+    assert len(found) == 2
 
 
 @pytest.mark.parametrize("kept", [128 << 20, 0])

@@ -107,7 +107,7 @@ def test_where_nodes_do_not_pay_the_detectors_are_the_nodes() -> None:
     assert nodes.weights.size == 0
     one, error = choose_nodes(np.array([0.3]), np.array([0.2]), LAYERS, 1e-5)
     assert (one.xi, one.eta, error) == (0.3, 0.2, 0.0)
-    assert str(one) == "the 1 detectors"
+    assert str(one) == "none: each of 1 detectors by itself"
     assert str(grid(XI, ETA, 2)) == "2 x 2 Chebyshev"
 
 

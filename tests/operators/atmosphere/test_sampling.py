@@ -206,3 +206,12 @@ def test_the_polynomials_hold_near_the_zenith_and_the_horizon(field: str, elevat
     x, y, _ = path(o.focalplane.xi, o.focalplane.eta, 0, 50)
     expected = track.unroll(crossing(rays(axes(o.boresight_azel[::8]), o.focalplane.xi, o.focalplane.eta)))
     np.testing.assert_allclose(np.stack([x, y]), expected, atol=2e-8)
+
+
+def test_what_no_polynomial_follows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    from zonda.operators.atmosphere import lines_of_sight as module
+
+    o = observation(*SCANS["far"], samples=400)
+    monkeypatch.setattr(module, "_DEGREES", (4,))  # of 35 deg, which wants 20
+    with pytest.raises(ZondaError, match=r"so close to the horizon .* of the height at best"):
+        LinesOfSight(o, tracks([o])[0], 8, 0, 50)
