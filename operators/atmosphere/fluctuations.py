@@ -33,7 +33,7 @@ POINTS_AT_ONCE = 1 << 19
 """Nodes x times that are worked on at a time, where nodes serve."""
 
 AHEAD = 8
-"""Units in time that a thread may be ahead of what it was asked for."""
+"""Units that a thread may be ahead of what it was asked for."""
 
 BYTES_KEPT = 128 << 20
 """Memory of the units that are kept: until the other detectors and operators have taken their part."""
@@ -137,8 +137,7 @@ class OfDetectors:
                 else:
                     self._units.move_to_end((unit, number))
                     if not wanted.done():
-                        stop = min(number + min(AHEAD, room), -(-self._n_samples // UNIT_SAMPLES))
-                        key = next(((unit, k) for k in range(number + 1, stop) if (unit, k) not in self._units), None)
+                        key = next((k for k in self._next(unit, number, min(AHEAD, room)) if k not in self._units), None)
                 if key is not None:
                     mine: Future[dict[str, Floats]] = Future()
                     self._units[key] = mine
@@ -156,6 +155,13 @@ class OfDetectors:
                 raise
             if key == (unit, number):
                 return mine.result()
+
+    def _next(self, unit: int, number: int, reach: int) -> Iterator[tuple[int, int]]:
+        """Units that will be asked for soon: later ones of the same detectors, the same time of the next detectors."""
+        for k in range(number + 1, min(number + reach, -(-self._n_samples // UNIT_SAMPLES))):
+            yield unit, k
+        for k in range(unit + 1, min(unit + reach, -(-len(self._xi) // UNIT_DETECTORS))):
+            yield k, number
 
     def _make(self, unit: int, number: int) -> dict[str, Floats]:
         rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)
