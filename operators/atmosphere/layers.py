@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSecond
 from zonda.core.data import Block, Data, Observation
-from zonda.core.errors import InputError, PointingError
+from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
@@ -162,6 +162,17 @@ class AtmosphereLayers(Operator):
     _source: Any = PrivateAttr(None)
     _tracks: dict[str, Track] = PrivateAttr(default_factory=dict)
     _air: dict[Any, tuple[Profile, BandAtmosphere]] = PrivateAttr(default_factory=dict)
+
+    @field_validator("spectra")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        from zonda.core.registry import spectra
+
+        try:
+            spectra.get(name)
+        except ZondaError as error:
+            raise ValueError(str(error)) from None
+        return name
 
     @model_validator(mode="after")
     def _consistent(self) -> AtmosphereLayers:

@@ -267,5 +267,5 @@ def test_spectra_are_plugins(monkeypatch):
     assert depths["thin"] / depths["am"] == pytest.approx(0.5, abs=0.02)
     with pytest.raises(ZondaError, match="'wrong' is str, not an AbsorptionTable"):
         zonda.AtmosphereLayers(pwv="5 mm", spectra="wrong")._weather(observation)
-    with pytest.raises(ZondaError, match="unknown spectra 'thim'"):
-        zonda.AtmosphereLayers(pwv="5 mm", spectra="thim")._weather(observation)
+    with pytest.raises(ValueError, match="unknown spectra 'thim'"):
+        zonda.AtmosphereLayers(pwv="5 mm", spectra="thim")
