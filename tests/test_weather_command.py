@@ -92,3 +92,8 @@ def test_fetch_without_the_package(capsys, monkeypatch, tmp_path):
     assert weather("fetch", "green_bank", "--output", tmp_path / "era5.nc") == 2
     assert "pip install 'zonda[weather]'" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_dry_air(tmp_path, capsys):
+    assert weather("chajnantor", "--pwv", "0mm", "--instrument", "atlast", "--output", tmp_path / "dry.png") == 0
+    assert "PWV    0.00 mm" in capsys.readouterr().out

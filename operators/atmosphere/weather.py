@@ -164,9 +164,11 @@ class Profile:
         Raises
         ------
         InputError
-            A PWV that is negative or above 60 mm.
+            A PWV that is negative or above 60 mm, or water asked of air that has none.
         """
         check_pwv(pwv)
+        if pwv > 0 and not self.pwv > 0:
+            raise InputError("the air has no water at all, so it has no shape to scale", cure="give a profile with some vapour")
         profile = self
         for _ in range(8):  # as in Layers.scaled
             profile = replace(profile, h2o=profile.h2o * (pwv / profile.pwv)) if pwv > 0 else replace(self, h2o=0 * self.h2o)

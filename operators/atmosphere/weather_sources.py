@@ -75,6 +75,10 @@ class Table(WeatherSource):
         return read_table(self.table, site)
 
 
+DRY = 1e-12
+"""m: what air of 0 mm is given, so that its profile keeps the shape of the water; it absorbs 1e-9 of what a millimetre does."""
+
+
 def air_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None) -> Profile:
     """The air of a scene; its ``stated`` says what was taken, and why.
 
@@ -113,7 +117,7 @@ def _water(profile: Profile, weather: WeatherSource, seed: int, pwv: float | Non
     if pwv is not None or (given is not None and given.metres is not None):
         wanted = pwv if pwv is not None else given.metres if given is not None else None
         assert wanted is not None
-        return profile.scaled(wanted), f"PWV {wanted * 1e3:.4g} mm, as given"
+        return profile.scaled(max(wanted, DRY)), f"PWV {wanted * 1e3:.4g} mm, as given"
     if given is None:
         return profile, f"PWV {profile.pwv * 1e3:.4g} mm, as the source has it"
     law = profile.distribution

@@ -1,5 +1,6 @@
 """The sources of weather: ERA5 files, tables, the standard atmosphere, and what a scene makes of them."""
 
+import dataclasses
 import importlib.util
 import math
 from pathlib import Path
@@ -493,3 +494,14 @@ def test_fetch_asks_for_the_cells_around_the_site(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "cdsapi", types.SimpleNamespace(Client=client))
     with pytest.raises(InputError, match=r"did not deliver: Missing/incomplete[\s\S]*free key"):
         retrieve(here(), NIGHT, 1, tmp_path / "x.nc")
+
+
+def test_dry_air_keeps_the_shape_of_its_water() -> None:
+    site, time = sites.create("chajnantor"), Instant.parse("2022-08-01T23:00:00Z")
+    dry = air_of(Climatology(pwv="0 mm"), site, time, 1)
+    assert 0 < dry.pwv < 1e-11
+    usual = air_of(None, site, time, 1)
+    # the pressure stays, so that the few per mille of molecules that were water are air: shapes agree to that
+    np.testing.assert_allclose(dry.scaled(usual.pwv).h2o, usual.h2o, rtol=1e-6)
+    with pytest.raises(InputError, match="no water at all"):
+        dataclasses.replace(usual, h2o=0 * usual.h2o).scaled(1e-3)
