@@ -144,17 +144,6 @@ class DetectorField:
     step: int
     n_samples: int
 
-    @classmethod
-    def from_values(cls, values: Floats, step: int, n_samples: int, dtype: type = np.float64) -> DetectorField:
-        """From detector values with a margin, as `SmoothField.from_values`, filtered a few detectors at a time."""
-        wanted = -(-n_samples // step) + 3
-        kept: Floats = np.empty((len(values), wanted), dtype)
-        one = np.ones((1, 1))
-        for first in range(0, len(values), 64):
-            rows = slice(first, first + 64)
-            kept[rows] = SmoothField.from_values(one, values[rows], step, n_samples).coefficients
-        return cls(kept, step, n_samples)
-
     def evaluate(self, detectors: slice, samples: slice, out: Floats | None = None) -> Floats:
         """As `SmoothField.evaluate`."""
         start, stop = samples.start, samples.stop

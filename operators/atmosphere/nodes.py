@@ -25,7 +25,7 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.smooth import PAD
+from zonda.core.smooth import PAD, SPLINE_MARGIN
 
 from .beams import Aperture
 from .covariance import mixture
@@ -34,9 +34,6 @@ Floats = NDArray[np.float64]
 
 LARGEST_STEP = 2048
 """Samples; see `core.tiles`."""
-
-MARGIN = 12
-"""Coarse values beyond both ends that `SmoothField.from_values` wants."""
 
 GRIDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 32, 40, 48, 64)
 _TRIED = 64
@@ -245,7 +242,7 @@ def layer_time_error(layer: LayerModel, speeds: Floats, delta: float, dt: float)
 
 def times_with_margin(n_samples: int, step: int) -> NDArray[np.int64]:
     """Samples at which `SmoothField.from_values` wants its values."""
-    return step * np.arange(-PAD - MARGIN, -(-n_samples // step) + 2 + MARGIN, dtype=np.int64)
+    return step * np.arange(-PAD - SPLINE_MARGIN, -(-n_samples // step) + 2 + SPLINE_MARGIN, dtype=np.int64)
 
 
 def candidate_steps(n_samples: int) -> list[int]:

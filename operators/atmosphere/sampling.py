@@ -21,7 +21,7 @@ from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
 
-from .geometry import Track
+from .geometry import Track, rim
 from .lines_of_sight import LinesOfSight
 from .turbulence import Field, Turbulence
 
@@ -162,11 +162,6 @@ class Layers:
                 cure="shorten the scans, narrow the field of view, or raise the lowest layer",
             )
 
-    @property
-    def fits(self) -> bool:
-        """Whether the tiles of the whole scan can be kept."""
-        return 4 * self.cells < BYTES_KEPT / 2
-
     def __call__(self, xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
         """The sum of the layers and the sine of the elevation, each (len(xi), count), from time ``first``."""
         stop = first + count
@@ -208,8 +203,6 @@ class Layers:
 
     def _swept(self, n: int, observation: Observation) -> tuple[int, float]:
         """Cells across the wind, and lattice points over which the field sweeps: bounds from its rim."""
-        from .geometry import rim
-
         path, (matrix, i, j) = self.paths[self._drifting[n].step], self._places[n]
         xi, eta = rim(observation.focalplane)
         sum_of_boxes, whole = 0.0, np.array([np.inf, -np.inf, np.inf, -np.inf])
