@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from .focalplane import Focalplane
 from .random import stream_key
 from .smooth import SmoothField
+from .tiles import TILE_DETECTORS, TILE_SAMPLES
 
 if TYPE_CHECKING:
     from .configuration.time import Instant
@@ -218,6 +221,9 @@ class Block:
     """Memory reused from block to block; `exec` must not keep a stream beyond the call."""
     places: dict[str, Floats] = field(default_factory=dict, repr=False)
     """Where the executor wants a stream to be made, so that it need not be copied there."""
+    again: bool = False
+    """These samples were worked on before, and are made again because the streams do not fit in memory: an operator makes the
+    same bits and counts nothing (what it tells ``observation.tally`` is thrown away)."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -254,7 +260,8 @@ class Stream:
     Attributes
     ----------
     array
-        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file.
+        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file. A stream that is made again
+        when it is read (`core.streams`) has none: it is read by `sweep`.
     means
         What must be added in float64 to have all of it, see `Block.means`.
     threads
@@ -271,6 +278,53 @@ class Stream:
     def shape(self) -> tuple[int, int]:
         n_det, n_samp = self.array.shape
         return n_det, n_samp
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """float32 or float64."""
+        return self.array.dtype
+
+    def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+        """(detectors, samples, result) of ``work(detectors, samples, part)`` over blocks that cover the stream once.
+
+        ``work`` is called from several threads and must not change or keep the part. Results come in an order in which no
+        detector's samples and no sample's detectors are ever out of order, whatever the blocks and threads: what is added up
+        tile by tile (`core.tiles`) has the same bits.
+        """
+        n_det, n_samp = self.shape
+        blocks = [
+            (slice(d, min(d + SWEEP_DETECTORS, n_det)), slice(t, min(t + SWEEP_SAMPLES, n_samp)))
+            for d in range(0, n_det, SWEEP_DETECTORS)
+            for t in range(0, n_samp, SWEEP_SAMPLES)
+        ]
+
+        def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
+            return detectors, samples, work(detectors, samples, self.array[detectors, samples])
+
+        return in_order(one, blocks, self.threads)
+
+
+SWEEP_DETECTORS, SWEEP_SAMPLES = 4 * TILE_DETECTORS, 32 * TILE_SAMPLES
+"""What is read at a time of a stream that is kept."""
+
+
+def in_order(work: Callable[..., Any], items: Iterable[tuple[Any, ...]], threads: int) -> Iterator[Any]:
+    """Results of ``work(*item)``, in order, made on several threads that run ahead by at most two items each."""
+    if threads == 1:
+        yield from (work(*item) for item in items)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        pending: deque[Future[Any]] = deque()
+        try:
+            for item in items:
+                pending.append(pool.submit(work, *item))
+                if len(pending) > 2 * threads:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
 
 
 @dataclass

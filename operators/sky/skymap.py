@@ -322,8 +322,9 @@ class State:
     _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
     def record(self, block: Block, beyond: int, behind: int) -> None:
-        """Keep a block's counts under its place: a block that is made twice is counted once."""
-        self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
+        """Keep a block's counts under its place; a block that is made again is counted once."""
+        if not block.again:
+            self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
 
     def totals(self) -> tuple[int, int]:
         counts = list(self._counts.values())
