@@ -31,7 +31,7 @@ def sample_linear(
     covered: NDArray[np.uint8],
     out: Floats,
 ) -> tuple[int, int]:
-    """As `sampling.sample`, from the grid's ``values`` (ny, nx). Samples within two grid points of its border are left as they are."""
+    """As `sampling.sample`, from the grid's ``values`` (ny, nx). Samples within two points of its border are left as they are."""
     kind = out.dtype.type
     constants = np.array([1 / 6, 2 / 3, 0.5, 1.0, 2.0, 1e6, 0.0], kind)
     a, b = xi.astype(kind), eta.astype(kind)

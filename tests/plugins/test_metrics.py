@@ -154,9 +154,8 @@ def test_the_uncertainty_of_structure_functions_through_noise():
     random = np.random.default_rng(4)
     n_det, n, noise, names = 8, 2048, 0.4, [f"d{k}" for k in range(8)]
     air = np.cumsum(random.standard_normal((n_det, n)), axis=1) / 30 + random.standard_normal((n_det, 1))
-    plane = SimpleNamespace(
-        names=names, xi=random.uniform(-1, 1, n_det), eta=random.uniform(-1, 1, n_det), illumination_efficiency=np.full(n_det, 0.8)
-    )
+    xi, eta = random.uniform(-1, 1, (2, n_det))
+    plane = SimpleNamespace(names=names, xi=xi, eta=eta, illumination_efficiency=np.full(n_det, 0.8))
 
     def measured(values, white):
         trace = SimpleNamespace(streams={"atmosphere": values, "white": white}, names=names)
