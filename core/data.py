@@ -67,6 +67,11 @@ class Tally:
         with self._lock:
             return sorted((*k, v) for k, v in self._counts.items())
 
+    def figures(self) -> list[tuple[str, str, str]]:
+        """The statements alone, in a fixed order."""
+        with self._lock:
+            return sorted((*k, v) for k, v in self._figures.items())
+
     def get(self, who: str, what: str) -> int:
         """A count, 0 where there is none."""
         return self._counts.get((who, what), 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import PrivateAttr
@@ -31,6 +32,10 @@ class Operator(Parameters):
        come again (`Block.again`) where the streams between operators do not fit in memory; one that makes no stream is spared.
     4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
     5. ``finalize(data)`` once at the end of the run: turn sums into products, write files.
+
+    A campaign (`core.campaign`) shares the observations out among tasks. What `observe` works out from all of them comes from
+    `agree` and `lay_out`; between `collect` and `finalize`, `pack` takes a task's partial products out of ``data.products`` and
+    `merge` adds them together. An operator that puts anything there in `collect` needs both to take part in a campaign.
 
     Class attributes
     ----------------
@@ -118,6 +123,27 @@ class Operator(Parameters):
 
     def finalize(self, data: Data) -> None:
         """Finish products."""
+
+    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
+        """What all observations of a campaign must have in common (the grid of a map), as plain values and arrays; None: nothing.
+
+        Called after pointing instead of `observe`, for one part of the observations after the other. ``before``: what those
+        before had in common. An entry ``fixed: True`` says that later parts cannot change it.
+        """
+        return None
+
+    def lay_out(self, layout: Mapping[str, Any]) -> None:
+        """Take what `agree` found for all observations."""
+
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """Take the partial products of the run in progress out of ``data.products``: plain values and arrays; None: nothing.
+
+        ``first``: the part begins with the very first observation; what is of that one alone need not be in the others.
+        """
+        return None
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Add a part that `pack` made to ``data.products``. Parts come in the order of their observations."""
 
     def traits(self, observation: Observation) -> Traits:
         """What other operators' bounds need to know of this one (noise, pixels, filters); see `core.plan`.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
@@ -156,6 +156,22 @@ class SkyMap(Operator):
         key = "input" if first is None or first.header.get("OPERATOR") == self.label else f"input.{self.label}"
         if key not in data.products:
             data.products[key] = state.sky.image(self.label)
+
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """The input of the very first observation."""
+        for key in ("input", f"input.{self.label}"):
+            image = data.products.get(key)
+            if image is not None and image.header.get("OPERATOR") == self.label:
+                del data.products[key]
+                wanted = first and not data.run
+                return {"key": key, "values": image.values, "header": image.header.tostring()} if wanted else None
+        return None
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Put it among the products."""
+        from astropy.io.fits import Header
+
+        data.products.setdefault(part["key"], Image(part["values"], Header.fromstring(part["header"])))
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
