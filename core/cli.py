@@ -282,13 +282,20 @@ def _command(
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.
 
-    Every mistake in the file is shown at once, with its place. Only `zonda run` reads the input maps and finds out whether the
-    target is up.
+    Every mistake in the file is shown at once, with its place. The telescope is pointed at some instants of the scans: whether
+    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam. Only
+    `zonda run` reads the input maps.
     """
     file = _load(pipeline, settings)
+    from .data import Data
+
+    data = Data(scene=file.scene())
+    found = [operator.check(data) for operator in file.pipeline().operators]
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
-    for step in file.steps:
+    for step, lines in zip(file.steps, found, strict=True):
         click.echo(f"  {step.key}")
+        for line in lines:
+            click.echo(f"    {line}")
 
 
 @zonda.command()

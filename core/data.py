@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -87,9 +88,10 @@ class Observation:
     start
         Exact start instant.
     seconds
-        (n_samp,) float64, seconds since ``start``.
+        (n_samp,) float64, increasing, seconds since ``start``: when each sample is taken. They need not be a perfect comb:
+        pointing and atmosphere follow them, noise and filters count samples (see `jitter`).
     sample_rate
-        Hz.
+        Hz; of the comb that comes nearest to ``seconds``.
     boresight_azel, boresight_radec
         (n_samp, 4) float64 quaternions (x, y, z, w), exactly TOAST's: Rz(lon) Ry(pi/2 - lat) Rz(psi), lon = -az for azel.
     centre
@@ -147,6 +149,23 @@ class Observation:
     def duration(self) -> float:
         """n_samples / sample_rate, s."""
         return self.n_samples / self.sample_rate
+
+    @property
+    def departures(self) -> NDArray[np.float64]:
+        """(n_samp,) s by which samples are later than a comb of `sample_rate` with the same mean; zeros for a perfect one."""
+        late = self.seconds - (self.seconds[0] + np.arange(self.n_samples) / self.sample_rate)
+        return np.asarray(late - late.mean(), np.float64) if late.any() else late
+
+    @cached_property
+    def jitter(self) -> float:
+        """rms of `departures`, s."""
+        late = self.departures
+        return float(np.sqrt(np.mean(late * late)))
+
+    def seconds_at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """`seconds` at sample numbers, which go on at `sample_rate` beyond the ends of the scan."""
+        inside = np.clip(index, 0, self.n_samples - 1)
+        return np.asarray(self.seconds[inside] + (index - inside) / self.sample_rate, np.float64)
 
     def key(self, *names: str | int) -> NDArray[np.uint32]:
         """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""

@@ -83,6 +83,13 @@ class Operator(Parameters):
     def observe(self, data: Data) -> None:
         """Append observations to ``data`` (pointing operators), or look at those that are there (map makers: a common grid)."""
 
+    def check(self, data: Data) -> list[str]:
+        """What `zonda check` finds out beyond the parameters, in well under a second: lines to print, or a `ZondaError`.
+
+        Pointing operators append (possibly coarser) observations to ``data``, on which later steps may look.
+        """
+        return []
+
     def configure(self, observation: Observation) -> None:
         """Resolve values that other operators read, e.g. the focal plane's efficiencies."""
 
