@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from .data import Floats, Observation, Stream
-from .errors import PipelineError
+from .errors import OutputError, PipelineError
 from .smooth import SmoothField
 
 if TYPE_CHECKING:
@@ -224,11 +224,30 @@ class Store:
         self._ledger.note(("streams",), self.held)
 
     def _file(self, name: str, shape: tuple[int, int]) -> Floats:
-        if self._folder is None:
-            self._folder = tempfile.TemporaryDirectory(prefix="zonda-")
-        handle, path = tempfile.mkstemp(".stream", name, self._folder.name)  # a new file: the old one may still be read
-        os.close(handle)
-        return np.memmap(path, self._dtype, "w+", shape=shape)
+        size = shape[0] * shape[1] * self._dtype.itemsize
+        try:
+            if self._folder is None:
+                self._folder = tempfile.TemporaryDirectory(prefix="zonda-")
+            handle, path = tempfile.mkstemp(".stream", name, self._folder.name)  # a new file: the old one may still be read
+            try:
+                _reserve(handle, size)
+            finally:
+                os.close(handle)
+        except OSError as error:
+            raise OutputError(
+                f"a stream of {size / 1e9:.3g} GB cannot be put there: {error.strerror or error}",
+                place=tempfile.gettempdir(),
+                cure="raise --memory, or point TMPDIR to a larger disk",
+            ) from error
+        return np.memmap(path, self._dtype, "r+", shape=shape)
+
+
+def _reserve(handle: int, size: int) -> None:
+    """Give a file its size, and blocks on the disk: where the disk fills up later, writing to a mapping kills the process."""
+    if size and hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(handle, 0, size)
+    else:
+        os.ftruncate(handle, size)
 
 
 def forget_pages(array: Floats) -> None:
