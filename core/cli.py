@@ -45,10 +45,25 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
+class Share(click.ParamType[Any]):
+    """``3/8``, the third of eight shares, as (3, 8)."""
+
+    name = "K/N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """(K, N); fails with what was expected."""
+        first, _, second = str(value).partition("/")
+        if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
+            self.fail(f"{value!r} is no share of the tasks; write K/N with K from 1 to N, e.g. 3/8", param, ctx)
+        return int(first), int(second)
+
+
 ELSEWHERE = {
     "accuracy": "zonda.core.accuracy.command:accuracy",
     "doctor": "zonda.plugins.doctor_command:doctor",
     "plan": "zonda.core.plan.command:plan",
+    "resume": "zonda.core.campaign.command:resume",
+    "status": "zonda.core.campaign.command:status",
     "weather": "zonda.plugins.weather_command:weather",
 }
 """Built-in commands that live with what they use, imported when they are named or listed.
@@ -136,7 +151,7 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 
 
 @zonda.command()
-@_pipeline
+@click.argument("pipelines", metavar="FILE_OR_NAME...", nargs=-1, required=True)
 @_set
 @_keep
 @_drop
@@ -146,8 +161,16 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 @click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
 @click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")
+@click.option(
+    "--engine",
+    type=click.Choice(["serial", "processes", "mpi", "dask"]),
+    help="Run scans as tasks of a campaign.  [default: as in the file's campaign]",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes.")
+@click.option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file.")
+@click.option("--task", "share", type=Share(), help="Run this share of a campaign's tasks, e.g. 3/8: for job arrays.")
 def run(
-    pipeline: str,
+    pipelines: tuple[str, ...],
     settings: tuple[str, ...],
     keep: tuple[str, ...],
     drop: tuple[str, ...],
@@ -157,8 +180,13 @@ def run(
     memory: int | None,
     verbose: bool,
     verify: bool,
+    engine: str | None,
+    workers: int | None,
+    scheduler: str | None,
+    share: tuple[int, int] | None,
 ) -> None:
-    """Run a pipeline file, or a shipped pipeline by its name.
+    """Run a pipeline file, or a shipped pipeline by its name; a campaign of observations where the file has `campaign:`, or where
+    there are several files.
 
     What its outputs do not depend on is left out, and effects are dropped or coarsened while the errors stay within the budget
     (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
@@ -167,11 +195,24 @@ def run(
 
     one_blas_thread()
     ensure_cache()
+    pipeline = pipelines[0]
+    file = _load(pipeline, settings)
+    if len(pipelines) > 1 or file.header.campaign is not None or engine or workers or scheduler or share:
+        if verify:
+            raise click.UsageError("--verify is for one run, not for a campaign")
+        from .campaign import command as campaign
+
+        campaign.run(
+            pipelines, settings, keep=keep, drop=drop, no_prune=no_prune, output=output, threads=threads, memory=memory,
+            verbose=verbose, engine=engine, workers=workers, scheduler=scheduler, share=share,
+            command=_command(pipelines, settings, keep, drop, no_prune),
+        )  # fmt: skip
+        return
     from .files import check_output_folder, write_text
+    from .lock import lock
     from .plan import table
     from .plan.planner import plan
 
-    file = _load(pipeline, settings)
     target = file.header.accuracy
     if target is not None:
         from .accuracy.store import settings_for
@@ -182,11 +223,12 @@ def run(
         file = _load(pipeline, settings)
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
+    click.get_current_context().with_resource(lock(folder))
     made = plan(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
     click.echo(table.line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
-    command = _command(pipeline, settings, keep, drop, no_prune)
+    command = _command(pipelines, settings, keep, drop, no_prune)
     provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
     write_text(folder / "resolved.yaml", resolved)
@@ -206,14 +248,18 @@ def run(
 
 
 def _command(
-    pipeline: str, settings: tuple[str, ...], keep: tuple[str, ...] = (), drop: tuple[str, ...] = (), no_prune: bool = False
+    pipelines: tuple[str, ...],
+    settings: tuple[str, ...],
+    keep: tuple[str, ...] = (),
+    drop: tuple[str, ...] = (),
+    no_prune: bool = False,
 ) -> str:
     """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
     import shlex
 
     options = [("--set", settings), ("--keep", keep), ("--drop", drop)]
     parts = [part for option, texts in options for text in texts for part in (option, text)]
-    return shlex.join(["zonda", "run", pipeline, *parts, *(["--no-prune"] if no_prune else [])])
+    return shlex.join(["zonda", "run", *pipelines, *parts, *(["--no-prune"] if no_prune else [])])
 
 
 @zonda.command()
@@ -222,13 +268,20 @@ def _command(
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.
 
-    Every mistake in the file is shown at once, with its place. Only `zonda run` reads the input maps and finds out whether the
-    target is up.
+    Every mistake in the file is shown at once, with its place. The telescope is pointed at some instants of the scans: whether
+    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam. Only
+    `zonda run` reads the input maps.
     """
     file = _load(pipeline, settings)
+    from .data import Data
+
+    data = Data(scene=file.scene())
+    found = [operator.check(data) for operator in file.pipeline().operators]
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
-    for step in file.steps:
+    for step, lines in zip(file.steps, found, strict=True):
         click.echo(f"  {step.key}")
+        for line in lines:
+            click.echo(f"    {line}")
 
 
 @zonda.command()

@@ -6,6 +6,7 @@ keys. Here scalars follow the YAML 1.2 core schema, equal keys are errors, and e
 
 from __future__ import annotations
 
+import copy
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -81,6 +82,18 @@ class Document:
         while path and path not in self.marks:
             path = path[:-1]
         return self.marks[path]
+
+    def copy(self) -> Document:
+        """A document of its own with the same content."""
+        return Document(copy.deepcopy(self.value), dict(self.marks), list(self.faults))
+
+    def sub(self, path: Path) -> Document:
+        """The value at ``path`` as a document of its own."""
+        value = self.value
+        for part in path:
+            value = value[part]
+        marks = {p[len(path) :]: m for p, m in self.marks.items() if p[: len(path)] == path}
+        return Document(copy.deepcopy(value), {(): self.mark(path), **marks}, [])
 
     def put(self, path: Path, value: Document, key: Span) -> None:
         """Replace or add the value at ``path``, whose parent must be a mapping or a list."""

@@ -128,6 +128,7 @@ def plan(
     threads: int | None = None,
     memory: int | None = None,
     measure: bool = False,
+    portable: bool = False,
 ) -> Plan:
     """Plan a pipeline file.
 
@@ -141,6 +142,8 @@ def plan(
         False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
     measure
         Run a slice of a few seconds to find the cost of operators that do not state it.
+    portable
+        Decide as on the reference machine, so that every machine makes the same plan.
 
     Raises
     ------
@@ -168,7 +171,7 @@ def plan(
         from .audit import measured
 
         costs |= measured(file, [label for label, cost in costs.items() if cost is None])
-    now = predict(context, costs, *settings)
+    now = predict(context, costs, *settings, portable=portable)
     decided = _decide(effects, kept, forced, allowed, now, context, prune_all)
     spent = {m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed}
     noise = (context.noise, context.map_noise, context.coverage.hits if context.coverage else 0.0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -136,26 +137,57 @@ class BinMap(Operator):
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""
+        layout = self.agree(data)
+        if layout is not None:
+            self.lay_out(layout)
+
+    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
+        """Centre, extent and units of the sums: of the first observation, and wide enough for all."""
         if not data.observations:
-            return
+            return before
         first = data.observations[0]
         instrument = first.instrument
-        self._variance = 2.0 ** round(math.log2(instrument.net**2 * first.sample_rate)) if instrument.net > 0 else 2.0**-12
-        self._fwhm = instrument.beam_fwhm
-        self._middle = in_frame(self.centre.icrs() if self.centre else first.centre, self.frame)
-        self._grid = self._healpix(data) if self.nside else self._image(data)
+        if before is None:
+            net = instrument.net
+            found: dict[str, Any] = {
+                "variance": 2.0 ** round(math.log2(net**2 * first.sample_rate)) if net > 0 else 2.0**-12,
+                "fwhm": instrument.beam_fwhm,
+                "frequency": instrument.band.centre,
+                "middle": [float(x) for x in in_frame(self.centre.icrs() if self.centre else first.centre, self.frame)],
+                "fixed": self.nside is None and self.width is not None,
+            }
+        else:
+            found = dict(before)
+            if not math.isclose(found["frequency"], instrument.band.centre, rel_tol=1e-6):
+                raise PipelineError(
+                    f"maps at {found['frequency'] / 1e9:.4g} GHz and {instrument.band.centre / 1e9:.4g} GHz cannot be added up",
+                    place=self.label,
+                    cure="leave the axis over which the band changes out of campaign.combine",
+                )
+        if self.nside:
+            nest = self.ordering == "nested"
+            pixels = covered_healpix(data.observations, self.nside, nest, self.frame)
+            found["pixels"] = np.union1d(found["pixels"], pixels) if "pixels" in found else pixels
+        elif not found["fixed"]:
+            longitude, latitude = found["middle"]
+            reach = covering_extent(data.observations, (longitude, latitude), self.frame)
+            half = found.get("half", (0.0, 0.0))
+            found["half"] = [max(half[0], reach[0]), max(half[1], reach[1])]
+        return found
 
-    def _healpix(self, data: Data) -> HealpixGrid:
-        assert self.nside is not None
-        nest = self.ordering == "nested"
-        return HealpixGrid(self.nside, nest, covered_healpix(data.observations, self.nside, nest, self.frame), self.frame)
+    def lay_out(self, layout: Mapping[str, Any]) -> None:
+        """Make the grid."""
+        longitude, latitude = layout["middle"]
+        self._variance, self._fwhm, self._middle = layout["variance"], layout["fwhm"], (longitude, latitude)
+        if self.nside:
+            self._grid = HealpixGrid(self.nside, self.ordering == "nested", np.asarray(layout["pixels"], np.int64), self.frame)
+        else:
+            self._grid = self._image(layout.get("half", (0.0, 0.0)))
 
-    def _image(self, data: Data) -> TangentGrid:
+    def _image(self, half: Sequence[float]) -> TangentGrid:
         width, height = self.width, self.height if self.height is not None else self.width
-        if width is None or height is None:
-            half_x, half_y = covering_extent(data.observations, self._middle, self.frame)
-            width = width if width is not None else 2 * half_x + 2 * self.pixel
-            height = height if height is not None else 2 * half_y + 2 * self.pixel
+        width = width if width is not None else 2 * half[0] + 2 * self.pixel
+        height = height if height is not None else 2 * half[1] + 2 * self.pixel
         nx, ny = (max(1, math.ceil(side / self.pixel - 1e-6)) for side in (width, height))
         if nx * ny > MOST_PIXELS:
             raise InputError(
@@ -246,6 +278,21 @@ class BinMap(Operator):
         if key not in data.products:
             data.products[key] = Halves(self._n_pixels())
         data.products[key].add(observation, sums, largest, self.label)
+
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """The sums, of pixels with hits only."""
+        halves: Halves | None = data.products.pop(data.product(f"{self.label} sums"), None)
+        if halves is None:
+            return None
+        return {**halves.packed(), "variance_unknown": self._variance_unknown}
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Add sums: exact, so that their order does not matter but for which scans are even."""
+        key = data.product(f"{self.label} sums")
+        if key not in data.products:
+            data.products[key] = Halves(self._n_pixels())
+        data.products[key].merge(part, self.label)
+        self._variance_unknown |= bool(part["variance_unknown"])
 
     def _n_pixels(self) -> int:
         assert self._grid is not None
@@ -388,12 +435,33 @@ class Halves:
         self.sums[len(self.scans) % 2] += sums
         self.scans.append(observation.name)
         self._largest = np.maximum(self._largest, largest)
+        self._check(f"{label}, {observation.name}")
+
+    def packed(self) -> dict[str, Any]:
+        """As plain values and arrays: numbers of the pixels with hits, and their sums."""
+        used = [np.flatnonzero(half[:, HITS]) for half in self.sums]
+        found: dict[str, Any] = {"scans": list(self.scans), "largest": self._largest}
+        for k, pixels in enumerate(used):
+            found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k][pixels]}
+        return found
+
+    def merge(self, part: Mapping[str, Any], label: str) -> None:
+        """Add what `packed` gave, whose scans follow those that are here. Raises PipelineError as `add`."""
+        shift = len(self.scans) % 2
+        for k in range(2):
+            self.sums[(k + shift) % 2][part[f"pixels_{k}"]] += part[f"sums_{k}"]
+        self.scans += part["scans"]
+        self._largest = np.maximum(self._largest, part["largest"])
+        self._check(label)
+
+    def _check(self, place: str) -> None:
+        """No sum can have overflowed."""
         deepest = float(self.sums[:, :, HITS].sum(axis=0).max(initial=0))
         if deepest * self._largest.max() >= 2.0**62:
             highest = self._largest[DATA] / VALUE
             raise PipelineError(
                 f"{deepest:.0f} samples in one pixel, each up to {highest:.3g} K, overflow the map's fixed-point sums",
-                place=f"{label}, {observation.name}",
+                place=place,
                 cure="make smaller pixels, or put a HighpassFilter before",
             )
 

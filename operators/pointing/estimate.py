@@ -12,6 +12,9 @@ import numpy as np
 
 from zonda.core.plan.estimate import Cost, Effect, Estimate, full, not_simulated
 
+from .limits import Moved
+from .samples_per_beam import Sampled
+
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
 
@@ -60,6 +63,7 @@ def pointing_estimate(operator: Pointing, context: Context) -> Estimate:
                "1.43 x interpolation_error"),
         not_simulated("sample integration", "samples are instants", context.sky_error(smear),
                       "(v / f_s)^2 8 ln 2 / (24 FWHM^2): loss of a point source's peak along the scan"),
+        *(Effect(what, (full("checked"),), {}, text) for _, what, text in o.tally if what.startswith(Moved.SAID + Sampled.SAID)),
         Effect("time stamps", (full("float64 seconds since the start"),), shift(resolution),
                "1.43 / FWHM x spacing of float64 at the scan's end x speed"),
     )  # fmt: skip

@@ -186,6 +186,18 @@ error: unknown key 'valu' for Ones
     assert not (here / "out").exists()
 
 
+def test_check_points_the_telescope(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "mustang2_cluster"]) == 0
+    out = capsys.readouterr().out
+    assert "    5 scans from 2024-11-25T07:00:00Z\n    elevation: 61.1" in out
+    assert re.search(r"largest speed of the axes: azimuth 16\d\.?\d* arcsec/s \([\d.]+ % of 0.6 deg/s\)", out)
+    assert re.search(r"samples per FWHM of 8.5 arcsec: 15\.\d", out)
+    assert cli.main(["check", "mustang2_cluster", "--set", "time=2024-11-25T18:00"]) == 2
+    assert "GBT reaches 5 deg to 88 deg" in capsys.readouterr().err
+    assert cli.main(["check", "mustang2_cluster", "--set", "PointingDaisy.speed=0.5 deg/s"]) == 2
+    assert "this would fit: speed" in capsys.readouterr().err
+
+
 def test_plugins(here: Path, plugin: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["plugins"]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
