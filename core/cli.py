@@ -132,6 +132,9 @@ _set = click.option(
 
 _keep = click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full, see `zonda plan`.")
 _drop = click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
+_only = click.option(
+    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone, as a companion run would."
+)
 _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything in full.")
 
 
@@ -140,6 +143,7 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 @_set
 @_keep
 @_drop
+@_only
 @_no_prune
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
@@ -151,6 +155,7 @@ def run(
     settings: tuple[str, ...],
     keep: tuple[str, ...],
     drop: tuple[str, ...],
+    only: tuple[str, ...],
     no_prune: bool,
     output: Path | None,
     threads: int | None,
@@ -171,7 +176,9 @@ def run(
     from .plan import table
     from .plan.planner import plan
 
-    file = _load(pipeline, settings)
+    if only and verify:
+        raise click.UsageError("--verify measures the whole pipeline: leave --only out")
+    file = _load(pipeline, settings, only)
     target = file.header.accuracy
     if target is not None:
         from .accuracy.store import settings_for
@@ -179,14 +186,14 @@ def run(
         choice = settings_for(file, target.target, target.metric)
         click.echo(f"accuracy: {choice.reason}", err=True)
         settings = (*settings, *choice.overrides)
-        file = _load(pipeline, settings)
+        file = _load(pipeline, settings, only)
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
     made = plan(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
     click.echo(table.line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
-    command = _command(pipeline, settings, keep, drop, no_prune)
+    command = _command(pipeline, settings, keep, drop, no_prune, only)
     provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
     write_text(folder / "resolved.yaml", resolved)
@@ -206,12 +213,17 @@ def run(
 
 
 def _command(
-    pipeline: str, settings: tuple[str, ...], keep: tuple[str, ...] = (), drop: tuple[str, ...] = (), no_prune: bool = False
+    pipeline: str,
+    settings: tuple[str, ...],
+    keep: tuple[str, ...] = (),
+    drop: tuple[str, ...] = (),
+    no_prune: bool = False,
+    only: tuple[str, ...] = (),
 ) -> str:
     """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
     import shlex
 
-    options = [("--set", settings), ("--keep", keep), ("--drop", drop)]
+    options = [("--set", settings), ("--keep", keep), ("--drop", drop), ("--only", only)]
     parts = [part for option, texts in options for text in texts for part in (option, text)]
     return shlex.join(["zonda", "run", pipeline, *parts, *(["--no-prune"] if no_prune else [])])
 
@@ -303,10 +315,15 @@ def schema() -> None:
     click.echo(json.dumps(json_schema(), indent=2))
 
 
-def _load(pipeline: str, settings: tuple[str, ...]) -> PipelineFile:
+def _load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) -> PipelineFile:
     from .configuration.pipeline_file import load
 
-    return load(pipeline, settings)
+    file = load(pipeline, settings)
+    if not only:
+        return file
+    from .plan.only import only as alone
+
+    return alone(file, only)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -8,6 +8,14 @@ G is never formed: one step of the Lanczos iteration (full reorthogonalization, 
 A^T q and A A^T q together. It starts from the detector mean and stops when
 
     |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is removed.                        (2)
+
+The u_i depend on A. Frozen, those of the complete data A act on another stream B (the sky alone):
+
+    B <- B - sum_i u_i (B^T u_i)^T.                                                                          (3)
+
+That is what (1) does to the part B of A = B + C: (3) of B plus (3) of C is (1) of A. (1) also changes with B because B turns
+the modes: to first order the filtered A changes by (1 - u u^T) B (1 - v v^T / |v|^2), which is (3) but for one degree of
+freedom in N_samples for each mode, and for terms of order sigma_2 / sigma_1.
 """
 
 from __future__ import annotations
@@ -105,6 +113,19 @@ class CommonModeFilter(Operator):
         tally.state(who, f"{observation.name}: modes removed", f"{count} ({found.what})")
         self._check_precision(found, count, gram, stream, place)
 
+    def freeze(self, state: Modes) -> Floats:
+        """The modes over detectors, (k, n_det)."""
+        return state.detectors
+
+    def measure_frozen(self, stream: Stream, state: Modes, frozen: Floats) -> None:
+        """Equation (3): v_i = B^T u_i."""
+        with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+            gram = Gram(stream, pool, use=np.asarray(frozen.any(axis=0)))
+            times = [gram.apply(u)[1] for u in frozen]
+        state.detectors, state.times = frozen, np.array(times).reshape(len(frozen), stream.shape[1])
+        what = f"{stream.observation.name}: modes removed"
+        stream.observation.tally.state(self.label, what, f"{len(frozen)} (those of the complete data)")
+
     def _choose(self, found: Ritz, gram: Gram, observation: Observation) -> int:
         """Number of modes to remove; may replace the modes by the detectors' mean."""
         tally = observation.tally
@@ -176,10 +197,14 @@ class Gram:
     number of threads.
     """
 
-    def __init__(self, stream: Stream, pool: ThreadPoolExecutor) -> None:
+    def __init__(self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None) -> None:
+        """``use``: the detectors to use, where they are known; they are found otherwise."""
         self.stream, self.pool = stream, pool
         self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.flags == 0
+        if use is not None:
+            self.use = use
+            return
         self.n_used = int(self.good_samples.sum())
         use = stream.observation.detector_flags == 0
         total, square = self._moments()
