@@ -161,6 +161,9 @@ _set = click.option(
 
 _keep = click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full, see `zonda plan`.")
 _drop = click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
+_only = click.option(
+    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone, as a companion run would."
+)
 _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything in full.")
 
 
@@ -169,6 +172,7 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 @_set
 @_keep
 @_drop
+@_only
 @_no_prune
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
@@ -188,6 +192,7 @@ def run(
     settings: tuple[str, ...],
     keep: tuple[str, ...],
     drop: tuple[str, ...],
+    only: tuple[str, ...],
     no_prune: bool,
     output: Path | None,
     threads: int | None,
@@ -212,8 +217,8 @@ def run(
     pipeline = pipelines[0]
     file = _load(pipeline, settings)
     if len(pipelines) > 1 or file.header.campaign is not None or engine or workers or scheduler or share:
-        if verify:
-            raise click.UsageError("--verify is for one run, not for a campaign")
+        if verify or only:
+            raise click.UsageError(f"{'--verify' if verify else '--only'} is for one run, not for a campaign")
         from .campaign import command as campaign
 
         campaign.run(
@@ -227,6 +232,9 @@ def run(
     from .plan import table
     from .plan.planner import plan
 
+    if only and verify:
+        raise click.UsageError("--verify measures the whole pipeline: leave --only out")
+    file = _load(pipeline, settings, only)
     target = file.header.accuracy
     if target is not None:
         from .accuracy.store import settings_for
@@ -234,7 +242,7 @@ def run(
         choice = settings_for(file, target.target, target.metric)
         click.echo(f"accuracy: {choice.reason}", err=True)
         settings = (*settings, *choice.overrides)
-        file = _load(pipeline, settings)
+        file = _load(pipeline, settings, only)
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
     click.get_current_context().with_resource(lock(folder))
@@ -242,7 +250,7 @@ def run(
     click.echo(table.line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
-    command = _command(pipelines, settings, keep, drop, no_prune)
+    command = _command(pipelines, settings, keep, drop, no_prune, only)
     provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
     write_text(folder / "resolved.yaml", resolved)
@@ -267,11 +275,12 @@ def _command(
     keep: tuple[str, ...] = (),
     drop: tuple[str, ...] = (),
     no_prune: bool = False,
+    only: tuple[str, ...] = (),
 ) -> str:
     """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
     import shlex
 
-    options = [("--set", settings), ("--keep", keep), ("--drop", drop)]
+    options = [("--set", settings), ("--keep", keep), ("--drop", drop), ("--only", only)]
     parts = [part for option, texts in options for text in texts for part in (option, text)]
     return shlex.join(["zonda", "run", *pipelines, *parts, *(["--no-prune"] if no_prune else [])])
 
@@ -370,10 +379,15 @@ def schema() -> None:
     click.echo(json.dumps(json_schema(), indent=2))
 
 
-def _load(pipeline: str, settings: tuple[str, ...]) -> PipelineFile:
+def _load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) -> PipelineFile:
     from .configuration.pipeline_file import load
 
-    return load(pipeline, settings)
+    file = load(pipeline, settings)
+    if not only:
+        return file
+    from .plan.only import only as alone
+
+    return alone(file, only)
 
 
 def main(arguments: list[str] | None = None) -> int:

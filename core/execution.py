@@ -23,6 +23,7 @@ import numpy as np
 from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, pieces, trimmed, whole_span, within
 from .data import Block, Data, Floats, Observation, Stream, Tally, in_order
 from .errors import PipelineError
+from .frozen import Frozen
 from .machine import available_memory, available_threads, resident_memory
 from .operator import Operator
 from .smooth import SmoothField
@@ -102,10 +103,16 @@ class Execution:
     """One pipeline over one observation."""
 
     def __init__(
-        self, operators: Sequence[Operator], observation: Observation, settings: Settings, timer: Timer, keep: Sequence[str]
+        self,
+        operators: Sequence[Operator],
+        observation: Observation,
+        settings: Settings,
+        timer: Timer,
+        keep: Sequence[str],
+        frozen: Frozen | None = None,
     ) -> None:
         self.operators, self.observation, self.settings, self.timer = list(operators), observation, settings, timer
-        self.keep = tuple(keep)
+        self.keep, self.frozen = tuple(keep), frozen
         self.states: dict[str, Any] = {}
         self._stop = threading.Event()
         self._local = threading.local()
@@ -122,12 +129,16 @@ class Execution:
                 operator.configure(observation)
             for operator in self.operators:
                 before(operator=operator, observation=observation, stage="prepare")
+                self._same_use(operator.label, "prepare")
                 start = time.thread_time()
                 self.states[operator.label] = operator.prepare(observation)
                 used = time.thread_time() - start
                 self.timer.add(operator.label, "prepare", used)
                 after(operator=operator, observation=observation, stage="prepare", seconds=used)
+            self._same_use("", "prepared")
             self._execute(before, after)
+            if self.frozen is not None:
+                self.frozen.complete = True
             for operator in self.operators:
                 start = time.thread_time()
                 operator.collect(data, observation, self.states[operator.label])
@@ -142,6 +153,11 @@ class Execution:
         finally:
             self.states.clear()
             self._store.close()
+
+    def _same_use(self, label: str, stage: str) -> None:
+        """Let a run with frozen modes use the samples and detectors that the main run used at this point."""
+        if self.frozen is not None:
+            self.frozen.at(self.observation, label, stage)
 
     # ---- segments
 
@@ -212,7 +228,14 @@ class Execution:
             stream = source.streams[names[0]]
         before(operator=operator, observation=self.observation, stage="measure")
         start, others = time.process_time(), self._seconds("exec")
-        operator.measure(stream, self.states[operator.label])
+        state, frozen = self.states[operator.label], self.frozen
+        if frozen is not None and frozen.complete:
+            operator.measure_frozen(stream, state, frozen.found[operator.label])
+        else:
+            operator.measure(stream, state)
+            if frozen is not None and operator.can_freeze:
+                frozen.found[operator.label] = operator.freeze(state)
+        self._same_use(operator.label, "measure")
         used = time.process_time() - start - (self._seconds("exec") - others)  # what makes the stream again is theirs
         self.timer.add(operator.label, "measure", used)
         after(operator=operator, observation=self.observation, stage="measure", seconds=used)

@@ -12,6 +12,7 @@ from .knobs import Knob
 
 if TYPE_CHECKING:
     from .data import Block, Data, Observation, Stream
+    from .pipeline import Companion
     from .plan.context import Context
     from .plan.estimate import Estimate, Traits
 
@@ -48,7 +49,8 @@ class Operator(Parameters):
         What one output sample depends on: ``sample`` (itself alone, plus `halo` neighbours), ``detectors`` (all detectors
         at that instant), ``time`` (one detector's whole scan), ``all``. An ``all`` operator implements
         ``measure(stream, state)``, which reads the whole stream as often as it likes; its ``exec`` then works like that of
-        a ``sample`` operator. One that says how often, in `sweeps`, need not have the stream in memory.
+        a ``sample`` operator. One that says how often, in `sweeps`, need not have the stream in memory. With ``freeze`` and
+        ``measure_frozen`` it can take part in companion runs with ``modes: full``.
     main_run_only
         True for operators left out of companion runs (spectra, saved time streams).
     at_end
@@ -74,11 +76,25 @@ class Operator(Parameters):
     """Label of this step in messages, products and random streams; the class name where absent."""
 
     _label: str = PrivateAttr("")
+    _runs: tuple[str, ...] = PrivateAttr(())
 
     @property
     def label(self) -> str:
         """Unique name of this step in its pipeline (the pipeline numbers namesakes: ``WhiteNoise``, ``WhiteNoise.2``)."""
         return self._label or self.name or type(self).__name__
+
+    def needs(self) -> tuple[Companion, ...]:
+        """The runs whose products this step reads (``at_end`` only); empty: whatever runs there are.
+
+        The pipeline adds a companion run of its own where none of the user's is like one of these; `runs` then names them. The
+        products of such a run are for this step alone: no other writes or draws them.
+        """
+        return ()
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Names of the runs that `needs` asks for, in its order; empty text: the main run, which leaves nothing out."""
+        return self._runs
 
     def observe(self, data: Data) -> None:
         """Append observations to ``data`` (pointing operators), or look at those that are there (map makers: a common grid)."""
@@ -111,6 +127,24 @@ class Operator(Parameters):
     def sweeps(self, observation: Observation) -> int:
         """How often `measure` goes through its stream with `Stream.sweep`; 0: it wants ``stream.array``, in memory or on disk."""
         return 0
+
+    @property
+    def can_freeze(self) -> bool:
+        """Whether it has both `freeze` and `measure_frozen`."""
+        mine = type(self)
+        return mine.freeze is not Operator.freeze and mine.measure_frozen is not Operator.measure_frozen
+
+    def freeze(self, state: Any) -> Any:
+        """What `measure` found in the complete data, small enough to keep, for `measure_frozen` (``couples = "all"`` only)."""
+        raise NotImplementedError(f"{self.label} cannot freeze what it measures")
+
+    def measure_frozen(self, stream: Stream, state: Any, frozen: Any) -> None:
+        """As `measure`, with what `freeze` returned in place of what this stream would show.
+
+        `exec` must then be linear in the stream, and the same as the main run's where the stream is the same. Flags are the main
+        run's already.
+        """
+        raise NotImplementedError(f"{self.label} cannot freeze what it measures")
 
     def exec(self, block: Block, state: Any) -> None:
         """Act on one block."""

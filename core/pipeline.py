@@ -16,7 +16,9 @@ from .configuration.parameters import Parameters
 from .data import Data, Tally, html_table
 from .errors import PipelineError
 from .execution import Execution, Settings, Timer, available_memory, available_threads
+from .frozen import Frozen
 from .operator import Operator
+from .sky_signal import SkySignal, place_of_signal
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -29,6 +31,11 @@ class Companion(Parameters):
     """Components to keep (e.g. [sky]: the noiseless run); all others are left out."""
     without: list[str] | None = Field(None, min_length=1)
     """Components to leave out (e.g. [sky]: the source-free run)."""
+    modes: Literal["own", "full"] = "own"
+    """Singular modes of filters: those of this run's own data (`own`: the noiseless run), or those of the complete data (`full`:
+    with the main run's modes, flags and weights, filters are linear, and what they do to each part adds up to the main run)."""
+    filters: Literal["all", "none"] = "all"
+    """`none`: leave out every step that changes the signal once it is formed."""
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Companion:
@@ -85,7 +92,10 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
     """Every step whose inputs are not there yet, or whose output comes too late to be used."""
     problems = []
     have: set[str] = set()
+    sky_is_signal = place_of_signal(operators)
     for index, operator in enumerate(operators):
+        if index == sky_is_signal:
+            have.add("signal")
         name = type(operator).__name__
         later = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides}
         for what in sorted(operator.requires - have):
@@ -158,6 +168,7 @@ class Pipeline:
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             raise PipelineError("\n".join(lines), place=self.name)
         self._check_runs()
+        self._add_needed_runs()
 
     def _name_steps(self) -> None:
         seen: dict[str, int] = {}
@@ -167,23 +178,76 @@ class Pipeline:
             operator._label = base if seen[base] == 1 else f"{base}.{seen[base]}"
 
     def _check_runs(self) -> None:
-        components = sorted(set().union(*(o.provides for o in self._generators())))
         for name, companion in self.runs.items():
-            if not name.isidentifier():
-                raise PipelineError(f"{name!r} cannot name a run", place=self.name, cure="use letters, digits and underscores")
-            for what in [*(companion.only or ()), *(companion.without or ())]:
-                if what not in components:
-                    raise PipelineError(
-                        f"run {name} names {what!r}, which no step provides",
-                        place=self.name,
-                        cure=f"choose from: {', '.join(components)}",
-                    )
+            if not name.isidentifier() or name.startswith("_"):
+                cure = "use letters, digits and underscores, the first a letter"
+                raise PipelineError(f"{name!r} cannot name a run", place=self.name, cure=cure)
+            self._check_components(companion, f"run {name} names")
+            self._check_frozen(name)
+
+    def _check_components(self, companion: Companion, who: str) -> None:
+        components = sorted(set().union(*(o.provides for o in self._generators())))
+        for what in [*(companion.only or ()), *(companion.without or ())]:
+            if what not in components:
+                cure = f"choose from: {', '.join(components)}"
+                raise PipelineError(f"{who} {what!r}, which no step provides", place=self.name, cure=cure)
+
+    def _check_frozen(self, name: str) -> None:
+        if self.runs[name].modes == "own":
+            return
+        for operator in self._selected(name):
+            if operator.couples == "all" and not operator.can_freeze:
+                raise PipelineError(
+                    f"run {name} has modes: full, but {operator.label} cannot freeze what it measures",
+                    place=self.name,
+                    cure=f"leave modes: full out, or give {type(operator).__name__} freeze and measure_frozen (docs/plugins.md)",
+                )
+
+    def _add_needed_runs(self) -> None:
+        """Find for each step the runs that it reads, see `Operator.needs`; add those that are not there."""
+        for operator in self.operators:
+            names = []
+            for wanted in operator.needs():
+                self._check_components(wanted, f"{operator.label} needs")
+                kind = self._kind(wanted)
+                same = [name for name, run in self.runs.items() if self._kind(run) == kind]
+                if kind == self._kind(None):
+                    names.append("")
+                elif same:
+                    names.append(same[0])
+                else:
+                    parts = [*(wanted.only or ["without", *(wanted.without or ())])]
+                    parts += ["unfiltered"] * (wanted.filters == "none") + ["full"] * (wanted.modes == "full")
+                    names.append("_" + "_".join(parts))
+                    self.runs[names[-1]] = wanted
+                    self._check_frozen(names[-1])
+            operator._runs = tuple(names)
+
+    def _kind(self, run: Companion | None) -> tuple[frozenset[str], frozenset[str], bool]:
+        """What tells runs apart: steps of components, filters, whether modes are the complete data's. None: the main run."""
+        makers, filters = self._generators(), self._filters()
+        kept = frozenset(o.label for o in makers if run is None or run.keeps(o.provides))
+        frozen = run is not None and run.modes == "full" and len(kept) < len(makers)
+        labels = frozenset(o.label for o in filters if run is None or run.filters == "all")
+        return kept, labels, frozen and any(o.couples == "all" for o in self.operators)
+
+    def is_frozen(self, run: str) -> bool:
+        """Whether a companion run takes singular modes from the main run (empty: the main run itself, which never does)."""
+        return bool(run) and self._kind(self.runs[run])[2]
+
+    def components(self, run: str) -> frozenset[str]:
+        """Labels of the steps whose components a run keeps."""
+        return self._kind(self.runs[run] if run else None)[0]
+
+    def _filters(self) -> list[Operator]:
+        """The operators that change the signal."""
+        return [o for o in self.operators if "signal" in o.requires & o.provides]
 
     def _generators(self) -> list[Operator]:
         """The operators that make signal components: those before `signal` is formed, pointing aside."""
         found = []
         for operator in self.operators:
-            if "signal" in operator.provides:
+            if "signal" in operator.provides | operator.requires:
                 break
             if operator.provides and "boresight" not in operator.provides:
                 found.append(operator)
@@ -191,9 +255,14 @@ class Pipeline:
 
     def _selected(self, run: str) -> list[Operator]:
         steps = [o for o in self.operators if not o.at_end and "boresight" not in o.provides]
+        if place_of_signal(self.operators) is not None:
+            steps.insert(place_of_signal(steps) or 0, SkySignal())
         if not run:
             return steps
-        dropped = {o.label for o in self._generators() if not self.runs[run].keeps(o.provides)}
+        companion = self.runs[run]
+        dropped = {o.label for o in self._generators() if not companion.keeps(o.provides)}
+        if companion.filters == "none":
+            dropped |= {o.label for o in self._filters()}
         return [o for o in steps if o.label not in dropped and not o.main_run_only]
 
     def run(
@@ -254,17 +323,20 @@ class Pipeline:
         if part is not None and part.scans is not None:
             data.observations = [data.observations[k] for k in part.scans]
         pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
+        freeze = any(run.modes == "full" for run in self.runs.values())
+        frozen = [Frozen() if freeze else None for _ in data.observations]
         for run in ["", *self.runs]:
             data.run = run
             steps = self._selected(run)
-            for observation, (focalplane, flags, detector_flags) in zip(data.observations, pristine, strict=True):
+            same = not run or self.runs[run].modes == "full"
+            for observation, (focalplane, flags, detector_flags), kept in zip(data.observations, pristine, frozen, strict=True):
                 before, observation.tally = observation.tally, Tally()
                 if not run:
                     observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
                 observation.focalplane, observation.smooth = focalplane.copy(), {}
                 observation.output = data.output
                 observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
-                execution = Execution(steps, observation, settings, timer, keep if not run else ())
+                execution = Execution(steps, observation, settings, timer, keep if not run else (), kept if same else None)
                 execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator)
                 data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             for operator in steps:
@@ -331,7 +403,7 @@ class Pipeline:
             "description": self.description,
             "seed": scene.seed,
             "precision": self.precision,
-            "runs": {k: v.model_dump(exclude_none=True) for k, v in self.runs.items()},
+            "runs": {k: v.model_dump(exclude_none=True, exclude_defaults=True) for k, v in self.runs.items()},
             "versions": versions(),
             "operators": [
                 (o.label, type(o).__name__, {k: str(v) for k, v in o.model_dump(mode="json", exclude_none=True).items()})

@@ -125,6 +125,33 @@ def check_same_bits(operator: Operator) -> None:
         assert _same(one, other), f"other bits with {threads} threads and {memory / 1e6:.1f} MB"
 
 
+def check_frozen(operator: Operator) -> None:
+    """What `freeze` returns makes `exec` do to the same stream what it did, and makes it linear (``modes: full``)."""
+    if operator.couples != "all" or not operator.can_freeze:
+        return
+    observation = _observation()
+    operator.configure(observation)
+    given, first = _given_block(observation), operator.prepare(observation)
+    _measured(operator, given, first)
+    frozen = operator.freeze(first)
+
+    def act(factor: float, state: Any = None) -> NDArray[np.float64]:
+        block = _given_block(observation, factor)
+        if state is None:
+            state = operator.prepare(observation)
+            _measured(operator, block, state, frozen)
+        operator.exec(block, state)
+        (name,) = operator.requires & operator.provides
+        return block.detdata[name].astype(np.float64)
+
+    if not operator.requires & operator.provides:
+        return
+    once, twice, own = act(1.0), act(2.0), act(1.0, first)
+    scale = 1e-5 * float(np.std(own)) + 1e-6 * float(np.std(next(iter(given.detdata.values()))))  # float32
+    assert np.allclose(once, own, rtol=0, atol=scale), "frozen, it does something else to the same stream"
+    assert np.allclose(twice, 2 * once, rtol=0, atol=4 * scale), "frozen, it is not linear: twice the stream gives another result"
+
+
 def check_finite(operator: Operator) -> None:
     """Finite streams stay finite."""
     for name, stream in _products(operator, threads=1, memory=1 << 30).items():
@@ -138,6 +165,7 @@ CHECKS: tuple[Callable[[Operator], None], ...] = (
     check_knobs,
     check_declared_streams,
     check_same_bits,
+    check_frozen,
     check_finite,
 )
 
@@ -224,11 +252,22 @@ def _products(operator: Operator, threads: int, memory: int) -> dict[str, Any]:
     return found | {name: _comparable(product) for name, product in data.products.items()}
 
 
-def _measured(operator: Operator, block: Block, state: Any) -> None:
+def _given_block(observation: Observation, factor: float = 1.0) -> Block:
+    """A whole scan of given streams, times a factor."""
+    block = Block(observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES))
+    given = _Given()
+    given.exec(block, given.prepare(observation))
+    for stream in block.detdata.values():
+        stream *= np.float32(factor)
+    return block
+
+
+def _measured(operator: Operator, block: Block, state: Any, frozen: Any = None) -> None:
     from .data import Stream
 
     (name,) = operator.requires - {"boresight"}
-    operator.measure(Stream(name, block.observation, block.detdata[name], {}, 1), state)
+    stream = Stream(name, block.observation, block.detdata[name], {}, 1)
+    operator.measure(stream, state) if frozen is None else operator.measure_frozen(stream, state, frozen)
 
 
 def _small(operator: Operator) -> int:

@@ -15,7 +15,8 @@ at least `COVERED` of the usual coverage:
     E = |p - p0| / |p0|                                                                                   (2)
 
 ``transfer``, the share T of each angular scale of the input map a (convolved with the beam, under the window of the coverage)
-that is left in the map b of the sky alone; rings i of equal width in log k, from the map's extent to the beam, that hold power:
+that is left in the map b of the sky alone, as `TransferFunction` measures it; rings i of equal width in log k, from the map's
+extent to the beam, that hold power:
 
     T_i = Re sum_ring b a* / sum_ring |a|^2,    E = sqrt( mean_i (T_i - T0_i)^2 )                         (3)
 
@@ -38,7 +39,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -51,6 +51,7 @@ from zonda.core.operator import Operator
 from zonda.core.pipeline import Companion
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStreams
+from zonda.operators.diagnostics.transfer_function import compare
 from zonda.operators.maps.image import Image
 from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 
@@ -148,18 +149,12 @@ class Transfer(Metric):
             raise InputError("no step kept the input map", place="transfer", cure="use a SkyMap")
         window = sky.hits / np.percentile(sky.hits[sky.hits > 0], 99)
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
-        a, b = (_spectrum(values, window) for values in (_as_seen(image, sky), np.nan_to_num(sky.signal)))
         side = np.array(window.shape) * sky.pixel
-        k = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n, sky.pixel) for n in window.shape), indexing="ij"))
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
         noise = float((window**2 * np.nan_to_num(main.noise) ** 2).sum())  # variance of each mode
-        power = [(abs(a[ring]) ** 2).sum() for ring in _rings(k, edges)]
-        rows = [
-            ((b[ring] * a[ring].conj()).real.sum() / p, math.sqrt(noise / 2 / p))
-            for ring, p in zip(_rings(k, edges), power, strict=True)
-            if p > 1e-6 * max(power)
-        ]
-        return np.array(rows, np.float64).T
+        rings = compare(_as_seen(image, sky), sky.signal, window, sky.pixel, edges)
+        use = rings.power > 1e-6 * rings.power.max()
+        return np.array([rings.transfer[use], np.sqrt(noise / 2 / rings.power[use])])
 
     def error(self, found: Floats, reference: Floats) -> float:
         return float(np.sqrt(np.mean((found[0] - reference[0]) ** 2)))
@@ -314,11 +309,3 @@ def _as_seen(image: Image, product: MapProduct) -> Floats:
     rows, columns = np.indices(product.signal.shape)
     x, y = image.wcs.world_to_pixel_values(*product.wcs.pixel_to_world_values(columns, rows))
     return np.asarray(map_coordinates(smooth, [y, x], order=1), np.float64)
-
-
-def _spectrum(values: Floats, window: Floats) -> NDArray[np.complex128]:
-    return np.asarray(np.fft.fft2((values - (values * window).sum() / window.sum()) * window), np.complex128)
-
-
-def _rings(k: Floats, edges: Floats) -> list[NDArray[np.bool_]]:
-    return [(k >= low) & (k < high) for low, high in pairwise(edges)]

@@ -1,14 +1,16 @@
 """The transfer function of a noiseless run: what the filters leave of each angular scale."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
 import zonda
+from zonda.core import cli
 from zonda.core.projection import rotation_matrices
+from zonda.operators.diagnostics.transfer_function import ARCSEC, compare, window_of
 
-PIXEL, CUT = 4.0, 0.08  # arcsec, Hz
+CUT = 0.08  # Hz
+HIGHPASS = zonda.HighpassFilter(frequency=f"{CUT} Hz")
+NOISE = (zonda.AtmosphereLayers(pwv="7.7 mm", layers=3), zonda.WhiteNoise(), zonda.PinkNoise(shared=0.8), zonda.Efficiency())
 
 
 @pytest.fixture(scope="module")
@@ -28,34 +30,27 @@ def field(tmp_path_factory):
     return path
 
 
-def noiseless(field, *filters):
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
-    steps = [
-        zonda.PointingDaisy(radius="4 arcmin", speed="50 arcsec/s", scan_duration="4.3 min", sample_rate="50 Hz"),
+def steps(field, *filters, noise=(), duration="4.3 min"):
+    return [
+        zonda.PointingDaisy(radius="4 arcmin", speed="50 arcsec/s", scan_duration=duration, sample_rate="50 Hz"),
         zonda.SkyMap(file=field),
-        zonda.WhiteNoise(),
-        zonda.Efficiency(),
+        *noise,
         *filters,
-        zonda.BinMap(pixel=f"{PIXEL} arcsec", width="10 arcmin"),
+        zonda.BinMap(pixel="4 arcsec", width="10 arcmin"),
     ]
-    data = zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"]}}).run(scene)
-    return data.products["noiseless/map"], data.observations[0]
 
 
-def transfer(before, after, scales):
-    """Real part of the cross spectrum over the spectrum of what was there, in rings between the scales [arcsec]."""
-    reach = np.radians(3.5 / 60)
-    window = np.cos(np.pi / 2 * np.minimum(before.distance() / reach, 1)) ** 2
+def run(chain, **more):
+    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+    return zonda.Pipeline(chain, **more).run(scene)
 
-    def spectrum(product):
-        signal = np.nan_to_num(product.signal)
-        return np.fft.fft2((signal - (signal * window).sum() / window.sum()) * window)
 
-    a, b = spectrum(before), spectrum(after)
-    side = before.signal.shape[0]
-    k = np.hypot(*np.meshgrid(np.fft.fftfreq(side, PIXEL), np.fft.fftfreq(side, PIXEL)))
-    rings = [(k >= 1 / low) & (k < 1 / high) for low, high in pairwise(scales)]
-    return [(k[r].mean(), (b[r] * a[r].conj()).real.sum() / (np.abs(a[r]) ** 2).sum()) for r in rings]
+def transfer(data, scales):
+    """(k, T) between these scales [arcsec], under a window of 3.5 arcmin."""
+    before, after = data.products["_sky_unfiltered/map"], data.products["map"]
+    window = window_of(before, np.radians(3.5 / 60))
+    rings = compare(before.signal, after.signal, window, before.pixel, 1 / (np.array(scales) * ARCSEC))
+    return rings.wavenumber * ARCSEC, rings.transfer
 
 
 def test_high_pass_and_common_mode(field):
@@ -64,24 +59,60 @@ def test_high_pass_and_common_mode(field):
     Averaged over phi, T(k) = 1 - (2 / pi) asin(cut / (k v)), and over the speeds v of the scan. The path bends within a cycle
     of the filter, so this holds to some percent below 100 arcsec. The common mode of 4.2 arcmin takes only what is larger.
     """
-    highpass = zonda.HighpassFilter(frequency=f"{CUT} Hz")
-    plain, observation = noiseless(field)
-    high, _ = noiseless(field, highpass)
-    both, _ = noiseless(field, highpass, zonda.CommonModeFilter(modes=1))
+    high = run([*steps(field, HIGHPASS), zonda.TransferFunction()])
+    both = run([*steps(field, HIGHPASS, zonda.CommonModeFilter(modes=1)), zonda.TransferFunction()])
+    observation = high.observations[0]
     forward = rotation_matrices(observation.boresight_radec)[:, :, 2]
     speed = np.degrees(np.linalg.norm(np.diff(forward, axis=0), axis=1)) * 3600 * observation.sample_rate
+
+    def expected(k):
+        return 1 - 2 / np.pi * np.arcsin(np.minimum(1, CUT / (k * speed))).mean()
+
     scales = [400, 250, 120, 75, 55, 40, 30, 22]
-    of_high, of_both = transfer(plain, high, scales), transfer(plain, both, scales)
-    for (k, found), (_, with_mode), large in zip(of_high, of_both, [True, True, *[False] * 5], strict=True):
-        expected = 1 - 2 / np.pi * np.arcsin(np.minimum(1, CUT / (k * speed))).mean()
+    (k, of_high), (_, of_both) = transfer(high, scales), transfer(both, scales)
+    for number, (found, with_mode) in enumerate(zip(of_high, of_both, strict=True)):
         assert with_mode < found + 0.01
-        if large:
+        if number < 2:
             assert with_mode < found < 0.85
         else:
-            assert abs(found - expected) < 0.05
+            assert abs(found - expected(k[number])) < 0.05
             assert abs(with_mode - found) < 0.02
-    assert of_both[0][1] < 0.4  # beyond 250 arcsec most is lost
-    assert of_both[-1][1] > 0.95  # at 25 arcsec nearly nothing
+    assert of_both[0] < 0.4  # beyond 250 arcsec most is lost
+    assert of_both[-1] > 0.95  # at 25 arcsec nearly nothing
+    product = high.products["transfer_function"]
+    sure = product.rings.error < 0.02
+    assert sure.sum() >= 4
+    for scale, found in zip(product.scale[sure], product.rings.transfer[sure], strict=True):
+        assert abs(found - expected(ARCSEC / scale)) < 0.03
+
+
+def test_no_filter_leaves_everything(field):
+    data = run([*steps(field, duration="2 min"), zonda.TransferFunction()])
+    rings = data.products["transfer_function"].rings
+    known = np.isfinite(rings.transfer)
+    assert known.sum() >= 9
+    np.testing.assert_allclose(rings.transfer[known], 1, atol=1e-14)  # the two spectra are of one map
+    assert np.nanmax(rings.error) < 1e-14
+    assert "_sky_unfiltered/map" not in data.products, "there is nothing to leave out"
+
+
+def test_modes_of_the_complete_data(field):
+    """Modes of the sky alone follow the sky and take more of it, on the scales of the array; small scales are alike."""
+    filters = HIGHPASS, zonda.CommonModeFilter(modes=1)
+    chain = [
+        *steps(field, *filters, noise=NOISE, duration="2 min"),
+        zonda.TransferFunction(),
+        zonda.TransferFunction(modes="full"),
+    ]
+    data = run(chain)
+    assert data.products["TransferFunction.2"].modes == "full"
+    sky, full = (data.products[name].rings.transfer for name in ("transfer_function", "TransferFunction.2"))
+    scale = data.products["transfer_function"].scale / ARCSEC
+    large, small = (scale > 170) & np.isfinite(sky), (scale > 20) & (scale < 100)
+    assert (full[large] > sky[large] + 0.01).all()
+    assert abs(full[small] - sky[small]).max() < 0.02
+    alone = run([*steps(field, *filters, duration="2 min"), zonda.TransferFunction()])
+    np.testing.assert_allclose(alone.products["transfer_function"].rings.transfer[small], sky[small], atol=1e-5)  # float32
 
 
 def test_without_filters_nothing_is_lost(field):
@@ -90,7 +121,7 @@ def test_without_filters_nothing_is_lost(field):
     from astropy.wcs import WCS
     from scipy.ndimage import gaussian_filter, map_coordinates
 
-    product, _ = noiseless(field)
+    product = run(steps(field)).products["map"]
     with fits.open(field) as file:
         smooth = gaussian_filter(file[0].data.astype(float), 8.5 / 2.3548 / 2.0)
         y, x = np.indices(product.signal.shape)
@@ -102,3 +133,71 @@ def test_without_filters_nothing_is_lost(field):
     assert np.sqrt(np.mean((product.signal - expected)[use] ** 2)) < 0.03 * expected[use].std()
     slope = (product.signal[use] * expected[use]).sum() / (expected[use] ** 2).sum()
     assert abs(slope - 1) < 0.01
+
+
+FILE = """
+seed: 7
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+operators:
+  - PointingDaisy: {{scan_duration: 30 s, sample_rate: 50 Hz}}
+  - SkyMap: {{file: {file}}}
+{air}  - HighpassFilter
+  - CommonModeFilter
+  - BinMap: {{pixel: 4 arcsec}}
+{end}"""
+AIR = "  - AtmosphereLayers: {pwv: 7.7 mm, layers: 2}\n  - WhiteNoise\n  - PinkNoise\n  - Efficiency\n"
+END = "  - TransferFunction\n"
+
+
+def written(tmp_path, field, air, end, *options):
+    """(steps that ran, tables and other files) of `zonda run`."""
+    (tmp_path / "p.yaml").write_text(FILE.format(file=field, air=air, end=end))
+    out = tmp_path / "out"
+    assert cli.main(["run", str(tmp_path / "p.yaml"), "--output", str(out), *options]) == 0
+    ran = [step.key for step in zonda.load(out / "resolved.yaml").steps]
+    return ran, {p.name: p.read_bytes() for p in out.iterdir()}
+
+
+def rows(table):
+    return [line for line in table.decode().splitlines() if not line.startswith("#")]
+
+
+def test_a_transfer_function_alone_draws_nothing(field, tmp_path):
+    """A complete file whose only output is the transfer function of the sky runs as the sky alone; so does --only sky."""
+    folders = [tmp_path / n for n in "abc"]
+    for folder in folders:
+        folder.mkdir()
+    asked, files = written(folders[0], field, AIR, END)
+    alone, same = written(folders[1], field, "", END)
+    only, again = written(folders[2], field, AIR, END, "--only", "sky")
+    assert asked == only == [*alone[:2], "Efficiency", *alone[2:]]
+    assert "WhiteNoise" not in asked
+    assert rows(files["transfer_function.ecsv"]) == rows(same["transfer_function.ecsv"]) == rows(again["transfer_function.ecsv"])
+
+
+def test_modes_of_the_complete_data_keep_what_determines_them(field, tmp_path, capsys):
+    end = "  - TransferFunction: {modes: full}\n"
+    ran, files = written(tmp_path, field, AIR, end)
+    assert {"AtmosphereLayers", "WhiteNoise", "PinkNoise"} <= set(ran)
+    assert "map.fits" not in files
+    assert cli.main(["run", str(tmp_path / "p.yaml"), "--only", "sky", "--output", str(tmp_path / "x")]) == 2
+    assert "singular modes of the complete data" in capsys.readouterr().err
+
+
+def test_only_the_sky_of_a_complete_file_is_its_noiseless_run(field, tmp_path):
+    """The same bits as the companion run of the whole."""
+    from astropy.io import fits
+
+    end = "  - SaveMap\n"
+    (tmp_path / "p.yaml").write_text(FILE.format(file=field, air=AIR, end=end) + "runs: {noiseless: {only: [sky]}}\n")
+    for options in ((), ("--only", "sky")):
+        folder = tmp_path / str(len(options))
+        assert cli.main(["run", str(tmp_path / "p.yaml"), "--output", str(folder), *options]) == 0
+    assert not (tmp_path / "2" / "noiseless_map.fits").exists()
+    with fits.open(tmp_path / "0" / "noiseless_map.fits") as a, fits.open(tmp_path / "2" / "map.fits") as b:
+        assert np.array_equal(a[0].data, b[0].data, equal_nan=True)
+    assert cli.main(["run", str(tmp_path / "p.yaml"), "--only", "skye", "--output", str(tmp_path / "x")]) == 2
+    assert cli.main(["run", str(tmp_path / "p.yaml"), "--only", "sky", "--verify", "--output", str(tmp_path / "x")]) == 2

@@ -408,6 +408,13 @@ class _Check:
                     except PipelineError as err:
                         span = self.document.mark(("runs", name, which, i)).value
                         self.wrong(err.message, span, nearest(component, components), err.cure)
+        if self.mistakes:
+            return
+        for name in [*header.runs, ""]:  # the last: runs that steps ask for themselves
+            try:
+                Pipeline(operators, runs={name: header.runs[name]} if name else {})
+            except PipelineError as err:
+                self.wrong(err.message, self.document.mark(("runs", name) if name else ("operators",)).start, "", err.cure)
 
 
 def _noun(value: Any) -> str:

@@ -10,6 +10,7 @@ import click
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
 @click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full.")
 @click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
+@click.option("--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone.")
 @click.option("--no-prune", is_flag=True, help="Leave nothing out.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(
@@ -21,6 +22,7 @@ def plan(
     settings: tuple[str, ...],
     keep: tuple[str, ...],
     drop: tuple[str, ...],
+    only: tuple[str, ...],
     no_prune: bool,
     as_json: bool,
     audit: bool,
@@ -38,9 +40,12 @@ def plan(
     ensure_cache()
     from ..configuration.pipeline_file import load
     from . import table
+    from .only import only as alone
     from .planner import plan as make
 
     file = load(pipeline, settings)
+    if only:
+        file = alone(file, only)
     made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)
     if not audit:
         import json

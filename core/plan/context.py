@@ -16,7 +16,7 @@ from ..pipeline import Pipeline
 from ..projection import rotation_matrices
 from ..scene import Scene
 from .estimate import Traits
-from .structure import Structure, selected
+from .structure import STREAMS, Structure, selected
 
 DEEP = 0.9
 """Quantile of the hits over the covered map: its deeper part has the least noise, so what holds there holds everywhere."""
@@ -214,7 +214,8 @@ def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> froz
     found = set()
     if context.coverage is not None:
         found |= {"map_rms", "peak"}
-        if any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
+        made = set().union(*(o.provides for o in context.operators)) & STREAMS
+        if made <= {"sky", "signal"} or any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
             found.add("transfer")
     if any(o.main_run_only for o in context.operators) or context.coverage is None:
         found |= {"tod", "psd"}

@@ -94,7 +94,7 @@ class Plan:
             kept.append(label)
         runs = {name: run for name, run in file.runs.items() if name in self.structure.runs}
         header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **settings.get("pipeline", {})})
-        return dataclasses.replace(file, header=header, steps=tuple(_same_labels(steps, kept)))
+        return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """Changed parameters by operator. Lists that several effects set are joined."""
@@ -343,7 +343,7 @@ def _check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Se
             raise ZondaError(f"{name!r} cannot be dropped: it {what}", place="zonda plan", cure="leave out --drop for it")
 
 
-def _same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
+def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
     """Steps named so that each keeps its label, on which its random numbers depend, though a namesake is left out."""
     named = []
     for step, label, new in zip(steps, labels, Pipeline([s.operator for s in steps]).operators, strict=True):

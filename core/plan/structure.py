@@ -2,7 +2,8 @@
 
 An operator takes part in a run if it is an output itself, if it changes a stream or a field that a later operator of the run
 reads, or if what it does cannot be known. `Operator.product_only` marks operators whose work is worth nothing unless a later
-step reads the product. A run is left out where nothing it makes is read.
+step reads the product. A run is left out where nothing it makes is read; the main run too, where a companion run that keeps less
+of the components can take its place, and no run needs the main run's singular modes.
 """
 
 from __future__ import annotations
@@ -39,46 +40,81 @@ class Structure:
         Companion runs that are of use.
     rows
         What is left out, and why.
+    instead
+        The companion run that takes the main run's place, its name no longer needed; empty: none.
     """
 
     operators: tuple[str, ...]
     runs: tuple[str, ...]
     rows: tuple[Row, ...]
+    instead: str = ""
 
 
 def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     """What the pipeline's outputs depend on. ``keep``: labels of operators that stay whatever depends on them."""
-    at_end = [o for o in pipeline.operators if o.at_end]
     rows: list[Row] = []
-    wanted: set[str] = set().union(*(o.requires | o.optional for o in at_end))
-    if all(o.product_only or "boresight" in o.provides or o.provides <= STREAMS for o in pipeline.operators):
-        wanted = set().union(*(o.provides for o in pipeline.operators))  # nothing is written: the products are the output
+    in_memory = all(o.product_only or "boresight" in o.provides or o.provides <= STREAMS for o in pipeline.operators)
     needed: dict[str, dict[str, str]] = {}  # by run: label -> reason
-    for run in ["", *pipeline.runs]:
-        steps = pipeline._selected(run)
-        found, left_out = _walk(steps, wanted, {*keep})
+    for run in [*pipeline.runs, ""]:  # the main run last: the others may need it
+        steps, wanted = pipeline._selected(run), _wanted(pipeline, run)
+        pinned = dict.fromkeys(keep, "asked for with --keep")
+        if in_memory:
+            wanted = set().union(*(o.provides for o in pipeline.operators))  # nothing is written: the products are the output
+        for frozen in [r for r in needed if not run and pipeline.is_frozen(r)]:
+            pinned |= {o.label: f"run {frozen} takes its modes" for o in steps if o.couples == "all"}
+        found, left_out = _walk(steps, wanted, pinned)
+        needed[run] = found
         if run and not any(_makes_something(o, wanted) for o in steps if o.label in found):
             reason = "nothing in it makes a product" if not _anything_made(steps) else "no later step reads what it makes"
-            rows.append(Row(run, "", False, reason))
-            continue
-        if run and not any((o.requires | o.optional) & STREAMS for o in steps if o.label in found):
+        elif run and not any((o.requires | o.optional) & STREAMS for o in steps if o.label in found):
             reason = "nothing in it depends on the sky, the air or the noise"
-            rows.append(Row(run, "", False, reason))
+        else:
+            rows += [Row(run, label, False, reason) for label, reason in left_out.items()]
+            rows += _not_in_run(pipeline, run, steps)
             continue
-        needed[run] = found
-        rows += [Row(run, label, False, reason) for label, reason in left_out.items()]
-        rows += _not_in_run(pipeline, run, steps)
+        rows.append(Row(run, "", False, reason))
+        del needed[run]
+    instead = _in_place_of_main(pipeline, needed, _wanted(pipeline, ""), {*keep}) if not in_memory else ""
+    if instead:
+        rows = [r for r in rows if r.run not in ("", instead)]
+        words = "the sky alone" if pipeline.runs[instead].only == ["sky"] else f"run {instead.strip('_')}"
+        reason = f"no step reads what a run of everything makes: {words} takes its place"
+        rows += [Row("", o.label, False, reason) for o in pipeline._selected("") if o.label not in needed[instead]]
+        needed[""] = needed.pop(instead)
     acting = set().union(*(set(found) for found in needed.values()))
     outside = [o for o in pipeline.operators if o.at_end or "boresight" in o.provides]
     acting |= {o.label for o in outside}
     nowhere = {r.operator for r in rows if r.run == "" and r.operator and r.operator not in acting}
     rows = [r for r in rows if not (r.run and r.operator in nowhere)]
     kept_rows = [r for r in rows if r.run or r.operator in nowhere]
+    kept_rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     kept = tuple(o.label for o in pipeline.operators if o.label in acting)
-    return Structure(kept, tuple(r for r in pipeline.runs if r in needed), tuple(kept_rows))
+    return Structure(kept, tuple(r for r in pipeline.runs if r in needed), tuple(kept_rows), instead)
 
 
-def _walk(steps: Sequence[Operator], wanted: set[str], keep: set[str]) -> tuple[dict[str, str], dict[str, str]]:
+def _wanted(pipeline: Pipeline, run: str) -> set[str]:
+    """Products of a run that steps at the end read: those that need certain runs in these, the others in all but their own."""
+    found: set[str] = set()
+    for o in pipeline.operators:
+        if o.at_end and (run in o.runs if o.needs() or run.startswith("_") else True):
+            found |= o.requires | o.optional
+    return found
+
+
+def _in_place_of_main(pipeline: Pipeline, needed: Mapping[str, Mapping[str, str]], wanted: set[str], keep: set[str]) -> str:
+    """A run whose components hold those of all other needed runs, where nothing reads what the main run makes; else empty."""
+    main = [o for o in pipeline._selected("") if o.label in needed[""]]
+    if any(_makes_something(o, wanted) or o.label in keep for o in main) or any(pipeline.is_frozen(run) for run in needed):
+        return ""
+    others = [run for run in needed if run and pipeline.runs[run].only is not None]
+    for run in others:
+        components, filters = pipeline.components(run), pipeline.runs[run].filters
+        if filters == "all" and len(others) == len(needed) - 1 and all(pipeline.components(r) <= components for r in others):
+            return run
+    return ""
+
+
+def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
     """(needed, left out) by label with reasons, going back through one run's steps."""
     read: dict[str, str] = {}  # stream or field -> who reads it
     needed: dict[str, str] = {}
@@ -87,7 +123,7 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: set[str]) -> tuple[
         made = operator.provides
         readers = sorted({read[name] for name in made if name in read})
         if operator.label in keep:
-            reason = "asked for with --keep"
+            reason = keep[operator.label]
         elif readers:
             reason = f"read by {', '.join(readers)}"
         elif made and made <= STREAMS and type(operator).finalize is Operator.finalize:
@@ -128,6 +164,8 @@ def _not_in_run(pipeline: Pipeline, run: str, steps: Sequence[Operator]) -> list
     for o in pipeline._selected(""):
         if o.label not in taking:
             why = "belongs to the main run only" if o.main_run_only else f"the run has {_words(pipeline.runs[run])}"
+            if not o.main_run_only and pipeline.runs[run].keeps(o.provides) | ("signal" in o.provides):
+                why = "the run has no filters"
             rows.append(Row(run, o.label, False, why))
     return rows
 

@@ -19,9 +19,10 @@ from zonda.operators.io.save_map import output_folder
 from zonda.operators.maps.image import Image
 from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 
-from .plots import SHOWN, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
+from .plots import SHOWN, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .power_spectrum import Spectrum
 from .time_streams import TimeStream
+from .transfer_function import Transfer
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -45,12 +46,13 @@ class Plots(Operator):
     """Draw what the run made and write it as PNG files to the output folder.
 
     ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``, ``power_spectra.png``, ``tod.png``,
-    ``scan.png``, each where there is something to show. Acts after all runs; the report shows the same pictures.
+    ``scan.png``, ``transfer_function.png``, each where there is something to show. Acts after all runs; the report shows the same
+    pictures.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    optional: ClassVar[frozenset[str]] = frozenset({"map", "spectrum", "time_streams"})
+    optional: ClassVar[frozenset[str]] = frozenset({"map", "spectrum", "time_streams", "transfer_function"})
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
     at_end: ClassVar[bool] = True
 
@@ -104,6 +106,8 @@ def pictures(data: Data, options: Plots) -> list[Picture]:
             made.append(_spectra(name, product, before.get(product.label, "")))
         elif isinstance(product, TimeStream):
             made.extend(_streams(name, product, before.get(product.label, "")))
+        elif isinstance(product, Transfer):
+            made.append(_transfer(name, product))
     return made
 
 
@@ -255,6 +259,17 @@ def _spectra(name: str, spectrum: Spectrum, before: str) -> Picture:
         caption += " The signal holds the mean emission too, which changes as the scan moves in elevation."
     suffix = "" if name == "spectrum" else f"_{product_path('', name).name}"
     return Picture(f"power_spectra{suffix}", "Power spectra", caption, _png(ax))
+
+
+def _transfer(name: str, transfer: Transfer) -> Picture:
+    whose = "the sky alone" if transfer.modes == "sky" else "the complete data"
+    caption = (
+        "The map of the sky alone through all filters against the same map without filters, by angular scale: the ratio of "
+        "their cross spectrum to the spectrum of the latter, with the standard error from the scatter of the modes (bars); "
+        f"dashed, the ratio of amplitudes. Dotted, the beam. Singular modes of {whose}."
+    )
+    ax = plot_transfer(transfer, title=f"Transfer function, singular modes of {whose}")
+    return Picture(product_path("", name).name, "Transfer function", caption, _png(ax))
 
 
 def _streams(name: str, stream: TimeStream, before: str) -> list[Picture]:

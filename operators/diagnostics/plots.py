@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from .power_spectrum import Spectrum
     from .time_streams import TimeStream
+    from .transfer_function import Transfer
 
 Floats = NDArray[np.floating]
 
@@ -272,6 +273,41 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
     ax.legend(frameon=False, fontsize=9, loc="upper right")
     ax.set_title(title)
     return ax  # type: ignore[no-any-return]
+
+
+def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer function") -> Axes:
+    """Share of each angular scale that the filters leave: T with its standard error, and S, the ratio of amplitudes.
+
+    Horizontal bars are the rings. The dotted line is the beam's FWHM; the upper axis counts wavelengths.
+    """
+    ax = _axes(ax, (7.2, 4.6))
+    r, arcsec = transfer.rings, ARCMIN / 60
+    scale, edges = transfer.scale / arcsec, 1 / transfer.edges / arcsec
+    width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
+    error = np.where(np.isfinite(r.error), r.error, 0.0)
+    ax.errorbar(scale, r.transfer, yerr=error, xerr=width, fmt="o", color=SEQUENCE[0], markersize=4, label="T: share in phase")
+    ax.plot(scale, r.amplitude, "--", color=SEQUENCE[1], linewidth=1.2, label="S: ratio of amplitudes")
+    ax.set_xscale("log")
+    ax.set_xlim(edges[0], edges[-1])
+    top = float(np.nanmax(np.append(r.amplitude, r.transfer), initial=1.0))
+    ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.05 * top)
+    ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
+    if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / arcsec <= edges[0]:
+        ax.axvline(transfer.fwhm / arcsec, color="black", linestyle=":", linewidth=1.0)
+    upper = ax.secondary_xaxis("top", functions=(_to_kilolambda, _to_kilolambda))
+    upper.set_xlabel("baseline [1000 wavelengths]")
+    ax.set_xlabel("angular scale [arcsec]")
+    ax.set_ylabel("transfer function")
+    ax.grid(which="major", color="0.9", linewidth=0.7)
+    ax.legend(frameon=False, fontsize=9, loc="lower right")
+    ax.set_title(title)
+    return ax  # type: ignore[no-any-return]
+
+
+def _to_kilolambda(arcsec: Any) -> Any:
+    """1000 wavelengths of a scale in arcsec, and back: the function is its own inverse."""
+    with np.errstate(divide="ignore"):
+        return 1e-3 / (np.asarray(arcsec, np.float64) * ARCMIN / 60)
 
 
 def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title: str = "") -> Axes:

@@ -40,7 +40,9 @@ class Report(Operator):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    optional: ClassVar[frozenset[str]] = frozenset({"pictures", "map_file", "tod_file", "map", "spectrum", "time_streams"})
+    optional: ClassVar[frozenset[str]] = frozenset(
+        {"pictures", "map_file", "tod_file", "map", "spectrum", "time_streams", "transfer_function"}
+    )
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
     at_end: ClassVar[bool] = True
 
@@ -390,7 +392,8 @@ def _provenance(data: Data) -> str:
     if provenance.get("precision"):
         rows.append(("precision", provenance["precision"]))
     for name, run in provenance.get("runs", {}).items():
-        rows.append((f"run {name}", ", ".join(f"{how} {' and '.join(components)}" for how, components in run.items())))
+        parts = [f"{how} {' and '.join(what) if isinstance(what, list) else what}" for how, what in run.items()]
+        rows.append((f"run {name}", ", ".join(parts)))
     files = [str(p.name) for key in ("map_file", "tod_file") for p in data.products.get(key, [])]
     if files:
         rows.append(("files", ", ".join(files)))

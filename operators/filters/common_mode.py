@@ -11,6 +11,14 @@ A^T q and A A^T q together. It starts from the detector mean and stops when
 
 The detectors' mean (`method: mean`) is found in one reading (`focal_plane_mean`), so that the stream may be larger than memory
 and disk; the iteration needs it whole.
+
+The u_i depend on A. Frozen, those of the complete data A act on another stream B (the sky alone):
+
+    B <- B - sum_i u_i (B^T u_i)^T.                                                                          (3)
+
+That is what (1) does to the part B of A = B + C: (3) of B plus (3) of C is (1) of A. (1) also changes with B because B turns
+the modes: to first order the filtered A changes by (1 - u u^T) B (1 - v v^T / |v|^2), which is (3) but for one degree of
+freedom in N_samples for each mode, and for terms of order sigma_2 / sigma_1.
 """
 
 from __future__ import annotations
@@ -143,6 +151,24 @@ class CommonModeFilter(Operator):
         observation.tally.count(self.label, kept, 1 - found.count)
         return usable, found
 
+    def freeze(self, state: Modes) -> Floats:
+        """The modes over detectors, (k, n_det)."""
+        return state.detectors
+
+    def measure_frozen(self, stream: Stream, state: Modes, frozen: Floats) -> None:
+        """Equation (3): v_i = B^T u_i."""
+        use, good = np.asarray(frozen.any(axis=0)), stream.observation.flags == 0
+        if self.method == "mean":
+            total = focal_plane_mean.read(stream, use, good).total
+            times = [total * u.max(initial=0.0) for u in frozen]
+        else:
+            with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+                gram = Gram(stream, pool, use)
+                times = [gram.apply(u)[1] for u in frozen]
+        state.detectors, state.times = frozen, np.array(times).reshape(len(frozen), stream.shape[1])
+        what = f"{stream.observation.name}: modes removed"
+        stream.observation.tally.state(self.label, what, f"{len(frozen)} (those of the complete data)")
+
     def _choose(self, found: Ritz, gram: Gram, observation: Observation) -> int:
         """Number of modes to remove; may replace the modes by the detectors' mean."""
         tally = observation.tally
@@ -245,12 +271,17 @@ class Gram:
     iteration begins with; where no detector turns out dead, `apply` has it at hand.
     """
 
-    def __init__(self, stream: Stream, pool: ThreadPoolExecutor) -> None:
+    def __init__(self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None) -> None:
+        """``use``: the detectors to use, where they are known; they are found otherwise."""
         self.stream, self.pool = stream, pool
         self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.flags == 0
         self.n_used = int(self.good_samples.sum())
         self.whole = stream.means.get("signal") is None and bool(self.good_samples.all())
+        self._known: tuple[Floats, Floats, Floats] | None = None
+        if use is not None:
+            self.usable = Usable(use, self.n_used)
+            return
         use = stream.observation.detector_flags == 0
         vector = _near_the_mean(use)
         total, square, image, times = self._pass(vector, np.flatnonzero(use), moments=True)

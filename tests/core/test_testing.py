@@ -27,6 +27,7 @@ BUILT_IN = {
     "TimeStreams": {},
     "SaveTOD": {},
     "SaveMap": {},
+    "TransferFunction": {},
     "Plots": {},
     "Report": {},
 }
@@ -136,3 +137,39 @@ def test_expected_failures():
     check_operator(Blows(), expected_failures={"check_finite": "it is meant to"})
     with pytest.raises(AssertionError, match="though it was expected to fail"):
         check_operator(Good(), expected_failures={"check_finite": "it was meant to"})
+
+
+class Normalizes(Operator):
+    """Divides by the rms of everything; frozen, it forgets to use the complete data's."""
+
+    requires: ClassVar[frozenset[str]] = SIGNAL
+    provides: ClassVar[frozenset[str]] = SIGNAL
+    couples: ClassVar = "all"
+
+    def prepare(self, observation):
+        return []
+
+    def measure(self, stream, state):
+        state[:] = [float(np.std(stream.array[:16, :1000].astype(float)))]
+
+    def freeze(self, state):
+        return state[0]
+
+    def measure_frozen(self, stream, state, frozen):
+        self.measure(stream, state)
+
+    def exec(self, block, state):
+        block.detdata["signal"] /= block.dtype(state[0])
+
+
+class NormalizesFrozen(Normalizes):
+    """The same, right."""
+
+    def measure_frozen(self, stream, state, frozen):
+        state[:] = [frozen]
+
+
+def test_an_operator_that_is_not_linear_when_frozen():
+    check_operator(NormalizesFrozen())
+    with pytest.raises(AssertionError, match="check_frozen: frozen, it is not linear"):
+        check_operator(Normalizes())

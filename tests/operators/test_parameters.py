@@ -273,6 +273,16 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "streams": ({}, {"streams": ["signal", "white"]}),
         "dtype": ({}, {"dtype": "float32"}),
     },
+    "TransferFunction": {
+        "modes": ({}, {"modes": "full"}),
+        "bins": ({}, {"bins": 4}),
+        "largest": ({}, {"largest": "50 arcsec"}),
+        "smallest": ({}, {"smallest": "20 arcsec"}),
+        "radius": ({}, {"radius": "60 arcsec"}),
+        "taper": ({}, {"taper": "20 arcsec"}),
+        "least_coverage": ({}, {"least_coverage": 0.6}),
+        "map": ({}, {"map": "chart"}),
+    },
     "SaveMap": {
         "central_diameter": ({}, {"central_diameter": "30 arcsec"}),
         "overwrite": ({}, {"overwrite": False}),
@@ -299,6 +309,16 @@ CHAINS = {
     "TimeStreams": ["WhiteNoise", "Efficiency", "TimeStreams"],
     "SaveTOD": ["WhiteNoise", "Efficiency", "SaveTOD"],
     "SaveMap": ["WhiteNoise", "Efficiency", "BinMap", "SaveMap"],
+    "TransferFunction": [
+        "SkyMap",
+        "WhiteNoise",
+        "PinkNoise",
+        "Efficiency",
+        "HighpassFilter",
+        "CommonModeFilter",
+        "BinMap",
+        "TransferFunction",
+    ],
     "Plots": ["WhiteNoise", "Efficiency", "BinMap", "Plots"],
     "Report": ["WhiteNoise", "Efficiency", "BinMap", "Report"],
 }
@@ -333,6 +353,7 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 REFUSALS = {
     ("BinMap", "projection"): "'TAN'",
     ("SkyMap", "missing"): "NaN",
+    ("TransferFunction", "map"): "there is no map 'chart'",
     ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
     ("SaveMap", "overwrite"): "is there already",
     ("PointingRecorded", "clock"): "is too large",

@@ -258,6 +258,20 @@ def test_a_sky_that_no_detector_reaches(made, save):
     assert scan.tally.get("SkyMap", "samples more than 90 deg from the input map's centre") == 600
 
 
+def test_a_sky_that_no_detector_reaches_is_not_convolved(made, save, monkeypatch):
+    from zonda.operators.sky import skymap
+
+    path = save(np.ones((20, 20)), made.tan_header((20, 20)))
+    calls = []
+    monkeypatch.setattr(skymap, "convolve", lambda *a, **k: calls.append(1) or (_ for _ in ()).throw(RuntimeError))
+    far = made.observation(np.full(300, np.radians(75.0)), np.radians(25.0), xi=[0, 1e-3], eta=[0, 0])
+    assert not SkyMap(file=path).prepare(far).beams
+    assert not calls
+    near = made.observation(np.full(300, np.radians(75.0)), np.radians(20.0), xi=[0, 1e-3], eta=[0, 0])
+    with pytest.raises(RuntimeError):
+        SkyMap(file=path).prepare(near)
+
+
 def test_a_block_made_twice_is_counted_once(made, save):
     operator = SkyMap(file=save(np.ones((20, 20)), made.tan_header((20, 20))))
     scan = made.observation(np.full(30, np.radians(80)), np.radians(20))

@@ -1,0 +1,294 @@
+"""What the filters leave of each angular scale of the sky.
+
+a is the map of the sky alone, binned without any filter; b the map of the sky alone through all filters; both of the same
+samples and pixels, so that beam, pixels and coverage are in both and only the filters tell them apart. With a window w and the
+Fourier transforms a_k, b_k of w (m - <m>_w), and rings i of wavenumbers k,
+
+    T_i = Re sum_i b_k a_k^* / sum_i |a_k|^2,                                                                 (1)
+    S_i = sqrt( sum_i |b_k|^2 / sum_i |a_k|^2 ) >= |T_i|.                                                     (2)
+
+T is the share that is left, in phase; S is the definition of van Marrewijk, Morris et al. (2024), which also counts what the
+filters bring from other scales and places. The standard error of T is that from the scatter of the modes of the ring, the sky
+being one of many with its spectrum (the maps have no noise):
+
+    sigma_i^2 = N / (N - 1) 2 c sum_i (Re (b_k - T_i a_k) a_k^*)^2 / (sum_i |a_k|^2)^2,   N = n_i / (2 c),    (3)
+
+n_i modes, each in the ring twice since maps are real, c = n_pixels sum w^4 / (sum w^2)^2 for the correlation of neighbours
+through the window.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from zonda.core.configuration.units import Angle
+from zonda.core.data import Data, html_table
+from zonda.core.errors import PipelineError
+from zonda.core.files import product_path
+from zonda.core.operator import Operator
+from zonda.core.pipeline import Companion
+from zonda.operators.io.ecsv import Column, write_ecsv
+from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
+
+if TYPE_CHECKING:
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
+
+Floats = NDArray[np.float64]
+
+ARCSEC = math.pi / 648000
+NO_POWER = 1e-12
+"""Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
+
+
+class TransferFunction(Operator):
+    """Measure the share of each angular scale of the sky that the filters leave in the map.
+
+    The map of the sky alone is compared with the same map binned without filters: the ratio of their cross spectrum to the
+    spectrum of the latter, in rings of equal width in the logarithm of the scale. The two runs are made for this step, unless
+    `runs` has them. Makes the product ``transfer_function`` (a `Transfer`), or one under this step's own name where it has one;
+    where there is an output folder, it is written there as a table (ECSV).
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"map"})
+    provides: ClassVar[frozenset[str]] = frozenset({"transfer_function"})
+    at_end: ClassVar[bool] = True
+
+    modes: Literal["sky", "full"] = "sky"
+    """Singular modes of the sky alone (`sky`: the paper's noiseless run), or of the complete data, applied to it (`full`)."""
+    bins: int = Field(12, ge=1, le=500)
+    """Number of rings, of equal width in the logarithm of the scale."""
+    largest: Angle | None = Field(None, gt=0)
+    """Largest angular scale, 1/k; where absent, the diameter of the disc with the window's area."""
+    smallest: Angle | None = Field(None, gt=0)
+    """Smallest angular scale; where absent, the beam's FWHM, or two pixels."""
+    radius: Angle | None = Field(None, gt=0)
+    """Use only what lies this near to the map's centre."""
+    taper: Angle | None = Field(None, gt=0)
+    """Width of the window's cosine edge; where absent, it reaches to the middle."""
+    least_coverage: float = Field(0.1, ge=0, lt=1)
+    """Where the (beam-smoothed) samples per pixel are below this share of their 99th percentile, the window is zero."""
+    map: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
+    """Which map: `BinMap.product`."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TransferFunction:
+        if self.largest is not None and self.smallest is not None and self.largest <= self.smallest:
+            raise ValueError("largest must be larger than smallest")
+        return self
+
+    def needs(self) -> tuple[Companion, ...]:
+        """The sky alone through the filters, and without them."""
+        modes: Literal["own", "full"] = "full" if self.modes == "full" else "own"
+        return Companion(only=["sky"], modes=modes), Companion(only=["sky"], modes=modes, filters="none")
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost, without that of the two runs."""
+        from zonda.core.plan.estimate import Cost, Estimate
+
+        return Estimate((), Cost(once=0.15, bytes=20e6, kernel="python"))
+
+    def finalize(self, data: Data) -> None:
+        """Compare the two maps. Raises PipelineError where there is none, or none that can be compared."""
+        after, before = (self._map(data, run) for run in self.runs)
+        window = window_of(before, self.radius, self.taper, self.least_coverage)
+        if not window.any():
+            raise PipelineError("no pixel is left in the window", place=self.label, cure="choose a larger radius")
+        smallest = self.smallest or max(before.fwhm, 2 * before.pixel)
+        largest = self.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
+        if largest <= smallest:
+            raise PipelineError(
+                f"scales from {largest / ARCSEC:.3g} to {smallest / ARCSEC:.3g} arcsec are none",
+                place=self.label,
+                cure="set largest and smallest, or map a larger field",
+            )
+        edges = np.geomspace(1 / largest, 1 / smallest, self.bins + 1)
+        rings = compare(before.signal, after.signal, window, before.pixel, edges)
+        found = Transfer(rings, edges, self.modes, before.fwhm, self.label, self.map)
+        empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
+        data.tally.count(self.label, "rings without modes or power: NaN", empty)
+        data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
+        if self.modes == "full":
+            what = "of the complete data, which are the sky alone" if not self.runs[0] else "of the complete data"
+            data.tally.state(self.label, "singular modes", what)
+        key = self.name or ("transfer_function" if self.label == type(self).__name__ else self.label)
+        data.products[key] = found
+        if data.output is not None:
+            found.write(product_path(data.output, key, ".ecsv"), data.provenance)
+
+    def _map(self, data: Data, run: str) -> MapProduct:
+        product = data.products.get(f"{run}/{self.map}" if run else self.map)
+        if not isinstance(product, MapProduct):
+            raise PipelineError(
+                f"there is no map {self.map!r}", place=self.label, cure="set map to BinMap's product, or BinMap.product to map"
+            )
+        if product.header is None or product.contents == "hits":
+            raise PipelineError(
+                "a transfer function needs a TAN map of the signal", place=self.label, cure="leave BinMap.nside and contents out"
+            )
+        return product
+
+
+@dataclass(frozen=True)
+class Rings:
+    """Equations (1) to (3), (n,) each: NaN where a ring has no modes or no power.
+
+    Attributes
+    ----------
+    wavenumber
+        Mean of k over the ring's modes, rad^-1.
+    transfer, error, amplitude
+        T, sigma and S; sigma is NaN where there are not two independent modes.
+    power
+        sum |a_k|^2.
+    modes
+        Independent modes N.
+    """
+
+    wavenumber: Floats
+    transfer: Floats
+    error: Floats
+    amplitude: Floats
+    power: Floats
+    modes: Floats
+
+
+def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: Floats) -> Rings:
+    """Equations (1) to (3) of two maps (ny, nx) of pixels of side ``pixel`` [rad]; NaN counts as nothing.
+
+    Parameters
+    ----------
+    before, after
+        a and b; pixels that are NaN in one of them are left out of both.
+    window
+        (ny, nx).
+    edges
+        (n + 1,) wavenumbers between the rings, rad^-1, ascending.
+    """
+    known = np.isfinite(before) & np.isfinite(after)
+    window = np.where(known, window, 0.0)
+    a, b = (_spectrum(np.where(known, m, 0.0), window) for m in (before, after))
+    k = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n, pixel) for n in window.shape), indexing="ij"))
+    correlated = window.size * (window**4).sum() / (window**2).sum() ** 2 if window.any() else np.inf
+    rows = [_ring(a[ring], b[ring], k[ring], correlated) for low, high in pairwise(edges) for ring in [(k >= low) & (k < high)]]
+    found = np.array(rows, np.float64).reshape(-1, 6)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        each = found[:, 4] / found[:, 5]
+        found[~(each > NO_POWER * np.nanmax(each, initial=0.0)), 1:4] = np.nan
+    return Rings(*found.T)
+
+
+def _ring(a: NDArray[np.complex128], b: NDArray[np.complex128], k: Floats, correlated: float) -> tuple[float, ...]:
+    """One row of `Rings`."""
+    power, independent = float((abs(a) ** 2).sum()), k.size / 2 / correlated
+    if power == 0 or not k.size:
+        return (float(k.mean()) if k.size else math.nan, math.nan, math.nan, math.nan, power, independent)
+    transfer = float((b * a.conj()).real.sum()) / power
+    amplitude = math.sqrt(float((abs(b) ** 2).sum()) / power)
+    error = math.nan
+    if independent >= 2:
+        rest = ((b - transfer * a) * a.conj()).real
+        error = math.sqrt(independent / (independent - 1) * 2 * correlated * float((rest**2).sum())) / power
+    return float(k.mean()), transfer, error, amplitude, power, independent
+
+
+def _spectrum(values: Floats, window: Floats) -> NDArray[np.complex128]:
+    mean = (values * window).sum() / window.sum() if window.any() else 0.0
+    return np.asarray(np.fft.fft2((values - mean) * window), np.complex128)
+
+
+def window_of(product: MapProduct, radius: float | None = None, taper: float | None = None, least: float = 0.1) -> Floats:
+    """sin^2(pi/2 min(d / taper, 1)), d the distance of a pixel to the nearest one outside the window, (ny, nx).
+
+    Inside are pixels with at least ``least`` of the 99th percentile of the beam-smoothed samples, holes filled, within
+    ``radius`` [rad] of the centre. ``taper`` None: the largest d, so that a disc has cos^2(pi/2 r / R).
+    """
+    from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter
+
+    hits = gaussian_filter(product.hits.astype(np.float64), product.fwhm / FWHM_PER_SIGMA / product.pixel, mode="constant")
+    seen = hits[product.hits > 0]
+    inside = hits >= max(least * float(np.percentile(seen, 99)), 1e-9) if seen.size else np.zeros(hits.shape, bool)
+    inside = binary_fill_holes(inside)
+    if radius is not None:
+        inside &= product.distance() <= radius
+    depth = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * product.pixel
+    width = depth.max(initial=0.0) if taper is None else taper
+    return np.asarray(np.sin(np.pi / 2 * np.minimum(depth / max(width, product.pixel), 1)) ** 2, np.float64)
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """A transfer function.
+
+    Attributes
+    ----------
+    rings
+        What was found.
+    edges
+        (n + 1,) wavenumbers between the rings, rad^-1.
+    modes
+        ``sky`` or ``full``: whose singular modes the filters took out.
+    fwhm
+        The beam's, rad.
+    label, map
+        Of the step, and of the map that it looked at.
+    """
+
+    rings: Rings
+    edges: Floats
+    modes: str
+    fwhm: float
+    label: str
+    map: str
+
+    @property
+    def scale(self) -> Floats:
+        """(n,) angular scales 1/k, rad; in a ring without modes its middle."""
+        k = self.rings.wavenumber
+        return np.asarray(1 / np.where(np.isfinite(k), k, np.sqrt(self.edges[1:] * self.edges[:-1])), np.float64)
+
+    @property
+    def kilolambda(self) -> Floats:
+        """(n,) the same as lengths of baselines in 1000 wavelengths."""
+        return np.asarray(1e-3 / self.scale, np.float64)
+
+    def columns(self) -> list[Column]:
+        """The table, largest scale first."""
+        r = self.rings
+        return [
+            Column("scale", self.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),
+            Column("scale_largest", 1 / self.edges[:-1] / ARCSEC, "arcsec", "edge of the ring"),
+            Column("scale_smallest", 1 / self.edges[1:] / ARCSEC, "arcsec", "edge of the ring"),
+            Column("kilolambda", self.kilolambda, "", "wavenumber, 1000 wavelengths"),
+            Column("transfer", r.transfer, "", "Re sum b a* / sum |a|^2: share that the filters leave, in phase"),
+            Column("error", r.error, "", "standard error of transfer from the scatter of the ring's modes"),
+            Column("amplitude", r.amplitude, "", "sqrt(sum |b|^2 / sum |a|^2)"),
+            Column("modes", r.modes, "", "independent modes"),
+        ]
+
+    def write(self, path: Any, provenance: Any) -> None:
+        """An ECSV table that `astropy.table.Table.read` knows."""
+        meta = {
+            "PIPELINE": str(provenance.get("name", "")),
+            "SEED": provenance.get("seed"),
+            "ZONDA": str(provenance.get("versions", {}).get("zonda", "")),
+            "COMMAND": str(provenance.get("command", "")),
+            "MODES": self.modes,
+            "MAP": self.map,
+            "BEAM": f"{self.fwhm / ARCSEC:.6g} arcsec",
+        }
+        write_ecsv(path, self.columns(), {k: v for k, v in meta.items() if v not in ("", None)})
+
+    def _repr_html_(self) -> str:
+        r = self.rings
+        rows = [
+            (f"{s / ARCSEC:.3g} arcsec", f"{t:.3f} +- {e:.3f}") for s, t, e in zip(self.scale, r.transfer, r.error, strict=True)
+        ]
+        return html_table(f"Transfer function, modes: {self.modes}", rows)
