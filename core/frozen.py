@@ -46,11 +46,11 @@ class Frozen:
             observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
             observation.focalplane.net = net.copy()
             return
-        flags, detector_flags, net = next(reversed(self._used.values())) if self._used else (None, None, None)
+        before = next(reversed(self._used.values())) if self._used else None
         self._used[here] = (
-            _copy(observation.flags, flags),
-            _copy(observation.detector_flags, detector_flags),
-            _copy(observation.focalplane.net, net),
+            _copy(observation.flags, before and before[0]),
+            _copy(observation.detector_flags, before and before[1]),
+            _copy(observation.focalplane.net, before and before[2]),
         )
 
 
