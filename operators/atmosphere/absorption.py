@@ -132,11 +132,9 @@ class AbsorptionTable:
         if (x < grid[0] - (PRESSURE_MARGIN - 1) * step).any():
             worst, limit = pressure.max() / 100, self.pressure[0] / 100 * 0.72 ** (1 - PRESSURE_MARGIN)
             raise InputError(f"a pressure of {worst:.5g} hPa is above the absorption table's limit of {limit:.5g} hPa")
-        if (x > grid[-1] + (PRESSURE_MARGIN - 1) * step).any():  # no air below `weather.TOP` is as thin as the shipped table's
-            worst, limit = pressure.min() / 100, self.pressure[-1] / 100 * 0.72 ** (PRESSURE_MARGIN - 1)
-            raise InputError(f"a pressure of {worst:.5g} hPa is below the absorption table's limit of {limit:.5g} hPa")
         below = np.clip(np.searchsorted(grid, x) - 1, 0, len(grid) - 2)  # the first and last step also serve the margins
-        return below, (x - grid[below]) / step
+        # Air thinner than the table's 0.13 hPa has the cross-sections of its edge; a `Profile` has none, it ends at 0.75 hPa.
+        return below, np.minimum((x - grid[below]) / step, PRESSURE_MARGIN)
 
     def _temperature_weights(self, pressure: Array, temperature: Array, row: NDArray[np.intp]) -> Array:
         """Lagrange weights in 1/temperature on the nodes of each layer's row. (n_temperature, n_layer)."""

@@ -40,9 +40,9 @@ REACH = 6.0
 SPLINE_MARGIN = 4
 """Grid points beyond the reach, for the 4 x 4 coefficients of the last sample."""
 SIGMA = 1.0 / np.sqrt(8.0 * np.log(2.0))
-TINY = 1e-20
-"""Coefficients smaller than this share of the largest are set to zero, so that float32 denormals never slow the sampling. A
-sample is a mean of 16 coefficients: it changes by no more than this share of the image's peak, 1e12 below float32's rounding."""
+TINY = 1e-16
+"""Coefficients smaller than this share of the largest are set to zero: they are rounding of the transform, and as float32
+denormals they would slow the sampling. A sample is a mean of 16 coefficients, so it changes by no more of the image's peak."""
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,8 @@ def test_denormals_are_flushed():
     values = np.zeros((200, 200))
     values[100, 100] = 1e-3
     c = convolve(values, np.diag([-ARCSEC, ARCSEC]), 8 * ARCSEC, 0.0).coefficients["float32"]
-    assert np.all((c == 0) | (np.abs(c) >= 9e-21))
+    assert np.all((c == 0) | (np.abs(c) >= 0.9e-16 * np.abs(c).max()))
+    assert np.count_nonzero(c == 0) > 1000
 
 
 def test_distinct_beams():
@@ -98,12 +99,12 @@ def test_distinct_beams():
 
 
 def test_a_faint_map_is_not_set_to_zero() -> None:
-    """What is flushed is a share of the image's own peak: a map of 1e-25 K keeps its shape."""
+    """What is flushed is a share of the image's own peak: a map of 8e-25 K keeps its shape to the bit."""
     values = np.zeros((41, 41))
     values[20, 20] = 1.0
     jacobian = np.diag([-1.0, 1.0]) * 1e-5
-    bright, faint = (convolve(values * scale, jacobian, 3e-5, 0.0).coefficients["float64"] for scale in (1.0, 1e-25))
-    assert faint == pytest.approx(bright * 1e-25, rel=1e-12, abs=1e-45)
-    assert np.count_nonzero(faint) == np.count_nonzero(bright) > 100
+    bright, faint = (convolve(values * scale, jacobian, 3e-5, 0.0).coefficients["float64"] for scale in (1.0, 2.0**-80))
+    assert np.array_equal(faint, bright * 2.0**-80)
     size = np.abs(bright[bright != 0])
-    assert size.min() >= 1e-20 * size.max()
+    assert size.size > 100
+    assert size.min() >= 1e-16 * size.max()
