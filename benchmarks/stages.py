@@ -13,29 +13,72 @@ the whole chain: on a machine that does other work too, the least is the nearest
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import resource
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 
 @dataclass(frozen=True)
 class Case:
-    """A scan, and the CPU seconds and memory [GB] that its chain may take."""
+    """A scan, and the CPU seconds and memory [GB] that its chain may take (0: no limit).
+
+    ``instrument``: changes of the named one. ``steps``: parameters of operators by class.
+    """
 
     about: str
+    scene: dict[str, str]
     pointing: dict[str, str]
-    cpu: float
-    memory: float = 1.0
+    cpu: float = 0.0
+    memory: float = 0.0
+    instrument: dict[str, object] = field(default_factory=dict)
+    steps: dict[str, dict[str, object]] = field(default_factory=dict)
 
+
+GREEN_BANK = {"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25T07:00", "target": "05h +20d"}
+CHAJNANTOR = {"site": "llano_de_chajnantor", "time": "2022-08-01T23:00", "target": "260d -10d"}
+M2_DAISY = {"radius": "4 arcmin", "speed": "50 arcsec/s"}
+M2_STEPS: dict[str, dict[str, object]] = {
+    "AtmosphereLayers": {"pwv": "7.7 mm", "pwv_rms": "0.5 %"},
+    "HighpassFilter": {"frequency": "0.08 Hz"},
+    "BinMap": {"pixel": "2 arcsec", "width": "15 arcmin"},
+}
+AT_STEPS: dict[str, dict[str, object]] = {
+    "AtmosphereLayers": {"pwv_rms": "5 %", "highest": "3000 m"},
+    "HighpassFilter": {"frequency": "0.5 Hz"},
+    "BinMap": {"pixel": "4 arcsec"},
+}
 
 CASES = {
-    "M2": Case("223 detectors x 100 Hz x 516 s, one scan", {"scan_duration": "516 s", "sample_rate": "100 Hz"}, 1.5),
-    "M2-45min": Case("223 detectors x 50 Hz x 45 min, one scan", {"scan_duration": "45 min", "sample_rate": "50 Hz"}, 3.0),
-}
+    "M2": Case(
+        "223 detectors x 100 Hz x 516 s, one scan", GREEN_BANK,
+        {**M2_DAISY, "scan_duration": "516 s", "sample_rate": "100 Hz"}, 1.5, 1.0, steps=M2_STEPS,
+    ),
+    "M2-45min": Case(
+        "223 detectors x 50 Hz x 45 min, one scan", GREEN_BANK,
+        {**M2_DAISY, "scan_duration": "45 min", "sample_rate": "50 Hz"}, 3.0, 1.0, steps=M2_STEPS,
+    ),
+    "AT-slice": Case(
+        "AtLAST's reduced camera, 3000 detectors x 225 Hz x 30 s", {**CHAJNANTOR, "instrument": "atlast"},
+        {"radius": "0.25 deg", "speed": "0.45 deg/s", "scan_duration": "30 s"}, steps=AT_STEPS,
+    ),
+    "LAT": Case(
+        "6 m, 7.8 deg, 2000 detectors x 200 Hz x 60 s", {**CHAJNANTOR, "instrument": "so_lat"},
+        {"radius": "3 deg", "speed": "1 deg/s", "scan_duration": "60 s", "sample_rate": "200 Hz"},
+        instrument={"detectors": 2000, "field_of_view": math.radians(7.8)},
+        steps={**AT_STEPS, "BinMap": {"pixel": "1 arcmin"}},
+    ),
+    "FULL-slice": Case(
+        "AtLAST's full field of 2 deg at 900 Hz, 1024 of its detectors x 20 s", {**CHAJNANTOR, "instrument": "atlast"},
+        {"radius": "1 deg", "speed": "0.9 deg/s", "scan_duration": "20 s", "sample_rate": "900 Hz"},
+        instrument={"detectors": 1024, "field_of_view": math.radians(2)},
+        steps={**AT_STEPS, "BinMap": {"pixel": "4 arcsec"}},
+    ),
+}  # fmt: skip
 
 BARS = {
     "atmosphere": (["AtmosphereLayers"], 0.5),
@@ -48,23 +91,28 @@ BARS = {
 """What prototypes reached on a quiet 2.x GHz Sapphire Rapids core (AVX-512), ns per sample; 1.5 times that is a fair bar."""
 
 
-def pipeline(pointing):
+def scene_of(name):
+    """What a case observes."""
     import zonda
 
+    case = CASES[name]
+    scene = zonda.Scene(**case.scene, seed=1)
+    if case.instrument:
+        scene = scene.model_copy(update={"instrument": scene.instrument.model_copy(update=case.instrument)})
+    return scene
+
+
+def pipeline_of(name, short=False, **pointing):
+    """A case's chain; ``short``: of 10 s, to compile it."""
+    import zonda
+
+    case = CASES[name]
     cluster = Path(zonda.__file__).resolve().parents[1] / "pipelines" / "data" / "merging_cluster.fits"
-    return zonda.Pipeline(
-        [
-            zonda.PointingDaisy(radius="4 arcmin", speed="50 arcsec/s", **pointing),
-            zonda.SkyMap(file=cluster),
-            zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms="0.5 %"),
-            zonda.WhiteNoise(),
-            zonda.PinkNoise(),
-            zonda.Efficiency(),
-            zonda.HighpassFilter(frequency="0.08 Hz"),
-            zonda.CommonModeFilter(modes=1),
-            zonda.BinMap(pixel="2 arcsec", width="15 arcmin"),
-        ]
-    )
+    pointing = {**case.pointing, **pointing, **({"scan_duration": "10 s"} if short else {})}
+    kinds = ["AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency", "HighpassFilter", "CommonModeFilter", "BinMap"]
+    steps = [getattr(zonda, kind)(**case.steps.get(kind, {})) for kind in kinds]
+    sky = zonda.SkyMap(file=cluster, centre="target")
+    return zonda.Pipeline([zonda.PointingDaisy(**pointing, check_limits="warn"), sky, *steps])
 
 
 def peak_memory():
@@ -85,19 +133,19 @@ def reference(repeat):
 
 
 def verdict(value, limit):
+    if not limit:
+        return "no limit"
     return f"{value / limit:5.2f} of the limit" + ("" if value <= limit else ": MISSED")
 
 
 def measure(name, threads, repeat):
     import numpy as np
 
-    import zonda
-
     case = CASES[name]
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
-    pipeline({**case.pointing, "scan_duration": "30 s"}).run(scene, threads=threads)  # imports, compilation
+    scene = scene_of(name)
+    pipeline_of(name, short=True).run(scene, threads=threads)  # imports, compilation
     before = peak_memory()
-    chain, totals, walls, runs = pipeline(case.pointing), [], [], []
+    chain, totals, walls, runs = pipeline_of(name), [], [], []
     for _ in range(repeat):
         cpu, wall = time.process_time(), time.perf_counter()
         data = chain.run(scene, threads=threads)

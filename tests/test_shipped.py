@@ -129,3 +129,23 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, monkeypatch, capsys):
     assert "no space left on the disk" in message
     assert "Traceback" not in message
     assert not [p for p in (tmp_path / "out").iterdir() if ".part" in p.name or p.name == "noiseless_map.fits"]
+
+
+def test_atlast_reduced_on_a_thin_slice(tmp_path):
+    """Two scans of 4 s, all detectors: a map and its noise map, whose noise is that of the detectors' NET."""
+    from astropy.io import fits
+
+    out = tmp_path / "out"
+    loaded = zonda.load("atlast_reduced", overrides=["PointingDaisy.scan_duration=4 s"])
+    chain = zonda.Pipeline([o for o in loaded.pipeline().operators if type(o).__name__ not in ("Plots", "Report")])
+    with pytest.warns(UserWarning, match="acceleration|samples per FWHM"):
+        data = chain.run(loaded.scene(), output=out)
+    assert [(o.n_detectors, o.n_samples, o.sample_rate) for o in data.observations] == [(3000, 900, 225.0)] * 2
+    product = data.products["map"]
+    assert product.hits.sum() == 2 * 900 * 3000
+    both = np.isfinite(product.half_difference) & (product.hits > 40)
+    # the half-difference over each pixel's noise from NET has unit variance, and what filters leave of 1/f noise and air more
+    ratio = (product.half_difference / product.noise)[both].std()
+    assert 0.9 < ratio < 1.5
+    with fits.open(out / "map.fits") as file:
+        assert {"SIGNAL", "HITS", "WEIGHTS", "NOISE", "HALF_DIFFERENCE"} <= {h.name for h in file}
