@@ -29,6 +29,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
+from zonda.core.streams import forget_pages
 from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
@@ -83,6 +84,11 @@ class CommonModeFilter(Operator):
     def prepare(self, observation: Observation) -> Modes:
         """Empty modes, filled by `measure`."""
         return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
+
+    def memory(self, observation: Observation) -> int:
+        """Series over the scan: one for each step of the iteration, or what `focal_plane_mean` adds up."""
+        series = 8 if self.method == "mean" else 20 + 8 * self.modes
+        return 8 * series * observation.n_samples + 100 * observation.n_detectors
 
     def sweeps(self, observation: Observation) -> int:
         """One reading for the mean; the singular modes want the stream whole."""
@@ -297,6 +303,7 @@ class Gram:
         def work(samples: slice) -> Floats:
             out = np.zeros((2, self.stream.shape[0]))
             _moments(*self._tile(samples), out)
+            forget_pages(self.stream.array)
             return out
 
         parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, 2, self.stream.shape[0])
@@ -311,6 +318,7 @@ class Gram:
         def work(samples: slice) -> Floats:
             out = np.zeros(q.size)
             _product(*self._tile(samples), q, rows, times[samples], out)
+            forget_pages(self.stream.array)
             return out
 
         parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, q.size)

@@ -149,6 +149,12 @@ class SkyMap(Operator):
         if key not in data.products:
             data.products[key] = state.sky.image(self.label)
 
+    def memory(self, observation: Observation) -> int:
+        """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""
+        widths, _ = self._widths(observation)
+        sky = self._sky(observation, float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)))
+        return (5 + 2 * len(widths)) * sky.nbytes
+
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
         from zonda.core.plan.estimate import Traits
