@@ -176,7 +176,12 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 @_no_prune
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
-@click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
+@click.option(
+    "--memory",
+    type=Bytes(),
+    metavar="SIZE",
+    help="Most memory to hold, e.g. 4GB; results do not depend on it.  [default: half of the free]",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
 @click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")
 @click.option(
@@ -252,7 +257,7 @@ def run(
     resolved = file.resolved_yaml()
     command = _command(pipelines, settings, keep, drop, no_prune, only)
     provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
-    data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
+    data = file.pipeline().run(file.scene(), output=folder, threads=threads, ceiling=memory, provenance=provenance)
     write_text(folder / "resolved.yaml", resolved)
     counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
     lost = {(who, what) for who, what in counts if what != "samples binned"}

@@ -41,7 +41,7 @@ from .streams import (
     disk_rate,
     forget_pages,
 )
-from .tiles import TILE_SAMPLES
+from .tiles import TILE_DETECTORS, TILE_SAMPLES
 
 __all__ = ["PIECE", "Execution", "Segment", "Settings", "Timer", "available_memory", "available_threads", "cut"]
 
@@ -175,7 +175,7 @@ class Execution:
             for operator in segment.operators:
                 before(operator=operator, observation=self.observation, stage="exec")
             begun += segment.operators
-            source = self._advance(Stage(segment, source, self._passed_on(segment, source, wanted)), later)
+            source = self._advance(Stage(segment, source, self.passed_on(segment, source, wanted)), later)
             if source.stage is None:  # else they are not through yet
                 for operator in begun:
                     used = self.timer.seconds.get((operator.label, "exec"), 0.0)
@@ -204,7 +204,7 @@ class Execution:
             settings.memory = room
             self._store = Store(room, settings.dtype, settings.spare, self.ledger)
 
-    def _passed_on(self, segment: Segment, source: Source, wanted: set[str]) -> frozenset[str]:
+    def passed_on(self, segment: Segment, source: Source, wanted: set[str]) -> frozenset[str]:
         """Streams that later segments may read."""
         made = source.names.union(*(o.provides for o in segment.operators))
         return frozenset(made & wanted & self._streams)
@@ -265,9 +265,9 @@ class Execution:
         """Let the segment of ``stage`` work, or put that off until its streams are read."""
         in_place = frozenset() if stage.segment.halo else stage.wanted & stage.source.streams.keys()
         new = sorted(stage.wanted - in_place)
-        size = len(new) * self._size()
-        if later and new and not self._store.fits(size):
-            how, why = self._where(stage, new, size, later)
+        size = len(new) * self.stream_size
+        if later and new and not self.keeps(stage, size, self._store.held, later):
+            how, why = self.where(stage, new, size, later)
             if how == "again":
                 self._store.clear_spare()
                 found = self._probe(stage)
@@ -275,10 +275,17 @@ class Execution:
                 for name in sorted(names):
                     self.observation.tally.state("Execution", f"stream {name} made again when it is read", why)
                 return Source({}, stage, names, dict(found.means))
+            return self._pass(stage, in_memory=False)
         return self._pass(stage)
 
-    def _where(self, stage: Stage, new: list[str], size: int, later: list[Segment]) -> tuple[Held, str]:
-        """What becomes of streams that do not fit in memory, and why."""
+    def keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
+        """Whether ``size`` bytes of streams beside those held stay in memory: in half of it, and leave room for blocks."""
+        following = Stage(later[0], Source(names=stage.wanted), frozenset())
+        blocks = max(self.least_blocks(stage), self.least_blocks(following))
+        return held + size <= min(self.settings.memory // 2, self.settings.memory - blocks)
+
+    def where(self, stage: Stage, new: list[str], size: int, later: list[Segment], measure: bool = True) -> tuple[Held, str]:
+        """What becomes of streams that do not fit in memory, and why. ``measure``: try what disk and operators take."""
         following = later[0]
         head, span = following.operators[0], stage.span
         hindrance = ""
@@ -292,7 +299,7 @@ class Execution:
         # what is made in order of time at little cost would cost much in any other
         slow = stage.in_time_order and whole_span(following.span, span) == "time"
         rate, cost = DISK_RATE, SAMPLE_COST
-        if size >= WORTH_MEASURING and not hindrance:
+        if measure and size >= WORTH_MEASURING and not hindrance:
             rate, cost = disk_rate(), self._cost(stage)
         return choose(
             f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
@@ -320,22 +327,22 @@ class Execution:
         rows, columns = least_block(stage.span, (self.observation.n_detectors, self.observation.n_samples))
         return self._make(stage, slice(0, rows), slice(0, columns), {}, again=True)
 
-    def _size(self) -> int:
+    @property
+    def stream_size(self) -> int:
         """Bytes of a whole stream."""
         return self.observation.n_detectors * self.observation.n_samples * np.dtype(self.settings.dtype).itemsize
 
-    def _pass(self, stage: Stage) -> Source:
-        """Run a segment's operators over all blocks; what it passes on is held."""
+    def _pass(self, stage: Stage, in_memory: bool = True) -> Source:
+        """Run a segment's operators over all blocks; what it passes on is held, ``in_memory`` where there is room."""
         observation, settings, source = self.observation, self.settings, stage.source
-        shape = (observation.n_detectors, observation.n_samples)
         made: dict[str, Stream] = {}
         for name in sorted(stage.wanted):
             if name in source.streams and not stage.segment.halo:
                 made[name] = source.streams[name]  # changed in place
                 continue
-            array, in_memory = self._store.allocate(name, shape)
+            array = self._store.allocate(name, self._shape, in_memory)
             made[name] = Stream(name, observation, array, {}, settings.threads)
-            if not in_memory:
+            if isinstance(array, np.memmap):
                 observation.tally.state("Execution", f"stream {name} spilled to disk", f"{array.nbytes / 1e9:.2f} GB")
         seen: set[str] = set()
         means: dict[str, SmoothField] = {}
@@ -456,23 +463,46 @@ class Execution:
 
     def _blocks(self, stage: Stage) -> list[tuple[slice, slice]]:
         """The blocks in which a stage works. Raises PipelineError where the least one does not fit."""
-        settings, observation = self.settings, self.observation
-        shape = observation.n_detectors, observation.n_samples
-        item = np.dtype(settings.dtype).itemsize
-        whole, part = self._streams_in_block(stage)
-        rows, columns = least_block(stage.span, shape)
-        shares = (block_share(room // settings.threads // item, whole, part) for room in (settings.memory // 2, self._room()))
-        share = next((share for share in shares if share >= rows * columns), 0)
-        if not share:
-            need = settings.threads * item * (whole * rows * columns + part * min(rows * columns, rows * PIECE))
+        rows, columns = least_block(stage.span, self._shape)
+        share = self._share(stage, self._store.held)
+        if rows * columns > share:
+            settings, need = self.settings, self.least_blocks(stage)
             raise PipelineError(
                 f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on each of {settings.threads} "
-                f"threads, the memory budget has {self._room() / 1e6:.1f} MB for all of them",
-                place=observation.name,
+                f"threads, the memory budget has {(settings.memory - self._store.held) / 1e6:.1f} MB for all of them",
+                place=self.observation.name,
                 cure=f"raise --memory to {self._ceiling_for(need + self._store.held)}, use fewer --threads, or make the scan "
                 "shorter",
             )
-        return list(blocks(stage.span, stage.in_time_order, shape, share))
+        return list(blocks(stage.span, stage.in_time_order, self._shape, share))
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.observation.n_detectors, self.observation.n_samples
+
+    def _share(self, stage: Stage, held: int) -> int:
+        """Samples that a block may hold beside ``held`` bytes of streams: within half of the budget, or all that is left."""
+        settings, (whole, part) = self.settings, self._streams_in_block(stage)
+        rows, columns = least_block(stage.span, self._shape)
+        each = settings.threads * np.dtype(settings.dtype).itemsize
+        share = block_share(settings.memory // 2 // each, whole, part)
+        return share if share >= rows * columns else block_share((settings.memory - held) // each, whole, part)
+
+    def least_blocks(self, stage: Stage) -> int:
+        """Bytes of the smallest blocks, on all threads."""
+        rows, columns = least_block(stage.span, self._shape)
+        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
+
+    def largest_blocks(self, stage: Stage, held: int) -> int:
+        """Bytes of the blocks that would be cut beside ``held`` bytes of streams, on all threads."""
+        share = max(self._share(stage, held), 1)
+        first = next(iter(blocks(stage.span, stage.in_time_order, self._shape, share)))
+        rows, columns = (s.stop - s.start for s in first)
+        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
+
+    def _bytes(self, stage: Stage, block: int, piece: int) -> int:
+        whole, part = self._streams_in_block(stage)
+        return self.settings.threads * np.dtype(self.settings.dtype).itemsize * (whole * block + part * piece)
 
     def _streams_in_block(self, stage: Stage | None) -> tuple[int, int]:
         """Numbers of block-sized and of piece-sized arrays that a stage and those before it hold."""
@@ -486,10 +516,6 @@ class Execution:
         scratch = SCRATCH_STREAMS if rest else 0
         margins = 2 if stage.segment.halo else 1  # a block with margins is trimmed to a copy
         return before[0] + margins * whole + scratch, max(before[1], part + (SCRATCH_STREAMS if first else 0))
-
-    def _room(self) -> int:
-        """Bytes that blocks may take in all: what streams leave."""
-        return self.settings.memory - self._store.held
 
     def _ceiling_for(self, need: int) -> str:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""

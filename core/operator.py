@@ -60,6 +60,8 @@ class Operator(Parameters):
         where no later step reads what they provide.
     knobs
         The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
+    lighter
+        What makes its `memory` less, in a few words (``choose a larger pixel``), for a run that does not fit.
     """
 
     zonda_api: ClassVar[int] = API_VERSION
@@ -71,6 +73,7 @@ class Operator(Parameters):
     at_end: ClassVar[bool] = False
     product_only: ClassVar[bool] = False
     knobs: ClassVar[tuple[Knob, ...]] = ()
+    lighter: ClassVar[str] = ""
 
     name: str | None = None
     """Label of this step in messages, products and random streams; the class name where absent."""
@@ -120,6 +123,13 @@ class Operator(Parameters):
     def in_time_order(self, observation: Observation, state: Any) -> bool:
         """Whether `exec` is much cheaper when it sees all detectors at one time before it goes on to the next."""
         return False
+
+    def memory(self, observation: Observation) -> int:
+        """Bytes that this step will hold for one observation, besides streams and blocks: tables, accumulators, products.
+
+        An upper bound, asked after `observe` and before `prepare`: a run that would not fit is refused before it starts.
+        """
+        return 0
 
     def measure(self, stream: Stream, state: Any) -> None:
         """Read the whole stream (``couples = "all"`` only); leave the result in ``state``."""

@@ -15,8 +15,10 @@ from pydantic import Field, model_validator
 from .configuration.parameters import Parameters
 from .data import Data, Tally, html_table
 from .errors import PipelineError
-from .execution import Execution, Settings, Timer, available_memory, available_threads
+from .execution import Execution, Settings, Timer
+from .forecast import room
 from .frozen import Frozen
+from .machine import available_memory, available_threads, resident_memory
 from .operator import Operator
 from .sky_signal import SkySignal, place_of_signal
 
@@ -272,6 +274,7 @@ class Pipeline:
         output: str | Path | None = None,
         threads: int | None = None,
         memory: int | None = None,
+        ceiling: int | None = None,
         keep: Sequence[str] = (),
         provenance: Mapping[str, Any] | None = None,
         part: Part | None = None,
@@ -287,7 +290,10 @@ class Pipeline:
         threads
             Threads; default: the CPUs this process may use. Results do not depend on it.
         memory
-            Budget for streams and blocks in bytes; default: half of the free memory. Results do not depend on it.
+            Bytes for streams and blocks; default: what the ceiling leaves. Results do not depend on it.
+        ceiling
+            Bytes that the process may hold (``--memory``); default, where no ``memory`` is given: what it holds now and half
+            of the free memory. A run that would not fit is refused before it starts.
         keep
             Streams to keep in ``observation.detdata`` (float64, mean emission included) as they stand after the last step.
         provenance
@@ -305,7 +311,7 @@ class Pipeline:
         data.provenance = {**self._provenance(scene), **(provenance or {})}
         settings = Settings(
             threads=threads or available_threads(),
-            memory=memory or available_memory() // 2,
+            memory=memory or available_memory() // 2,  # less, once the operators have said what they hold
             dtype=np.float64 if self.precision == "float64" else np.float32,
             progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
         )
@@ -322,6 +328,7 @@ class Pipeline:
             raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
         if part is not None and part.scans is not None:
             data.observations = [data.observations[k] for k in part.scans]
+        self._keep_to(ceiling, memory, data, settings)
         pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         freeze = any(run.modes == "full" for run in self.runs.values())
         frozen = [Frozen() if freeze else None for _ in data.observations]
@@ -388,6 +395,15 @@ class Pipeline:
                 self._finalize(operator, data, timer, hooks)
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
+
+    def _keep_to(self, ceiling: int | None, memory: int | None, data: Data, settings: Settings) -> None:
+        """Divide what the process may hold; refuse what does not fit."""
+        if ceiling is None and memory is not None:
+            return
+        budget = ceiling or resident_memory() + available_memory() // 2
+        left, products = room(self._selected(""), data.observations, settings, budget, self.name)
+        settings.memory = min(left, memory or left)
+        settings.ceiling = budget - products
 
     def _finalize(self, operator: Operator, data: Data, timer: Timer, hooks: Any) -> None:
         hooks.zonda_before_operator(operator=operator, observation=None, stage="finalize")

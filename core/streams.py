@@ -4,7 +4,8 @@ Making again needs no room and no disk: operators depend on absolute detectors a
 the segments before can run once more for any block that a later segment or an `Operator.measure` reads. It costs their time
 once more for each reading. What is done follows from sizes, free disk and that cost:
 
-    kept      while all streams of an observation that are held at once take at most half of the budget;
+    kept      while all streams of an observation that are held at once take at most half of the budget, and leave
+              room for blocks;
     spilled   where the disk has room and 2 N b / D <= k N c / threads;                                      (1)
     again     otherwise,
 
@@ -187,20 +188,20 @@ class Store:
         """Whether ``size`` more bytes stay within the streams' share of the budget."""
         return self._in_use + size <= self._room
 
-    def allocate(self, name: str, shape: tuple[int, int]) -> tuple[Floats, bool]:
-        """An array of anything, and whether it lies in memory."""
+    def allocate(self, name: str, shape: tuple[int, int], in_memory: bool = True) -> Floats:
+        """An array of anything; a memory map of a file where it does not fit or is not wanted in memory."""
         size = shape[0] * shape[1] * self._dtype.itemsize
-        if not self.fits(size):
-            array: Floats = self._file(name, shape)
-        else:
+        if in_memory and self.fits(size):
             alike = [a for a in self._spare if a.shape == shape and a.dtype == self._dtype]
             self._spare[:] = alike[1:]
             if not alike:
                 self._spare.clear()
             array = alike[0] if alike else np.empty(shape, self._dtype)
+        else:
+            array = self._file(name, shape)
         self._live[id(array)] = array
         self._note()
-        return array, not isinstance(array, np.memmap)
+        return array
 
     def release(self, arrays: list[Floats]) -> None:
         """Keep memory that is no longer used for the next stream: touching fresh memory costs as much as the physics."""

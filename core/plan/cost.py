@@ -14,8 +14,8 @@ from functools import cache
 
 import numpy as np
 
-from ..execution import SCRATCH_STREAMS
-from ..tiles import TILE_DETECTORS
+from ..execution import Settings
+from ..forecast import BASE, forecast
 from .context import Context
 from .estimate import Cost
 
@@ -24,9 +24,6 @@ REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
 
 STARTUP = Cost(once=1.4, kernel="python")
 """Imports and compiled code from the cache; planning is measured."""
-
-BASE = 230e6
-"""Bytes of the interpreter, libraries and compiled code."""
 
 
 @cache
@@ -91,7 +88,7 @@ def predict(
     costs
         By label of the operators that take part; None: unknown.
     threads, memory
-        As in `Settings`.
+        As in `Settings`, but the memory is that of the whole process.
     item
         Bytes of one sample of a stream.
     portable
@@ -107,26 +104,12 @@ def predict(
         seconds[label] = factors[cost.kernel] * (runs * each + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     late = {o.label for o in context.operators if o.at_end}
-    held = sum(cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
+    longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
+    own = {o.label: o.memory(longest) for o in context.operators}
+    held = sum(own.get(label) or cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
     after = sum(cost.bytes for label, cost in costs.items() if cost is not None and label in late)
     startup = factors[STARTUP.kernel] * STARTUP.once
-    during = held + stream_bytes(context, threads, item, memory)
-    return Prediction(seconds, BASE + max(during, after), unknown, startup, factors)
-
-
-def stream_bytes(context: Context, threads: int, item: int, memory: int) -> float:
-    """Streams kept whole between segments, and the blocks of the threads (see `core.execution`)."""
-    from ..execution import cut
-
-    longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
     steps = [o for o in context.operators if not o.at_end and "boresight" not in o.provides]
-    segments = cut(steps, longest)
-    whole = longest.n_samples * longest.n_detectors * item
-    streams = sum(1 for k in range(1, len(segments)) if k == 1)
-    kept = sum(1 for name in context.kept_streams) if len(segments) > 1 else 0
-    held = (streams + kept) * whole if whole <= memory // 2 else 0.0
-    rows = min(TILE_DETECTORS, longest.n_detectors)
-    columns = longest.n_samples if any(s.span == "time" for s in segments) else min(longest.n_samples, 1 << 16)
-    blocks = threads * (SCRATCH_STREAMS + 2) * rows * columns * item
-    pointing = sum(o.n_samples * (4 + 4 + 1) * 8 for o in context.observations)
-    return held + min(blocks, memory // 2) + pointing
+    settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
+    during = held + forecast(steps, longest, settings).bytes
+    return Prediction(seconds, BASE + max(during, after), unknown, startup, factors)

@@ -249,6 +249,10 @@ class AtmosphereLayers(Operator):
         """Report the mean and rms of the water that was drawn while the blocks were worked on."""
         self._state_drawn(observation, state)
 
+    def memory(self, observation: Observation) -> int:
+        """Tables, tiles of the turbulence, weights of some nodes. The nodes themselves are chosen in `prepare`."""
+        return 100_000_000 + 700 * observation.n_detectors + 40 * observation.n_samples
+
     def in_time_order(self, observation: Observation, state: AtNodes | OfDetectors) -> bool:
         """Where detectors are evaluated one by one and the scan is long, all of them share the air of the moment."""
         return not state.fits

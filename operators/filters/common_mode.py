@@ -37,6 +37,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
+from zonda.core.streams import forget_pages
 from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
@@ -91,6 +92,11 @@ class CommonModeFilter(Operator):
     def prepare(self, observation: Observation) -> Modes:
         """Empty modes, filled by `measure`."""
         return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
+
+    def memory(self, observation: Observation) -> int:
+        """Series over the scan: one for each step of the iteration, or what `focal_plane_mean` adds up."""
+        series = 8 if self.method == "mean" else 20 + 8 * self.modes
+        return 8 * series * observation.n_samples + 100 * observation.n_detectors
 
     def sweeps(self, observation: Observation) -> int:
         """One reading for the mean; the singular modes want the stream whole."""
@@ -339,9 +345,10 @@ class Gram:
                 _products(
                     np.asarray(self.stream.array), samples.start, samples.stop, q, rows, times[samples], moments, parts[some[0] :]
                 )
-                return
-            for k in some:
-                _products(*self._tile(tiles[k]), q, rows, times[tiles[k]], moments, parts[k:])
+            else:
+                for k in some:
+                    _products(*self._tile(tiles[k]), q, rows, times[tiles[k]], moments, parts[k:])
+            forget_pages(self.stream.array)
 
         some = TILES_AT_ONCE
         list(self.pool.map(work, [range(k, min(k + some, len(tiles))) for k in range(0, len(tiles), some)]))

@@ -95,6 +95,10 @@ class HighpassFilter(Operator):
             tally.state(self.label, f"{observation.name} is shorter than 1/frequency", "only the mean and a line are removed")
         return plan
 
+    def memory(self, observation: Observation) -> int:
+        """Spline weights in both precisions, and what they are made from."""
+        return 100 * observation.n_samples
+
     def traits(self, observation: Observation) -> Traits:
         """What passes."""
         from .estimate import highpass_traits

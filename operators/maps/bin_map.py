@@ -69,6 +69,7 @@ class BinMap(Operator):
     requires: ClassVar[Any] = _Requires()
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
     product_only: ClassVar[bool] = True
+    lighter: ClassVar[str] = "choose a larger pixel or a smaller width"
 
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Side of a pixel."""
@@ -222,6 +223,10 @@ class BinMap(Operator):
         return Binning(
             self._grid, self._grid.pointing(observation), (observation.flags == 0).astype(np.uint8), weight, noise, alike
         )
+
+    def memory(self, observation: Observation) -> int:
+        """Sums of two threads, their total, two halves, the product; and the pointing, twice while it is laid out."""
+        return 128 * self._n_pixels() + 150 * observation.n_samples
 
     def traits(self, observation: Observation) -> Traits:
         """Size of the pixels."""

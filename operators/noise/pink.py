@@ -111,6 +111,12 @@ class PinkNoise(Operator):
             common.add(0, 0, state.common)
         return state
 
+    def memory(self, observation: Observation) -> int:
+        """Filter states that are kept, and the common part."""
+        kept = -(-observation.n_detectors // TILE_DETECTORS) * (observation.n_samples // CHECKPOINT + 3)
+        common = 12 * observation.n_samples if self.shared > 0 else 0
+        return kept * (4 * TILE_DETECTORS * (self.poles + 3) + 300) + common + 80 * observation.n_detectors
+
     def traits(self, observation: Observation) -> Traits:
         """rms of one sample."""
         from .estimate import pink_traits

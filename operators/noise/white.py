@@ -75,6 +75,10 @@ class WhiteNoise(Operator):
         level: NoiseLevel = observation.resolved["noise levels"][self.label]
         return _State(level, observation.key(self.label))
 
+    def memory(self, observation: Observation) -> int:
+        """Amplitudes at the nodes of the mean emission."""
+        return 200 * observation.n_detectors
+
     def traits(self, observation: Observation) -> Traits:
         """White noise of one sample."""
         from .estimate import white_traits

@@ -39,6 +39,9 @@ OPAQUE = 1e-6
 FLAG_OPAQUE = 4
 """Bit set in ``flags`` and ``detector_flags`` where the band transmission is below `OPAQUE`."""
 
+AT_ONCE = 4096
+"""Detectors whose series of the smooth fields are worked on at a time."""
+
 MEAN_ERROR = 1e-7
 """Largest error allowed in the smooth mean M, relative to its largest value."""
 
@@ -100,6 +103,11 @@ class Efficiency(Operator):
         tally.state(self.label, "zeta and epsilon (mean)", f"{zeta.mean():.4g}, {epsilon.mean():.4g}")
         tally.state(self.label, "calibrated by", f"zeta e^-tau, {self.calibration}")
         return Calibration(zeta, epsilon, gain, transmission, mean)
+
+    def memory(self, observation: Observation) -> int:
+        """Means at their nodes, and what is worked on at a time in `quotient`."""
+        at_once = min(AT_ONCE, observation.n_detectors)
+        return 700 * observation.n_detectors + 64 * at_once * (observation.n_samples // 512 + 3)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
@@ -209,11 +217,12 @@ def _normals(observation: Observation, *names: str) -> Floats:
 
 def _flag_opaque(label: str, observation: Observation, transmission: SmoothField) -> None:
     """Flag detectors that are opaque most of the time, and the samples at which one of the others is."""
-    knots = transmission.weights @ _knots(transmission, transmission.step)[0]
-    opaque = ~(knots >= OPAQUE)
-    dead = opaque.mean(axis=1) > 0.5
-    observation.detector_flags[dead] |= FLAG_OPAQUE
-    cell = opaque[~dead].any(axis=0)
+    knots = _knots(transmission, transmission.step)[0]
+    dead, cell = np.zeros(len(transmission.weights), bool), np.zeros(knots.shape[1], bool)
+    for rows in _some(len(dead)):
+        opaque = ~(transmission.weights[rows] @ knots >= OPAQUE)
+        dead[rows] = opaque.mean(axis=1) > 0.5
+        cell |= opaque[~dead[rows]].any(axis=0)
     bad = np.repeat(cell[:-1] | cell[1:], transmission.step)[: observation.n_samples]
     observation.flags[bad] |= FLAG_OPAQUE
     observation.tally.count(label, f"detectors flagged: band transmission below {OPAQUE:g}", int(dead.sum()))
@@ -225,35 +234,28 @@ def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> t
 
     The ratio is taken at the coarse times (with its derivative at the two ends) and refitted by an interpolating spline
     in time and by least squares over the nodes of ``above``; where the nodes do not carry it, over its own leading
-    singular vectors. The step is halved until the error at the cells' midpoints is below `MEAN_ERROR`.
+    singular vectors. The fit is made from some hundreds of detectors, its error taken over all. The step is halved
+    until the error at the cells' midpoints is below `MEAN_ERROR`.
     """
-    few, n_samples, step = _some(above.weights), above.n_samples, min(above.step, below.step)
-    if len(few) < len(above.weights):
-        kept = np.isin(few, use)
-        field, error = quotient(_at(above, few), _at(below, few), np.flatnonzero(kept))
-        if np.array_equal(field.weights, above.weights[few]):  # the nodes carry it, also for the detectors in between
-            return SmoothField(above.weights.astype(np.float64), field.coefficients, field.step, n_samples), error
+    n_samples, step, n_det = above.n_samples, min(above.step, below.step), len(above.weights)
+    fitted = _few(above.weights, use)
     while True:
-        (high, high_slope), (low, low_slope) = _knots(above, step), _knots(below, step)
-        top, bottom = above.weights @ high, below.weights @ low
-        clear = bottom > OPAQUE
-        bottom = np.maximum(bottom, OPAQUE)
-        ratio = top / bottom
-        ends = [0, -1]
-        slope = above.weights @ high_slope[:, ends] - ratio[:, ends] * (below.weights @ low_slope[:, ends]) * clear[:, ends]
-        known = np.hstack([slope[:, :1] / bottom[:, :1], ratio, slope[:, 1:] / bottom[:, -1:]])
-        half_top, half_bottom = (f.weights @ _knots(f, step, 0.5)[0] for f in (above, below))
-        exact = half_top / np.maximum(half_bottom, OPAQUE)
-        tolerance = MEAN_ERROR * max(float(np.abs(ratio[use]).max(initial=0.0)), 1e-30)
+        known = _ratio(above, below, step, fitted)
+        at_knots = known[:, 1:-1]
+        largest = float(np.abs(at_knots[np.isin(fitted, use)]).max(initial=0.0))
+        tolerance = MEAN_ERROR * max(largest, 1e-30)
         error = np.inf
-        for basis in (above.weights.astype(np.float64), None):
-            if basis is None:
-                left, size, _ = np.linalg.svd(known, full_matrices=False)
-                basis = left[:, : max(1, int(np.count_nonzero(size > 1e-13 * size[0])))]
-            fit = np.linalg.lstsq(basis, known, rcond=1e-12)[0]
+        for nodes in (above.weights.astype(np.float64), None):
+            if nodes is not None:
+                basis = nodes
+                fit = np.linalg.lstsq(basis[fitted], known, rcond=1e-12)[0]
+            else:
+                _, size, fit = np.linalg.svd(known, full_matrices=False)
+                fit = fit[: max(1, int(np.count_nonzero(size > 1e-13 * size[0])))]
+                parts = [_ratio(above, below, step, np.arange(n_det)[rows]) @ fit.T for rows in _some(n_det)]
+                basis = np.concatenate(parts)
             field = SmoothField(basis, _spline(np.asarray(fit, np.float64)), step, n_samples)
-            fitted = field.weights @ _knots(field, step, 0.5)[0]
-            error = float(np.abs(fitted - exact)[use].max(initial=0.0))
+            error = _error(field, above, below, step, use)
             if error <= tolerance:
                 break
         if error <= tolerance or step == 1:
@@ -261,16 +263,42 @@ def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> t
         step //= 2
 
 
-def _some(weights: Floats) -> NDArray[np.intp]:
-    """Of more than 512 detectors some 256, with those at which a node weighs most and least among them."""
+def _few(weights: NDArray[np.floating], use: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Of more than 512 detectors some hundreds: evenly, those at which a node weighs most and least, and some in ``use``."""
     n = len(weights)
     if n <= 512:
         return np.arange(n)
-    return np.unique(np.r_[np.linspace(0, n - 1, 256).astype(np.intp), weights.argmin(axis=0), weights.argmax(axis=0)])
+    evenly, used = np.linspace(0, n - 1, 256), use[np.linspace(0, len(use) - 1, min(len(use), 64)).astype(np.intp)]
+    return np.unique(np.r_[evenly.astype(np.intp), weights.argmin(axis=0), weights.argmax(axis=0), used])
 
 
-def _at(field: SmoothField, detectors: NDArray[np.intp]) -> SmoothField:
-    return SmoothField(field.weights[detectors], field.coefficients, field.step, field.n_samples)
+def _ratio(above: SmoothField, below: SmoothField, step: int, rows: NDArray[np.intp]) -> Floats:
+    """above / max(below, `OPAQUE`) of the detectors ``rows`` at the coarse times; before and behind, its slopes at the ends."""
+    (high, high_slope), (low, low_slope) = _knots(above, step), _knots(below, step)
+    one, other = above.weights[rows], below.weights[rows]
+    top, bottom = one @ high, other @ low
+    clear = bottom > OPAQUE
+    bottom = np.maximum(bottom, OPAQUE)
+    ratio = top / bottom
+    ends = [0, -1]
+    slope = one @ high_slope[:, ends] - ratio[:, ends] * (other @ low_slope[:, ends]) * clear[:, ends]
+    return np.hstack([slope[:, :1] / bottom[:, :1], ratio, slope[:, 1:] / bottom[:, -1:]])
+
+
+def _error(field: SmoothField, above: SmoothField, below: SmoothField, step: int, use: NDArray[np.intp]) -> float:
+    """Largest difference between ``field`` and above / below at the cells' midpoints, over the detectors ``use``."""
+    middle, top, bottom = (_knots(f, step, 0.5)[0] for f in (field, above, below))
+    worst = 0.0
+    for part in _some(len(use)):
+        rows = use[part]
+        exact = (above.weights[rows] @ top) / np.maximum(below.weights[rows] @ bottom, OPAQUE)
+        worst = max(worst, float(np.abs(field.weights[rows] @ middle - exact).max(initial=0.0)))
+    return worst
+
+
+def _some(n: int) -> list[slice]:
+    """Parts of `AT_ONCE`."""
+    return [slice(k, min(k + AT_ONCE, n)) for k in range(0, n, AT_ONCE)]
 
 
 def _knots(field: SmoothField, step: int, offset: float = 0.0) -> tuple[Floats, Floats]:

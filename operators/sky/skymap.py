@@ -173,6 +173,12 @@ class SkyMap(Operator):
 
         data.products.setdefault(part["key"], Image(part["values"], Header.fromstring(part["header"])))
 
+    def memory(self, observation: Observation) -> int:
+        """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""
+        widths, _ = self._widths(observation)
+        sky = self._sky(observation, float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)))
+        return (5 + 2 * len(widths)) * sky.nbytes
+
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
         from zonda.core.plan.estimate import Traits

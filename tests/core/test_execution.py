@@ -150,7 +150,7 @@ def execute(operators, obs, room=None, **settings):
     nothing = lambda **k: None  # noqa: E731
     execution = Execution(operators, obs, Settings(**settings), Timer(), ["signal"])
     if room is not None:
-        execution._store._room = room
+        execution._store._room, execution.keeps = room, lambda stage, size, held, later: held + size <= room
     execution.run(data, nothing, nothing)
     return execution, obs.detdata["signal"], data
 
