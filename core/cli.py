@@ -275,6 +275,11 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
     for step in file.steps:
         click.echo(f"  {step.key}")
+    if file.header.campaign is not None:
+        from .campaign.command import source
+        from .campaign.prepare import outline
+
+        click.echo(outline(source(pipeline, settings, False))[0])
 
 
 @zonda.command()

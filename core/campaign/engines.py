@@ -165,7 +165,8 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
     here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).Get_size()  # processes on this machine
     with MPICommExecutor(MPI.COMM_WORLD, root=0) as executor:
         mine = max(1, here - 1) if size == here else here
-        threads = threads or max(1, available_threads() // mine)
+        bound = available_threads() < (os.cpu_count() or 1)  # each process has CPUs of its own, as srun gives them
+        threads = threads or (available_threads() if bound else max(1, available_threads() // mine))
         yield Pool(cast(Executor | None, executor), size - 1, size - 1, threads, memory or available_memory() // 2 // mine)
 
 
@@ -203,8 +204,11 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
         except TimeoutError:
             raise PipelineError("the Dask scheduler has had no worker for ten minutes", place=scheduler) from None
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
-        each = threads or min(int(w["nthreads"]) for w in workers)
-        yield Pool(client.get_executor(pure=False, retries=0), max(1, len(workers)), len(workers), each, memory)
+        count = max(1, sum(int(w["nthreads"]) for w in workers))  # a Dask worker does as many tasks at once as it has threads
+        limits = [int(w["memory_limit"]) // int(w["nthreads"]) for w in workers if w.get("memory_limit")]
+        yield Pool(
+            client.get_executor(pure=False, retries=0), count, count, threads or 1, memory or min(limits, default=0) // 2 or None
+        )
 
 
 def _missing(package: str, extra: str, err: ImportError) -> PipelineError:

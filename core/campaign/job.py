@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -137,6 +138,10 @@ class Job:
             combinations = tuple(Combination(**c) for c in values.pop("combinations"))
             tasks = tuple(Task(**{**t, "scans": tuple(t["scans"])}) for t in values.pop("tasks"))
             pipelines, source = tuple(values.pop("pipelines")), tuple(values.pop("source"))
+            if any(".." in Path(c.folder).parts or Path(c.folder).is_absolute() for c in combinations):
+                raise ValueError("a folder of products lies outside")
+            if any(re.fullmatch("[0-9a-f]{32}", t.key) is None for t in tasks):
+                raise ValueError("a task has no proper key")
             plans = tuple(tuple(tuple(row) for row in plan) for plan in values.pop("plans"))
             return cls(**values, pipelines=pipelines, source=source, plans=plans, combinations=combinations, tasks=tasks)
         except FileNotFoundError:

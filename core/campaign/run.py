@@ -76,9 +76,9 @@ def begin(
         raise OutputError(
             "holds an unfinished campaign", place=str(folder), cure=f"zonda resume {folder}, remove it, or choose another folder"
         )
-    for old in (FILE, LOG):
+    for old in (folder / FILE, folder / LOG, *folder.glob("jobs.*.sqlite")):
         with contextlib.suppress(FileNotFoundError):
-            (folder / old).unlink()
+            old.unlink()
     shutil.rmtree(folder / TASKS, ignore_errors=True)
     made = prepare(sources, folder, command, keep, drop, prune_all, _progress())
     _describe(made, folder, say)
@@ -130,8 +130,13 @@ def share(
         draft.mkdir()
         try:
             made.write(draft)
-            with contextlib.suppress(FileExistsError):  # another job was first
+            try:
                 os.link(draft / FILE, folder / FILE)
+            except FileExistsError:  # another job was first
+                pass
+            except OSError:  # no hard links here
+                if not (folder / FILE).exists():
+                    os.replace(draft / FILE, folder / FILE)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
     job = Job.read(folder)
@@ -224,11 +229,13 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
     waiting, suspects = deque(tasks), deque[Task]()
     at_work: dict[Future[Outcome], Task] = {}
     attempts = dict.fromkeys((t.number for t in tasks), 0)
+    claimed: set[int] = set()
     result, failed, stop = Result(folder), dict[int, str](), ""
     shown = _Progress(len(tasks), sum(t.samples for t in tasks))
 
     def note(task: Task, outcome: Outcome) -> None:
         nonlocal stop
+        claimed.discard(task.number)
         if not outcome.error:
             log.done(task.number, outcome.host, outcome.seconds, outcome.digest)
             result.tasks += 1
@@ -252,6 +259,7 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
             if not batch and not at_work and suspects and not stop:
                 batch.append(suspects.popleft())
             if batch:
+                claimed |= {task.number for task in batch}
                 log.claim(task.number for task in batch)
                 for task in batch:
                     attempts[task.number] += 1
@@ -270,7 +278,7 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
         for future in at_work:
             future.cancel()
         with contextlib.suppress(Exception):
-            log.put_off(task.number for task in at_work.values())
+            log.put_off(claimed)
         raise
     finally:
         shown.end()
