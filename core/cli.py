@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -72,8 +74,20 @@ Through the hook `zonda_commands`, as a third party's, they would cost ``zonda -
 """
 
 
+class Stopped(KeyboardInterrupt):
+    """A signal that asks the process to end; it is handled as Ctrl-C is. ``status``: the exit status, 128 + its number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.status = 128 + number
+
+
 class Interrupted(Exception):
-    """Ctrl-C; click would print an empty line for a KeyboardInterrupt."""
+    """Ctrl-C or `Stopped`; click would print an empty line for a KeyboardInterrupt."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)
+        self.status = status
 
 
 class Commands(click.Group):
@@ -108,8 +122,8 @@ class Commands(click.Group):
         """Run a command."""
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt:
-            raise Interrupted from None
+        except KeyboardInterrupt as err:
+            raise Interrupted(getattr(err, "status", INTERRUPTED)) from None
 
     def _import(self, name: str) -> None:
         from importlib import import_module
@@ -268,13 +282,20 @@ def _command(
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.
 
-    Every mistake in the file is shown at once, with its place. Only `zonda run` reads the input maps and finds out whether the
-    target is up.
+    Every mistake in the file is shown at once, with its place. The telescope is pointed at some instants of the scans: whether
+    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam. Only
+    `zonda run` reads the input maps.
     """
     file = _load(pipeline, settings)
+    from .data import Data
+
+    data = Data(scene=file.scene())
+    found = [operator.check(data) for operator in file.pipeline().operators]
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
-    for step in file.steps:
+    for step, lines in zip(file.steps, found, strict=True):
         click.echo(f"  {step.key}")
+        for line in lines:
+            click.echo(f"    {line}")
     if file.header.campaign is not None:
         from .campaign.command import source
         from .campaign.prepare import outline
@@ -361,8 +382,8 @@ def _load(pipeline: str, settings: tuple[str, ...]) -> PipelineFile:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 (a fault of a plugin), 2 (a user's mistake), 130 (interrupted)."""
-    with _plain_warnings():
+    """Run the command line; returns the exit status: 0, 1 (a fault of a plugin), 2 (a user's mistake), 130 (interrupted), 143 (terminated)."""
+    with _plain_warnings(), _stoppable():
         try:
             result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)
             return result if isinstance(result, int) else 0
@@ -371,10 +392,11 @@ def main(arguments: list[str] | None = None) -> int:
             return err.exit_code
         except ZondaError as err:
             _report(err)
-        except (Interrupted, KeyboardInterrupt, click.Abort):
+        except (Interrupted, KeyboardInterrupt, click.Abort) as err:
             _clear()
-            click.echo("interrupted: unfinished files were removed", err=True)
-            return INTERRUPTED
+            with contextlib.suppress(OSError):  # the terminal may be gone
+                click.echo("interrupted: unfinished files were removed", err=True)
+            return int(getattr(err, "status", INTERRUPTED))
         except OSError as err:
             if err.filename is None and err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
                 raise
@@ -395,6 +417,31 @@ def _clear() -> None:
     """Clear the line that a progress plugin may have left."""
     if sys.stderr.isatty():
         click.echo("\r\033[K", nl=False, err=True)
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM (batch systems, containers) and SIGHUP (a terminal that closes) end a command as Ctrl-C does: cleaned up, once.
+
+    A signal that somebody handles or ignores (nohup) already is left alone.
+    """
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    taken = [n for n in numbers if signal.getsignal(n) is signal.SIG_DFL]
+
+    def stop(number: int, frame: object) -> None:
+        for n in taken:
+            signal.signal(n, signal.SIG_IGN)  # a second one must not interrupt the cleaning
+        raise Stopped(number)
+
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

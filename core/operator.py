@@ -28,7 +28,8 @@ class Operator(Parameters):
     2. For each observation, ``configure(observation)`` of every operator (resolve values that others need: efficiencies,
        NET), then ``prepare(observation) -> state`` of every operator (draw turbulence, build coefficients).
     3. ``exec(block, state)`` for every block. Called from several threads at once: the state is read only, or guarded.
-       Its result may depend on absolute detector and sample indices only, never on where the block begins or ends.
+       Its result may depend on absolute detector and sample indices only, never on where the block begins or ends. A block may
+       come again (`Block.again`) where the streams between operators do not fit in memory; one that makes no stream is spared.
     4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
     5. ``finalize(data)`` once at the end of the run: turn sums into products, write files.
 
@@ -47,7 +48,7 @@ class Operator(Parameters):
         What one output sample depends on: ``sample`` (itself alone, plus `halo` neighbours), ``detectors`` (all detectors
         at that instant), ``time`` (one detector's whole scan), ``all``. An ``all`` operator implements
         ``measure(stream, state)``, which reads the whole stream as often as it likes; its ``exec`` then works like that of
-        a ``sample`` operator.
+        a ``sample`` operator. One that says how often, in `sweeps`, need not have the stream in memory.
     main_run_only
         True for operators left out of companion runs (spectra, saved time streams).
     at_end
@@ -82,6 +83,13 @@ class Operator(Parameters):
     def observe(self, data: Data) -> None:
         """Append observations to ``data`` (pointing operators), or look at those that are there (map makers: a common grid)."""
 
+    def check(self, data: Data) -> list[str]:
+        """What `zonda check` finds out beyond the parameters, in well under a second: lines to print, or a `ZondaError`.
+
+        Pointing operators append (possibly coarser) observations to ``data``, on which later steps may look.
+        """
+        return []
+
     def configure(self, observation: Observation) -> None:
         """Resolve values that other operators read, e.g. the focal plane's efficiencies."""
 
@@ -99,6 +107,10 @@ class Operator(Parameters):
 
     def measure(self, stream: Stream, state: Any) -> None:
         """Read the whole stream (``couples = "all"`` only); leave the result in ``state``."""
+
+    def sweeps(self, observation: Observation) -> int:
+        """How often `measure` goes through its stream with `Stream.sweep`; 0: it wants ``stream.array``, in memory or on disk."""
+        return 0
 
     def exec(self, block: Block, state: Any) -> None:
         """Act on one block."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .. import registry
 from ..campaign.entries import mistakes as campaign_mistakes
@@ -72,6 +72,13 @@ class Header(Parameters):
     realizations; and the engine that works on them."""
     outputs: Path | None = None
     """Folder for products, relative to the working directory; where absent, out/<name>."""
+
+    @field_validator("outputs")
+    @classmethod
+    def _a_path(cls, value: Path | None) -> Path | None:
+        if value is not None and "\0" in str(value):
+            raise ValueError("a folder's name cannot hold a null character")
+        return value
 
 
 SCENE_KEYS = tuple(Scene.model_fields)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.files import own_data
 
 Array = NDArray[np.float64]
 
@@ -64,7 +65,7 @@ class AbsorptionTable:
     """
 
     def __init__(self, path: Path) -> None:
-        with np.load(path) as file:
+        with own_data(path) as file:
             self._code = np.cumsum(file["difference"], axis=-1, dtype=np.uint16)
             self._low, self._high = file["low"].astype(np.float64), file["high"].astype(np.float64)
             self.frequency: Array = file["frequency"].astype(np.float64)

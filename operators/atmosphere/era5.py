@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core import hdf5_files
 from zonda.core.errors import InputError
+from zonda.core.files import reading
 from zonda.core.weather import Column
 
 from .humidity import from_relative, from_specific, ozone_from_mass
@@ -111,8 +113,8 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
 class _File:
     """What NetCDF-3 and NetCDF-4 have in common."""
 
-    def __init__(self, variables: Any, dimensions: dict[str, list[str]]) -> None:
-        self._variables, self._dimensions = variables, dimensions
+    def __init__(self, variables: Any, dimensions: dict[str, list[str]], place: str) -> None:
+        self._variables, self._dimensions, self._place = variables, dimensions, place
 
     def __contains__(self, name: str) -> bool:
         return name in self._dimensions
@@ -126,6 +128,8 @@ class _File:
 
     def values(self, name: str, where: Any = ()) -> Array:
         """Unpacked values, NaN where they are missing."""
+        if hasattr(self._variables[name], "dims"):
+            hdf5_files.check_size(self._variables[name], self._place)
         raw = np.asarray(self._variables[name][where])
         missing = [self.attribute(name, key) for key in ("_FillValue", "missing_value")]
         out = raw.astype(np.float64) * float(self.attribute(name, "scale_factor", 1.0)) + float(
@@ -170,30 +174,18 @@ class _File:
 def _opened(path: Path, place: str) -> Iterator[_File]:
     import h5py
 
-    try:
-        if h5py.is_hdf5(path):
-            opened = h5py.File(path, "r")
-        else:
-            from scipy.io import netcdf_file
+    kind, cure = "NetCDF", f"a GRIB file must be converted, a zip file unpacked; {GET}"
+    with reading(place, kind, cure):
+        of_hdf5 = path.is_file() and h5py.is_hdf5(path)
+    if of_hdf5:
+        with hdf5_files.opened(path, place, kind, cure) as file:
+            sets = {name: file[name] for name in file if isinstance(file.get(name), h5py.Dataset)}
+            yield _File(sets, {name: [_label(d) for d in item.dims] for name, item in sets.items()}, place)
+        return
+    from scipy.io import netcdf_file
 
-            opened = netcdf_file(path, "r", mmap=False)
-    except (OSError, TypeError, ValueError, EOFError, IndexError) as err:
-        raise _unreadable(err, place) from None
-    with opened as file:
-        try:
-            if isinstance(file, h5py.File):
-                sets = {name: item for name, item in file.items() if isinstance(item, h5py.Dataset)}
-                yield _File(sets, {name: [_label(d) for d in item.dims] for name, item in sets.items()})
-            else:
-                yield _File(file.variables, {name: list(v.dimensions) for name, v in file.variables.items()})
-        except OSError as err:
-            raise _unreadable(err, place) from None
-
-
-def _unreadable(err: Exception, place: str) -> InputError:
-    text = str(err).splitlines()[0] if str(err) else type(err).__name__
-    cure = f"a GRIB file must be converted, a zip file unpacked; {GET}"
-    return InputError(f"cannot be read as NetCDF: {text}", place=place, cure=cure)
+    with reading(place, kind, cure), netcdf_file(path, "r", mmap=False) as file:
+        yield _File(file.variables, {name: list(v.dimensions) for name, v in file.variables.items()}, place)
 
 
 def _label(dimension: Any) -> str:

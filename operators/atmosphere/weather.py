@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.files import own_data
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
 
@@ -252,14 +253,14 @@ def check_pwv(pwv: float) -> None:
 @lru_cache(maxsize=1)
 def climatologies() -> tuple[str, ...]:
     """Names of the embedded climatologies, sorted."""
-    with np.load(CLIMATOLOGY) as file:
+    with own_data(CLIMATOLOGY) as file:
         return tuple(sorted({key.split("/")[0] for key in file.files}))
 
 
 @lru_cache(maxsize=8)
 def coefficients(name: str) -> dict[str, NDArray[np.float32]]:
     """The arrays of one embedded climatology by quantity, as data/README.md lists them."""
-    with np.load(CLIMATOLOGY) as file:
+    with own_data(CLIMATOLOGY) as file:
         return {key.split("/")[1]: file[key] for key in file.files if key.startswith(f"{name}/")}
 
 
