@@ -33,6 +33,8 @@ class Pool:
         For each task; None: the worker decides (all it may use).
     remake
         A new executor in place of a broken one; None where there is no such thing.
+    stop
+        End the workers at once; None where that is not ours to do.
     """
 
     executor: Executor | None
@@ -41,6 +43,7 @@ class Pool:
     threads: int | None = None
     memory: int | None = None
     remake: Callable[[], Executor] | None = None
+    stop: Callable[[], None] | None = None
 
 
 class SerialExecutor(Executor):
@@ -110,11 +113,14 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
         made[:] = [pool]
         return pool
 
-    try:
-        yield Pool(make(), count, 1, threads, memory, make)
-    except BaseException:
+    def stop() -> None:
         for pool in made:
             _end(pool)
+
+    try:
+        yield Pool(make(), count, 1, threads, memory, make, stop)
+    except BaseException:
+        stop()
         raise
     for pool in made:
         pool.shutdown()

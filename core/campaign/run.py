@@ -252,33 +252,39 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
 
     try:
         begin = time.monotonic()
-        while (waiting and not stop) or at_work or (suspects and not stop):
+        ended: set[Future[Outcome]] = set()
+        while True:
             batch: list[Task] = []
-            while waiting and not stop and len(at_work) + len(batch) < pool.workers + pool.ahead:
-                batch.append(waiting.popleft())
-            if not batch and not at_work and suspects and not stop:
-                batch.append(suspects.popleft())
-            if batch:
+            with log.together():
+                for future in ended:
+                    task = at_work.pop(future)
+                    note(task, _outcome(future, task, folder))
+                while waiting and not stop and len(at_work) + len(batch) < pool.workers + pool.ahead:
+                    batch.append(waiting.popleft())
+                if not batch and not at_work and suspects and not stop:
+                    batch.append(suspects.popleft())
                 claimed |= {task.number for task in batch}
                 log.claim(task.number for task in batch)
-                for task in batch:
-                    attempts[task.number] += 1
-                    at_work[_submit(pool, _order(job, folder, pool, task))] = task
+            for task in batch:
+                attempts[task.number] += 1
+                at_work[_submit(pool, _order(job, folder, pool, task))] = task
+            if not at_work:
+                break
             ended, _ = wait(at_work, return_when=FIRST_COMPLETED)
             if any(isinstance(f.exception(), BrokenExecutor) for f in ended if not f.cancelled()):
                 ended, _ = wait(at_work)
                 if pool.remake is None:
                     raise PipelineError("the engine is gone", place=str(folder), cure=f"zonda resume {folder}")
                 pool.executor = pool.remake()
-            for future in ended:
-                task = at_work.pop(future)
-                note(task, _outcome(future, task, folder))
         result.seconds = time.monotonic() - begin
     except BaseException:
         for future in at_work:
             future.cancel()
         with contextlib.suppress(Exception):
             log.put_off(claimed)
+        if pool.stop is not None:
+            pool.stop()
+            _clean(folder)
         raise
     finally:
         shown.end()
