@@ -310,6 +310,11 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
         click.echo(f"  {step.key}")
         for line in lines:
             click.echo(f"    {line}")
+    if file.header.campaign is not None:
+        from .campaign.command import source
+        from .campaign.prepare import outline
+
+        click.echo(outline(source(pipeline, settings, False))[0])
 
 
 @zonda.command()

@@ -44,7 +44,12 @@ def check_size(path: str | os.PathLike[str], hdu: Any, place: str) -> None:
     size = _data_bytes(hdu.header)
     check_memory(size, "the array or table", place)
     info = hdu.fileinfo()
-    if info is None or Path(path).suffix.lower() in COMPRESSED or hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU":
+    if (
+        info is None
+        or Path(path).suffix.lower() in COMPRESSED
+        or hdu.header.get("ZIMAGE")
+        or type(hdu).__name__ == "CompImageHDU"
+    ):
         return
     needed, found = info["datLoc"] + size, os.path.getsize(path)
     if found < needed:

@@ -58,7 +58,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     write_map(tmp_path / "map.fits")
     (tmp_path / "p.yaml").write_text(PIPELINE)
-    (tmp_path / "small.yaml").write_text("".join(line for line in PIPELINE.splitlines(True) if "Plots" not in line and "Report" not in line))
+    (tmp_path / "small.yaml").write_text(
+        "".join(line for line in PIPELINE.splitlines(True) if "Plots" not in line and "Report" not in line)
+    )
     return tmp_path
 
 

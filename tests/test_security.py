@@ -64,7 +64,9 @@ def test_no_code_from_data() -> None:
                 found.add((where.as_posix(), name))
             for keyword in call.keywords:
                 assert not (keyword.arg == "shell" and ast.unparse(keyword.value) != "False"), f"{where}: a shell"
-                assert not (keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False"), f"{where}: pickles in arrays"
+                assert not (keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False"), (
+                    f"{where}: pickles in arrays"
+                )
                 assert not (keyword.arg == "character_as_bytes" and "pickle" in ast.unparse(call)), where
     assert found <= set(ALLOWED), f"say in ALLOWED why these are safe: {sorted(found - set(ALLOWED))}"
 
@@ -75,7 +77,8 @@ def test_the_walk_sees_what_it_looks_for() -> None:
 
 
 @pytest.mark.parametrize(
-    "tag", ["python/object/apply:os.system [touch owned]", "python/name:os.system ''", "python/module:os ''", "python/object:x.Y {}"]
+    "tag",
+    ["python/object/apply:os.system [touch owned]", "python/name:os.system ''", "python/module:os ''", "python/object:x.Y {}"],
 )
 def test_yaml_makes_no_objects(tag: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -145,7 +148,9 @@ def test_a_table_of_air_is_numbers_only(tmp_path: Path) -> None:
     from zonda.core.site import Site
     from zonda.operators.atmosphere.profile_table import read_table
 
-    (tmp_path / "air.csv").write_text("height [m], pressure [hPa], temperature [K], relative humidity [%]\n__import__('os'), 1, 2, 3\n")
+    (tmp_path / "air.csv").write_text(
+        "height [m], pressure [hPa], temperature [K], relative humidity [%]\n__import__('os'), 1, 2, 3\n"
+    )
     with pytest.raises(InputError, match="is not a number"):
         read_table(tmp_path / "air.csv", Site(name="s", latitude="0 deg", longitude="0 deg"))
 
@@ -239,7 +244,16 @@ sys.exit(main(sys.argv[1:]))
     "arguments",
     [
         ["plan", "mustang2_cluster"],
-        ["run", "mustang2_cluster", "--set", "PointingDaisy.scan_duration=4 s", "--set", "PointingDaisy.scans=2", "--output", "out"],
+        [
+            "run",
+            "mustang2_cluster",
+            "--set",
+            "PointingDaisy.scan_duration=4 s",
+            "--set",
+            "PointingDaisy.scans=2",
+            "--output",
+            "out",
+        ],
         ["doctor"],
         ["plugins", "--check"],
     ],

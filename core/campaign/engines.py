@@ -33,6 +33,8 @@ class Pool:
         For each task; None: the worker decides (all it may use).
     remake
         A new executor in place of a broken one; None where there is no such thing.
+    stop
+        End the workers at once; None where that is not ours to do.
     """
 
     executor: Executor | None
@@ -41,6 +43,7 @@ class Pool:
     threads: int | None = None
     memory: int | None = None
     remake: Callable[[], Executor] | None = None
+    stop: Callable[[], None] | None = None
 
 
 class SerialExecutor(Executor):
@@ -110,11 +113,14 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
         made[:] = [pool]
         return pool
 
-    try:
-        yield Pool(make(), count, 1, threads, memory, make)
-    except BaseException:
+    def stop() -> None:
         for pool in made:
             _end(pool)
+
+    try:
+        yield Pool(make(), count, 1, threads, memory, make, stop)
+    except BaseException:
+        stop()
         raise
     for pool in made:
         pool.shutdown()
@@ -165,7 +171,8 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
     here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).Get_size()  # processes on this machine
     with MPICommExecutor(MPI.COMM_WORLD, root=0) as executor:
         mine = max(1, here - 1) if size == here else here
-        threads = threads or max(1, available_threads() // mine)
+        bound = available_threads() < (os.cpu_count() or 1)  # each process has CPUs of its own, as srun gives them
+        threads = threads or (available_threads() if bound else max(1, available_threads() // mine))
         yield Pool(cast(Executor | None, executor), size - 1, size - 1, threads, memory or available_memory() // 2 // mine)
 
 
@@ -203,8 +210,11 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
         except TimeoutError:
             raise PipelineError("the Dask scheduler has had no worker for ten minutes", place=scheduler) from None
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
-        each = threads or min(int(w["nthreads"]) for w in workers)
-        yield Pool(client.get_executor(pure=False, retries=0), max(1, len(workers)), len(workers), each, memory)
+        count = max(1, sum(int(w["nthreads"]) for w in workers))  # a Dask worker does as many tasks at once as it has threads
+        limits = [int(w["memory_limit"]) // int(w["nthreads"]) for w in workers if w.get("memory_limit")]
+        yield Pool(
+            client.get_executor(pure=False, retries=0), count, count, threads or 1, memory or min(limits, default=0) // 2 or None
+        )
 
 
 def _missing(package: str, extra: str, err: ImportError) -> PipelineError:

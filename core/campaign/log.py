@@ -115,7 +115,16 @@ class Log:
         self._db.close()
 
     @contextlib.contextmanager
+    def together(self) -> Iterator[None]:
+        """Write what the body says at once, when it ends: the disk is waited for once."""
+        with self._transaction():
+            yield
+
+    @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
+        if self._db.in_transaction:
+            yield
+            return
         with self._told():
             self._db.execute("BEGIN IMMEDIATE")
             try:

@@ -134,6 +134,16 @@ def job(
     )
 
 
+def outline(source: Source) -> tuple[str, PipelineFile]:
+    """What a campaign consists of in one line; and its first entry as a pipeline file, with its share of the budget."""
+    found = entries(source.campaign, source.file.scene().seed, lambda settings: source.load(settings).scene().time)
+    first = found[0]
+    together = sum(e.combination == first.combination for e in found)
+    sets = len({repr(e.combination) for e in found})
+    text = f"campaign of {len(found)} entries, combined into {sets} set{'s' if sets != 1 else ''} of products"
+    return text, _with_budget(source.load(first.settings), 1 / math.sqrt(together))
+
+
 def about(entry: Entry) -> str:
     """An entry's place on the axes, e.g. ``site=atacama, night=3``."""
     return ", ".join(f"{k}={v}" for k, v in entry.values.items())

@@ -39,6 +39,9 @@ class Thinned(Observation):
     samples: int = 0
     detectors: int = 0
 
+    def __post_init__(self) -> None:
+        """No flags are made for the samples that are not here."""
+
     @property
     def n_samples(self) -> int:
         return self.samples
@@ -149,9 +152,8 @@ def _thinned(data: Data, scan: dict[str, Any], index: int) -> Thinned:
     from ..configuration.time import Instant
 
     scene = data.scene
-    ones = [np.ones(n, np.uint8) for n in scan["flagged"]]
     plane = data.observations[0].focalplane if data.observations else scene.instrument.focalplane()
-    found = Thinned(
+    return Thinned(
         name=scan["name"],
         index=index,
         site=scene.site,
@@ -164,10 +166,8 @@ def _thinned(data: Data, scan: dict[str, Any], index: int) -> Thinned:
         boresight_radec=scan["radec"],
         centre=(scan["centre"][0], scan["centre"][1]),
         seed=scene.seed,
-        flags=np.zeros(1, np.uint8),
-        detector_flags=np.zeros(1, np.uint8),
+        flags=np.ones(scan["flagged"][0], np.uint8),
+        detector_flags=np.ones(scan["flagged"][1], np.uint8),
         samples=scan["n_samples"],
         detectors=scan["n_detectors"],
     )
-    found.flags, found.detector_flags = ones
-    return found

@@ -76,9 +76,9 @@ def begin(
         raise OutputError(
             "holds an unfinished campaign", place=str(folder), cure=f"zonda resume {folder}, remove it, or choose another folder"
         )
-    for old in (FILE, LOG):
+    for old in (folder / FILE, folder / LOG, *folder.glob("jobs.*.sqlite")):
         with contextlib.suppress(FileNotFoundError):
-            (folder / old).unlink()
+            old.unlink()
     shutil.rmtree(folder / TASKS, ignore_errors=True)
     made = prepare(sources, folder, command, keep, drop, prune_all, _progress())
     _describe(made, folder, say)
@@ -130,8 +130,13 @@ def share(
         draft.mkdir()
         try:
             made.write(draft)
-            with contextlib.suppress(FileExistsError):  # another job was first
+            try:
                 os.link(draft / FILE, folder / FILE)
+            except FileExistsError:  # another job was first
+                pass
+            except OSError:  # no hard links here
+                if not (folder / FILE).exists():
+                    os.replace(draft / FILE, folder / FILE)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
     job = Job.read(folder)
@@ -224,11 +229,13 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
     waiting, suspects = deque(tasks), deque[Task]()
     at_work: dict[Future[Outcome], Task] = {}
     attempts = dict.fromkeys((t.number for t in tasks), 0)
+    claimed: set[int] = set()
     result, failed, stop = Result(folder), dict[int, str](), ""
     shown = _Progress(len(tasks), sum(t.samples for t in tasks))
 
     def note(task: Task, outcome: Outcome) -> None:
         nonlocal stop
+        claimed.discard(task.number)
         if not outcome.error:
             log.done(task.number, outcome.host, outcome.seconds, outcome.digest)
             result.tasks += 1
@@ -245,32 +252,39 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
 
     try:
         begin = time.monotonic()
-        while (waiting and not stop) or at_work or (suspects and not stop):
+        ended: set[Future[Outcome]] = set()
+        while True:
             batch: list[Task] = []
-            while waiting and not stop and len(at_work) + len(batch) < pool.workers + pool.ahead:
-                batch.append(waiting.popleft())
-            if not batch and not at_work and suspects and not stop:
-                batch.append(suspects.popleft())
-            if batch:
+            with log.together():
+                for future in ended:
+                    task = at_work.pop(future)
+                    note(task, _outcome(future, task, folder))
+                while waiting and not stop and len(at_work) + len(batch) < pool.workers + pool.ahead:
+                    batch.append(waiting.popleft())
+                if not batch and not at_work and suspects and not stop:
+                    batch.append(suspects.popleft())
+                claimed |= {task.number for task in batch}
                 log.claim(task.number for task in batch)
-                for task in batch:
-                    attempts[task.number] += 1
-                    at_work[_submit(pool, _order(job, folder, pool, task))] = task
+            for task in batch:
+                attempts[task.number] += 1
+                at_work[_submit(pool, _order(job, folder, pool, task))] = task
+            if not at_work:
+                break
             ended, _ = wait(at_work, return_when=FIRST_COMPLETED)
             if any(isinstance(f.exception(), BrokenExecutor) for f in ended if not f.cancelled()):
                 ended, _ = wait(at_work)
                 if pool.remake is None:
                     raise PipelineError("the engine is gone", place=str(folder), cure=f"zonda resume {folder}")
                 pool.executor = pool.remake()
-            for future in ended:
-                task = at_work.pop(future)
-                note(task, _outcome(future, task, folder))
         result.seconds = time.monotonic() - begin
     except BaseException:
         for future in at_work:
             future.cancel()
         with contextlib.suppress(Exception):
-            log.put_off(task.number for task in at_work.values())
+            log.put_off(claimed)
+        if pool.stop is not None:
+            pool.stop()
+            _clean(folder)
         raise
     finally:
         shown.end()

@@ -44,6 +44,12 @@ def plan(
     from .planner import plan as make
 
     file = load(pipeline, settings)
+    if file.header.campaign is not None:
+        from ..campaign.command import source
+        from ..campaign.prepare import outline
+
+        text, file = outline(source(pipeline, settings, False))
+        click.echo(f"{text}; the plan of the first one:", err=as_json)
     if only:
         file = alone(file, only)
     made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)

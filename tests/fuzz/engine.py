@@ -98,7 +98,11 @@ def fuzz(
                 warnings.simplefilter("ignore")
                 target(data)
         except Exception as err:
-            frames = [(f.filename, f.lineno) for f in traceback.extract_tb(err.__traceback__) if "zonda" in f.filename or "core" in f.filename]
+            frames = [
+                (f.filename, f.lineno)
+                for f in traceback.extract_tb(err.__traceback__)
+                if "zonda" in f.filename or "core" in f.filename
+            ]
             kind = (type(err), *frames[-2:])
             if kind not in told:
                 told.add(kind)

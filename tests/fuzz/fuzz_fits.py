@@ -84,7 +84,15 @@ def mutate(data: bytes, longest: int, seed: int) -> bytes:
 def seeds() -> Iterator[bytes]:
     rng = np.random.default_rng(0)
     image = fits.PrimaryHDU(rng.standard_normal((4, 5)).astype(np.float32))
-    world = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 3, "CRPIX2": 2, "CRVAL1": 75.0, "CRVAL2": 20.0, "CUNIT1": "deg"}
+    world = {
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "CRPIX1": 3,
+        "CRPIX2": 2,
+        "CRVAL1": 75.0,
+        "CRVAL2": 20.0,
+        "CUNIT1": "deg",
+    }
     image.header.update({**world, "CDELT1": -1 / 60, "CDELT2": 1 / 60, "CUNIT2": "deg", "BUNIT": "K", "TEMPSCAL": "K_RJ"})
     table = fits.BinTableHDU.from_columns([fits.Column("T", "D", unit="K_CMB", array=np.arange(12.0))])
     table.header.update({"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": 1, "COORDSYS": "C"})
@@ -94,7 +102,13 @@ def seeds() -> Iterator[bytes]:
     packed = fits.ImageHDU((rng.standard_normal((4, 5)) * 100).astype(np.int16), header=image.header)
     packed.header.update({"BSCALE": 0.1, "BZERO": 3.0, "BLANK": -32768})
     squeezed = fits.CompImageHDU(rng.integers(0, 100, (8, 8)).astype(np.int32), header=image.header, compression_type="RICE_1")
-    for hdus in ([image], [fits.PrimaryHDU(), table], [fits.PrimaryHDU(), partial], [fits.PrimaryHDU(), packed], [fits.PrimaryHDU(), squeezed]):
+    for hdus in (
+        [image],
+        [fits.PrimaryHDU(), table],
+        [fits.PrimaryHDU(), partial],
+        [fits.PrimaryHDU(), packed],
+        [fits.PrimaryHDU(), squeezed],
+    ):
         fits.HDUList(hdus).writeto(FILE, overwrite=True)
         yield FILE.read_bytes()
     FILE.unlink()

@@ -37,7 +37,14 @@ def whole(tod: TimeOrderedData) -> None:
     assert tod.detector_flags.shape == (d,)
     assert all(column.shape == (d,) for column in tod.columns.values())
     assert all(stream.shape[:2] == (d, n) and stream.dtype.kind in "fiu" for stream in tod.streams.values())
-    for values in (tod.times, tod.seconds, tod.boresight_azel, tod.boresight_radec, tod.quats, [tod.sample_rate, tod.field_of_view]):
+    for values in (
+        tod.times,
+        tod.seconds,
+        tod.boresight_azel,
+        tod.boresight_radec,
+        tod.quats,
+        [tod.sample_rate, tod.field_of_view],
+    ):
         assert np.isfinite(values).all()
     assert np.isfinite(tod.site[1:]).all()
     assert tod.sample_rate > 0

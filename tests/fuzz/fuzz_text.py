@@ -41,7 +41,9 @@ def target(data: bytes) -> None:
 
 
 def seeds() -> Iterator[bytes]:
-    rows = "".join(f"{h}, {1000 * 0.88 ** (h / 1000):.2f}, {288 - 6.5 * h / 1000}, {80 - h / 200}\n" for h in range(0, 12000, 1000))
+    rows = "".join(
+        f"{h}, {1000 * 0.88 ** (h / 1000):.2f}, {288 - 6.5 * h / 1000}, {80 - h / 200}\n" for h in range(0, 12000, 1000)
+    )
     yield b"T# air\nheight [m], pressure [hPa], temperature [K], relative humidity [%]\n" + rows.encode()
     yield b"P" + "".join(f"{f} {max(0, 1 - abs(f - 90) / 15)}\n" for f in range(75, 106)).encode()
     yield b"P# GHz\n75 0\n90 1\n105 0\n"

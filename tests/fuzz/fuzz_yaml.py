@@ -105,7 +105,22 @@ def words() -> list[str]:
                 walk(value)
 
     walk(json_schema())
-    notation = ["&a ", "*a", "<<: ", "!!python/object:os.system ", "? ", "---\n", "|\n", "1e999", "-0", ".nan", "9" * 40, "{", "[", "  - "]
+    notation = [
+        "&a ",
+        "*a",
+        "<<: ",
+        "!!python/object:os.system ",
+        "? ",
+        "---\n",
+        "|\n",
+        "1e999",
+        "-0",
+        ".nan",
+        "9" * 40,
+        "{",
+        "[",
+        "  - ",
+    ]
     return sorted(word for word in found | set(notation) | {f"1 {unit}" for unit in UNITS} if len(word) < 60)
 
 

@@ -87,7 +87,9 @@ def test_damage_at_random_places(name: str, seed: int, how: str) -> None:
 
 
 @pytest.mark.parametrize("name", FUZZERS)
-@pytest.mark.parametrize("data", [b"", b"\0", b"\1", b"\xff" * 5000, b"SIMPLE  =", b"\x89HDF\r\n\x1a\n", b"CDF\1", b"PK\3\4", b"\x1f\x8b\x08"])
+@pytest.mark.parametrize(
+    "data", [b"", b"\0", b"\1", b"\xff" * 5000, b"SIMPLE  =", b"\x89HDF\r\n\x1a\n", b"CDF\1", b"PK\3\4", b"\x1f\x8b\x08"]
+)
 def test_stumps(name: str, data: bytes) -> None:
     for first in (b"", b"\0", b"\1", b"T", b"P", b"F"):
         read(name, first + data)

@@ -89,17 +89,17 @@ def test_a_target_is_at_the_same_place_on_the_next_night():
 @pytest.mark.parametrize(
     ("campaign", "words", "place"),
     [
-        ("{grid: {sed: [1]}}", ["nothing is called 'sed'", "did you mean 'seed'?"], "18:19"),
-        ("{grid: {site: [green_bank, greenbank]}}", ["unknown site 'greenbank'", "did you mean 'green_bank'?"], "18:38"),
-        ("{grid: {BinMap.pixel: [4 arcsec, 2 s]}}", ["BinMap, pixel: expected an angle"], "18:46"),
-        ("{grid: {BinMap.pixle: [4 arcsec]}}", ["unknown key 'pixle' for BinMap", "did you mean 'pixel'?"], "18:19"),
-        ("{observations: [{time: now}]}", ["cannot read 'now' as a time"], "18:34"),
-        ("{realization: 2}", ["unknown key 'realization'", "did you mean 'realizations'?"], "18:12"),
-        ("{engine: dsk}", ["did you mean 'dask'?"], "18:20"),
-        ("{nights: 2, combine: [site]}", ["which is no axis of this campaign; its axes: night"], "18:11"),
-        ("{grid: {name: [a, b]}}", ["'name' cannot change from one entry to the next"], "18:19"),
-        ("{scheduler: 'tcp://a:1'}", ["scheduler is for engine: dask"], "18:11"),
-        ("{nights: {start: 2024-11-25}}", ["give a number of nights, or start and stop"], "18:20"),
+        ("{grid: {sed: [1]}}", ["nothing is called 'sed'", "did you mean 'seed'?"], "17:19"),
+        ("{grid: {site: [green_bank, greenbank]}}", ["unknown site 'greenbank'", "did you mean 'green_bank'?"], "17:38"),
+        ("{grid: {BinMap.pixel: [4 arcsec, 2 s]}}", ["BinMap, pixel: expected an angle"], "17:46"),
+        ("{grid: {BinMap.pixle: [4 arcsec]}}", ["unknown key 'pixle' for BinMap", "did you mean 'pixel'?"], "17:19"),
+        ("{observations: [{time: now}]}", ["cannot read 'now' as a time"], "17:34"),
+        ("{realization: 2}", ["unknown key 'realization'", "did you mean 'realizations'?"], "17:12"),
+        ("{engine: dsk}", ["did you mean 'dask'?"], "17:20"),
+        ("{nights: 2, combine: [site]}", ["which is no axis of this campaign; its axes: night"], "17:11"),
+        ("{grid: {name: [a, b]}}", ["'name' cannot change from one entry to the next"], "17:19"),
+        ("{scheduler: 'tcp://a:1'}", ["scheduler is for engine: dask"], "17:11"),
+        ("{nights: {start: 2024-11-25}}", ["give a number of nights, or start and stop"], "17:20"),
     ],
 )
 def test_mistakes_are_shown_at_their_place(bench, campaign, words, place):
@@ -109,6 +109,22 @@ def test_mistakes_are_shown_at_their_place(bench, campaign, words, place):
     text = caught.value.render()
     assert f"p.yaml:{place}" in text, text
     assert all(word in text for word in words), text
+
+
+def test_check_and_plan_know_a_campaign(bench, capsys):
+    path = bench.file("{grid: {seed: [1, 2]}, nights: 4, combine: [night]}")
+    assert bench.command("check", path) == 0
+    assert capsys.readouterr().out.endswith("campaign of 8 entries, combined into 2 sets of products\n")
+    assert bench.command("plan", path) == 0
+    shown = capsys.readouterr().out
+    assert "the plan of the first one:" in shown
+    spent = next(line for line in shown.splitlines() if line.startswith("budget for map_rms"))
+    noise = next(line for line in shown.splitlines() if line.startswith("noise: "))
+    # a tenth of the noise of a pixel, divided by the square root of the four nights that are co-added
+    pixel, budget = float(noise.split()[1]), float(spent.split(" of ")[1].split()[0])
+    assert noise.split()[2] == "mK"
+    assert spent.split(" of ")[1].split()[1] == "uK"
+    assert abs(budget / (1e3 * pixel * 0.1 / 2) - 1) < 0.01
 
 
 def test_resolved_campaign_reads_back(bench):

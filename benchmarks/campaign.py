@@ -1,0 +1,100 @@
+"""What a campaign costs beside its observations: seconds per task, and memory against the number of tasks done.
+
+    python benchmarks/campaign.py                       # 1000 tiny observations, two worker processes
+    python benchmarks/campaign.py --tasks 200 --engine serial --plot memory.png
+
+The observations are 19 detectors x 100 samples, so that nearly all of the time is the campaign's own: sending tasks, the job log,
+partial products. Resident memory of the main process and of the largest worker is noted at every task.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+YAML = """\
+site: green_bank
+instrument: {{name: cam, telescope: {{name: dish, diameter: 100 m}}, band: {{name: b, low: 80 GHz, high: 100 GHz}}, detectors: 19,
+  field_of_view: 2 arcmin, fwhm: 9 arcsec, main_beam_efficiency: 0.3, illumination_efficiency: 0.8, net: 1 mK s(1/2),
+  sample_rate: 50 Hz}}
+time: 2024-11-25T07:00
+target: 05h00m00s +20d00m00s
+campaign: {{realizations: {tasks}}}
+operators:
+  - PointingDaisy: {{radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 2 s}}
+  - WhiteNoise
+  - Efficiency
+  - BinMap: {{pixel: 4 arcsec}}
+  - SaveMap
+"""
+
+
+def resident():
+    """Resident memory of this process, bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def main(arguments):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--tasks", type=int, default=1000)
+    parser.add_argument("--engine", default="processes")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--plot", type=Path)
+    given = parser.parse_args(arguments)
+
+    from zonda.core.campaign import run as campaign
+    from zonda.core.cli import main as zonda
+
+    rows = []
+    usual = campaign._outcome
+
+    def watched(future, task, folder):
+        outcome = usual(future, task, folder)
+        rows.append((time.monotonic(), resident(), outcome.peak, outcome.seconds))
+        return outcome
+
+    campaign._outcome = watched
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tiny.yaml"
+        path.write_text(YAML.format(tasks=given.tasks))
+        options = ["--workers", str(given.workers)] if given.engine == "processes" else []
+        begin, cpu = time.monotonic(), time.process_time()
+        status = zonda(["run", str(path), "--output", str(Path(folder) / "out"), "--engine", given.engine, *options])
+        wall, cpu = time.monotonic() - begin, time.process_time() - cpu
+    if status:
+        return status
+    skip = min(len(rows) // 10, 50)  # while workers start and compile
+    span = rows[-1][0] - rows[skip][0]
+    inside = sum(r[3] for r in rows[skip + 1 :])
+    n = len(rows) - skip - 1
+    print(f"{len(rows)} tasks in {wall:.1f} s with planning and combining, {cpu:.1f} s of CPU time of the main process")
+    print(f"{1e3 * span / n:.1f} ms a task, of which {1e3 * inside / n:.1f} ms in the task itself on each worker")
+    for k in [*range(skip, len(rows), max(1, len(rows) // 10)), len(rows) - 1]:
+        print(
+            f"{k + 1:>6} tasks  main {rows[k][1] / 1e6:6.1f} MB  worker at most {max(r[2] for r in rows[: k + 1]) / 1e6:6.1f} MB"
+        )
+    if given.plot:
+        plot(rows, given.plot)
+    return 0
+
+
+def plot(rows, path):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+    ax = figure.add_subplot()
+    done = range(1, len(rows) + 1)
+    ax.plot(done, [r[1] / 1e6 for r in rows], label="main process")
+    ax.plot(done, [r[2] / 1e6 for r in rows], ".", markersize=2, label="worker, largest so far")
+    ax.set_xlabel("tasks done")
+    ax.set_ylabel("resident memory [MB]")
+    ax.set_ylim(0)
+    ax.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
