@@ -377,7 +377,7 @@ def _load(pipeline: str, settings: tuple[str, ...]) -> PipelineFile:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 (a fault of a plugin), 2 (a user's mistake), 130 (interrupted), 143 (terminated)."""
+    """Run the command line; the exit status: 0, 1 (a plugin's fault), 2 (a user's mistake), 128 + a signal that ended it."""
     with _plain_warnings(), _stoppable():
         try:
             result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +14,9 @@ from .files import check_memory, reading
 
 COMPRESSION_MAX = 1100
 """Bytes in memory per byte of the file: deflate, the densest filter in use, reaches 1032."""
+
+PATIENCE = 60.0
+"""Seconds for the first look at a file."""
 
 
 @contextlib.contextmanager
@@ -22,9 +27,29 @@ def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> It
     """
     import h5py
 
+    with reading(place, kind, cure):
+        survey(path, place, cure)
     with reading(place, kind, cure), h5py.File(path, "r") as file:
         _refuse_other_files(file, place)
         yield file
+
+
+def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
+    """Let a process of its own look at the file first (`core.hdf5_survey`). `InputError` where libhdf5 hangs or crashes."""
+    with open(path, "rb"):  # not there, not readable: told as it is
+        pass
+    command = [sys.executable, "-m", "zonda.core.hdf5_survey", os.fspath(path)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE, env=_environment())
+    except subprocess.TimeoutExpired:
+        raise InputError("is corrupt: the HDF5 library does not come to an end with it", place=place, cure=cure) from None
+    if done.returncode < 0:
+        raise InputError(f"is corrupt: the HDF5 library crashes on it (signal {-done.returncode})", place=place, cure=cure)
+
+
+def _environment() -> dict[str, str]:
+    """For a child that finds the same packages."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
 
 def check_size(dataset: Any, place: str) -> None:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from ..errors import InputError
 from ..files import write_text
@@ -137,6 +137,8 @@ class Job:
                 raise ValueError("it is of another format")
             combinations = tuple(Combination(**c) for c in values.pop("combinations"))
             tasks = tuple(Task(**{**t, "scans": tuple(t["scans"])}) for t in values.pop("tasks"))
+            if any(not _inside(c.folder) for c in combinations) or not all(re.fullmatch("[0-9a-f]{32}", t.key) for t in tasks):
+                raise ValueError("it names files outside its folder")
             lists = {k: tuple(values.pop(k)) for k in ("pipelines", "source")}
             plans = tuple(tuple(tuple(row) for row in plan) for plan in values.pop("plans"))
             return cls(**values, **lists, plans=plans, combinations=combinations, tasks=tasks)
@@ -151,6 +153,11 @@ def key_of(version: str, pipeline: str, seed: int, time: int, scans: tuple[int, 
     """Hash of all that a task's product depends on."""
     parts = [version, pipeline, seed, time, list(scans), first, layout]
     return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()
+
+
+def _inside(folder: str) -> bool:
+    """Whether a relative path stays in its folder by its letters."""
+    return not Path(folder).is_absolute() and ".." not in Path(folder).parts and "\0" not in folder
 
 
 def digest_of_text(text: str) -> str:

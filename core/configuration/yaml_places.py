@@ -194,10 +194,9 @@ class _Reader:
 
     def survey(self, text: str) -> None:
         """Count values and depth event by event, without recursion, before anything is built. Raises yaml.YAMLError."""
-        depth = values = 0
-        for event in yaml.parse(text, Loader=_Loader):
+        depth = 0
+        for values, event in enumerate(yaml.parse(text, Loader=_Loader)):
             depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
-            values += 1
             if depth > MAXIMUM_DEPTH:
                 raise yaml.MarkedYAMLError(problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=event.start_mark)
             if values > 2 * MAXIMUM_VALUES:  # a list or mapping makes two events

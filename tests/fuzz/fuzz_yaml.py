@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from engine import ROOT, fuzz, guided_by, scratch
+from engine import ROOT, fuzz, guided_by, scratch, told
 
 with guided_by("zonda.core", "zonda.operators", "yaml"):
     import yaml  # noqa: F401
@@ -72,7 +72,7 @@ def target(data: bytes) -> None:
     try:
         file = load(FILE, overrides)
     except ZondaError as err:
-        assert str(err)
+        told(err)
         return
     text = file.resolved_yaml()
     again = parse(text, name=str(FILE), folder=FILE.parent).resolved_yaml()
@@ -105,7 +105,22 @@ def words() -> list[str]:
                 walk(value)
 
     walk(json_schema())
-    notation = ["&a ", "*a", "<<: ", "!!python/object:os.system ", "? ", "---\n", "|\n", "1e999", "-0", ".nan", "9" * 40, "{", "[", "  - "]
+    notation = [
+        "&a ",
+        "*a",
+        "<<: ",
+        "!!python/object:os.system ",
+        "? ",
+        "---\n",
+        "|\n",
+        "1e999",
+        "-0",
+        ".nan",
+        "9" * 40,
+        "{",
+        "[",
+        "  - ",
+    ]
     return sorted(word for word in found | set(notation) | {f"1 {unit}" for unit in UNITS} if len(word) < 60)
 
 
