@@ -129,19 +129,19 @@ def nan_samples_that_count_as_zero(patch: Patch) -> None:
 
 def sums_rounded_by_block(patch: Patch) -> None:
     """Each block adds float32 sums, as a naive accumulator would."""
-    add = bin_map._add
+    add = bin_map._add_image
 
     def rounded(*arguments: Any) -> None:
         add(*arguments)
         sums = arguments[-3]
         sums[:, bin_map.DATA] = sums[:, bin_map.DATA].astype(np.float32).astype(np.int64)
 
-    patch.setattr(bin_map, "_add", rounded)
+    patch.setattr(bin_map, "_add_image", rounded)
 
 
 def noise_that_starts_again_in_each_block(patch: Patch) -> None:
     add = white._add_normals
-    patch.setattr(white, "_add_normals", lambda key, first, start, amplitude, out: add(key, first, 0, amplitude, out))
+    patch.setattr(white, "_add_normals", lambda key, first, start, lines, cell, *rest: add(key, first, 0, lines, 0, *rest))
 
 
 def pink_noise_with_a_period(patch: Patch) -> None:

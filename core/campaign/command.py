@@ -54,7 +54,7 @@ def run(
         if pool.executor is None:
             return
         check_output_folder(folder)
-        pruning = {"keep": keep, "drop": drop, "prune_all": not no_prune}
+        pruning: dict[str, Any] = {"keep": keep, "drop": drop, "prune_all": not no_prune}
         if share is not None:
             with lock(folder, f"{share[0]}-of-{share[1]}"):
                 campaign.share(sources, folder, command, pool, _say, *share, **pruning)
@@ -180,9 +180,8 @@ def _say(text: str) -> None:
 
 def _show(result: Result, verbose: bool) -> None:
     """What was lost, or with ``verbose`` all of the tally."""
-    counted = {(c, who, what) for c, who, what, value in result.tally if value.isdigit() and value != "0" and "/" not in who}
-    for combination, who, what, value in result.tally:
-        if verbose or ((combination, who, what) in counted and what != "samples binned"):
+    for combination, who, what, value, counted in result.tally:
+        if verbose or (counted and value != "0" and "/" not in who and what != "samples binned"):
             _say(f"{combination}{': ' if combination else ''}{who}: {what}: {value}")
 
 
@@ -200,10 +199,12 @@ def _counts(table: Sequence[tuple[Task, Row | None]]) -> dict[str, int]:
 
 
 def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> list[str]:
+    from .log import WAITING
+
     counts = _counts(table)
     done = [(task, row) for task, row in table if row and row.state == "done"]
     samples = sum(task.samples for task, _ in done)
-    seconds = sum(row.seconds for _, row in done if row)
+    seconds = sum(row.seconds for _, row in done)
     lines = [f"{job.name}: {len(job.tasks)} tasks, {len(job.combinations)} sets of products"]
     lines += [f"  {state:<8} {number}" for state, number in counts.items() if number or state == "done"]
     share = samples / job.samples if job.samples else 1.0
@@ -211,21 +212,17 @@ def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> 
     lines.append(f"  samples  {samples:.3g} of {job.samples:.3g} ({100 * share:.0f} %){rate}")
     if listed:
         lines += ["", "  task  state    attempts  seconds  worker                  entry"]
-        for task, row in table:
-            state, attempts, used, host = (row.state, row.attempts, row.seconds, row.host) if row else ("waiting", 0, 0.0, "")
+        for task, known in table:
+            row = known or WAITING
+            state, attempts, used, host = row.state, row.attempts, row.seconds, row.host
             scans = f"scan {task.scans[0]}" if len(task.scans) == 1 else f"{len(task.scans)} scans"
             about = ", ".join(filter(None, (task.about, scans)))
             lines.append(f"  {task.number:>4}  {state:<7}  {attempts:>8}  {used:>7.1f}  {host:<22}  {about}")
     troubled = [(task, row) for task, row in table if row and row.error and (row.state != "done" or listed)]
     for task, row in troubled[:20]:
-        if row:
-            text = row.error.strip().splitlines()
-            shown = text if listed or not row.error.startswith("Traceback") else text[-1:]
-            lines += [
-                "",
-                f"task {task.number} ({row.state}, {task.about or 'the only entry'}):",
-                *(f"  {line}" for line in shown),
-            ]
+        text = row.error.strip().splitlines()
+        shown = text if listed or not row.error.startswith("Traceback") else text[-1:]
+        lines += ["", f"task {task.number} ({', '.join(filter(None, (row.state, task.about)))}):", *(f"  {t}" for t in shown)]
     if len(troubled) > 20:
         lines += ["", f"and {len(troubled) - 20} more: zonda status --json"]
     return lines

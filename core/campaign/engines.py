@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ..errors import PipelineError
 from ..execution import available_memory, available_threads
@@ -166,14 +166,13 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
     with MPICommExecutor(MPI.COMM_WORLD, root=0) as executor:
         mine = max(1, here - 1) if size == here else here
         threads = threads or max(1, available_threads() // mine)
-        yield Pool(executor, size - 1, size - 1, threads, memory or available_memory() // 2 // mine)
+        yield Pool(cast(Executor | None, executor), size - 1, size - 1, threads, memory or available_memory() // 2 // mine)
 
 
 @contextlib.contextmanager
 def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: int | None) -> Iterator[Pool]:
     try:
-        from distributed import Client
-        from distributed.security import Security
+        import distributed
     except ImportError as err:
         raise _missing("dask.distributed", "dask", err) from None
     if scheduler is None:
@@ -188,11 +187,11 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
     else:
         options["scheduler_file"] = scheduler
     if tls is not None:
-        options["security"] = Security(
+        options["security"] = distributed.Security(
             tls_ca_file=tls.ca_file, tls_client_cert=tls.cert, tls_client_key=tls.key, require_encryption=True
         )
     try:
-        client = Client(**options)
+        client = distributed.Client(**options)
     except (OSError, ValueError, TypeError) as err:
         why = str(err).splitlines()[0] if str(err) else type(err).__name__
         raise PipelineError(

@@ -160,7 +160,9 @@ def mistakes(
     """
     found: list[Diagnostic] = []
     refused: set[str] = set()
-    grid = [[(key, ("campaign", "grid", key, k))] for key, values in campaign.grid.items() for k in range(len(values))]
+    grid: list[list[tuple[str, tuple[Any, ...]]]] = [
+        [(key, ("campaign", "grid", key, k))] for key, values in campaign.grid.items() for k in range(len(values))
+    ]
     listed = [[(key, ("campaign", "observations", k, key)) for key in entry] for k, entry in enumerate(campaign.observations)]
     for together in [*grid, *listed]:
         changed, wrong = document.copy(), False

@@ -70,7 +70,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Combination:
-    """What is co-added into one set of products: in ``folder`` ('' : the output folder itself), from tasks that share a layout."""
+    """What is co-added into one set of products: in ``folder`` ('': the output folder), from tasks that share a layout."""
 
     name: str
     folder: str
@@ -137,11 +137,11 @@ class Job:
                 raise ValueError("it is of another format")
             combinations = tuple(Combination(**c) for c in values.pop("combinations"))
             tasks = tuple(Task(**{**t, "scans": tuple(t["scans"])}) for t in values.pop("tasks"))
-            if any(not _inside(c.folder) for c in combinations) or not all(re.fullmatch("[0-9a-f]{32}", t.key) for t in tasks):
+            if not all(_inside(c.folder) for c in combinations) or not all(re.fullmatch("[0-9a-f]{32}", t.key) for t in tasks):
                 raise ValueError("it names files outside its folder")
-            lists = {k: tuple(values.pop(k)) for k in ("pipelines", "source")}
+            pipelines, source = tuple(values.pop("pipelines")), tuple(values.pop("source"))
             plans = tuple(tuple(tuple(row) for row in plan) for plan in values.pop("plans"))
-            return cls(**values, **lists, plans=plans, combinations=combinations, tasks=tasks)
+            return cls(**values, pipelines=pipelines, source=source, plans=plans, combinations=combinations, tasks=tasks)
         except FileNotFoundError:
             raise InputError("holds no campaign", place=str(folder), cure="zonda run FILE --output DIR begins one") from None
         except (OSError, ValueError, KeyError, TypeError) as err:

@@ -39,6 +39,10 @@ class Row:
     digest: str
 
 
+WAITING = Row(-1, "waiting", 0, "", "", 0.0, 0, "")
+"""Of a task that no log knows."""
+
+
 class Log:
     """An open job log. Raises `OutputError` where it cannot be written, `InputError` where it is damaged."""
 

@@ -274,8 +274,8 @@ def _files(file: PipelineFile) -> dict[str, str]:
     if Path(file.place).is_file():
         path = Path(file.place).resolve()
         found[str(path)] = _stamp(path, "text")
-    models = [*file.operators, *([file.scene().weather] if file.scene().weather is not None else [])]
-    for model in models:
+    models: list[Any] = [*file.operators, file.scene().weather]
+    for model in filter(None, models):
         for field in type(model).model_fields:
             value = getattr(model, field)
             if isinstance(value, Path) and value.is_file():

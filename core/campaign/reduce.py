@@ -1,7 +1,8 @@
 """Partial products together, in a fixed tree: the same bits for any engine, any number of workers, any order of completion.
 
-The parts of a combination are numbered in the order of their scans. Runs of `FAN` parts are added up from left to right, the sums
-likewise, until one is left. Sums of maps are integers and exact anyway; means of spectra are floats, and owe their bits to the tree.
+The parts of a combination are numbered in the order of their scans. Runs of `FAN` parts are added up from left to right,
+the sums likewise, until one is left. Sums of maps are integers and exact anyway; means of spectra are floats and owe their bits
+to the tree.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ class Thinned(Observation):
 
 @dataclass(frozen=True)
 class Combined:
-    """What became of a combination: its tally, or what went wrong."""
+    """What became of a combination: its tally (who, what, value, whether it is a count), or what went wrong."""
 
-    tally: tuple[tuple[str, str, str], ...] = ()
+    tally: tuple[tuple[str, str, str, bool], ...] = ()
     error: ZondaError | None = None
 
 
@@ -64,7 +65,8 @@ def combine(folder: str, number: int, digests: Mapping[int, str]) -> Combined:
         data = combined(Job.read(Path(folder)), Path(folder), number, digests)
     except ZondaError as err:
         return Combined(error=err)
-    return Combined(tuple(data.tally))
+    counts = {(who, what) for who, what, _ in data.tally.counts()}
+    return Combined(tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally))
 
 
 def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) -> Data:

@@ -37,7 +37,7 @@ class Result:
     Attributes
     ----------
     tally
-        Of all combinations: rows (combination, who, what, value).
+        Of all combinations: rows (combination, who, what, value, whether it is a count).
     tasks
         Number of tasks that were run now.
     seconds
@@ -45,7 +45,7 @@ class Result:
     """
 
     folder: Path
-    tally: list[tuple[str, str, str, str]] = field(default_factory=list)
+    tally: list[tuple[str, str, str, str, bool]] = field(default_factory=list)
     tasks: int = 0
     samples: int = 0
     seconds: float = 0.0

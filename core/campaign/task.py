@@ -96,7 +96,7 @@ def perform(order: Order) -> Outcome:
         digest = _run(order)
     except ZondaError as err:
         final = isinstance(err, PipelineError | PointingError)
-        stop = isinstance(err, OutputError) or isinstance(err, _NotCombined)
+        stop = isinstance(err, OutputError | _NotCombined)
         return Outcome(number, host, time.monotonic() - begin, error=str(err), final=final, stop=stop, peak=_peak())
     except Exception as err:
         import traceback

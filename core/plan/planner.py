@@ -65,6 +65,8 @@ class Plan:
         White noise: rms of one sample and of a map pixel (0: no map), K; samples per pixel in the deep part of the map.
     prediction, unpruned
         With the plan, and with everything on.
+    costs
+        Of the operators that state one, as the pipeline asks for them.
     """
 
     structure: Structure
@@ -76,6 +78,7 @@ class Plan:
     unpruned: Prediction
     context: Context
     pruned: bool = True
+    costs: Mapping[str, Cost] = dataclasses.field(default_factory=dict)
 
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators left out."""
@@ -179,7 +182,8 @@ def plan(
     unpruned = _unpruned(pipeline, scene, structure, everything, context, estimates, now, settings)
     planning = time.process_time() - begin
     prediction, unpruned = (dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned))
-    return Plan(structure, tuple(decided), allowed, spent, noise, prediction, unpruned, context, prune_all)
+    known = {label: cost for label, cost in costs.items() if cost is not None}
+    return Plan(structure, tuple(decided), allowed, spent, noise, prediction, unpruned, context, prune_all, known)
 
 
 def _decide(
@@ -305,6 +309,8 @@ def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
     rms = context.fluctuation * 2.0**-24 / math.sqrt(3.0)
     formula = "2^-24 / sqrt(3) x rms of the stream, independent between samples"
     bound = context.bound(rms)
+    if context.noise > 0:
+        bound["psd"] = (rms / context.noise) ** 2  # both are white
     if pipeline.precision == "float32":
         return [Effect("precision", (full("float32"),), bound, formula)]
     carries_mean = context.cut == 0 and any("atmosphere" in o.provides for o in context.operators)

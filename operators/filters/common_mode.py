@@ -241,7 +241,8 @@ class Gram:
     """G = A A^T as an operator on vectors over detectors, without flagged samples, flagged and dead detectors.
 
     Work is cut into absolute tiles of `TILE_SAMPLES` samples, whose parts are added in order: the bits do not depend on the
-    number of threads.
+    number of threads. The detectors' moments, which tell the dead ones, are taken on the way of the product that the
+    iteration begins with; where no detector turns out dead, `apply` has it at hand.
     """
 
     def __init__(self, stream: Stream, pool: ThreadPoolExecutor) -> None:
@@ -249,8 +250,13 @@ class Gram:
         self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.flags == 0
         self.n_used = int(self.good_samples.sum())
-        self.usable = Usable(stream.observation.detector_flags == 0, self.n_used)
-        self.usable.judge(*self._moments())
+        self.whole = stream.means.get("signal") is None and bool(self.good_samples.all())
+        use = stream.observation.detector_flags == 0
+        vector = _near_the_mean(use)
+        total, square, image, times = self._pass(vector, np.flatnonzero(use), moments=True)
+        self.usable = Usable(use, self.n_used)
+        self.usable.judge(total, square)
+        self._known = (vector, image, times) if np.array_equal(self.use, use) else None
 
     @property
     def use(self) -> NDArray[np.bool_]:
@@ -291,30 +297,31 @@ class Gram:
         copy[:, ~good] = 0
         return copy, 0, copy.shape[1]
 
-    def _moments(self) -> tuple[Floats, Floats]:
-        """Sum and sum of squares of each detector's good samples, (n_det,) each."""
+    def _pass(self, q: Floats, rows: NDArray[np.intp], moments: bool = False) -> tuple[Floats, Floats, Floats, Floats]:
+        """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the stream."""
+        times, tiles = np.zeros(self.n_samples), self._tiles()
+        parts = np.zeros((len(tiles), 3, q.size))
 
-        def work(samples: slice) -> Floats:
-            out = np.zeros((2, self.stream.shape[0]))
-            _moments(*self._tile(samples), out)
-            return out
+        def work(some: range) -> None:
+            if self.whole:  # no tile needs a copy: all in one call
+                samples = slice(tiles[some[0]].start, tiles[some[-1]].stop)
+                _products(
+                    np.asarray(self.stream.array), samples.start, samples.stop, q, rows, times[samples], moments, parts[some[0] :]
+                )
+                return
+            for k in some:
+                _products(*self._tile(tiles[k]), q, rows, times[tiles[k]], moments, parts[k:])
 
-        parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, 2, self.stream.shape[0])
-        with np.errstate(invalid="ignore"):
-            total, square = parts.sum(axis=0)
-        return total, square
+        some = TILES_AT_ONCE
+        list(self.pool.map(work, [range(k, min(k + some, len(tiles))) for k in range(0, len(tiles), some)]))
+        total, square, image = parts.sum(axis=0)
+        return total, square, image, times
 
     def apply(self, q: Floats) -> tuple[Floats, Floats]:
         """(G q, A^T q): shapes (n_det,) and (n_samp,); A^T q is 0 at flagged samples."""
-        times, rows = np.zeros(self.n_samples), np.flatnonzero(self.use)
-
-        def work(samples: slice) -> Floats:
-            out = np.zeros(q.size)
-            _product(*self._tile(samples), q, rows, times[samples], out)
-            return out
-
-        parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, q.size)
-        return parts.sum(axis=0), times
+        if self._known is not None and np.array_equal(q, self._known[0]):
+            return self._known[1], self._known[2]
+        return self._pass(q, np.flatnonzero(self.use))[2:]
 
     def left(self, detectors: Floats, times: Floats) -> float:
         """Energy of A - sum u v^T, formed without cancellation."""
@@ -380,8 +387,7 @@ def lanczos(gram: Gram, how: CommonModeFilter) -> Ritz:
     n, wanted = gram.n_good, how.modes
     if n == 0:
         return Ritz.nothing(gram.use.size, gram.n_samples)
-    start = gram.use * (1.0 + 0.01 * _directions(0, gram))
-    basis: list[Floats] = [start / np.linalg.norm(start)]
+    basis: list[Floats] = [_near_the_mean(gram.use)]
     times: list[Floats] = []
     projected = np.zeros((n, n)) if n <= 4096 else np.zeros((512, 512))
     while True:
@@ -420,28 +426,49 @@ def lanczos(gram: Gram, how: CommonModeFilter) -> Ritz:
                 rank += gram.left(seen @ space, seen @ np.array(times)) > NOTHING * gram.energy
             return Ritz(values, detectors, series, residuals[:k], rank, m)
         if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
-            rest = gram.use * _directions(m, gram)
+            rest = gram.use * _directions(m, gram.use.size)
             for _ in range(2):
                 rest = rest - (space @ rest) @ space
             beta = float(np.linalg.norm(rest))
         basis.append(rest / beta)
 
 
-def _directions(step: int, gram: Gram) -> Floats:
-    """Fixed pseudo-random numbers over detectors (n_det,)."""
-    return normals(stream_key(0, "CommonModeFilter", step), 0, gram.use.size).astype(np.float64)
+def _near_the_mean(use: NDArray[np.bool_]) -> Floats:
+    """A unit vector (n_det,) close to the mean that no mode is orthogonal to."""
+    start = use * (1.0 + 0.01 * _directions(0, use.size))
+    return np.asarray(start / max(float(np.sqrt(start @ start)), 1e-300), np.float64)
 
+
+def _directions(step: int, n_detectors: int) -> Floats:
+    """Fixed pseudo-random numbers over detectors (n_det,)."""
+    return normals(stream_key(0, "CommonModeFilter", step), 0, n_detectors).astype(np.float64)
+
+
+TILES_AT_ONCE = 4
+"""Tiles in one call of the kernel."""
 
 LANES = 32
 
 
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
+    """`_product` (and `_moments`) of the samples start .. stop - 1 tile by tile: v = A^T q; out (n_tile, 3, n_det) takes each
+    tile's sums, sums of squares and A v."""
+    for k in range(-(-(stop - start) // TILE_SAMPLES)):
+        low = start + k * TILE_SAMPLES
+        high = min(low + TILE_SAMPLES, stop)
+        _product(array, low, high, q, rows, v[low - start : high - start], out[k, 2])
+        if moments:
+            _moments(array, low, high, rows, out[k])
+
+
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _moments(array, start, stop, out):  # type: ignore[no-untyped-def]
-    """Adds each row's sum and sum of squares over samples start .. stop - 1 to out (2, n_det)."""
-    n_det, n = array.shape[0], stop - start
+def _moments(array, start, stop, rows, out):  # type: ignore[no-untyped-def]
+    """Adds the sum and sum of squares of each of ``rows`` over samples start .. stop - 1 to out[:2] (2, n_det)."""
+    n = stop - start
     whole = n // LANES * LANES
     first, second = np.empty(LANES), np.empty(LANES)
-    for d in range(n_det):
+    for d in rows:
         row = array[d, start:stop]
         first[:] = 0.0
         second[:] = 0.0

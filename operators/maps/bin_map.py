@@ -27,7 +27,7 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
 from zonda.core.tiles import TILE_SAMPLES
 
-from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
+from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame, tangent_pixels
 from .map_product import MapProduct
 
 if TYPE_CHECKING:
@@ -48,6 +48,9 @@ MAGIC_BITS = 0x4338000000000000
 
 TOGETHER = 4
 """Detectors that are scattered side by side: successive samples of one often fall in the same pixel and would wait for it."""
+
+AT_ONCE = 256
+"""Samples of 16 detectors whose pixels, values and pointing are in the first cache together."""
 
 DATA, HITS, WEIGHTS, NOISE = range(4)
 OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
@@ -242,16 +245,20 @@ class BinMap(Operator):
             signal.fill(0)
         else:
             signal = block.total("signal") if "signal" in block.means else block.detdata["signal"]
-        begin, rows = block.samples.start, block.detectors
+        begin, end, rows = block.samples.start, block.samples.stop, block.detectors
         xi, eta, use = plane.xi[rows], plane.eta[rows], observation.detector_flags[rows] == 0
-        for start in range(begin, block.samples.stop, TILE_SAMPLES):
-            stop = min(start + TILE_SAMPLES, block.samples.stop)
+        how = (
+            use, state.good[begin:end], state.weight[rows], state.noise[rows], self.noise == "scatter", state.alike,
+            1 / self._variance, sums, dropped, largest,
+        )  # fmt: skip
+        if isinstance(state.grid, TangentGrid):
+            _add_image(signal, state.pointing, begin, xi, eta, *state.grid.shape, *how)
+            return
+        for start in range(begin, end, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, end)
             index = np.empty((len(xi), stop - start), np.int32)
             state.grid.pixels(state.pointing, start, stop, xi, eta, index)
-            _add(
-                signal, start - begin, index, use, state.good[start:stop], state.weight[rows], state.noise[rows],
-                self.noise == "scatter", state.alike, 1 / self._variance, sums, dropped, largest,
-            )  # fmt: skip
+            _add(signal, start - begin, index, *how)
 
     def collect(self, data: Data, observation: Observation, state: Binning) -> None:
         """Add this observation to the even or the odd scans' sums."""
@@ -460,16 +467,29 @@ class Halves:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _add_image(signal, h, start, xi, eta, ny, nx, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
+    """`_add` of a block that begins at sample ``start`` to the pixels of an image, found as they are needed."""
+    n = signal.shape[1]
+    space = np.empty(xi.size * AT_ONCE, np.int32)
+    for low in range(0, n, AT_ONCE):
+        high = min(low + AT_ONCE, n)
+        index = space[: xi.size * (high - low)].reshape(xi.size, high - low)
+        tangent_pixels(h, start + low, start + high, xi, eta, ny, nx, index)
+        _add(signal, low, index, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
     """Add samples to the fixed-point sums of their pixels; count what is dropped; note the largest terms.
 
     The last row of ``sums`` takes what is dropped. ``index`` (n_det, n): pixels of the samples first .. first + n - 1 of the
-    block. ``alike``: all detectors weigh the same; the sums of weights and noise follow from the hits.
+    block, like ``good``. ``alike``: all detectors weigh the same; the sums of weights and noise follow from the hits.
     """
     n = index.shape[1]
     flat, columns = sums.reshape(-1), np.uintp(sums.shape[1])
     trash = np.int32(sums.shape[0] - 1)
     lost = sums[trash, HITS]
+    fine = good[first : first + n]
     rows = np.flatnonzero(use)
     dropped[FLAGGED] += n * (use.size - rows.size)
     shifted, cells = np.empty((TOGETHER, n)), np.empty((TOGETHER, n), np.int32)
@@ -479,7 +499,7 @@ def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_var
         for k in range(group.size):
             d = group[k]
             limit, factor, square = _scales(weight[d], per_variance, scatter)
-            high = _units(signal[d, first : first + n], index[d], good, limit, factor, trash, shifted[k], units[k], cells[k])
+            high = _units(signal[d, first : first + n], index[d], fine, limit, factor, trash, shifted[k], units[k], cells[k])
             w, term = np.int64(np.rint(weight[d] * WEIGHT)), np.int64(np.rint(noise[d] * WEIGHT))
             if not alike:
                 for t in range(n):
@@ -496,7 +516,7 @@ def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_var
     if sums[trash, HITS] != lost:
         for d in rows:
             limit, _, _ = _scales(weight[d], per_variance, scatter)
-            _count_dropped(signal[d, first : first + n], index[d], good, limit, dropped)
+            _count_dropped(signal[d, first : first + n], index[d], fine, limit, dropped)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

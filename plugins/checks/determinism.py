@@ -141,7 +141,7 @@ class Killed(BaseException):
 
 
 class Backwards(Executor):
-    """Completes what was asked for last first, as an engine may; after ``stop`` calls it ends the campaign, cutting a file short."""
+    """Completes what was asked for last first, as an engine may; after ``stop`` calls it breaks the campaign off."""
 
     def __init__(self, stop: int = 10**9) -> None:
         self.left, self.stop = 0, stop

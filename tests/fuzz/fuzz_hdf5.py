@@ -93,8 +93,10 @@ def seeds() -> Iterator[bytes]:
         yield b"\0" + layout(FILE, latitude=(41.0, 40.5), longitude=(10.0, 10.25), hours=(0, 3)).read_bytes()
 
 
-WORDS = ("valid_time", "time", "pressure_level", "level", "latitude", "longitude", "hours since 1900-01-01", "scale_factor", "hPa",
-         "_FillValue", "toast_format_version", "CDF\1", "CDF\2", "\x89HDF", "TREE", "SNOD", "HEAP", "OHDR", "GCOL")  # fmt: skip
+WORDS = (
+    "valid_time", "time", "pressure_level", "level", "latitude", "longitude", "hours since 1900-01-01", "scale_factor",
+    "hPa", "_FillValue", "toast_format_version", "CDF\1", "CDF\2", "\x89HDF", "TREE", "SNOD", "HEAP", "OHDR", "GCOL",
+)  # fmt: skip
 
 if __name__ == "__main__":
     from zonda.core import hdf5_files

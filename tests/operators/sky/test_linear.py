@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from zonda.operators.sky.estimate import LINEAR
 from zonda.operators.sky.skymap import SkyMap
 
 ARCSEC = np.pi / 648000
@@ -30,8 +31,8 @@ def test_the_error_is_within_its_bound_and_has_no_mean(made, source, points):
     path, scan, exact = source
     got = made.look(SkyMap(file=path, interpolation="linear", pixels_per_fwhm=min(points, 16)), scan)[0]
     error = (got - exact) / exact.max()
-    bound = 2 * 8 * np.log(2) / 12 / points**2  # 0.924 / n^2; the next order of the series adds some per cent at 9 points
-    assert 0.6 * bound < np.abs(error).max() < 1.1 * bound
+    bound = LINEAR / points**2
+    assert 0.5 * bound < np.abs(error).max() < bound
     # regression on the source: without the division by sinc^2 its amplitude would be low by h^2 / 12 x 2 / sigma^2 / 2, that is
     # a third of the largest error or more; the scatter of 4000 samples of e ~ bound / 3 leaves less than a twentieth
     amplitude = (got @ exact) / (exact @ exact) - 1
