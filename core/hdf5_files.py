@@ -64,6 +64,74 @@ def check_size(dataset: Any, place: str) -> None:
     check_memory(size, str(dataset.name), place)
 
 
+class Disk:
+    """A file for h5py to write to. libhdf5 crashes when it closes a file that it could not write: it is never told of a failure.
+
+    Raises OSError at the next `check` or `close`; whatever is written after a failure is dropped.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115
+        self._error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of it where the last `seek` led."""
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while self._error is None and len(rest):
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            self._error = error
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what was written; zeros beyond the end."""
+        view = memoryview(buffer).cast("B")
+        have = 0
+        while have < len(view) and (more := self._file.readinto(view[have:])):
+            have += more
+        view[have:] = bytes(len(view) - have)
+        return len(view)
+
+    def read(self, size: int) -> bytes:
+        """As `readinto`, in bytes of its own."""
+        found = bytearray(size)
+        self.readinto(found)
+        return bytes(found)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """As any file's."""
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """As any file's."""
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        """Cut the file, or make it longer."""
+        try:
+            if self._error is None:
+                return self._file.truncate(size)
+        except OSError as error:
+            self._error = error
+        return size or 0
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def check(self) -> None:
+        """Raise the first failure."""
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Close the file, then raise the first failure."""
+        if not self._file.closed:
+            self._file.close()
+            self.check()
+
+
 def _refuse_other_files(file: Any, place: str) -> None:
     import h5py
 

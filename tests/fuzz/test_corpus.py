@@ -42,7 +42,7 @@ def whole(name: str) -> list[bytes]:
 def _limits(monkeypatch: pytest.MonkeyPatch) -> None:
     from zonda.core import hdf5_files, machine
 
-    monkeypatch.setattr(hdf5_files, "PATIENCE", 10.0)
+    monkeypatch.setattr(hdf5_files, "PATIENCE", 4.0)
     monkeypatch.setattr(machine, "available_memory", lambda: 256 << 20)
 
 
@@ -96,7 +96,7 @@ def test_damage_at_random_places(name: str, seed: int, how: str) -> None:
     read(name, damaged(data, seed, how))
 
 
-@many(15)
+@many(8)
 @given(seed=st.integers(0, 2**32), how=st.sampled_from(HOW))
 def test_damage_at_random_places_of_hdf5(seed: int, how: str) -> None:
     """Few, because a process of its own looks at each first."""
