@@ -392,6 +392,9 @@ def main(arguments: list[str] | None = None) -> int:
             with contextlib.suppress(OSError):  # the terminal may be gone
                 click.echo("interrupted: unfinished files were removed", err=True)
             return int(getattr(err, "status", INTERRUPTED))
+        except MemoryError as err:
+            cure = "make the scans shorter, the sample rate lower or the detectors fewer, or use a larger machine"
+            _report(ZondaError(f"not enough memory{f': {err}' if str(err) else ''}", cure=cure))
         except OSError as err:
             if err.filename is None and err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
                 raise

@@ -267,6 +267,31 @@ def test_an_input_removed_after_it_was_read_changes_nothing(here: Path) -> None:
     np.testing.assert_array_equal(first, second)
 
 
+# -------------------------------------------------------------------------------------------------- two runs, one folder
+
+HOLD = """
+import sys
+from zonda.core.lock import lock
+with lock("out"):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_two_runs_into_one_folder(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The second is refused at once and writes nothing; when the first has ended, however it ended, the folder is free."""
+    (here / "out").mkdir()
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", HOLD], env=ENVIRONMENT, cwd=here, **pipes) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        assert "is writing to this folder" in refused(capsys, "run", "small.yaml", "--output", "out")
+        assert {p.name for p in (here / "out").iterdir()} == {".zonda-lock"}
+        holder.kill()  # no chance to clean up
+    assert cli.main(["run", "small.yaml", "--output", "out"]) == 0
+    assert {"map.fits", "resolved.yaml"} <= set(whole(here / "out"))
+
+
 # ------------------------------------------------------------------------------------------------- signals and clocks
 
 
