@@ -48,9 +48,9 @@ time: 2024-11-25T07:00
 target: 05h00m00s +20d00m00s
 seed: 1
 budget: 0 %
-campaign: {nights: 3, realizations: 2}
+campaign: {nights: 4, realizations: 2}
 operators:
-  - PointingDaisy: {radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 20 s, scans: 2}
+  - PointingDaisy: {radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 20 s}
   - SkyMap: {file: sky.fits}
   - WhiteNoise
   - PinkNoise
@@ -60,7 +60,7 @@ operators:
   - BinMap: {pixel: 4 arcsec}
   - SaveMap
 """
-TASKS_IN_ALL = 12
+TASKS_IN_ALL = 8
 KILLS_OF_THE_MAIN_PROCESS, KILLS_OF_WORKERS = 16, 4
 
 NURSERY = """
@@ -197,8 +197,8 @@ def check_whole(folder: Path) -> None:
     job = Job.read(folder) if (folder / FILE).exists() else None
     keys = {task.product: task.key for task in job.tasks} if job else {}
     for path in folder.rglob("*"):
-        if path.name.startswith(".") or path.suffix == ".fits" or not path.is_file():
-            continue  # hidden names are temporary files and the lock
+        if path.name.startswith(".") or path.suffix == ".fits" or "damaged" in path.name or not path.is_file():
+            continue  # hidden names are temporary files and the lock; damaged logs are put aside
         if path.parent.name == TASKS:
             if path.name in keys or path.name.startswith("layout"):
                 parts.read(path, keys.get(path.name, "layout"))
