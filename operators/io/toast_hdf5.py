@@ -80,6 +80,7 @@ class Writer:
         """Write everything else and close the file."""
         with writing(self.path):
             try:
+                self._disk.check()
                 _write_root(self._file, self._tod)
                 _write_instrument(self._file.create_group("instrument"), self._tod)
                 _write_metadata(self._file, self._tod)

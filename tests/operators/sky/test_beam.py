@@ -95,3 +95,12 @@ def test_distinct_beams():
     np.testing.assert_array_equal(index, [2, 0, 2, 0, 1])
     values, index = distinct(np.full(5, 4.1e-5))
     assert values.tolist() == [4.1e-5]
+
+
+@pytest.mark.parametrize("pixel", [1e-9, 1e-35, 1e-100])
+def test_pixels_far_smaller_than_the_beam_are_refused(pixel):
+    """Their margins, a beam wide, fit no memory."""
+    from zonda.core.errors import InputError
+
+    with pytest.raises(InputError, match=r"needs .* GB"):
+        convolve(np.ones((11, 11)), np.diag([-pixel, pixel]) * 4.8e-6, 5e-5, 0.0)
