@@ -78,7 +78,7 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
     except PermissionError as error:
         raise InputError("permission denied", place=place, cure="make the file readable") from error
     except KeyError as error:
-        raise InputError(f"is incomplete: {error.args[0] if error.args else ''}", place=place, cure=cure) from error
+        raise InputError(f"is incomplete or corrupt: {error.args[0] if error.args else ''}", place=place, cure=cure) from error
     except MemoryError as error:
         raise InputError("needs more memory than there is", place=place, cure=cure) from error
     except Exception as error:
