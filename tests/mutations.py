@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zonda.core.data import Block
+from zonda.core.data import Block, Observation
 from zonda.operators.atmosphere import band, covariance, turbulence
 from zonda.operators.filters import common_mode, highpass
 from zonda.operators.maps import bin_map
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
+from zonda.operators.pointing import recording
 from zonda.operators.pointing.transform import CelestialTransform
 from zonda.operators.sky import read
 
@@ -170,6 +171,14 @@ def days_of_86400_seconds(patch: Patch) -> None:
     patch.setattr(CelestialTransform, "_utc", divided)
 
 
+def air_that_ignores_the_times(patch: Patch) -> None:
+    patch.setattr(Observation, "seconds_at", lambda self, index: index / self.sample_rate)
+
+
+def gaps_filled_in_silence(patch: Patch) -> None:
+    patch.setattr(recording, "NOT_RECORDED", np.uint8(0))
+
+
 MUTATIONS = (
     Mutation("1 - C by subtraction", "covariance.structure_function", one_minus_correlation),
     Mutation("C(0) - C(r) by subtraction", "covariance.behind_a_beam", difference_of_covariances),
@@ -192,5 +201,7 @@ MUTATIONS = (
     Mutation("1/f noise with a period", "noise.no_period", pink_noise_with_a_period),
     Mutation("1/f noise that starts from nothing", "noise.first_sample", pink_noise_that_starts_from_nothing),
     Mutation("the time in one float64", "pointing.exact_start", times_in_one_float),
+    Mutation("the air is sampled by a comb", "timing.jittered_atmosphere", air_that_ignores_the_times),
+    Mutation("NaN rows and gaps are interpolated", "timing.recorded_gaps_and_nan", gaps_filled_in_silence),
     Mutation("days of 86400 s", "pointing.leap_second", days_of_86400_seconds),
 )

@@ -61,6 +61,9 @@ HIGHEST = 20000.0
 HALF_CELL = 0.13
 """deg that the place may lie outside the grid: half a cell of ERA5's own."""
 
+DRIEST = 1e-9
+"""kg/kg, or % of relative humidity: less is taken as this, which is 1e-5 mm of water in the whole column."""
+
 GET = "`zonda weather fetch SITE --time TIME --output era5.nc` gets such a file, or the Climate Data Store's pages do"
 
 
@@ -97,6 +100,7 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
             h2o = from_specific(column("q", logarithm=True))
         else:
             h2o = from_relative(column("r", logarithm=True) / 100, pressure, temperature)
+        o3 = column("o3") if "o3" in file else None
         return Column(
             pressure=pressure,
             height=column("z") / GRAVITY,
@@ -105,16 +109,29 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
             wind_east=column("u"),
             wind_north=column("v"),
             ozone_pressure=pressure if "o3" in file else None,
-            ozone=ozone_from_mass(np.maximum(column("o3"), 0.0)) if "o3" in file else None,
-            stated=f"ERA5 from {path.name}, {time}" + ("" if "o3" in file else " (ozone of the standard atmosphere)"),
+            ozone=ozone_from_mass(np.maximum(o3, 0.0)) if o3 is not None else None,
+            stated=f"ERA5 from {path.name}, {time}"
+            + (f" ({'; '.join(remarks)})" if (remarks := _remarks(file.below_none, o3)) else ""),
         )
 
 
+def _remarks(water_below_none: int, o3: Array | None) -> list[str]:
+    """What ERA5's packing and spectral transform leave: slightly negative water and ozone, which are taken as none."""
+    ozone_below_none = 0 if o3 is None else int(np.count_nonzero(o3 < 0))
+    found = ["ozone of the standard atmosphere"] if o3 is None else []
+    found += [f"{water_below_none} negative values of the humidity taken as none"] if water_below_none else []
+    return found + ([f"{ozone_below_none} negative levels of ozone taken as none"] if ozone_below_none else [])
+
+
 class _File:
-    """What NetCDF-3 and NetCDF-4 have in common."""
+    """What NetCDF-3 and NetCDF-4 have in common.
+
+    ``below_none``: how many values below 0 were raised to `DRIEST` before their logarithm was taken.
+    """
 
     def __init__(self, variables: Any, dimensions: dict[str, list[str]], place: str) -> None:
         self._variables, self._dimensions, self._place = variables, dimensions, place
+        self.below_none = 0
 
     def __contains__(self, name: str) -> bool:
         return name in self._dimensions
@@ -147,7 +164,10 @@ class _File:
             for j, b in weights["lat"].items():
                 for k, c in weights["lon"].items():
                     column = self._column(name, axes, {"time": i, "lat": j, "lon": k}, place)
-                    total = total + a * b * c * (np.log(np.maximum(column, 1e-9)) if log else column)
+                    if log:
+                        self.below_none += int(np.count_nonzero(column < 0))
+                        column = np.log(np.maximum(column, DRIEST))
+                    total = total + a * b * c * column
         return np.asarray(np.exp(total) if log else total)
 
     def _column(self, name: str, axes: dict[str, str], at: dict[str, int], place: str) -> Array:

@@ -312,6 +312,8 @@ class BinMap(Operator):
         if self.noise == "scatter":
             alone = int(np.count_nonzero(product.hits == 1))
             data.tally.count(self.label, "pixels with one sample, whose scatter is unknown: noise NaN", alone)
+            equal = int(np.count_nonzero((product.hits > 1) & (product.noise == 0)))
+            data.tally.count(self.label, "pixels whose samples scatter by less than rounding: noise 0", equal)
             if self.smooth is not None:
                 data.tally.count(self.label, "of them left out of the smoothed noise, which is too low around them", alone)
         if self.weights == "inverse_variance" and self._variance_unknown:
@@ -362,6 +364,7 @@ class BinMap(Operator):
         with np.errstate(invalid="ignore", divide="ignore"):
             if self.noise == "net":
                 return np.where(hits > 0, np.sqrt(term) / weight, np.nan)
+            # equal samples leave the rounding of their squares, of either sign: a scatter below it is counted, and 0
             scatter = np.maximum(term / weight - signal**2, 0.0)
             return np.where(hits > 1, np.sqrt(scatter / (hits - 1)), np.nan)
 

@@ -22,7 +22,7 @@ from zonda.core.random import normals, stream_key
 
 from .limits import Moved, check_elevation, excess, lower_elevation
 from .motion import POINTS, Peak, Quantity, motion, rate_text
-from .observed import observed, state_times
+from .observed import centre_of, observed, state_times
 from .samples_per_beam import Sampled
 from .transform import CelestialTransform, unit_vectors
 
@@ -193,12 +193,7 @@ class Pointing(Operator):
         transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
 
         horizontal = self.directions(transform, target, offset, seconds)
-        middle = np.array([(seconds[0] + seconds[-1]) / 2])
-        if target.frame == "horizontal":
-            towards = transform.icrs(unit_vectors([-target.longitude], [target.latitude]), middle)[0]
-            centre = (math.atan2(towards[1], towards[0]) % (2 * math.pi), math.atan2(towards[2], math.hypot(*towards[:2])))
-        else:
-            centre = target.icrs()
+        centre = centre_of(transform, target, seconds)
         place = f"{self.label}, scan {index} from {start}"
         total = self.scans * self.scan_duration + (self.scans - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from zonda.core.plan.context import Context
 
     from .base import Pointing
+    from .recorded import PointingRecorded
 
 STEEPEST = math.sqrt(8 * math.log(2)) * math.exp(-0.5)
 """Largest slope of a Gaussian beam, in peaks per FWHM."""
@@ -35,7 +36,7 @@ ABERRATION = 1.0e-4
 """v / c of the Earth's orbit and rotation."""
 
 
-def pointing_estimate(operator: Pointing, context: Context) -> Estimate:
+def pointing_estimate(operator: Pointing | PointingRecorded, context: Context) -> Estimate:
     """Refraction, aberration, sky rotation, sampling in time, precision."""
     o = context.first
     fwhm = float(o.focalplane.fwhm.min())

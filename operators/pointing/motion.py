@@ -66,16 +66,15 @@ def motion(
     finer
         The same track in steps of so many seconds, where samples are too far apart.
     """
-    stride = 1 << max(0, math.ceil(math.log2(max(len(horizontal), 1) / POINTS)))
+    stride = 1 << max(0, math.ceil(math.log2(max(len(horizontal) / POINTS, rate * SHORTEST_STEP, 1e-9))))
     step = stride / rate
     while True:
         track = horizontal[::stride] if stride else finer(step)
         found = _peaks(track, step)
         known = all(found[q].error <= ACCURACY * max(found[q].figure, 0.3 * limit) for q, limit in limits.items() if q in found)
         points = 2 * len(track)
-        if (known and (found or not limits)) or step / 2 < SHORTEST_STEP or points > max(MOST_POINTS, len(horizontal)):
-            return found
-        if len(horizontal) < 2:  # one instant: it does not move
+        enough = known and (found or not limits)
+        if enough or step / 2 < SHORTEST_STEP or points > max(MOST_POINTS, len(horizontal)) or len(horizontal) < 2:
             return found
         stride, step = stride // 2, step / 2
 

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 
+from .transform import unit_vectors
+
 if TYPE_CHECKING:
+    from zonda.core.configuration.target import Target
     from zonda.core.configuration.time import Instant
     from zonda.core.scene import Scene
 
@@ -57,6 +60,15 @@ def observed(
     if not transform.orientation_known:
         warnings.warn(f"{label}: Earth orientation at {start}: {transform.source}", stacklevel=4)
     return observation
+
+
+def centre_of(transform: CelestialTransform, target: Target, seconds: Floats) -> tuple[float, float]:
+    """ICRS (ra, dec) of a target; of an az/el one where it points to in the middle of the scan."""
+    if target.frame != "horizontal":
+        return target.icrs()
+    middle = np.array([(seconds[0] + seconds[-1]) / 2])
+    x, y, z = transform.icrs(unit_vectors([-target.longitude], [target.latitude]), middle)[0]
+    return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
 
 
 def state_times(label: str, observation: Observation) -> None:

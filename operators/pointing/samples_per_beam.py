@@ -32,7 +32,7 @@ class Sampled:
 
     def add(self, observation: Observation, rate: float) -> None:
         """Take a scan into account, read out at ``rate`` [Hz]."""
-        speed, turn = on_the_sky(observation.boresight_radec, observation.sample_rate)
+        speed, turn = on_the_sky(observation.boresight_radec, observation.seconds, observation.flags == 0)
         total = speed + turn * math.atan(observation.focalplane.radius)
         if len(total) and total.max() > self._fastest:
             self._fastest, self._usual = float(total.max()), float(np.median(total))
@@ -70,18 +70,22 @@ class Sampled:
         return f"integrating over its interval, a sample loses {100 * peak_lost(self.least):.2g} % of a point source's peak"
 
 
-def on_the_sky(boresight: Floats, rate: float) -> tuple[Floats, Floats]:
+def on_the_sky(boresight: Floats, seconds: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Speed of the beam and rate of the field's rotation [rad/s] at up to about `POINTS` pairs of neighbouring samples.
 
-    ``boresight``: quaternions (n, 4) at ``rate`` [Hz]. From the rotation between neighbours, in the focal plane's own axes.
+    ``boresight``: quaternions (n, 4) at ``seconds`` (n,), of which those to ``use`` (n,) count. From the rotation between
+    neighbours, in the focal plane's own axes.
     """
     at = np.arange(0, max(len(boresight) - 1, 0), max(1, len(boresight) // POINTS))
+    at = at[use[at] & use[at + 1]]
     ax, ay, az, aw = (-boresight[at] * np.array([1.0, 1.0, 1.0, -1.0])).T
     bx, by, bz, bw = boresight[at + 1].T
     x = aw * bx + ax * bw + ay * bz - az * by
     y = aw * by - ax * bz + ay * bw + az * bx
     z = aw * bz + ax * by - ay * bx + az * bw
-    return 2 * np.arcsin(np.minimum(np.hypot(x, y), 1.0)) * rate, 2 * np.arcsin(np.minimum(abs(z), 1.0)) * rate
+    step = seconds[at + 1] - seconds[at]
+    # sines of half angles: at most 1 but for rounding
+    return 2 * np.arcsin(np.minimum(np.hypot(x, y), 1.0)) / step, 2 * np.arcsin(np.minimum(abs(z), 1.0)) / step
 
 
 def peak_lost(samples_per_fwhm: float) -> float:

@@ -19,6 +19,7 @@ from astropy.io import fits
 from pydantic import ValidationError
 
 import zonda
+from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.registry import mapmakers, noise_models, operators
 from zonda.core.site import Site
@@ -71,6 +72,19 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
             image.header["TEMPSCAL"] = "K_RJ"
         image.writeto(folder / f"{name}.fits")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
+    seen = Data(scene())
+    operators.get("PointingStare")(scan_duration="1 s").observe(seen)
+    az, el = (float(np.degrees(v[0])) for v in (seen.observations[0].azimuth, seen.observations[0].elevation))
+    for name, seconds in (
+        ("scan", 12),
+        ("other", 13),
+        ("long", 30),
+    ):  # to and fro about where the target stands, with a gap of 4 s
+        t = np.arange(0, seconds, 0.02)
+        t = t[(t < 3) | (t > 7)]
+        columns = [1732518000 + t, az + 0.02 * np.sin(t), el + 0.01 * np.cos(t)]
+        head = "time [s], az [deg], el [deg]"
+        np.savetxt(folder / f"{name}.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=head)
     return folder
 
 
@@ -153,6 +167,13 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "speed": ({}, {"speed": "20 arcsec/s"}),
         "acceleration": ({}, {"acceleration": "30 arcsec/s2"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
+    },
+    "PointingRecorded": {
+        "file": ({}, {"file": "other.csv"}),
+        "clock": ({}, {"clock": "scene"}),
+        "split": ({}, {"split": "2 s"}),
+        "target": ({}, {"target": "05h00m10s +20d00m00s"}),
+        "interpolation_error": ({"file": "long.csv"}, {"interpolation_error": 1e-9}),
     },
     "SkyMap": {
         "file": ({}, {"file": "flux.fits"}),
@@ -265,6 +286,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
 }  # fmt: skip
 
 CHAINS = {
+    "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
     "AtmosphereLayers": ["AtmosphereLayers"],
     "WhiteNoise": ["WhiteNoise"],
@@ -289,6 +311,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "PointingDaisy": SCAN,
     "PointingStare": {"scan_duration": "12 s"},
     "PointingBackAndForth": TURN,
+    "PointingRecorded": {"file": "scan.csv"},
 }
 
 
@@ -312,6 +335,7 @@ REFUSALS = {
     ("SkyMap", "missing"): "NaN",
     ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
     ("SaveMap", "overwrite"): "is there already",
+    ("PointingRecorded", "clock"): "is too large",
     ("PointingDaisy", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingStare", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingBackAndForth", "check_limits"): "dish's largest speed of the azimuth axis",

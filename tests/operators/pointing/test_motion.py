@@ -44,8 +44,8 @@ def test_figures_are_those_of_the_closed_form(amplitude: float, omega: float, el
     found = motion(track(np.arange(round(length * rate)) / rate), rate, limits, lambda step: track(np.arange(0, length, step)))
     for (axis, order), true in limits.items():
         peak = found[axis, order]
-        # difference quotients are means of the derivative; rounding: 2^order ulp of the angle over step^order, step >= 1e-3 s
-        rounding = 2**order * 4e-16 / (1e-3 if rate > 1000 else 0.5 / max(rate, omega * 20)) ** order
+        # difference quotients are means of the derivative; rounding: 2^order x 2 ulp of the angle over step^order, step >= 1 ms
+        rounding = 2**order * 4.4e-16 / 1e-3**order
         assert peak.figure <= true * (1 + 1e-9) + rounding
         assert peak.figure >= true * (1 - 0.012) - rounding
         assert true - peak.figure <= 2 * peak.error + 1e-3 * true + rounding
