@@ -401,7 +401,7 @@ def _load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) 
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 (a fault of a plugin), 2 (a user's mistake), 130 (interrupted), 143 (terminated)."""
+    """Run the command line; the exit status: 0, 1 (a plugin's fault), 2 (a user's mistake), 128 + a signal that ended it."""
     with _plain_warnings(), _stoppable():
         try:
             result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)
@@ -416,6 +416,9 @@ def main(arguments: list[str] | None = None) -> int:
             with contextlib.suppress(OSError):  # the terminal may be gone
                 click.echo("interrupted: unfinished files were removed", err=True)
             return int(getattr(err, "status", INTERRUPTED))
+        except MemoryError as err:
+            cure = "make the scans shorter, the sample rate lower or the detectors fewer, or use a larger machine"
+            _report(ZondaError(f"not enough memory{f': {err}' if str(err) else ''}", cure=cure))
         except OSError as err:
             if err.filename is None and err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
                 raise

@@ -1,4 +1,4 @@
-"""Reading and writing files: what cannot be read, or written, says what to do about it; a product is there whole or not at all."""
+"""Reading and writing files: a product is there whole or not at all, and a failure says what to do about it."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
     except PermissionError as error:
         raise InputError("permission denied", place=place, cure="make the file readable") from error
     except KeyError as error:
-        raise InputError(f"is incomplete: {error.args[0] if error.args else ''}", place=place, cure=cure) from error
+        raise InputError(f"is incomplete or corrupt: {error.args[0] if error.args else ''}", place=place, cure=cure) from error
     except MemoryError as error:
         raise InputError("needs more memory than there is", place=place, cure=cure) from error
     except Exception as error:
@@ -91,8 +91,11 @@ def own_data(path: Path) -> Iterator[Any]:
     import numpy as np
 
     cure = "the installation is damaged: pip install --force-reinstall zonda"
-    with reading(f"data file {path}", "a numpy archive", cure), np.load(path, allow_pickle=False) as archive:
-        yield archive
+    try:
+        with reading(f"data file {path}", "a numpy archive", cure), np.load(path, allow_pickle=False) as archive:
+            yield archive
+    except InputError as error:
+        raise InputError(error.message, place=error.place, cure=cure) from error
 
 
 def first_line(error: Exception) -> str:
@@ -103,7 +106,7 @@ def first_line(error: Exception) -> str:
 
 def check_memory(size: int, what: str, place: str) -> None:
     """Refuse to read ``what`` of ``size`` bytes where that is more than the machine has free (`InputError`)."""
-    from .execution import available_memory
+    from .machine import available_memory
 
     free = available_memory()
     if size > free:

@@ -20,7 +20,7 @@ COMPRESSED = (".gz", ".bz2", ".xz", ".z", ".zip")
 
 
 FIELDS_MAX = 999
-"""Axes of an array and columns of a table that the FITS standard (4.0, 4.4.1 and 7.3.1) allows; astropy loops over what is claimed."""
+"""Axes of an array, and columns of a table, that FITS 4.0 allows (4.4.1, 7.3.1); astropy loops over what is claimed."""
 HEADER_MAX = 10_000_000
 """Bytes of one header: 125 000 cards."""
 

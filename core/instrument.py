@@ -153,7 +153,7 @@ class Instrument(Parameters):
     """Pink noise falls as f^-slope."""
     pink_minimum_frequency: Hertz = quantity("1 mHz", gt=0)
     """Below this frequency pink noise is flat."""
-    sample_rate: Hertz = Field(gt=0)
+    sample_rate: Hertz = Field(gt=0, le=1e6)
     """Read-out rate."""
     provenance: str = ""
     """Where these numbers come from."""

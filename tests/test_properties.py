@@ -5,6 +5,8 @@ Properties of single operators are tested beside them; these are of pipelines.
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ import zonda
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
 from zonda.core.operator import Operator
-from zonda.plugins.checks import scenes
+from zonda.plugins.checks import determinism, scenes
 from zonda.plugins.checks.scenes import camera, differing, scan, sky_file
 
 few = settings(max_examples=3, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -184,6 +186,16 @@ def test_blocks_and_threads_change_no_bit(threads: int, megabytes_each: int, see
     one = run(chain(filters=filters), o[0], precision="float32")
     other = run(chain(filters=filters), o[1], precision="float32", threads=threads, memory=threads * megabytes_each * 1_000_000)
     assert sum(differing(getattr(one.products["map"], p), getattr(other.products["map"], p)) for p in PLANES) == 0
+
+
+@few
+@given(workers=st.integers(1, 7))
+def test_workers_change_no_bit_of_a_campaign(workers: int) -> None:
+    """Tasks are done in whatever order the threads take them; the whole file is compared, tally and headers too."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(workers) as executor:
+        assert determinism._campaign(Path(folder) / "out", executor, workers) == determinism._campaign_once()
 
 
 def whitened(stream: np.ndarray) -> np.ndarray:

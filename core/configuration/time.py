@@ -88,6 +88,8 @@ class Instant:
                 zone = timezone(timedelta(minutes=-minutes if part["sign"] == "-" else minutes))
             day = datetime.fromisoformat(part["date"])
             local = day.replace(hour=int(part["hour"] or 0), minute=int(part["minute"] or 0), second=seconds, tzinfo=zone)
+            if not 2 <= local.year <= 9998:  # a scan, or another time zone, may end in another year
+                raise ValueError("the year is not between 2 and 9998")
         except ValueError as err:
             raise PydanticCustomError(
                 "time_range", "{got} is no time: {why}", {"got": repr(text), "why": str(err), "eg": _EXAMPLES[0]}

@@ -178,6 +178,10 @@ class _TooMany(yaml.YAMLError):
     pass
 
 
+def _too_deep(mark: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=mark)
+
+
 _PLAIN = frozenset(f"tag:yaml.org,2002:{tag}" for tag in ("str", "int", "float", "bool", "null", "merge", "seq", "map"))
 _MERGE = "tag:yaml.org,2002:merge"
 _OPENING = (yaml.SequenceStartEvent, yaml.MappingStartEvent)
@@ -194,12 +198,11 @@ class _Reader:
 
     def survey(self, text: str) -> None:
         """Count values and depth event by event, without recursion, before anything is built. Raises yaml.YAMLError."""
-        depth = values = 0
-        for event in yaml.parse(text, Loader=_Loader):
+        depth = 0
+        for values, event in enumerate(yaml.parse(text, Loader=_Loader)):
             depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
-            values += 1
             if depth > MAXIMUM_DEPTH:
-                raise yaml.MarkedYAMLError(problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=event.start_mark)
+                raise _too_deep(event.start_mark)
             if values > 2 * MAXIMUM_VALUES:  # a list or mapping makes two events
                 raise _TooMany(f"more than {MAXIMUM_VALUES} values")
 
@@ -241,7 +244,7 @@ class _Reader:
         if len(self.marks) > MAXIMUM_VALUES:
             raise _TooMany(f"more than {MAXIMUM_VALUES} values")
         if len(path) > MAXIMUM_DEPTH:
-            raise yaml.MarkedYAMLError(problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=node.start_mark)
+            raise _too_deep(node.start_mark)
         self.marks[path] = Mark(span, key)
         above = (*above, id(node))
         if node.tag not in _PLAIN:

@@ -18,7 +18,7 @@ import numpy as np
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.files import writing
-from zonda.core.hdf5_files import check_size, opened
+from zonda.core.hdf5_files import Disk, check_size, opened
 
 from .time_ordered_data import UNITS, Floats, TimeOrderedData
 
@@ -63,7 +63,8 @@ class Writer:
 
         self.path, self._tod = path, tod
         with writing(path):
-            self._file = h5py.File(path, "w")
+            self._disk = Disk(path)
+            self._file = h5py.File(self._disk, "w")
         group = self._file.create_group("detdata")
         for name in streams:
             data = group.create_dataset(name, (tod.n_detectors, tod.n_samples), dtype)
@@ -73,11 +74,13 @@ class Writer:
         """A rectangle of a stream."""
         with writing(self.path):
             self._file["detdata"][stream][detectors, samples] = values
+            self._disk.check()
 
     def finish(self) -> None:
         """Write everything else and close the file."""
         with writing(self.path):
             try:
+                self._disk.check()
                 _write_root(self._file, self._tod)
                 _write_instrument(self._file.create_group("instrument"), self._tod)
                 _write_metadata(self._file, self._tod)
@@ -88,11 +91,13 @@ class Writer:
                     flags[int(d)] = self._tod.detector_flags[d]
             finally:
                 self._file.close()
+                self._disk.close()
 
     def close(self) -> None:
         """Close an unfinished file."""
         with contextlib.suppress(OSError):  # nothing is lost: the caller removes the file
             self._file.close()
+            self._disk.close()
 
 
 def _write_root(file: Any, tod: TimeOrderedData) -> None:

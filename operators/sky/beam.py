@@ -30,6 +30,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.errors import InputError
+
 Floats = NDArray[np.float64]
 
 PIXELS_PER_FWHM = 4.0
@@ -90,6 +92,7 @@ def convolve(
     width = np.sqrt(np.diag(covariance))  # sigma in pixels along (x, y)
     across = fwhm / np.linalg.norm(jacobian, axis=0)  # pixels per FWHM along (x, y)
     qx, qy = (int(np.ceil(pixels_per_fwhm / a - 1e-9)) if SMOOTH_BELOW <= a < pixels_per_fwhm else 1 for a in across)
+    _check_size(values.shape, width, across, (qx, qy))
     pad_x, pad_y = (int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy)))
     rows, columns = values.shape
     ny, nx = fft.next_fast_len(rows * qy + 2 * pad_y, True), fft.next_fast_len(columns * qx + 2 * pad_x, True)
@@ -112,6 +115,21 @@ def convolve(
         steps=(qx, qy),
         coarse=bool((across < SMOOTH_BELOW).any()),
     )
+
+
+def _check_size(shape: tuple[int, ...], width: Floats, across: Floats, steps: tuple[int, int]) -> None:
+    """Refuse a map whose margins, a beam wide, do not fit the memory: pixels far smaller than the beam (`InputError`)."""
+    from zonda.core.machine import available_memory
+
+    cells = float(np.prod([n * q + 2 * REACH * w * q for n, w, q in zip(shape[::-1], width, steps, strict=True)]))
+    free = available_memory()
+    if not 4 * 8 * cells <= free:  # the grid, its transform, the beam's transform, and one on the way
+        raise InputError(
+            f"convolving the map with the beam needs {4 * 8 * cells / 1e9:.3g} GB, {free / 1e9:.3g} GB are free: a beam is "
+            f"{np.max(across):.3g} of its pixels wide",
+            place="sky map",
+            cure="check the map's pixel size, or rebin it to some ten pixels per FWHM",
+        )
 
 
 def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: NDArray[np.bool_]) -> Floats:

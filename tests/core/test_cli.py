@@ -314,6 +314,17 @@ def test_interrupted(here: Path, number: str) -> None:
     assert [p for p in here.rglob("*") if p.is_file()] == [here / "p.yaml"]
 
 
+def test_too_little_memory(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def command(*arguments: object, **options: object) -> None:
+        raise MemoryError("Unable to allocate 8 EB")
+
+    monkeypatch.setattr(cli.zonda, "main", command)
+    assert cli.main([]) == 2
+    message = capsys.readouterr().err
+    assert "not enough memory: Unable to allocate 8 EB" in message
+    assert "make the scans shorter" in message
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX does")
 def test_signals_that_are_ignored_or_handled_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}

@@ -42,9 +42,14 @@ def guided_by(*modules: str) -> contextlib.AbstractContextManager[Any]:
 
 def little_memory() -> None:
     """Let readers believe that 256 MB are free: what would ask for more is refused, and libFuzzer's own limit is a finding."""
-    from zonda.core import execution
+    from zonda.core import machine
 
-    execution.available_memory = lambda: 256 << 20  # type: ignore[assignment]
+    machine.available_memory = lambda: 256 << 20  # type: ignore[assignment]
+
+
+def told(error: Exception) -> None:
+    """A clean error says something."""
+    assert str(error).strip(), f"{type(error).__name__} without a message"
 
 
 def scratch(suffix: str) -> Path:

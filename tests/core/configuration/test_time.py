@@ -92,6 +92,8 @@ def test_order_and_hash() -> None:
         ("2024-11-25T07:00+99:00", "is no time"),
         ("2016-12-31T23:59:60Z", "is a leap second"),
         ("2024-11-25T07:00:00.0000000001Z", "more than nine decimals"),
+        ("9999-12-31T23:59", "the year is not between 2 and 9998"),
+        ("0001-01-01", "the year is not between 2 and 9998"),
         (20241125, "expected a time such as"),
         (True, "expected a time such as"),
         (None, "expected a time such as"),

@@ -98,6 +98,15 @@ def test_distinct_beams():
     assert values.tolist() == [4.1e-5]
 
 
+@pytest.mark.parametrize("pixel", [1e-9, 1e-35, 1e-100])
+def test_pixels_far_smaller_than_the_beam_are_refused(pixel):
+    """Their margins, a beam wide, fit no memory."""
+    from zonda.core.errors import InputError
+
+    with pytest.raises(InputError, match=r"needs .* GB"):
+        convolve(np.ones((11, 11)), np.diag([-pixel, pixel]) * 4.8e-6, 5e-5, 0.0)
+
+
 def test_a_faint_map_is_not_set_to_zero() -> None:
     """What is flushed is a share of the image's own peak: a map of 8e-25 K keeps its shape to the bit."""
     values = np.zeros((41, 41))
