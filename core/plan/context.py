@@ -135,6 +135,17 @@ class Context:
         """Whether what all detectors have in common is removed."""
         return any(t.removes_common for t in self.traits.values())
 
+    @cached_property
+    def before_filters(self) -> bool:
+        """Whether a stream is saved, measured or drawn above a filter: what the filters remove is then in it."""
+        filters = [k for k, o in enumerate(self.operators) if self._filters(o.label)]
+        readers = [k for k, o in enumerate(self.operators) if o.main_run_only]
+        return bool(filters and readers) and min(readers) < max(filters)
+
+    def _filters(self, label: str) -> bool:
+        traits = self.traits.get(label)
+        return traits is not None and (traits.removes_common or traits.response is not None)
+
     @property
     def samples(self) -> int:
         """Detectors x samples of all observations."""

@@ -8,7 +8,9 @@ the detectors' mean taken off where it is removed. The integral is a sum over ra
 sum_j w_j exp(-r^2 / 4 e_j) (normal, of variance 1 / 2 e_j on each axis; components that differ over the field are drawn more
 often), the sum over h one over random instants at which the pixel is in the field; what these instants scatter more than the H
 samples do is taken off. Positions move with the wind: this is the ensemble's variance, exact but for the draws, whose standard
-error is added twice. One scan is looked at, and no high-pass filter: both only lessen it.
+error is added twice. One scan is looked at, and no high-pass filter. Such a filter removes most of what drifts slowly by, but not
+all: a scan has ends, and the singular mode that is subtracted turns a little with what it is made of. Counting only the waves
+that a ray sees above the cut made bounds that did not hold (docs/plan.md).
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-INSTANTS, CANDIDATES, HITS, WAVES = 4000, 48, 160, 96
+INSTANTS, CANDIDATES, HITS, WAVES = 4000, 48, 160, 160
 
 
 def shares(operator: AtmosphereLayers, context: Context, a: Air) -> list[float]:
@@ -69,7 +71,7 @@ def shares(operator: AtmosphereLayers, context: Context, a: Air) -> list[float]:
             raw = float(parts.sum())
             mean = max((number * raw - one) / max(number - 1, 1), raw / 4)
             total = mean + one / max(hits, 1.0) + 2 * math.sqrt(float((parts**2).sum()))
-            worst = max(worst, total / max(one, 1e-300))
+            worst = max(worst, total / one if one > 0 else 1.0)
         found.append(math.sqrt(min(worst, 1.0)))
     return found
 

@@ -69,7 +69,7 @@ class Air:
     kelvin: float
     stretch: float
     elevations: tuple[float, float]
-    speeds: list[Floats]
+    velocities: list[Floats]
     points: dict[float, float] = field(default_factory=dict)
     planning: dict[str, float] = field(default_factory=dict)
     averages: dict[str, list[float]] = field(default_factory=dict)
@@ -87,7 +87,7 @@ class Air:
         from scipy.special import erfc
 
         e, w = self.components[layer]
-        argument = 2 * math.pi * frequency * np.divide.outer(np.sqrt(e), np.maximum(self.speeds[layer], 1e-6))
+        argument = 2 * math.pi * frequency * np.divide.outer(np.sqrt(e), np.maximum(np.hypot(*self.velocities[layer]), 1e-6))
         return self.kelvin * self.models[layer].amplitude * math.sqrt(max(float(w @ erfc(argument).mean(1)), 0.0))
 
     @cached_property
@@ -125,19 +125,19 @@ def _air(operator: AtmosphereLayers, observation: Observation) -> Air:
     if operator.pwv_rms_after_beam:
         scale /= math.sqrt(sum(m.amplitude**2 * v for m, v in zip(models, variances, strict=True)))
     stretch = 1 / math.sin(track.elevation) if track.kind == "horizontal" else 1.0
-    speeds = _speeds(observation, track, layers)
-    return Air(band, profile, pwv, layers, models, variances, scale * abs(slope) * share, stretch, (low, high), speeds)
+    velocities = _velocities(observation, track, layers)
+    return Air(band, profile, pwv, layers, models, variances, scale * abs(slope) * share, stretch, (low, high), velocities)
 
 
-def _speeds(o: Observation, track: Track, layers: list[Layer]) -> list[Floats]:
-    """Speeds [m/s] of the boresight's ray through the air of each layer, at some instants of the scan."""
+def _velocities(o: Observation, track: Track, layers: list[Layer]) -> list[Floats]:
+    """Velocities (2, n) [m/s] of the boresight's ray through the air of each layer, at some instants of the scan."""
     if o.n_samples < 2:
-        return [np.zeros(1)] * len(layers)
+        return [np.zeros((2, 1))] * len(layers)
     at = np.unique(np.linspace(0, o.n_samples - 2, INSTANTS).astype(int))
     both = np.stack([at, at + 1], axis=1).ravel()
     x = track.unroll(crossing(rays(axes(o.boresight_azel[both]), np.zeros(1), np.zeros(1)))[:, 0]).reshape(2, -1, 2)
     velocity = (x[:, :, 1] - x[:, :, 0]) * o.sample_rate
-    return [np.hypot(*(layer.height * velocity - (track.drift @ layer.wind)[:, None])) for layer in layers]
+    return [layer.height * velocity - (track.drift @ layer.wind)[:, None] for layer in layers]
 
 
 def atmosphere_traits(operator: AtmosphereLayers, observation: Observation) -> Traits:
@@ -190,6 +190,8 @@ def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list
         rms = SAFETY * left_of_layer(context, a, k)
         bound = context.bound(rms, _correlated(operator, context, model, layer.wind), common=True)
         bound["map_rms"] = min(bound["map_rms"], averages[k] * rms)
+        if context.before_filters:
+            bound["tod"] = SAFETY * a.kelvin * model.amplitude * math.sqrt(a.variances[k])
         opacity = _opacity_share(a) * operator.pwv_rms * model.amplitude * math.sqrt(a.variances[k])
         bound |= context.sky_error(opacity)
         bound["psd"] = min(SAFETY**2 * spectra[k], 1.0)
@@ -211,12 +213,11 @@ def _averages(operator: AtmosphereLayers, context: Context, a: Air) -> list[floa
     return a.averages[key]
 
 
-def _average(operator: AtmosphereLayers, context: Context, a: Air) -> float:
-    """Of all layers together: rms in a pixel over that in a sample, of an error in proportion to the fluctuation."""
+def _left(operator: AtmosphereLayers, context: Context, a: Air) -> tuple[float, float]:
+    """rms of what subtraction of the mean leaves of the fluctuation: of a sample, and of its mean in a pixel, K."""
     left = [left_of_layer(context, a, k) for k in range(len(a.models))]
-    total = math.sqrt(sum(x * x for x in left))
-    mapped = math.sqrt(sum((x * y) ** 2 for x, y in zip(left, _averages(operator, context, a), strict=True)))
-    return mapped / total if total > 0 else 1.0
+    mapped = ((x * y) ** 2 for x, y in zip(left, _averages(operator, context, a), strict=True))
+    return math.sqrt(sum(x * x for x in left)), math.sqrt(sum(mapped))
 
 
 def _spectral_shares(context: Context, a: Air) -> list[float]:
@@ -230,10 +231,11 @@ def _spectral_shares(context: Context, a: Air) -> list[float]:
     return [float(v) for v in (each / np.maximum(total, 1e-300)).max(axis=1)]
 
 
-def _in_proportion(operator: AtmosphereLayers, context: Context, a: Air, share: float, seen: float, correlated: float) -> Any:
-    """Bound of an error that is ``share`` of the fluctuation, which has the rms ``seen`` in a sample."""
-    bound = context.bound(share * seen, correlated, common=True)
-    bound["map_rms"] = min(bound["map_rms"], SAFETY * share * seen * _average(operator, context, a))
+def _in_proportion(operator: AtmosphereLayers, context: Context, a: Air, share: float, correlated: float) -> dict[str, float]:
+    """Bound of an error that is ``share`` of the fluctuation."""
+    sample, pixel = _left(operator, context, a)
+    bound = context.bound(SAFETY * share * sample, correlated, common=True)
+    bound["map_rms"] = min(bound["map_rms"], SAFETY * share * pixel)
     return bound | {"psd": 2 * share + share**2}
 
 
@@ -296,8 +298,7 @@ def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Ef
             choices.append(Choice("coarse", what, {"tolerance": tolerance}, bound=bound, formula=text, seconds=saved))
     effects = [Effect("detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text)]
     fidelity = FIDELITIES[operator.fidelity]
-    seen = left if context.removes_common else a.rms
-    wrong = _in_proportion(operator, context, a, 0.5 * fidelity.structure_error, seen, correlated)
+    wrong = _in_proportion(operator, context, a, 0.5 * fidelity.structure_error, correlated)
     text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
     effects.append(Effect("turbulence lattice", (full(f"{operator.fidelity}, {_lattice(operator):g} of the beam"),), wrong, text))
     return effects
@@ -307,10 +308,6 @@ def _spectral(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effe
     """The band's spectrum and ozone: what the fluctuation would be off by, by radiative transfer at one frequency, without O3."""
     band, layers = context.first.instrument.band, replace(a.profile.layers, spectra=operator._table())
     middle = Band(name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz")
-    seen = a.rms
-    if context.removes_common:
-        xi, eta = some(context.first.focalplane.xi, context.first.focalplane.eta)
-        seen = a.kelvin * differential_rms(xi, eta, a.models, a.stretch)
     correlated = max(_correlated(operator, context, m, layer.wind) for m, layer in zip(a.models, a.layers, strict=True))
     elevation = a.elevations[0]
     right = _slope(_BandTransfer(band, layers), a.pwv, elevation)
@@ -325,7 +322,7 @@ def _spectral(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effe
         text = "|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer " + (
             "at the band's centre alone" if other is one else "without ozone"
         )
-        effects.append(Effect(name, (full(what),), _in_proportion(operator, context, a, share, seen, correlated), text))
+        effects.append(Effect(name, (full(what),), _in_proportion(operator, context, a, share, correlated), text))
     return effects
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -72,6 +73,9 @@ def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
         assert coarse is not None
         power = difference(law, coarse, context, o.sample_rate, o.duration)
         bound = context.bound(sigma * factor * math.sqrt(power), correlated=_correlated(law, context), common=common)
+        if context.before_filters:
+            free = difference(law, coarse, replace(context, traits={}), o.sample_rate, o.duration)
+            bound["tod"] = sigma * factor * math.sqrt(free)
         bound["psd"] = psd_error(law, coarse, level)
         text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
         saved = cost.seconds(context.times, o.n_detectors) - pink_cost(poles).seconds(context.times, o.n_detectors)
@@ -83,6 +87,8 @@ def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
         assert traits.faster is not None
         passed = LEAKS * traits.faster(context.cut)
     size = context.bound(passed, correlated=_correlated(law, context), common=common)
+    if context.before_filters:
+        size["tod"] = rms
     size["psd"] = level * float(law.response(np.array([0.1 / (o.duration * o.sample_rate)]))[0])
     text = "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R: high-pass filter"
     if pink.shared == 0 and not context.kept_streams & pink.provides:

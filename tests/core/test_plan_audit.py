@@ -6,11 +6,12 @@ import dataclasses
 import json
 import math
 
+import numpy as np
 import pytest
 
 import zonda
 from zonda.core import cli
-from zonda.core.plan.audit import Audit, Checked, audit
+from zonda.core.plan.audit import SECONDS, SHORTEST, Audit, Checked, audit, extent, sliced
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
 SET = [a for s in SHORT for a in ("--set", s)]
@@ -112,3 +113,26 @@ operators:
     found = audit(file, made, threads=1, seconds=5.0)
     assert [(r.effect, r.metric, r.actual) for r in found.rows if r.effect == "structure"] == [("structure", "map_rms", 0.0)]
     assert not found.violated
+
+
+def test_the_slice_is_chosen_by_cost(file, made):
+    """Cheap: the whole minute or the scan; a thousand times dearer: the shortest, and fewer detectors."""
+    assert extent(made, 4).seconds == pytest.approx(min(SECONDS, 40.0))
+    assert extent(made, 4).every == 1
+    dear = {k: dataclasses.replace(c, per_sample=3000 * c.per_sample) for k, c in made.costs.items()}
+    found = extent(dataclasses.replace(made, costs=dear), 4)
+    assert found.seconds == SHORTEST
+    assert found.every == 223 // 64
+    assert extent(made, 400).seconds < extent(made, 4).seconds
+
+
+def test_a_slice_of_detectors(file):
+    """Every fourth, and the outermost: the field keeps its extent."""
+    part = sliced(file, 2.0, 1, every=4)
+    data = part.pipeline().run(part.scene(), threads=1)
+    whole = zonda.load("mustang2_cluster").scene().instrument.focalplane()
+    plane = data.observations[0].focalplane
+    assert len(whole) / 4 <= len(plane) <= len(whole) / 4 + 5
+    assert plane.radius == pytest.approx(whole.radius, rel=0.02)
+    assert data.observations[0].n_samples == 200
+    assert np.isfinite(data.products["map"].signal).any()
