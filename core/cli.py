@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import os
 import sys
 import warnings
@@ -167,9 +168,12 @@ def run(
 
     one_blas_thread()
     ensure_cache()
+    click.get_current_context().call_on_close(gc.enable)
+    gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
+    from .compile_ahead import Helper
     from .files import check_output_folder, write_text
     from .plan import table
-    from .plan.planner import plan
+    from .plan.remembered import outcome
 
     file = _load(pipeline, settings)
     target = file.header.accuracy
@@ -182,13 +186,18 @@ def run(
         file = _load(pipeline, settings)
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
-    made = plan(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
+    helper = Helper()
+    click.get_current_context().call_on_close(helper.close)
+    made = outcome(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
     click.echo(table.line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
     command = _command(pipeline, settings, keep, drop, no_prune)
-    provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
+    provenance = {"resolved_yaml": resolved, "command": command, "plan": made.short}
+    gc.freeze()
+    gc.enable()
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, memory=memory, provenance=provenance)
+    helper.succeeded()
     write_text(folder / "resolved.yaml", resolved)
     counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
     lost = {(who, what) for who, what in counts if what != "samples binned"}

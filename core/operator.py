@@ -101,6 +101,10 @@ class Operator(Parameters):
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """Add this observation's partial products to ``data.products``."""
 
+    def after_run(self, data: Data) -> None:
+        """Called for `at_end` operators after the main run and after each companion run: time to begin with what `finalize` will
+        do, in the background, as far as it depends on products that are there and will not change."""
+
     def discard(self, observation: Observation, state: Any) -> None:
         """Undo what `prepare` and `exec` began (temporary files): called instead of `collect` when the run fails."""
 

@@ -212,6 +212,8 @@ class Pipeline:
         timer = Timer()
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:
+            timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
+        for operator in sorted(self.operators, key=lambda o: not o.at_end):  # what only acts at the end may refuse at once
             start = time.thread_time()
             operator.observe(data)  # pointing steps append observations; map makers lay out the grid of all of them
             timer.add(operator.label, "observe", time.thread_time() - start)
@@ -233,6 +235,9 @@ class Pipeline:
                 data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             for operator in steps:
                 self._finalize(operator, data, timer, hooks)
+            for operator in self.operators:
+                if operator.at_end:
+                    operator.after_run(data)
         data.run = ""
         for operator in self.operators:
             if operator.at_end:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -43,7 +42,6 @@ class TimeStream:
     names: list[str]
     observation: str
     label: str
-    lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
 
 class TimeStreams(Operator):
