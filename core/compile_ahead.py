@@ -2,7 +2,7 @@
 
 `kernels` lists those of the shipped pipelines with the types of their arguments, in the order of their first use. The child works
 through it from the end; both find in the cache what the other has made (`kernel_cache`), so they meet in the middle. Whatever
-goes wrong there only means that this process compiles it.
+goes wrong there only means that this process compiles it. Later runs load the kernels in a thread while they point the telescope.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from importlib import import_module
+from threading import Event, Thread
 from typing import Any
 
 from . import user_cache
@@ -27,7 +28,7 @@ _CHILD = "import sys; sys.path[:] = {path!r}; from zonda.core.compile_ahead impo
 
 
 class Helper:
-    """The second process of a first run; nothing where everything is compiled already, or there is one processor only.
+    """The second process of a first run, the thread of a later one; nothing where there is one processor only.
 
     Make it when the operators are imported: the child compiles the kernels of modules that are imported here. `close` it in any
     case; after `succeeded` there is no first run any more.
@@ -42,7 +43,15 @@ class Helper:
             "where": cache_folder(),
         }
         self._first = user_cache.recall(KIND, self._key) is None
-        if self._first and available_threads() > 1:
+        self._thread: Thread | None = None
+        self._enough = Event()
+        modules = [name for name in sys.modules if name.startswith("zonda.")]
+        if available_threads() == 1 or not sys.executable:
+            return
+        if not self._first:
+            self._thread = Thread(target=compile_listed, args=(modules, False, self._enough), daemon=True)
+            self._thread.start()
+        else:
             with suppress(OSError):
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", _CHILD.format(path=sys.path)],
@@ -52,7 +61,7 @@ class Helper:
                     start_new_session=True,  # Ctrl-C is the parent's affair
                 )
                 assert self._process.stdin is not None
-                self._process.stdin.write(json.dumps([m for m in sys.modules if m.startswith("zonda.")]).encode() + b"\n")
+                self._process.stdin.write(json.dumps(modules).encode() + b"\n")
                 self._process.stdin.flush()
 
     def succeeded(self) -> None:
@@ -61,7 +70,11 @@ class Helper:
             user_cache.remember(KIND, self._key, True)
 
     def close(self) -> None:
-        """End the process."""
+        """End the process and the thread."""
+        self._enough.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
@@ -70,8 +83,6 @@ class Helper:
 
 def serve() -> None:
     """The child's side: it ends when there is nothing left to compile, or when the parent has hung up."""
-    from threading import Thread
-
     modules = json.loads(sys.stdin.buffer.readline())
 
     def leave_with_parent() -> None:
@@ -82,12 +93,15 @@ def serve() -> None:
     compile_listed(modules)
 
 
-def compile_listed(modules: list[str]) -> int:
-    """Compile the listed kernels of these modules, the last first; returns how many there are."""
+def compile_listed(modules: list[str], last_first: bool = True, enough: Event | None = None) -> int:
+    """Compile or load the listed kernels of these modules until ``enough``; returns how many there were."""
     from .kernels import KERNELS
 
+    rows = [row for line in KERNELS if (row := line.split())[0] in modules]
     done = 0
-    for module, name, *types in reversed([row for line in KERNELS if (row := line.split())[0] in modules]):
+    for module, name, *types in reversed(rows) if last_first else rows:
+        if enough is not None and enough.is_set():
+            break
         with suppress(Exception):  # a list of another version: what it lacks is compiled when it is used
             getattr(import_module(module), name).compile(tuple(map(type_of, types)))
             done += 1

@@ -23,13 +23,15 @@ class Operator(Parameters):
 
     A pipeline calls, in this order:
 
-    1. ``observe(data)`` once, in order: pointing operators append `Observation`s.
+    1. ``observe(data)`` once, in order: pointing operators append `Observation`s. `at_end` operators come first: what they refuse
+       (an output folder) is refused at once.
     2. For each observation, ``configure(observation)`` of every operator (resolve values that others need: efficiencies,
        NET), then ``prepare(observation) -> state`` of every operator (draw turbulence, build coefficients).
     3. ``exec(block, state)`` for every block. Called from several threads at once: the state is read only, or guarded.
        Its result may depend on absolute detector and sample indices only, never on where the block begins or ends.
     4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
-    5. ``finalize(data)`` once at the end of the run: turn sums into products, write files.
+    5. ``finalize(data)`` once at the end of the run: turn sums into products, write files. After it `at_end` operators see
+       ``after_run(data)``.
 
     Class attributes
     ----------------

@@ -209,6 +209,7 @@ class Pipeline:
             dtype=np.float64 if self.precision == "float64" else np.float32,
             progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
         )
+        data.threads = settings.threads
         timer = Timer()
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:

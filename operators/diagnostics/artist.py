@@ -27,6 +27,8 @@ class Artist:
 
     def __init__(self) -> None:
         self._closed = False
+        if not sys.executable:
+            raise OSError("this is no Python interpreter that could be started again")
         self._process = subprocess.Popen(
             [sys.executable, "-c", _CHILD.format(path=sys.path)],
             stdin=subprocess.PIPE,

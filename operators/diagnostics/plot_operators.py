@@ -17,7 +17,6 @@ from pydantic import Field, PrivateAttr
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
-from zonda.core.execution import available_threads
 from zonda.core.files import atomic_path, product_path
 from zonda.core.operator import Operator
 from zonda.operators.io.map_view import MapView, maps_of, noise_sources
@@ -75,7 +74,7 @@ class Plots(Operator):
         """Refuse a missing or unwritable output folder before anything is simulated; let a second process be started."""
         output_folder(data, self.label)
         self._begun = {}
-        if self._artist is None and available_threads() > 1:
+        if self._artist is None and data.threads > 1:
             with suppress(OSError):
                 self._artist = Artist()
 
@@ -91,7 +90,7 @@ class Plots(Operator):
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(once=3.0 + 0.25 * len(context.observations), bytes=60e6, kernel="python"))
+        return Estimate((), Cost(once=3.0 + 0.25 * len(context.observations), bytes=200e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
@@ -167,8 +166,11 @@ def _drawings(data: Data, options: Plots) -> Iterator[Drawing]:
 
 def _tracks(data: Data) -> tuple[list[Any]]:
     """What `plot_scan` reads of the observations: they themselves cannot be sent to another process."""
-    names = ("name", "centre", "n_samples", "ra", "dec")
-    return ([SimpleNamespace(**{name: getattr(o, name) for name in names}) for o in data.observations],)
+    tracks = []
+    for o in data.observations:
+        ra, dec, _ = o.derotate("boresight_radec")
+        tracks.append(SimpleNamespace(name=o.name, centre=o.centre, n_samples=o.n_samples, ra=ra, dec=dec))
+    return (tracks,)
 
 
 def _steps_before(data: Data) -> dict[str, str]:

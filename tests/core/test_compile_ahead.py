@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from threading import Event
 
 import pytest
 from numba import types
@@ -52,6 +53,10 @@ def test_listed_kernels_are_compiled_and_what_is_wrong_is_passed_over(monkeypatc
     wrong = [("zonda.no_module", "_scales"), (CHEAP[0], "no_kernel"), (CHEAP[0], CHEAP[1], "f8"), (CHEAP[0], CHEAP[1], "x8")]
     monkeypatch.setattr(kernels, "KERNELS", [" ".join(row) for row in (CHEAP, *wrong)])
     assert compile_listed(["zonda.elsewhere"]) == 0
+    enough = Event()
+    assert compile_listed([CHEAP[0], "zonda.no_module"], False, enough) == 1
+    enough.set()
+    assert compile_listed([CHEAP[0], "zonda.no_module"], False, enough) == 0
     assert compile_listed([CHEAP[0], "zonda.no_module"]) == 1
     kernel = getattr(import_module(CHEAP[0]), CHEAP[1])
     assert tuple(map(type_of, CHEAP[2:])) in kernel.overloads
@@ -69,8 +74,15 @@ def test_there_is_one_first_run(monkeypatch, tmp_path):
     helper = Helper()
     helper.succeeded()
     helper.close()
-    Helper().close()
+    loaded = []
+    monkeypatch.setattr(compile_ahead, "compile_listed", lambda *arguments: loaded.append(arguments))
+    later = Helper()
+    later.close()
     assert len(started) == 3
+    ((modules, last_first, enough),) = loaded
+    assert "zonda.core.compile_ahead" in modules
+    assert not last_first
+    assert enough.is_set()
 
 
 class Process:

@@ -233,13 +233,13 @@ def test_every_picture_is_written(data, products, make_observation):
     assert "smoothed by 9″" in noise.caption
 
 
-def test_a_second_process_draws_the_same(data, products, make_observation, monkeypatch):
+def test_a_second_process_draws_the_same(data, products, make_observation):
     data.observations.append(make_observation(500))
     data.products.update(products)
     Plots().finalize(data)
     alone = data.products.pop("pictures")
     data.products = {name: product for name, product in products.items() if "/" not in name}
-    monkeypatch.setattr(plot_operators, "available_threads", lambda: 2)
+    data.threads = 2
     data.provenance["runs"] = {"noiseless": {}, "source_free": {}}
     operator = Plots()
     operator.observe(data)
@@ -261,9 +261,9 @@ def test_a_second_process_draws_the_same(data, products, make_observation, monke
     assert sorted(data.products["pictures"], key=lambda p: p.name) == sorted(alone, key=lambda p: p.name)
 
 
-def test_what_the_second_process_fails_at_is_drawn_here(data, products, monkeypatch):
+def test_what_the_second_process_fails_at_is_drawn_here(data, products):
     data.products.update(products)
-    monkeypatch.setattr(plot_operators, "available_threads", lambda: 2)
+    data.threads = 2
     operator = Plots()
     operator.observe(data)
     operator._artist._process.kill()
