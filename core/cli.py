@@ -6,7 +6,9 @@ import contextlib
 import errno
 import gc
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,10 +48,25 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
+class Share(click.ParamType[Any]):
+    """``3/8``, the third of eight shares, as (3, 8)."""
+
+    name = "K/N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """(K, N); fails with what was expected."""
+        first, _, second = str(value).partition("/")
+        if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
+            self.fail(f"{value!r} is no share of the tasks; write K/N with K from 1 to N, e.g. 3/8", param, ctx)
+        return int(first), int(second)
+
+
 ELSEWHERE = {
     "accuracy": "zonda.core.accuracy.command:accuracy",
     "doctor": "zonda.plugins.doctor_command:doctor",
     "plan": "zonda.core.plan.command:plan",
+    "resume": "zonda.core.campaign.command:resume",
+    "status": "zonda.core.campaign.command:status",
     "weather": "zonda.plugins.weather_command:weather",
 }
 """Built-in commands that live with what they use, imported when they are named or listed.
@@ -58,8 +75,20 @@ Through the hook `zonda_commands`, as a third party's, they would cost ``zonda -
 """
 
 
+class Stopped(KeyboardInterrupt):
+    """A signal that asks the process to end; it is handled as Ctrl-C is. ``status``: the exit status, 128 + its number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.status = 128 + number
+
+
 class Interrupted(Exception):
-    """Ctrl-C; click would print an empty line for a KeyboardInterrupt."""
+    """Ctrl-C or `Stopped`; click would print an empty line for a KeyboardInterrupt."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)
+        self.status = status
 
 
 class Commands(click.Group):
@@ -94,8 +123,8 @@ class Commands(click.Group):
         """Run a command."""
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt:
-            raise Interrupted from None
+        except KeyboardInterrupt as err:
+            raise Interrupted(getattr(err, "status", INTERRUPTED)) from None
 
     def _import(self, name: str) -> None:
         from importlib import import_module
@@ -137,7 +166,7 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 
 
 @zonda.command()
-@_pipeline
+@click.argument("pipelines", metavar="FILE_OR_NAME...", nargs=-1, required=True)
 @_set
 @_keep
 @_drop
@@ -147,8 +176,16 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
 @click.option("--memory", type=Bytes(), metavar="SIZE", help="Memory budget, e.g. 4GB; results do not depend on it.")
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
 @click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")
+@click.option(
+    "--engine",
+    type=click.Choice(["serial", "processes", "mpi", "dask"]),
+    help="Run scans as tasks of a campaign.  [default: as in the file's campaign]",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes.")
+@click.option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file.")
+@click.option("--task", "share", type=Share(), help="Run this share of a campaign's tasks, e.g. 3/8: for job arrays.")
 def run(
-    pipeline: str,
+    pipelines: tuple[str, ...],
     settings: tuple[str, ...],
     keep: tuple[str, ...],
     drop: tuple[str, ...],
@@ -158,8 +195,13 @@ def run(
     memory: int | None,
     verbose: bool,
     verify: bool,
+    engine: str | None,
+    workers: int | None,
+    scheduler: str | None,
+    share: tuple[int, int] | None,
 ) -> None:
-    """Run a pipeline file, or a shipped pipeline by its name.
+    """Run a pipeline file, or a shipped pipeline by its name; a campaign of observations where the file has `campaign:`, or where
+    there are several files.
 
     What its outputs do not depend on is left out, and effects are dropped or coarsened while the errors stay within the budget
     (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
@@ -170,12 +212,26 @@ def run(
     ensure_cache()
     click.get_current_context().call_on_close(gc.enable)
     gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
+    pipeline = pipelines[0]
+    file = _load(pipeline, settings)
+    if len(pipelines) > 1 or file.header.campaign is not None or engine or workers or scheduler or share:
+        if verify:
+            raise click.UsageError("--verify is for one run, not for a campaign")
+        gc.enable()
+        from .campaign import command as campaign
+
+        campaign.run(
+            pipelines, settings, keep=keep, drop=drop, no_prune=no_prune, output=output, threads=threads, memory=memory,
+            verbose=verbose, engine=engine, workers=workers, scheduler=scheduler, share=share,
+            command=_command(pipelines, settings, keep, drop, no_prune),
+        )  # fmt: skip
+        return
     from .compile_ahead import Helper
     from .files import check_output_folder, write_text
+    from .lock import lock
     from .plan import table
     from .plan.remembered import outcome
 
-    file = _load(pipeline, settings)
     target = file.header.accuracy
     if target is not None:
         from .accuracy.store import settings_for
@@ -186,13 +242,14 @@ def run(
         file = _load(pipeline, settings)
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
+    click.get_current_context().with_resource(lock(folder))
     helper = Helper()
     click.get_current_context().call_on_close(helper.close)
     made = outcome(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
     click.echo(table.line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
-    command = _command(pipeline, settings, keep, drop, no_prune)
+    command = _command(pipelines, settings, keep, drop, no_prune)
     provenance = {"resolved_yaml": resolved, "command": command, "plan": made.short}
     gc.freeze()
     gc.enable()
@@ -215,14 +272,18 @@ def run(
 
 
 def _command(
-    pipeline: str, settings: tuple[str, ...], keep: tuple[str, ...] = (), drop: tuple[str, ...] = (), no_prune: bool = False
+    pipelines: tuple[str, ...],
+    settings: tuple[str, ...],
+    keep: tuple[str, ...] = (),
+    drop: tuple[str, ...] = (),
+    no_prune: bool = False,
 ) -> str:
     """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
     import shlex
 
     options = [("--set", settings), ("--keep", keep), ("--drop", drop)]
     parts = [part for option, texts in options for text in texts for part in (option, text)]
-    return shlex.join(["zonda", "run", pipeline, *parts, *(["--no-prune"] if no_prune else [])])
+    return shlex.join(["zonda", "run", *pipelines, *parts, *(["--no-prune"] if no_prune else [])])
 
 
 @zonda.command()
@@ -231,13 +292,20 @@ def _command(
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.
 
-    Every mistake in the file is shown at once, with its place. Only `zonda run` reads the input maps and finds out whether the
-    target is up.
+    Every mistake in the file is shown at once, with its place. The telescope is pointed at some instants of the scans: whether
+    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam. Only
+    `zonda run` reads the input maps.
     """
     file = _load(pipeline, settings)
+    from .data import Data
+
+    data = Data(scene=file.scene())
+    found = [operator.check(data) for operator in file.pipeline().operators]
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
-    for step in file.steps:
+    for step, lines in zip(file.steps, found, strict=True):
         click.echo(f"  {step.key}")
+        for line in lines:
+            click.echo(f"    {line}")
 
 
 @zonda.command()
@@ -319,8 +387,8 @@ def _load(pipeline: str, settings: tuple[str, ...]) -> PipelineFile:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 (a fault of a plugin), 2 (a user's mistake), 130 (interrupted)."""
-    with _plain_warnings():
+    """Run the command line; returns the exit status: 0, 1 (a fault of a plugin), 2 (a user's mistake), 130 (interrupted), 143 (terminated)."""
+    with _plain_warnings(), _stoppable():
         try:
             result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)
             return result if isinstance(result, int) else 0
@@ -329,10 +397,11 @@ def main(arguments: list[str] | None = None) -> int:
             return err.exit_code
         except ZondaError as err:
             _report(err)
-        except (Interrupted, KeyboardInterrupt, click.Abort):
+        except (Interrupted, KeyboardInterrupt, click.Abort) as err:
             _clear()
-            click.echo("interrupted: unfinished files were removed", err=True)
-            return INTERRUPTED
+            with contextlib.suppress(OSError):  # the terminal may be gone
+                click.echo("interrupted: unfinished files were removed", err=True)
+            return int(getattr(err, "status", INTERRUPTED))
         except OSError as err:
             if err.filename is None and err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
                 raise
@@ -353,6 +422,31 @@ def _clear() -> None:
     """Clear the line that a progress plugin may have left."""
     if sys.stderr.isatty():
         click.echo("\r\033[K", nl=False, err=True)
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM (batch systems, containers) and SIGHUP (a terminal that closes) end a command as Ctrl-C does: cleaned up, once.
+
+    A signal that somebody handles or ignores (nohup) already is left alone.
+    """
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    taken = [n for n in numbers if signal.getsignal(n) is signal.SIG_DFL]
+
+    def stop(number: int, frame: object) -> None:
+        for n in taken:
+            signal.signal(n, signal.SIG_IGN)  # a second one must not interrupt the cleaning
+        raise Stopped(number)
+
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +16,7 @@ from numpy.typing import NDArray
 from .focalplane import Focalplane
 from .random import stream_key
 from .smooth import SmoothField
+from .tiles import TILE_DETECTORS, TILE_SAMPLES
 
 if TYPE_CHECKING:
     from .configuration.time import Instant
@@ -63,6 +67,11 @@ class Tally:
         with self._lock:
             return sorted((*k, v) for k, v in self._counts.items())
 
+    def figures(self) -> list[tuple[str, str, str]]:
+        """The statements alone, in a fixed order."""
+        with self._lock:
+            return sorted((*k, v) for k, v in self._figures.items())
+
     def get(self, who: str, what: str) -> int:
         """A count, 0 where there is none."""
         return self._counts.get((who, what), 0)
@@ -79,9 +88,10 @@ class Observation:
     start
         Exact start instant.
     seconds
-        (n_samp,) float64, seconds since ``start``.
+        (n_samp,) float64, increasing, seconds since ``start``: when each sample is taken. They need not be a perfect comb:
+        pointing and atmosphere follow them, noise and filters count samples (see `jitter`).
     sample_rate
-        Hz.
+        Hz; of the comb that comes nearest to ``seconds``.
     boresight_azel, boresight_radec
         (n_samp, 4) float64 quaternions (x, y, z, w), exactly TOAST's: Rz(lon) Ry(pi/2 - lat) Rz(psi), lon = -az for azel.
     centre
@@ -139,6 +149,23 @@ class Observation:
     def duration(self) -> float:
         """n_samples / sample_rate, s."""
         return self.n_samples / self.sample_rate
+
+    @property
+    def departures(self) -> NDArray[np.float64]:
+        """(n_samp,) s by which samples are later than a comb of `sample_rate` with the same mean; zeros for a perfect one."""
+        late = self.seconds - (self.seconds[0] + np.arange(self.n_samples) / self.sample_rate)
+        return np.asarray(late - late.mean(), np.float64) if late.any() else late
+
+    @cached_property
+    def jitter(self) -> float:
+        """rms of `departures`, s."""
+        late = self.departures
+        return float(np.sqrt(np.mean(late * late)))
+
+    def seconds_at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """`seconds` at sample numbers, which go on at `sample_rate` beyond the ends of the scan."""
+        inside = np.clip(index, 0, self.n_samples - 1)
+        return np.asarray(self.seconds[inside] + (index - inside) / self.sample_rate, np.float64)
 
     def key(self, *names: str | int) -> NDArray[np.uint32]:
         """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""
@@ -218,6 +245,9 @@ class Block:
     """Memory reused from block to block; `exec` must not keep a stream beyond the call."""
     places: dict[str, Floats] = field(default_factory=dict, repr=False)
     """Where the executor wants a stream to be made, so that it need not be copied there."""
+    again: bool = False
+    """These samples were worked on before, and are made again because the streams do not fit in memory: an operator makes the
+    same bits and counts nothing (what it tells ``observation.tally`` is thrown away)."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -254,7 +284,8 @@ class Stream:
     Attributes
     ----------
     array
-        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file.
+        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file. A stream that is made again
+        when it is read (`core.streams`) has none: it is read by `sweep`.
     means
         What must be added in float64 to have all of it, see `Block.means`.
     threads
@@ -271,6 +302,53 @@ class Stream:
     def shape(self) -> tuple[int, int]:
         n_det, n_samp = self.array.shape
         return n_det, n_samp
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """float32 or float64."""
+        return self.array.dtype
+
+    def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+        """(detectors, samples, result) of ``work(detectors, samples, part)`` over blocks that cover the stream once.
+
+        ``work`` is called from several threads and must not change or keep the part. Results come in an order in which no
+        detector's samples and no sample's detectors are ever out of order, whatever the blocks and threads: what is added up
+        tile by tile (`core.tiles`) has the same bits.
+        """
+        n_det, n_samp = self.shape
+        blocks = [
+            (slice(d, min(d + SWEEP_DETECTORS, n_det)), slice(t, min(t + SWEEP_SAMPLES, n_samp)))
+            for d in range(0, n_det, SWEEP_DETECTORS)
+            for t in range(0, n_samp, SWEEP_SAMPLES)
+        ]
+
+        def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
+            return detectors, samples, work(detectors, samples, self.array[detectors, samples])
+
+        return in_order(one, blocks, self.threads)
+
+
+SWEEP_DETECTORS, SWEEP_SAMPLES = 4 * TILE_DETECTORS, 32 * TILE_SAMPLES
+"""What is read at a time of a stream that is kept."""
+
+
+def in_order(work: Callable[..., Any], items: Iterable[tuple[Any, ...]], threads: int) -> Iterator[Any]:
+    """Results of ``work(*item)``, in order, made on several threads that run ahead by at most two items each."""
+    if threads == 1:
+        yield from (work(*item) for item in items)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        pending: deque[Future[Any]] = deque()
+        try:
+            for item in items:
+                pending.append(pool.submit(work, *item))
+                if len(pending) > 2 * threads:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
 
 
 @dataclass

@@ -3,91 +3,81 @@
 The chain is cut into segments where the coupling changes (see `Operator.couples`). A segment works through the observation
 in blocks; operators that couple nothing work through a block in pieces of `TILE_DETECTORS` x `PIECE` samples, each of which
 passes through all of them while it is hot in the cache. Between segments the streams that later operators need are kept in
-memory, or spilled to a temporary file where they do not fit. Blocks and pieces begin at multiples of `TILE_DETECTORS` and
-`TILE_SAMPLES`, so that no result depends on the budget or on the number of threads.
+memory, spilled to a temporary file, or made again when they are read (`core.streams`). Blocks and pieces begin at multiples
+of `TILE_DETECTORS` and `TILE_SAMPLES`, so that no result depends on the budget or on the number of threads.
 """
 
 from __future__ import annotations
 
-import os
-import tempfile
+import copy
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .data import Block, Data, Floats, Observation, Stream
+from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, pieces, trimmed, whole_span, within
+from .data import Block, Data, Floats, Observation, Stream, Tally, in_order
 from .errors import PipelineError
+from .machine import available_memory, available_threads, resident_memory
 from .operator import Operator
 from .smooth import SmoothField
-from .tiles import TILE_DETECTORS, TILE_SAMPLES
+from .streams import (
+    DISK_RATE,
+    SAMPLE_COST,
+    WORTH_MEASURING,
+    Held,
+    Ledger,
+    Source,
+    Stage,
+    Store,
+    StreamMadeAgain,
+    choose,
+    disk_rate,
+    forget_pages,
+)
+from .tiles import TILE_SAMPLES
 
-SCRATCH_STREAMS = 3
+__all__ = ["PIECE", "Execution", "Segment", "Settings", "Timer", "available_memory", "available_threads", "cut"]
+
+
+SCRATCH_STREAMS = 2
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
-
-PIECE = 4 * TILE_SAMPLES
-"""Samples that operators without coupling see at once: 0.5 MB per float32 stream, and little time lost between calls."""
 
 
 @dataclass
 class Settings:
-    """How to execute: threads, memory budget [bytes], stream type, whom to tell of progress, memory to use again."""
+    """How to execute.
+
+    Attributes
+    ----------
+    threads
+        Threads that work on blocks.
+    memory
+        Bytes for streams and blocks.
+    ceiling
+        Bytes that the whole process may hold; None: only ``memory`` counts.
+    dtype
+        Type of the streams.
+    prefer
+        What is done with streams that do not fit in memory where there is a choice; None: what is quicker.
+    progress
+        Whom to tell.
+    spare
+        Memory to use again.
+    """
 
     threads: int = 1
     memory: int = 2 << 30
     dtype: type[np.floating[Any]] = np.float32
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
     spare: list[Floats] = field(default_factory=list)
-
-
-@dataclass
-class Segment:
-    """Operators that see the same blocks. ``span``: what a block must hold whole (sample: nothing).
-
-    ``in_time_order``: blocks hold all detectors and come in order of time (`Operator.in_time_order`).
-    """
-
-    operators: list[Operator]
-    span: str = "sample"
-    halo: int = 0
-    in_time_order: bool = False
-
-    def split(self) -> tuple[list[Operator], list[Operator]]:
-        """The first operators, which take a block in pieces, and those from the first coupled one on."""
-        if self.halo:
-            return [], self.operators
-        coupled = [o.couples in ("detectors", "time") for o in self.operators]
-        cut = coupled.index(True) if any(coupled) else len(coupled)
-        return self.operators[:cut], self.operators[cut:]
-
-
-def cut(operators: Sequence[Operator], observation: Observation, ordered: Collection[str] = ()) -> list[Segment]:
-    """Cut a chain into segments. ``ordered``: labels of the operators that want their blocks in order of time."""
-    segments = [Segment([])]
-    for operator in operators:
-        last = segments[-1]
-        couples, halo, in_order = operator.couples, operator.halo(observation), operator.label in ordered
-        if (in_order and last.span == "time") or (last.in_time_order and couples == "time"):
-            segments.append(Segment([operator], couples, in_time_order=in_order))
-        elif couples == "all":
-            segments.append(Segment([operator]))
-        elif halo > 0 and last.span != "time":  # whole scans need no halo; otherwise read the stream with margins
-            segments.append(Segment([operator], halo=halo))
-        elif couples in ("sample", last.span):
-            last.operators.append(operator)
-        elif last.span == "sample" and not last.halo:
-            last.operators.append(operator)
-            last.span = couples
-        else:
-            segments.append(Segment([operator], couples))
-        segments[-1].in_time_order |= in_order
-    return [s for s in segments if s.operators]
+    ceiling: int | None = None
+    prefer: Held | None = None
 
 
 @dataclass
@@ -119,7 +109,10 @@ class Execution:
         self.states: dict[str, Any] = {}
         self._stop = threading.Event()
         self._local = threading.local()
-        self._spill: tempfile.TemporaryDirectory[str] | None = None
+        self.ledger = Ledger()
+        self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
+        streams = set(keep).union(*(o.requires | o.optional for o in operators if type(o).exec is not Operator.exec))
+        self._streams = frozenset(streams - {"boresight"})
 
     def run(self, data: Data, before: Callable[..., None], after: Callable[..., None]) -> None:
         """Configure, prepare, execute and collect; on any failure operators discard what they began."""
@@ -148,99 +141,232 @@ class Execution:
             raise
         finally:
             self.states.clear()
-            if self._spill is not None:
-                self._spill.cleanup()
+            self._store.close()
 
     # ---- segments
 
     def _execute(self, before: Callable[..., None], after: Callable[..., None]) -> None:
+        self._keep_to_ceiling()
         ordered = [o.label for o in self.operators if o.in_time_order(self.observation, self.states[o.label])]
         segments = cut(self.operators, self.observation, ordered)
-        streams: dict[str, Stream] = {}
+        source, begun = Source(), list[Operator]()
         for number, segment in enumerate(segments):
-            last = number + 1 == len(segments)
-            later = [o for s in segments[number + 1 :] for o in s.operators]
-            wanted = set(self.keep) if last else set(self.keep).union(*(o.requires | o.optional for o in later))
+            later = segments[number + 1 :]
+            wanted = set(self.keep).union(*(o.requires | o.optional for s in later for o in s.operators))
             head = segment.operators[0]
             if head.couples == "all":
-                self._measure(head, streams, before, after)
+                self._measure(head, source, before, after)
             for operator in segment.operators:
                 before(operator=operator, observation=self.observation, stage="exec")
-            streams = self._pass(segment, streams, wanted)
-            for operator in segment.operators:
-                used = self.timer.seconds.get((operator.label, "exec"), 0.0)
-                after(operator=operator, observation=self.observation, stage="exec", seconds=used)
+            begun += segment.operators
+            source = self._advance(Stage(segment, source, self._passed_on(segment, source, wanted)), later)
+            if source.stage is None:  # else they are not through yet
+                for operator in begun:
+                    used = self.timer.seconds.get((operator.label, "exec"), 0.0)
+                    after(operator=operator, observation=self.observation, stage="exec", seconds=used)
+                begun.clear()
         for name in self.keep:
-            if name not in streams:
+            if name not in source.streams:
                 raise PipelineError(
                     f"stream {name!r} was asked to be kept, but no operator makes it", cure="keep a stream that a step provides"
                 )
-            stream = streams[name]
+            stream = source.streams[name]
             whole = np.array(stream.array, np.float64)
             if name in stream.means:
                 whole += stream.means[name].evaluate(slice(0, whole.shape[0]), slice(0, whole.shape[1]))
             self.observation.detdata[name] = whole
 
-    def _measure(
-        self, operator: Operator, streams: dict[str, Stream], before: Callable[..., None], after: Callable[..., None]
-    ) -> None:
-        names = sorted(operator.requires & set(streams))
+    def _keep_to_ceiling(self) -> None:
+        """What operators hold by now is known; streams and blocks may have the rest."""
+        settings = self.settings
+        if settings.ceiling is None:
+            return
+        spare = sum(a.nbytes for a in settings.spare)
+        room = max(settings.ceiling - (resident_memory() - spare), 1)
+        if room < settings.memory:
+            self.settings = settings = copy.copy(settings)
+            settings.memory = room
+            self._store = Store(room, settings.dtype, settings.spare, self.ledger)
+
+    def _passed_on(self, segment: Segment, source: Source, wanted: set[str]) -> frozenset[str]:
+        """Streams that later segments may read."""
+        made = source.names.union(*(o.provides for o in segment.operators))
+        return frozenset(made & wanted & self._streams)
+
+    def _measure(self, operator: Operator, source: Source, before: Callable[..., None], after: Callable[..., None]) -> None:
+        names = sorted(operator.requires & source.names)
         if len(names) != 1:
             raise PipelineError(
                 f"{operator.label} measures a whole stream, but {len(names)} reach it", cure="it must require exactly one"
             )
+        stream: Stream
+        if source.stage is not None:
+            stage, name, threads = source.stage, names[0], self.settings.threads
+            what = f"{operator.label} measures {name}"
+
+            def sweeper(work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+                return self._sweep(stage, name, work, what)
+
+            stream = StreamMadeAgain(name, self.observation, source.means, threads, self.settings.dtype, sweeper)
+        else:
+            stream = source.streams[names[0]]
         before(operator=operator, observation=self.observation, stage="measure")
-        start = time.process_time()
-        operator.measure(streams[names[0]], self.states[operator.label])
-        used = time.process_time() - start
+        start, others = time.process_time(), self._seconds("exec")
+        operator.measure(stream, self.states[operator.label])
+        used = time.process_time() - start - (self._seconds("exec") - others)  # what makes the stream again is theirs
         self.timer.add(operator.label, "measure", used)
         after(operator=operator, observation=self.observation, stage="measure", seconds=used)
 
-    def _pass(self, segment: Segment, sources: dict[str, Stream], wanted: set[str]) -> dict[str, Stream]:
-        """Run one segment's operators over all blocks; return the streams that are wanted later."""
-        observation, settings = self.observation, self.settings
+    def _seconds(self, stage: str) -> float:
+        return sum(self.timer.seconds.get((o.label, stage), 0.0) for o in self.operators)
+
+    def _sweep(
+        self, stage: Stage, name: str, work: Callable[[slice, slice, Floats], Any], what: str
+    ) -> Iterator[tuple[slice, slice, Any]]:
+        """`Stream.sweep` of a stream that ``stage`` makes."""
+
+        def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
+            block = self._make(stage, detectors, samples, {}, again=False)
+            return detectors, samples, work(detectors, samples, block.detdata[name])
+
+        todo = self._blocks(stage)
+        for done, result in enumerate(in_order(one, todo, self.settings.threads), 1):
+            self.settings.progress(done, len(todo), f"{self.observation.name}: {what}")
+            yield result
+        stage.has_been_swept()
+        self._let_go()
+
+    # ---- streams between segments
+
+    def _advance(self, stage: Stage, later: list[Segment]) -> Source:
+        """Let the segment of ``stage`` work, or put that off until its streams are read."""
+        in_place = frozenset() if stage.segment.halo else stage.wanted & stage.source.streams.keys()
+        new = sorted(stage.wanted - in_place)
+        size = len(new) * self._size()
+        if later and new and not self._store.fits(size):
+            how, why = self._where(stage, new, size, later)
+            if how == "again":
+                self._store.clear_spare()
+                found = self._probe(stage)
+                names = frozenset(stage.wanted & found.detdata.keys())
+                for name in sorted(names):
+                    self.observation.tally.state("Execution", f"stream {name} made again when it is read", why)
+                return Source({}, stage, names, dict(found.means))
+        return self._pass(stage)
+
+    def _where(self, stage: Stage, new: list[str], size: int, later: list[Segment]) -> tuple[Held, str]:
+        """What becomes of streams that do not fit in memory, and why."""
+        following = later[0]
+        head, span = following.operators[0], stage.span
+        hindrance = ""
+        if head.couples == "all" and not head.sweeps(self.observation):
+            hindrance = f"{head.label} reads it as a whole"
+        elif {span, following.span} == {"time", "detectors"}:
+            hindrance = f"{head.label} needs the other direction whole"
+        heads = [s.operators[0] for s in later]
+        readings = sum(o.sweeps(self.observation) for o in heads if o.couples == "all")
+        readings += round(2 * following.halo / PIECE + 0.4)
+        # what is made in order of time at little cost would cost much in any other
+        slow = stage.in_time_order and whole_span(following.span, span) == "time"
+        rate, cost = DISK_RATE, SAMPLE_COST
+        if size >= WORTH_MEASURING and not hindrance:
+            rate, cost = disk_rate(), self._cost(stage)
+        return choose(
+            f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
+            size,
+            self.observation.n_detectors * self.observation.n_samples,
+            readings=readings,
+            hindrance=hindrance,
+            threads=self.settings.threads,
+            prefer="spilled" if slow else self.settings.prefer,
+            rate=rate,
+            cost=cost,
+            place=self.observation.name,
+            ceiling=self._ceiling_for(2 * (self._store.held + size)),
+        )
+
+    def _cost(self, stage: Stage) -> float:
+        """CPU seconds for a sample, from a small block made twice: the first may compile."""
+        self._probe(stage)
+        start = time.thread_time()
+        block = self._probe(stage)
+        return (time.thread_time() - start) / (block.shape[0] * block.shape[1])
+
+    def _probe(self, stage: Stage) -> Block:
+        """The smallest block, made before its time."""
+        rows, columns = least_block(stage.span, (self.observation.n_detectors, self.observation.n_samples))
+        return self._make(stage, slice(0, rows), slice(0, columns), {}, again=True)
+
+    def _size(self) -> int:
+        """Bytes of a whole stream."""
+        return self.observation.n_detectors * self.observation.n_samples * np.dtype(self.settings.dtype).itemsize
+
+    def _pass(self, stage: Stage) -> Source:
+        """Run a segment's operators over all blocks; what it passes on is held."""
+        observation, settings, source = self.observation, self.settings, stage.source
         shape = (observation.n_detectors, observation.n_samples)
-        provided = set(sources).union(*(o.provides | o.optional | o.requires for o in segment.operators))
         made: dict[str, Stream] = {}
-        for name in sorted(wanted & provided):
-            if name in sources and not segment.halo:
-                made[name] = sources[name]  # changed in place
-            elif name in sources or any(name in o.provides for o in segment.operators):
-                made[name] = Stream(name, observation, self._allocate(name, shape), {}, settings.threads)
+        for name in sorted(stage.wanted):
+            if name in source.streams and not stage.segment.halo:
+                made[name] = source.streams[name]  # changed in place
+                continue
+            array, in_memory = self._store.allocate(name, shape)
+            made[name] = Stream(name, observation, array, {}, settings.threads)
+            if not in_memory:
+                observation.tally.state("Execution", f"stream {name} spilled to disk", f"{array.nbytes / 1e9:.2f} GB")
         seen: set[str] = set()
         means: dict[str, SmoothField] = {}
 
-        first, rest = segment.split()
-        passed_on = set(made).union(*(o.requires | o.optional for o in rest))
-        in_block = set(sources).union(passed_on, *(o.provides for o in rest)) if rest else provided
-        n_streams = len((in_block & provided) - {"boresight"}) + SCRATCH_STREAMS
-
         def work(detectors: slice, samples: slice) -> None:
-            margin = -(-segment.halo // TILE_SAMPLES) * TILE_SAMPLES
-            reach = slice(max(0, samples.start - margin), min(shape[1], samples.stop + margin))
-            # whole scans, and what is only taken in pieces, are worked on where they are kept
-            in_place = not segment.halo and (not rest or reach == slice(0, shape[1]))
-            block = self._block(detectors, reach, sources, made, in_place)
-            if first:
-                self._in_pieces(first, block, passed_on)
-            self._exec(rest[:1], block)
-            if reach != samples:
-                block = _trimmed(block, samples)
-            self._exec(rest[1:], block)
+            block = self._make(stage, detectors, samples, made, again=False)
             for name, stream in made.items():
                 if name in block.detdata:
                     seen.add(name)
                     if block.detdata[name] is not block.places.get(name):
                         stream.array[block.detectors, block.samples] = block.detdata[name]
             means.update(block.means)  # the same fields in every block
+            for stream in (*made.values(), *source.streams.values()):
+                forget_pages(stream.array)
 
-        blocks = list(self._blocks(segment, shape, n_streams))
-        what = ", ".join(o.label for o in segment.operators)
-        self._map(work, blocks, what)
+        what = ", ".join(o.label for o in stage.segment.operators)
+        self._map(work, self._blocks(stage), what)
+        stage.has_been_swept()
+        self._let_go()
         kept = {name: Stream(name, observation, s.array, means, settings.threads) for name, s in made.items() if name in seen}
         held = {id(s.array) for s in kept.values()}
-        self._release([s.array for s in [*sources.values(), *made.values()] if id(s.array) not in held])
-        return kept
+        self._store.release([s.array for s in [*source.streams.values(), *made.values()] if id(s.array) not in held])
+        return Source.of(kept, means)
+
+    def _let_go(self) -> None:
+        """Blocks are done with: their threads have ended."""
+        self._local = threading.local()
+        self.ledger.drop("blocks")
+
+    # ---- blocks
+
+    def _make(self, stage: Stage, detectors: slice, samples: slice, made: dict[str, Stream], *, again: bool) -> Block:
+        """A block with the segment's operators, and those of the stages before it, carried out."""
+        segment, again = stage.segment, again or stage.swept
+        n_samples = self.observation.n_samples
+        margin = -(-segment.halo // TILE_SAMPLES) * TILE_SAMPLES
+        reach = slice(max(0, samples.start - margin), min(n_samples, samples.stop + margin))
+        first, rest = segment.split()
+        # whole scans, and what is only taken in pieces, are worked on where they are kept
+        in_place = bool(made) and not segment.halo and (not rest or reach == slice(0, n_samples))
+        block = self._block(stage, detectors, reach, samples, made if in_place else {}, again)
+        passed_on = set(stage.wanted).union(*(o.requires | o.optional for o in rest))
+        if again:
+            first, rest = ([o for o in some if o.provides & self._streams] for some in (first, rest))
+        if first:
+            self._in_pieces(first, block, passed_on)
+        self._exec(rest[:1], block)
+        if reach != samples:
+            block = trimmed(block, samples)
+        self._exec(rest[1:], block)
+        buffers = [*self._local.__dict__.get("blocks", {}).values(), self._local.__dict__.get("pieces", {})]
+        size = sum(array.nbytes for held in buffers for array in held.values())
+        self.ledger.note(("blocks", threading.get_ident()), size)
+        return block
 
     def _exec(self, operators: list[Operator], block: Block) -> None:
         for operator in operators:
@@ -250,30 +376,51 @@ class Execution:
             operator.exec(block, self.states[operator.label])
             self.timer.add(operator.label, "exec", time.thread_time() - start)
 
-    def _block(
-        self, detectors: slice, samples: slice, sources: dict[str, Stream], made: dict[str, Stream], in_place: bool
-    ) -> Block:
-        """A block with its sources in it: where they are kept, or copies. With margins never in place: others read them too."""
-        buffers = self._local.__dict__.setdefault("blocks", {})
-        block = Block(self.observation, detectors, samples, dtype=self.settings.dtype, buffers=buffers)
-        if in_place:
-            block.places = {name: stream.array[detectors, samples] for name, stream in made.items()}
-        for name, stream in sources.items():
-            if in_place:
-                block.detdata[name] = block.places.get(name, stream.array[detectors, samples])
+    def _block(self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool) -> Block:
+        """A block with its sources in it: where they are kept (as ``made`` says), copies, or made again.
+
+        With margins never in place: others read them too.
+        """
+        source, observation = stage.source, self.observation
+        if again:
+            observation = copy.copy(observation)
+            observation.tally = Tally()
+        buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(stage.depth, {})
+        block = Block(observation, detectors, reach, dtype=self.settings.dtype, buffers=buffers, again=again)
+        block.places = {name: stream.array[detectors, reach] for name, stream in made.items()}
+        for name, stream in source.streams.items():
+            if made:
+                block.detdata[name] = block.places.get(name, stream.array[detectors, reach])
             else:
                 block.detdata[name] = block.buffer(name, block.shape)
-                block.detdata[name][...] = stream.array[detectors, samples]
+                block.detdata[name][...] = stream.array[detectors, reach]
             block.means.update(stream.means)
+        if source.stage is None:
+            return block
+        margins = slice(reach.start, samples.start), slice(samples.stop, reach.stop)
+        for part, known in ((margins[0], True), (samples, again), (margins[1], True)):
+            if part.start == part.stop:
+                continue
+            before = self._make(source.stage, detectors, part, {}, again=known)
+            for name in source.names:
+                if reach == samples:
+                    block.detdata[name] = before.detdata[name]
+                    continue
+                if name not in block.detdata:
+                    block.detdata[name] = block.buffer(name, block.shape)
+                block.detdata[name][:, within(reach, part)] = before.detdata[name]
+            block.means.update(before.means)
         return block
 
     def _in_pieces(self, operators: list[Operator], block: Block, passed_on: set[str]) -> None:
         """Let operators that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
         given, means = dict(block.detdata), block.means
         buffers = self._local.__dict__.setdefault("pieces", {})
-        for detectors, samples in _pieces(block.detectors, block.samples):
-            piece = Block(block.observation, detectors, samples, means=dict(means), dtype=block.dtype, buffers=buffers)
-            where = _within(block.detectors, detectors), _within(block.samples, samples)
+        for detectors, samples in pieces(block.detectors, block.samples):
+            piece = Block(
+                block.observation, detectors, samples, means=dict(means), dtype=block.dtype, buffers=buffers, again=block.again
+            )
+            where = within(block.detectors, detectors), within(block.samples, samples)
             for name, stream in given.items():
                 piece.detdata[name] = piece.buffer(name, piece.shape)
                 piece.detdata[name][...] = stream[where]
@@ -284,56 +431,48 @@ class Execution:
                 block.detdata[name][where] = piece.detdata[name]
             block.means = piece.means  # the same fields in every piece
 
-    def _allocate(self, name: str, shape: tuple[int, int]) -> Floats:
-        size = shape[0] * shape[1] * np.dtype(self.settings.dtype).itemsize
-        if size <= self.settings.memory // 2:
-            spare = self.settings.spare
-            while spare:
-                array = spare.pop()
-                if array.shape == shape and array.dtype == self.settings.dtype:
-                    return array
-            return np.empty(shape, self.settings.dtype)
-        if self._spill is None:
-            self._spill = tempfile.TemporaryDirectory(prefix="zonda-")
-        self.observation.tally.state("Execution", f"stream {name} spilled to disk", f"{size / 1e9:.2f} GB")
-        handle, path = tempfile.mkstemp(".stream", name, self._spill.name)  # a new file: the old one may still be read
-        os.close(handle)
-        return np.memmap(path, self.settings.dtype, "w+", shape=shape)
-
-    def _release(self, arrays: list[Floats]) -> None:
-        """Keep memory that is no longer used for the next stream: touching fresh memory costs as much as the physics."""
-        for array in {id(a): a for a in arrays if not isinstance(a, np.memmap)}.values():
-            self.settings.spare.append(array)
-
-    def _blocks(self, segment: Segment, shape: tuple[int, int], n_streams: int) -> Iterator[tuple[slice, slice]]:
-        span = segment.span
-        n_det, n_samp = shape
-        item = np.dtype(self.settings.dtype).itemsize
-        share = self.settings.memory // 2 // self.settings.threads // (n_streams * item)  # samples a block may hold
-        if span == "detectors":
-            rows, least = n_det, n_det * min(n_samp, TILE_SAMPLES)
-        else:
-            rows = min(n_det, TILE_DETECTORS)
-            least = rows * (n_samp if span == "time" else min(n_samp, TILE_SAMPLES))
-        if least > share:
-            need = 2 * least * self.settings.threads * n_streams * item
+    def _blocks(self, stage: Stage) -> list[tuple[slice, slice]]:
+        """The blocks in which a stage works. Raises PipelineError where the least one does not fit."""
+        settings, observation = self.settings, self.observation
+        shape = observation.n_detectors, observation.n_samples
+        item = np.dtype(settings.dtype).itemsize
+        whole, part = self._streams_in_block(stage)
+        rows, columns = least_block(stage.span, shape)
+        shares = (block_share(room // settings.threads // item, whole, part) for room in (settings.memory // 2, self._room()))
+        share = next((share for share in shares if share >= rows * columns), 0)
+        if not share:
+            need = settings.threads * item * (whole * rows * columns + part * min(rows * columns, rows * PIECE))
             raise PipelineError(
-                f"one block of {rows} detectors needs {need / 1e6:.1f} MB, "
-                f"the memory budget is {self.settings.memory / 1e6:.1f} MB",
-                place=self.observation.name,
-                cure=f"raise --memory to {-(-need // 1_000_000)}MB, use fewer --threads, or make the scan shorter",
+                f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on each of {settings.threads} "
+                f"threads, the memory budget has {self._room() / 1e6:.1f} MB for all of them",
+                place=observation.name,
+                cure=f"raise --memory to {self._ceiling_for(need + self._store.held)}, use fewer --threads, or make the scan "
+                "shorter",
             )
-        if segment.in_time_order and span == "sample":
-            columns = min(n_samp, PIECE, max(1, share // rows // TILE_SAMPLES) * TILE_SAMPLES)
-            rows = min(n_det, max(1, share // columns // TILE_DETECTORS) * TILE_DETECTORS)
-            for start in range(0, n_samp, columns):
-                for first in range(0, n_det, rows):
-                    yield slice(first, min(first + rows, n_det)), slice(start, min(start + columns, n_samp))
-            return
-        columns = n_samp if span == "time" else min(n_samp, max(1, share // rows // TILE_SAMPLES) * TILE_SAMPLES)
-        for first in range(0, n_det, rows):
-            for start in range(0, n_samp, columns):
-                yield slice(first, min(first + rows, n_det)), slice(start, min(start + columns, n_samp))
+        return list(blocks(stage.span, stage.in_time_order, shape, share))
+
+    def _streams_in_block(self, stage: Stage | None) -> tuple[int, int]:
+        """Numbers of block-sized and of piece-sized arrays that a stage and those before it hold."""
+        if stage is None:
+            return 0, 0
+        first, rest = stage.segment.split()
+        names = set(stage.source.names | stage.wanted).union(*(o.requires | o.optional | o.provides for o in rest))
+        every = names.union(*(o.requires | o.optional | o.provides for o in first)) if first else set()
+        before = self._streams_in_block(stage.source.stage)
+        whole, part = len(names & self._streams), len(every & self._streams)
+        scratch = SCRATCH_STREAMS if rest else 0
+        margins = 2 if stage.segment.halo else 1  # a block with margins is trimmed to a copy
+        return before[0] + margins * whole + scratch, max(before[1], part + (SCRATCH_STREAMS if first else 0))
+
+    def _room(self) -> int:
+        """Bytes that blocks may take in all: what streams leave."""
+        return self.settings.memory - self._store.held
+
+    def _ceiling_for(self, need: int) -> str:
+        """``--memory`` with which streams and blocks may take ``need`` bytes."""
+        settings = self.settings
+        fixed = max(settings.ceiling - settings.memory, 0) if settings.ceiling else 0
+        return f"{-(-(need + fixed) // 1_000_000)}MB"
 
     def _map(self, work: Callable[[slice, slice], None], blocks: list[tuple[slice, slice]], what: str) -> None:
         """Call ``work`` on every block, on ``threads`` threads; the first error stops all."""
@@ -354,38 +493,3 @@ class Execution:
                 for future in futures:
                     future.cancel()
                 raise
-
-
-def _pieces(detectors: slice, samples: slice) -> Iterator[tuple[slice, slice]]:
-    """The pieces of a block, in order of time."""
-    for start in range(samples.start, samples.stop, PIECE):
-        for first in range(detectors.start, detectors.stop, TILE_DETECTORS):
-            yield slice(first, min(first + TILE_DETECTORS, detectors.stop)), slice(start, min(start + PIECE, samples.stop))
-
-
-def _within(whole: slice, part: slice) -> slice:
-    """Where ``part`` lies in an array that begins where ``whole`` does."""
-    return slice(part.start - whole.start, part.stop - whole.start)
-
-
-def _trimmed(block: Block, samples: slice) -> Block:
-    """The block without its margins."""
-    inside = _within(block.samples, samples)
-    detdata = {name: np.ascontiguousarray(array[:, inside]) for name, array in block.detdata.items()}
-    return Block(block.observation, block.detectors, samples, detdata, block.means, block.dtype)
-
-
-def available_memory() -> int:
-    """Free memory of this machine in bytes (2 GB where it cannot be told)."""
-    with suppress(OSError, ValueError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    with suppress(OSError, ValueError, AttributeError):
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return 2 << 30
-
-
-def available_threads() -> int:
-    """CPUs this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Writing files: a product is there whole or not at all, and a failure says what to do about it."""
+"""Reading and writing files: what cannot be read, or written, says what to do about it; a product is there whole or not at all."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from .errors import OutputError
+from .errors import InputError, OutputError, ZondaError
 
 _CURES = {
     errno.ENOSPC: ("no space left on the disk", "free some space or choose another output folder"),
@@ -49,6 +50,68 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except OSError as error:
         raise output_error(error, path) from error
+
+
+@contextlib.contextmanager
+def reading(place: str, kind: str, cure: str) -> Iterator[None]:
+    """Raise an `InputError` for whatever reading a file of foreign bytes raises in the body.
+
+    Libraries meet corrupt bytes with nearly every exception there is, so all are caught: keep only the reading in the body.
+
+    Parameters
+    ----------
+    place
+        The file, as messages call it.
+    kind
+        What it should be: ``FITS``.
+    cure
+        What to do where it is something else.
+    """
+    try:
+        yield
+    except ZondaError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError("no such file", place=place, cure="check the path; it may have been removed during the run") from error
+    except IsADirectoryError as error:
+        raise InputError("is a folder, not a file", place=place, cure="give the file's path") from error
+    except PermissionError as error:
+        raise InputError("permission denied", place=place, cure="make the file readable") from error
+    except KeyError as error:
+        raise InputError(f"is incomplete: {error.args[0] if error.args else ''}", place=place, cure=cure) from error
+    except MemoryError as error:
+        raise InputError("needs more memory than there is", place=place, cure=cure) from error
+    except Exception as error:
+        raise InputError(f"cannot be read as {kind}: {first_line(error)}", place=place, cure=cure) from error
+
+
+@contextlib.contextmanager
+def own_data(path: Path) -> Iterator[Any]:
+    """A numpy archive that comes with zonda. Raises `InputError` where it is missing or damaged (its checksums are tested)."""
+    import numpy as np
+
+    cure = "the installation is damaged: pip install --force-reinstall zonda"
+    with reading(f"data file {path}", "a numpy archive", cure), np.load(path, allow_pickle=False) as archive:
+        yield archive
+
+
+def first_line(error: Exception) -> str:
+    """The line of an error's text that says why: wcslib begins with the line of its own source code."""
+    lines = [line for line in str(error).splitlines() if line.strip() and not line.startswith("ERROR ")]
+    return (lines or [type(error).__name__])[0].strip().rstrip(".")[:300]
+
+
+def check_memory(size: int, what: str, place: str) -> None:
+    """Refuse to read ``what`` of ``size`` bytes where that is more than the machine has free (`InputError`)."""
+    from .execution import available_memory
+
+    free = available_memory()
+    if size > free:
+        raise InputError(
+            f"{what} needs {size / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are free",
+            place=place,
+            cure="if the file should be smaller it is corrupt: copy it again; else give a smaller one or a larger machine",
+        )
 
 
 def temporary_sibling(path: str | os.PathLike[str]) -> Path:

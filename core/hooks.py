@@ -60,6 +60,15 @@ class Hooks:
         """``done`` of ``total`` steps of ``what`` are finished; may come from any thread."""
 
     @hookspec
+    def zonda_campaign_progress(self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float) -> None:
+        """``done`` of ``total`` tasks of a campaign are finished, with ``samples`` of ``all_samples``, after ``seconds``; and
+        ``failed`` attempts have failed."""
+
+    @hookspec
+    def zonda_campaign_end(self) -> None:
+        """No task of the campaign is at work any more."""
+
+    @hookspec
     def zonda_commands(self, group: click.Group) -> None:
         """Add commands to ``zonda``: ``@group.command() def mine(): ...``."""
 

@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from .configuration.files import InputPath
 from .configuration.parameters import Parameters, quantity
-from .configuration.units import Angle, AngularAcceleration, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
+from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
 from .errors import InputError
 from .focalplane import Focalplane
 
@@ -110,6 +110,18 @@ class Telescope(Parameters):
     """Fastest motion on the sky, where there is a limit."""
     acceleration_max: AngularAcceleration | None = Field(None, gt=0)
     """Largest acceleration on the sky, where there is a limit."""
+    azimuth_speed_max: AngularSpeed | None = Field(None, gt=0)
+    """Fastest turn of the azimuth axis: the speed on the sky over the cosine of the elevation."""
+    azimuth_acceleration_max: AngularAcceleration | None = Field(None, gt=0)
+    """Largest acceleration of the azimuth axis."""
+    azimuth_jerk_max: AngularJerk | None = Field(None, gt=0)
+    """Fastest change of the azimuth axis' acceleration."""
+    elevation_speed_max: AngularSpeed | None = Field(None, gt=0)
+    """Fastest turn of the elevation axis."""
+    elevation_acceleration_max: AngularAcceleration | None = Field(None, gt=0)
+    """Largest acceleration of the elevation axis."""
+    elevation_jerk_max: AngularJerk | None = Field(None, gt=0)
+    """Fastest change of the elevation axis' acceleration."""
 
 
 class Instrument(Parameters):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import PrivateAttr
@@ -28,10 +29,15 @@ class Operator(Parameters):
     2. For each observation, ``configure(observation)`` of every operator (resolve values that others need: efficiencies,
        NET), then ``prepare(observation) -> state`` of every operator (draw turbulence, build coefficients).
     3. ``exec(block, state)`` for every block. Called from several threads at once: the state is read only, or guarded.
-       Its result may depend on absolute detector and sample indices only, never on where the block begins or ends.
+       Its result may depend on absolute detector and sample indices only, never on where the block begins or ends. A block may
+       come again (`Block.again`) where the streams between operators do not fit in memory; one that makes no stream is spared.
     4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
     5. ``finalize(data)`` once at the end of the run: turn sums into products, write files. After it `at_end` operators see
        ``after_run(data)``.
+
+    A campaign (`core.campaign`) shares the observations out among tasks. What `observe` works out from all of them comes from
+    `agree` and `lay_out`; between `collect` and `finalize`, `pack` takes a task's partial products out of ``data.products`` and
+    `merge` adds them together. An operator that puts anything there in `collect` needs both to take part in a campaign.
 
     Class attributes
     ----------------
@@ -44,7 +50,7 @@ class Operator(Parameters):
         What one output sample depends on: ``sample`` (itself alone, plus `halo` neighbours), ``detectors`` (all detectors
         at that instant), ``time`` (one detector's whole scan), ``all``. An ``all`` operator implements
         ``measure(stream, state)``, which reads the whole stream as often as it likes; its ``exec`` then works like that of
-        a ``sample`` operator.
+        a ``sample`` operator. One that says how often, in `sweeps`, need not have the stream in memory.
     main_run_only
         True for operators left out of companion runs (spectra, saved time streams).
     at_end
@@ -79,6 +85,13 @@ class Operator(Parameters):
     def observe(self, data: Data) -> None:
         """Append observations to ``data`` (pointing operators), or look at those that are there (map makers: a common grid)."""
 
+    def check(self, data: Data) -> list[str]:
+        """What `zonda check` finds out beyond the parameters, in well under a second: lines to print, or a `ZondaError`.
+
+        Pointing operators append (possibly coarser) observations to ``data``, on which later steps may look.
+        """
+        return []
+
     def configure(self, observation: Observation) -> None:
         """Resolve values that other operators read, e.g. the focal plane's efficiencies."""
 
@@ -97,6 +110,10 @@ class Operator(Parameters):
     def measure(self, stream: Stream, state: Any) -> None:
         """Read the whole stream (``couples = "all"`` only); leave the result in ``state``."""
 
+    def sweeps(self, observation: Observation) -> int:
+        """How often `measure` goes through its stream with `Stream.sweep`; 0: it wants ``stream.array``, in memory or on disk."""
+        return 0
+
     def exec(self, block: Block, state: Any) -> None:
         """Act on one block."""
 
@@ -112,6 +129,27 @@ class Operator(Parameters):
 
     def finalize(self, data: Data) -> None:
         """Finish products."""
+
+    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
+        """What all observations of a campaign must have in common (the grid of a map), as plain values and arrays; None: nothing.
+
+        Called after pointing instead of `observe`, for one part of the observations after the other. ``before``: what those
+        before had in common. An entry ``fixed: True`` says that later parts cannot change it.
+        """
+        return None
+
+    def lay_out(self, layout: Mapping[str, Any]) -> None:
+        """Take what `agree` found for all observations."""
+
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """Take the partial products of the run in progress out of ``data.products``: plain values and arrays; None: nothing.
+
+        ``first``: the part begins with the very first observation; what is of that one alone need not be in the others.
+        """
+        return None
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Add a part that `pack` made to ``data.products``. Parts come in the order of their observations."""
 
     def traits(self, observation: Observation) -> Traits:
         """What other operators' bounds need to know of this one (noise, pixels, filters); see `core.plan`.

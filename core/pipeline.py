@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -41,6 +41,34 @@ class Companion(Parameters):
         if self.only is not None:
             return bool(provides & set(self.only))
         return not provides & set(self.without or ())
+
+
+@dataclass
+class Part:
+    """Some of the scans of a run, whose products stay unfinished, to be combined with those of other parts (`core.campaign`).
+
+    Attributes
+    ----------
+    scans
+        Positions of the scans; None: all.
+    layouts
+        By label: what `Operator.agree` found for all scans of all parts.
+    first
+        Whether the very first scan is among them.
+    packed
+        By run and label: what `Operator.pack` took out. Filled by `Pipeline.run`.
+    """
+
+    scans: Sequence[int] | None = None
+    layouts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    first: bool = True
+    packed: dict[str, dict[str, Mapping[str, Any]]] = field(default_factory=dict)
+
+    def take(self, operator: Operator, data: Data) -> None:
+        """Pack one operator's products of the run in progress."""
+        found = operator.pack(data, self.first)
+        if found is not None:
+            self.packed.setdefault(data.run, {})[operator.label] = found
 
 
 @dataclass(frozen=True)
@@ -177,6 +205,7 @@ class Pipeline:
         memory: int | None = None,
         keep: Sequence[str] = (),
         provenance: Mapping[str, Any] | None = None,
+        part: Part | None = None,
     ) -> Data:
         """Observe the scene and return what came out.
 
@@ -194,13 +223,15 @@ class Pipeline:
             Streams to keep in ``observation.detdata`` (float64, mean emission included) as they stand after the last step.
         provenance
             Entries added to ``data.provenance``.
+        part
+            Run some of the scans only and pack their products instead of finishing them; nothing acts at the end.
         """
         from .files import check_output_folder
         from .hooks import manager
 
         hooks = manager().hook
         data = Data(scene=scene, output=None if output is None else Path(output))
-        if data.output is not None:
+        if data.output is not None and part is None:  # a part makes a folder only when it writes there
             check_output_folder(data.output)
         data.provenance = {**self._provenance(scene), **(provenance or {})}
         settings = Settings(
@@ -216,10 +247,15 @@ class Pipeline:
             timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
         for operator in sorted(self.operators, key=lambda o: not o.at_end):  # what only acts at the end may refuse at once
             start = time.thread_time()
-            operator.observe(data)  # pointing steps append observations; map makers lay out the grid of all of them
+            if part is None or not (operator.at_end or operator.label in part.layouts):
+                operator.observe(data)  # pointing steps append observations; map makers lay out the grid of all of them
+            elif operator.label in part.layouts:
+                operator.lay_out(part.layouts[operator.label])
             timer.add(operator.label, "observe", time.thread_time() - start)
         if not data.observations:
             raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
+        if part is not None and part.scans is not None:
+            data.observations = [data.observations[k] for k in part.scans]
         pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         for run in ["", *self.runs]:
             data.run = run
@@ -235,6 +271,47 @@ class Pipeline:
                 execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator)
                 data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             for operator in steps:
+                if part is None:
+                    self._finalize(operator, data, timer, hooks)
+                else:
+                    part.take(operator, data)
+        data.run = ""
+        for operator in self.operators:
+            if operator.at_end and part is None:
+                data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
+                self._finalize(operator, data, timer, hooks)
+        data.provenance["timings"] = timer.rows()
+        hooks.zonda_pipeline_end(pipeline=self, data=data)
+        return data
+
+    def pack(self, data: Data, first: bool) -> dict[str, dict[str, Mapping[str, Any]]]:
+        """The partial products in ``data``, by run and label."""
+        part = Part(first=first)
+        for run in ["", *self.runs]:
+            data.run = run
+            for operator in self._selected(run):
+                part.take(operator, data)
+        data.run = ""
+        return part.packed
+
+    def merge(self, data: Data, packed: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
+        """Add the partial products of a part to ``data``."""
+        for run in ["", *self.runs]:
+            data.run = run
+            for operator in self._selected(run):
+                if (found := packed.get(run, {}).get(operator.label)) is not None:
+                    operator.merge(data, found)
+        data.run = ""
+
+    def finish(self, data: Data) -> Data:
+        """Finish merged products, and let the operators act that act at the end."""
+        from .hooks import manager
+
+        hooks, timer = manager().hook, Timer()
+        hooks.zonda_pipeline_start(pipeline=self, data=data)
+        for run in ["", *self.runs]:
+            data.run = run
+            for operator in self._selected(run):
                 self._finalize(operator, data, timer, hooks)
             for operator in self.operators:
                 if operator.at_end:
@@ -242,9 +319,7 @@ class Pipeline:
         data.run = ""
         for operator in self.operators:
             if operator.at_end:
-                data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
                 self._finalize(operator, data, timer, hooks)
-        data.provenance["timings"] = timer.rows()
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 

@@ -115,21 +115,31 @@ def _target(start: int, stop: int, stream: int, out: NDArray[Any] | None, dtype:
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def fill_normals(key, stream, start, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n,) float32 or float64 with normal deviates ``start`` .. of ``stream`` under ``key`` (2,) uint32."""
-    words = np.empty((4, _BLOCKS), np.uint32)
-    tile = np.empty(TILE, np.float32)
-    bits = np.empty(_BLOCKS, np.int32)
+    words, bits, tile = normal_scratch()
     first = int64(start)
     stop = first + int64(out.size)
     for number in range(first >> int64(10), (stop + int64(TILE - 1)) >> int64(10)):
-        counter = uint64(number) << uint64(8)
-        philox(key, counter & uint64(0xFFFFFFFF), counter >> uint64(32), uint64(stream), uint64(0), words)
-        box_muller(words[0], words[1], bits, tile[0:256], tile[256:512])
-        box_muller(words[2], words[3], bits, tile[512:768], tile[768:1024])
+        normal_tile(key, stream, number, words, bits, tile)
         origin = number << int64(10)
         low, high = max(first, origin), min(stop, origin + int64(TILE))
         source, target = tile[low - origin : high - origin], out[low - first : high - first]
         for k in range(uint64(source.size)):
             target[k] = source[k]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def normal_scratch():  # type: ignore[no-untyped-def]
+    """(words, bits, tile) for `normal_tile`."""
+    return np.empty((4, _BLOCKS), np.uint32), np.empty(_BLOCKS, np.int32), np.empty(TILE, np.float32)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def normal_tile(key, stream, number, words, bits, tile):  # type: ignore[no-untyped-def]
+    """Fill ``tile`` (`TILE`,) float32 with normal deviates `TILE` number .. of ``stream`` under ``key``."""
+    counter = uint64(number) << uint64(8)
+    philox(key, counter & uint64(0xFFFFFFFF), counter >> uint64(32), uint64(stream), uint64(0), words)
+    box_muller(words[0], words[1], bits, tile[0:256], tile[256:512])
+    box_muller(words[2], words[3], bits, tile[512:768], tile[768:1024])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

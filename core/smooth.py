@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -63,6 +64,16 @@ def bspline_weights(step: int, dtype: type = np.float64) -> Floats:
 @lru_cache(maxsize=32)
 def _basis(step: int, dtype: str) -> Floats:
     return bspline_weights(step, np.dtype(dtype).type)
+
+
+class Series(NamedTuple):
+    """A field over a block, for kernels that evaluate it where they use it with `series_into`."""
+
+    lines: Floats
+    """(n_det_block, n): each detector's B-spline coefficients from cell ``first`` on."""
+    first: int
+    basis: Floats
+    """(4, step): the weights B_j."""
 
 
 @dataclass(frozen=True)
@@ -118,14 +129,20 @@ class SmoothField:
 
         Bits depend on the absolute detector and sample only. ``out`` is overwritten.
         """
-        weights = self.weights[detectors]
+        if out is None:
+            out = np.empty((len(self.weights[detectors]), samples.stop - samples.start))
+        _evaluate(*self.series(detectors, samples, out.dtype), samples.start, out)
+        return out
+
+    def series(self, detectors: slice, samples: slice, dtype: np.dtype[Any]) -> Series:
+        """What a kernel needs to evaluate f at the detectors and samples of a block, to the same bits as `evaluate`."""
         start, stop = samples.start, samples.stop
         if not 0 <= start <= stop <= self.n_samples:
             raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
-        if out is None:
-            out = np.empty((weights.shape[0], stop - start))
-        _evaluate(weights, self.coefficients, _basis(self.step, out.dtype.str), start, out)
-        return out
+        weights, first = self.weights[detectors], start // self.step
+        lines = np.empty((len(weights), -(-stop // self.step) - first + 3), dtype)
+        _lines(weights, self.coefficients, first, lines)
+        return Series(lines, first, _basis(self.step, lines.dtype.str))
 
 
 @dataclass(frozen=True)
@@ -193,26 +210,33 @@ def _evaluate_rows(coefficients, basis, start, out):  # type: ignore[no-untyped-
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
-def _evaluate(weights, coefficients, basis, start, out):  # type: ignore[no-untyped-def]
-    n_det, n = out.shape
-    n_node = weights.shape[1]
-    step = basis.shape[1]
-    stop = start + n
-    first, last = start // step, (stop + step - 1) // step
-    line = np.empty(last - first + 3, out.dtype)
-    b0, b1, b2, b3 = basis[0], basis[1], basis[2], basis[3]
-    for d in range(n_det):
-        for k in range(line.size):
+def _lines(weights, coefficients, first, lines):  # type: ignore[no-untyped-def]
+    """lines[d, k] = sum_n weights[d, n] coefficients[n, first + k], summed in float64."""
+    for d in range(lines.shape[0]):
+        for k in range(lines.shape[1]):
             total = 0.0
-            for node in range(n_node):
+            for node in range(weights.shape[1]):
                 total += weights[d, node] * coefficients[node, first + k]
-            line[k] = total
-        row = out[d]
-        for m in range(first, last):
-            low, high = max(m * step, start), min((m + 1) * step, stop)
-            k, r = m - first, low - m * step
-            c0, c1, c2, c3 = line[k], line[k + 1], line[k + 2], line[k + 3]
-            into = row[low - start : high - start]
-            w0, w1, w2, w3 = b0[r : r + into.size], b1[r : r + into.size], b2[r : r + into.size], b3[r : r + into.size]
-            for t in range(into.size):
-                into[t] = c0 * w0[t] + c1 * w1[t] + c2 * w2[t] + c3 * w3[t]
+            lines[d, k] = total
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _evaluate(lines, first, basis, start, out):  # type: ignore[no-untyped-def]
+    for d in range(out.shape[0]):
+        series_into(lines[d], first, basis, start, out[d])
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def series_into(line, first, basis, start, into):  # type: ignore[no-untyped-def]
+    """One detector of a `Series` at the samples start .. start + into.size - 1 (absolute). For use in kernels."""
+    step = basis.shape[1]
+    stop = start + into.size
+    b0, b1, b2, b3 = basis[0], basis[1], basis[2], basis[3]
+    for m in range(start // step, (stop + step - 1) // step):
+        low, high = max(m * step, start), min((m + 1) * step, stop)
+        k, r = m - first, low - m * step
+        c0, c1, c2, c3 = line[k], line[k + 1], line[k + 2], line[k + 3]
+        part = into[low - start : high - start]
+        w0, w1, w2, w3 = b0[r : r + part.size], b1[r : r + part.size], b2[r : r + part.size], b3[r : r + part.size]
+        for t in range(part.size):
+            part[t] = c0 * w0[t] + c1 * w1[t] + c2 * w2[t] + c3 * w3[t]

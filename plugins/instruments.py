@@ -13,17 +13,55 @@ PAPER = "van Marrewijk, Morris et al. 2024, Table 1"
 ROUND = "round values after public descriptions of the instrument; efficiencies, NET and knee are our assumptions"
 NO_PINK = "it gives no pink-noise level: knee and slope are our choice"
 
+# Limits of the axes. AtLAST: "3 deg/s scanning and 1 deg/s2 acceleration" (Mroczkowski et al. 2025, A&A 694, A142), taken on the
+# sky, as the paper's own scans need them. GBT: 36 deg/min in azimuth (17 in the cold; Minter, GBT keyhole memo). APEX: an ALMA
+# antenna, 6 and 3 deg/s (Saito et al. 2011 for the ACA's). Round values after public descriptions: GBT's elevation and
+# accelerations, LMT, ACT, SPT, SO LAT and FYST (one design, 3 deg/s and 6 deg/s2 in azimuth; Parshley et al. 2018), SO SAT,
+# CMB-S4's (3 deg/s2 of its reference scans). None is known to us where none stands.
 TELESCOPES = {
-    "GBT": Telescope(name="GBT", diameter="100 m", elevation_min="5 deg", elevation_max="88 deg"),
+    "GBT": Telescope(
+        name="GBT",
+        diameter="100 m",
+        elevation_min="5 deg",
+        elevation_max="88 deg",
+        azimuth_speed_max="0.6 deg/s",
+        azimuth_acceleration_max="0.05 deg/s2",
+        elevation_speed_max="0.3 deg/s",
+        elevation_acceleration_max="0.05 deg/s2",
+    ),
     "AtLAST": Telescope(name="AtLAST", diameter="50 m", speed_max="3 deg/s", acceleration_max="1 deg/s2"),
-    "LMT": Telescope(name="LMT", diameter="50 m"),
-    "ACT": Telescope(name="ACT", diameter="6 m"),
-    "SO LAT": Telescope(name="SO LAT", diameter="6 m"),
-    "SO SAT": Telescope(name="SO SAT", diameter="0.42 m"),
-    "SPT": Telescope(name="SPT", diameter="10 m"),
-    "FYST": Telescope(name="FYST", diameter="6 m"),
-    "CMB-S4 LAT": Telescope(name="CMB-S4 LAT", diameter="6 m"),
-    "APEX": Telescope(name="APEX", diameter="12 m"),
+    "LMT": Telescope(name="LMT", diameter="50 m", azimuth_speed_max="1 deg/s", elevation_speed_max="1 deg/s"),
+    "ACT": Telescope(name="ACT", diameter="6 m", azimuth_speed_max="2 deg/s"),
+    "SO LAT": Telescope(
+        name="SO LAT",
+        diameter="6 m",
+        azimuth_speed_max="3 deg/s",
+        azimuth_acceleration_max="6 deg/s2",
+        elevation_speed_max="1.5 deg/s",
+    ),
+    "SO SAT": Telescope(
+        name="SO SAT",
+        diameter="0.42 m",
+        azimuth_speed_max="3 deg/s",
+        azimuth_acceleration_max="3 deg/s2",
+        elevation_speed_max="1 deg/s",
+    ),
+    "SPT": Telescope(
+        name="SPT",
+        diameter="10 m",
+        azimuth_speed_max="4 deg/s",
+        azimuth_acceleration_max="4 deg/s2",
+        elevation_speed_max="2 deg/s",
+    ),
+    "FYST": Telescope(
+        name="FYST",
+        diameter="6 m",
+        azimuth_speed_max="3 deg/s",
+        azimuth_acceleration_max="6 deg/s2",
+        elevation_speed_max="1.5 deg/s",
+    ),
+    "CMB-S4 LAT": Telescope(name="CMB-S4 LAT", diameter="6 m", azimuth_speed_max="3 deg/s", azimuth_acceleration_max="3 deg/s2"),
+    "APEX": Telescope(name="APEX", diameter="12 m", azimuth_speed_max="6 deg/s", elevation_speed_max="3 deg/s"),
     "generic 6 m": Telescope(name="generic 6 m", diameter="6 m"),
 }
 

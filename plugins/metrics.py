@@ -27,6 +27,11 @@ that is left in the map b of the sky alone; rings i of equal width in log k, fro
 and between detectors (bins of separation), all in one list of values D:
 
     D = < (s(t + lag) - s(t))^2 >  and  < (s_i(t) - s_j(t))^2 >,    E = sqrt( mean (D / D0 - 1)^2 )       (5)
+
+Each of N differences d measured through white noise of rms n per sample has the square (d + sqrt(2) n g)^2, g a standard normal,
+of variance 8 n^4 + 8 n^2 D where d is given, so that D, its 2 n^2 taken off, is known to within
+
+    sqrt( (8 n^4 + 8 n^2 D) / N )                                                                        (6)
 """
 
 from __future__ import annotations
@@ -202,7 +207,7 @@ class Psd(Metric):
 
 
 class Structure(Metric):
-    """Equation (5). It keeps the atmosphere's stream at some detectors by a step of its own."""
+    """Equation (5). It keeps the atmosphere's stream, and the white noise, at some detectors by a step of its own."""
 
     says: ClassVar[str] = "rms relative error of the atmosphere's structure functions in time and across the field"
 
@@ -212,22 +217,30 @@ class Structure(Metric):
             raise PipelineError("the metric structure needs an atmosphere, and no step makes one", place="--metric", cure=cure)
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
-        """With a `TimeStreams` of the atmosphere behind the step that forms the signal."""
+        """With a `TimeStreams` of the atmosphere, and of the noise, behind the step that forms the signal."""
         at = next(k for k, o in enumerate(operators) if "signal" in o.provides) + 1
-        trace = TimeStreams(name=TRACE, streams=["atmosphere"], detectors=TRACED)
+        noisy = any("white" in o.provides for o in operators[:at])
+        trace = TimeStreams(name=TRACE, streams=["atmosphere", "white"] if noisy else ["atmosphere"], detectors=TRACED)
         return [*operators[:at], trace, *operators[at:]]
 
     def measure(self, data: Data) -> Floats:
+        """(2, n): D, and its relative standard error from the white noise of those detectors (NaN where there is none)."""
         trace, observation = data.products[TRACE], data.observations[0]
         s: Floats = trace.streams["atmosphere"]
         n = s.shape[1]
         lags = np.unique(np.geomspace(1, max(1, n // 4), LAGS).astype(int))
-        in_time = [float(np.mean((s[:, lag:] - s[:, :-lag]) ** 2)) for lag in lags if lag < n]
+        lags = lags[lags < n]
+        in_time = np.array([float(np.mean((s[:, lag:] - s[:, :-lag]) ** 2)) for lag in lags])
         index = [observation.focalplane.names.index(name) for name in trace.names]
-        xi, eta = observation.focalplane.xi[index], observation.focalplane.eta[index]
+        plane = observation.focalplane
+        noise = math.nan  # of one sample, in kelvins of the atmosphere
+        if "white" in trace.streams:
+            noise = float(trace.streams["white"].std() / plane.illumination_efficiency[index].mean())
+        pairs = len(index) * (n - lags) / 2  # increments that overlap share a sample
+        xi, eta = plane.xi[index], plane.eta[index]
         i, j = np.triu_indices(len(index), 1)
         if not i.size:
-            return np.array(in_time)
+            return np.array([in_time, _uncertain(in_time, noise, pairs)])
         distance = np.hypot(xi[i] - xi[j], eta[i] - eta[j])
         seen = s[:, :: max(1, n // INSTANTS)]
         squares = np.array([np.mean((seen[a] - seen[b]) ** 2) for a, b in zip(i, j, strict=True)])
@@ -235,14 +248,27 @@ class Structure(Metric):
         number = np.clip(np.searchsorted(edges, distance, "right") - 1, 0, SEPARATIONS - 1)
         count = np.bincount(number, minlength=SEPARATIONS)
         across = np.bincount(number, squares, SEPARATIONS)[count > 0] / count[count > 0]
-        return np.concatenate([in_time, across])
+        # a bin's pairs share detectors: no more of them are independent than there are detectors
+        pairs = np.concatenate([pairs, np.minimum(count[count > 0], len(index) / 2) * seen.shape[1]])
+        d = np.concatenate([in_time, across])
+        return np.array([d, _uncertain(d, noise, pairs)])
 
     def error(self, found: Floats, reference: Floats) -> float:
-        return _relative(found, reference)
+        return _relative(found[0], reference[0])
 
     def summary(self, found: Floats) -> Floats:
         """ln D: differences of it are relative."""
-        return np.log(np.maximum(found, 1e-300))
+        return np.asarray(np.log(np.maximum(found[0], 1e-300)), np.float64)
+
+    def floor(self, reference: Floats) -> float | None:
+        """Statistical uncertainty of D where it is measured through the detectors' white noise, equation (6)."""
+        value = float(np.sqrt(np.mean(reference[1] ** 2)))
+        return value if math.isfinite(value) else None
+
+
+def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
+    """Relative standard error of D from N differences that carry white noise of the given rms, equation (6)."""
+    return np.asarray(np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs) / np.maximum(d, 1e-300), np.float64)
 
 
 def _relative(a: Floats, b: Floats) -> float:

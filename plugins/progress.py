@@ -36,8 +36,29 @@ class Progress:
             sys.stderr.flush()
 
     @hookimpl
+    def zonda_campaign_progress(self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float) -> None:
+        """One line: ``tasks 12 of 100 [##........] 12 %, 3.1e+06 samples/s, 80 s left``."""
+        if not sys.stderr.isatty():
+            return
+        now = time.monotonic()
+        with self._lock:
+            if done < total and now - self._shown < INTERVAL:
+                return
+            self._shown, self._visible = now, True
+            sys.stderr.write("\r\033[K" + campaign_line(done, total, failed, samples, all_samples, seconds))
+            sys.stderr.flush()
+
+    @hookimpl
+    def zonda_campaign_end(self) -> None:
+        """Clear the line."""
+        self._clear()
+
+    @hookimpl
     def zonda_pipeline_end(self, pipeline: Any) -> None:
         """Clear the line."""
+        self._clear()
+
+    def _clear(self) -> None:
         with self._lock:
             if self._visible:
                 sys.stderr.write("\r\033[K")
@@ -51,6 +72,18 @@ def line(done: int, total: int, what: str, seconds: float, width: int = 20) -> s
     bar = "#" * int(width * share)
     left = f", {seconds * (1 - share) / share:.0f} s left" if 0 < share < 1 and seconds >= 1 else ""
     return f"{what[:60]} [{bar:.<{width}}] {100 * share:.0f} %{left}"
+
+
+def campaign_line(done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float, width: int = 20) -> str:
+    """The text of a campaign's progress line. Time left: as the samples that are left take at the rate so far."""
+    share = min(1.0, samples / all_samples) if all_samples > 0 else 1.0
+    bar = "#" * int(width * share)
+    text = f"tasks {done} of {total} [{bar:.<{width}}] {100 * share:.0f} %"
+    if samples and seconds > 0:
+        left = seconds * (1 - share) / share
+        words = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min" if left < 7200 else f"{left / 3600:.1f} h"
+        text += f", {samples / seconds:.3g} samples/s, {words} left"
+    return text + (f", {failed} attempts failed" if failed else "")
 
 
 progress = Progress()

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zonda.core.data import Block
+from zonda.core.data import Block, Observation
 from zonda.operators.atmosphere import band, covariance, turbulence
 from zonda.operators.filters import common_mode, highpass
 from zonda.operators.maps import bin_map
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
+from zonda.operators.pointing import recording
 from zonda.operators.pointing.transform import CelestialTransform
 from zonda.operators.sky import read
 
@@ -129,19 +130,19 @@ def nan_samples_that_count_as_zero(patch: Patch) -> None:
 
 def sums_rounded_by_block(patch: Patch) -> None:
     """Each block adds float32 sums, as a naive accumulator would."""
-    add = bin_map._add
+    add = bin_map._add_image
 
     def rounded(*arguments: Any) -> None:
         add(*arguments)
         sums = arguments[-3]
         sums[:, bin_map.DATA] = sums[:, bin_map.DATA].astype(np.float32).astype(np.int64)
 
-    patch.setattr(bin_map, "_add", rounded)
+    patch.setattr(bin_map, "_add_image", rounded)
 
 
 def noise_that_starts_again_in_each_block(patch: Patch) -> None:
     add = white._add_normals
-    patch.setattr(white, "_add_normals", lambda key, first, start, amplitude, out: add(key, first, 0, amplitude, out))
+    patch.setattr(white, "_add_normals", lambda key, first, start, lines, cell, *rest: add(key, first, 0, lines, 0, *rest))
 
 
 def pink_noise_with_a_period(patch: Patch) -> None:
@@ -170,6 +171,14 @@ def days_of_86400_seconds(patch: Patch) -> None:
     patch.setattr(CelestialTransform, "_utc", divided)
 
 
+def air_that_ignores_the_times(patch: Patch) -> None:
+    patch.setattr(Observation, "seconds_at", lambda self, index: index / self.sample_rate)
+
+
+def gaps_filled_in_silence(patch: Patch) -> None:
+    patch.setattr(recording, "NOT_RECORDED", np.uint8(0))
+
+
 MUTATIONS = (
     Mutation("1 - C by subtraction", "covariance.structure_function", one_minus_correlation),
     Mutation("C(0) - C(r) by subtraction", "covariance.behind_a_beam", difference_of_covariances),
@@ -192,5 +201,7 @@ MUTATIONS = (
     Mutation("1/f noise with a period", "noise.no_period", pink_noise_with_a_period),
     Mutation("1/f noise that starts from nothing", "noise.first_sample", pink_noise_that_starts_from_nothing),
     Mutation("the time in one float64", "pointing.exact_start", times_in_one_float),
+    Mutation("the air is sampled by a comb", "timing.jittered_atmosphere", air_that_ignores_the_times),
+    Mutation("NaN rows and gaps are interpolated", "timing.recorded_gaps_and_nan", gaps_filled_in_silence),
     Mutation("days of 86400 s", "pointing.leap_second", days_of_86400_seconds),
 )

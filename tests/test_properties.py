@@ -185,7 +185,7 @@ def test_the_order_of_detectors_changes_no_map(seed: int) -> None:
 
 
 @few
-@given(threads=st.integers(1, 6), megabytes_each=st.integers(3, 20), seed=seeds)
+@given(threads=st.integers(1, 6), megabytes_each=st.integers(5, 20), seed=seeds)
 def test_blocks_and_threads_change_no_bit(threads: int, megabytes_each: int, seed: int) -> None:
     filters = (zonda.HighpassFilter(), zonda.CommonModeFilter())
     o = [scan(37, 5000) for _ in range(2)]

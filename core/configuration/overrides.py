@@ -25,13 +25,18 @@ def apply(document: Document, text: str, keys: list[str]) -> list[Diagnostic]:
     new = yaml_places.load(source, column=len(key) + 1, text=value)
     if new.faults:
         return [Diagnostic(f.message, f.span, f.label, "the value is YAML; quote what YAML cannot read") for f in new.faults]
-    parts = key.strip().split(".")
+    return put(document, key.strip(), new, place, keys)
+
+
+def put(document: Document, key: str, value: Document, place: Span, keys: list[str]) -> list[Diagnostic]:
+    """As `apply`, with a value that was read already. ``place``: where the key stands."""
+    parts = key.split(".")
     try:
-        path = _header_path(document, parts) if parts[0] in keys else _step_path(document, key.strip(), keys)
+        path = _header_path(document, parts) if parts[0] in keys else _step_path(document, key, keys)
     except _Refused as why:
         message, label, cure = why.args
         return [Diagnostic(message, place, label, cure)]
-    document.put(path, new, place)
+    document.put(path, value, place)
     return []
 
 

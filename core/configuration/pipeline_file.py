@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .. import registry
+from ..campaign.entries import mistakes as campaign_mistakes
+from ..campaign.settings import Campaign
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
 from ..pipeline import Companion, Pipeline, check_order
@@ -65,8 +67,18 @@ class Header(Parameters):
     the cheapest setting of the knobs that a stored front of `zonda accuracy` shows to meet it, else the tightest."""
     budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
     """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
+    campaign: Campaign | None = None
+    """Many observations of this pipeline as tasks: a grid or a list of sites, times, seeds or steps' parameters, nights,
+    realizations; and the engine that works on them."""
     outputs: Path | None = None
     """Folder for products, relative to the working directory; where absent, out/<name>."""
+
+    @field_validator("outputs")
+    @classmethod
+    def _a_path(cls, value: Path | None) -> Path | None:
+        if value is not None and "\0" in str(value):
+            raise ValueError("a folder's name cannot hold a null character")
+        return value
 
 
 SCENE_KEYS = tuple(Scene.model_fields)
@@ -138,6 +150,10 @@ class PipelineFile:
         """
         header = self.header.model_dump(mode="json")
         header["runs"] = {name: run.model_dump(mode="json", exclude_none=True) for name, run in self.runs.items()}
+        if self.header.campaign is None:
+            del header["campaign"]
+        else:
+            header["campaign"] = self.header.campaign.model_dump(mode="json", exclude_none=True)
         scene = self._scene.model_dump(mode="json")
         for kind in ("site", "instrument"):  # each as its own class, with all its fields
             scene[kind] = getattr(self._scene, kind).model_dump(mode="json")
@@ -209,6 +225,8 @@ class _Check:
         steps = self.steps()
         if header is not None:
             self.runs(header, steps)
+        if not self.mistakes and header is not None and header.campaign is not None:
+            self.mistakes += campaign_mistakes(self.document, header.campaign, KEYS, self.without_campaign)
         if self.mistakes:
             raise ConfigurationError(self.mistakes, self.name)
         assert header is not None
@@ -218,6 +236,15 @@ class _Check:
         header = header.model_copy(update={"name": name, "outputs": header.outputs or Path("out") / name})
         parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree}
         return PipelineFile(header, parameters, tuple(s for s in steps if s is not None), self.name, scene)
+
+    def without_campaign(self, document: Document) -> list[Diagnostic]:
+        """What is wrong with a document but for its campaign."""
+        del document.value["campaign"]
+        try:
+            _Check(document, self.name, self.context["folder"], []).run()
+        except ConfigurationError as err:
+            return err.diagnostics
+        return []
 
     def wrong(self, message: str, span: Span, label: str = "", help: str = "") -> None:
         self.mistakes.append(Diagnostic(message, span, label, help))

@@ -36,6 +36,7 @@ KINDS = {
     "rad": Kind("an angle", ("4 arcmin", "11 arcsec", "0.5 deg"), ("deg", "arcmin", "arcsec", "rad")),
     "rad / s": Kind("an angular speed", ("51 arcsec/s", "0.5 deg/s"), ("deg/s", "arcmin/s", "arcsec/s", "rad/s")),
     "rad / s2": Kind("an angular acceleration", ("0.05 deg/s2",), ("deg/s2", "arcmin/s2", "arcsec/s2", "rad/s2")),
+    "rad / s3": Kind("an angular jerk", ("0.2 deg/s3",), ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3")),
     "s": Kind("a time", ("20 min", "600 s"), ("s", "min", "h", "ms")),
     "Hz": Kind("a frequency", ("90 GHz", "100 Hz"), ("Hz", "mHz", "GHz")),
     "m": Kind("a length", ("1.8 mm", "1 km"), ("m", "mm", "km")),
@@ -57,6 +58,7 @@ DIMENSIONS: dict[tuple[float, ...], str] = {
     TEMPERATURE: "temperature",
     (1, -1, 0, 0): "angular speed",
     (1, -2, 0, 0): "angular acceleration",
+    (1, -3, 0, 0): "angular jerk",
     (0, -1, 1, 0): "speed",
     (0, -2, 1, 0): "acceleration",
     (0, 0.5, 0, 1): "noise level",
@@ -268,6 +270,8 @@ AngularSpeed = Annotated[float, Unit("rad / s")]
 """rad/s."""
 AngularAcceleration = Annotated[float, Unit("rad / s2")]
 """rad/s^2."""
+AngularJerk = Annotated[float, Unit("rad / s3")]
+"""rad/s^3."""
 Seconds = Annotated[float, Unit("s")]
 """s."""
 Hertz = Annotated[float, Unit("Hz")]

@@ -6,6 +6,7 @@ keys. Here scalars follow the YAML 1.2 core schema, equal keys are errors, and e
 
 from __future__ import annotations
 
+import copy
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,11 @@ Path = tuple[Any, ...]
 """Keys and indices that lead to a value: ("operators", 2, "BinMap", "pixel")."""
 
 MAXIMUM_VALUES = 100_000
-"""More values than this (nested aliases multiply) are refused."""
+"""More values than this (nested aliases and merges multiply) are refused."""
+MAXIMUM_DEPTH = 64
+"""Lists and mappings nested deeper are refused: what reads them recurses, libyaml's C code without a net."""
+MAXIMUM_DIGITS = 64
+"""Integers of more digits are refused: nothing here is as large, and Python would not write them."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,18 @@ class Document:
             path = path[:-1]
         return self.marks[path]
 
+    def copy(self) -> Document:
+        """A document of its own with the same content."""
+        return Document(copy.deepcopy(self.value), dict(self.marks), list(self.faults))
+
+    def sub(self, path: Path) -> Document:
+        """The value at ``path`` as a document of its own."""
+        value = self.value
+        for part in path:
+            value = value[part]
+        marks = {p[len(path) :]: m for p, m in self.marks.items() if p[: len(path)] == path}
+        return Document(copy.deepcopy(value), {(): self.mark(path), **marks}, [])
+
     def put(self, path: Path, value: Document, key: Span) -> None:
         """Replace or add the value at ``path``, whose parent must be a mapping or a list."""
         parent = self.value
@@ -121,6 +138,8 @@ for _class in (_Loader, _Dumper):
 
 def _integer(loader: Any, node: Any) -> int:
     text = loader.construct_scalar(node)
+    if len(text) > MAXIMUM_DIGITS:
+        raise ValueError(f"a number of {len(text)} digits")
     return int(text, {"0x": 16, "0o": 8}.get(text[:2].lower(), 10))
 
 
@@ -139,6 +158,7 @@ def load(source: Source, *, column: int = 0, text: str | None = None) -> Documen
         reader.fault(err)
         return reader.document(None)
     try:
+        reader.survey(source.text if text is None else text)
         node = loader.get_single_node()
         value = reader.build(loader, node, (), None, ()) if node is not None else None
     except yaml.YAMLError as err:
@@ -158,11 +178,30 @@ class _TooMany(yaml.YAMLError):
     pass
 
 
+_PLAIN = frozenset(f"tag:yaml.org,2002:{tag}" for tag in ("str", "int", "float", "bool", "null", "merge", "seq", "map"))
+_MERGE = "tag:yaml.org,2002:merge"
+_OPENING = (yaml.SequenceStartEvent, yaml.MappingStartEvent)
+_CLOSING = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
+
+
 class _Reader:
     def __init__(self, source: Source, column: int) -> None:
         self.source, self.column = source, column
         self.marks: dict[Path, Mark] = {}
         self.faults: list[Fault] = []
+        self.flat: dict[int, list[tuple[Any, Any]]] = {}
+        self.merged = 0
+
+    def survey(self, text: str) -> None:
+        """Count values and depth event by event, without recursion, before anything is built. Raises yaml.YAMLError."""
+        depth = values = 0
+        for event in yaml.parse(text, Loader=_Loader):
+            depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
+            values += 1
+            if depth > MAXIMUM_DEPTH:
+                raise yaml.MarkedYAMLError(problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=event.start_mark)
+            if values > 2 * MAXIMUM_VALUES:  # a list or mapping makes two events
+                raise _TooMany(f"more than {MAXIMUM_VALUES} values")
 
     def document(self, value: Any) -> Document:
         self.marks.setdefault((), Mark(Span(self.source, 0, self.column, 0, max(self.column + 1, len(self.source.text)))))
@@ -201,8 +240,14 @@ class _Reader:
             return None
         if len(self.marks) > MAXIMUM_VALUES:
             raise _TooMany(f"more than {MAXIMUM_VALUES} values")
+        if len(path) > MAXIMUM_DEPTH:
+            raise yaml.MarkedYAMLError(problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=node.start_mark)
         self.marks[path] = Mark(span, key)
         above = (*above, id(node))
+        if node.tag not in _PLAIN:
+            tag = node.tag.replace("tag:yaml.org,2002:", "!!")
+            self.faults.append(Fault(f"the tag {tag:.60} is not known", span, "leave it away: nothing here needs one"))
+            return None
         if isinstance(node, yaml.SequenceNode):
             return [self.build(loader, item, (*path, i), None, above) for i, item in enumerate(node.value)]
         if isinstance(node, yaml.MappingNode):
@@ -212,14 +257,13 @@ class _Reader:
     def mapping(self, loader: Any, node: Any, path: Path, above: tuple[int, ...]) -> dict[Any, Any]:
         first: dict[str, Any] = {}
         for key, _ in node.value:  # before merging, where the same key is an override
-            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+            if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
                 if key.value in first:
                     line = first[key.value].start_mark.line + 1
                     self.faults.append(Fault(f"duplicate key '{key.value}'", self.span(key), f"first given on line {line}"))
                 first.setdefault(key.value, key)
-        loader.flatten_mapping(node)
         result: dict[Any, Any] = {}
-        for key, value in node.value:
+        for key, value in self.flattened(node):
             if not isinstance(key, yaml.ScalarNode):
                 self.faults.append(Fault("a key must be plain text", self.span(key)))
                 continue
@@ -227,11 +271,36 @@ class _Reader:
             result[name] = self.build(loader, value, (*path, name), self.span(key), above)
         return result
 
+    def flattened(self, node: Any) -> list[tuple[Any, Any]]:
+        """Keys and values of a mapping, those merged by ``<<`` first; each key once where it is merged, nearer ones win.
+
+        PyYAML's own repeats merged keys: eight lines of them fill the memory.
+        """
+        if id(node) in self.flat:
+            return self.flat[id(node)]
+        self.flat[id(node)] = []  # what merges itself finds nothing
+        merged: dict[Any, tuple[Any, Any]] = {}
+        own = []
+        for key, value in node.value:
+            if not (isinstance(key, yaml.ScalarNode) and key.tag == _MERGE):
+                own.append((key, value))
+                continue
+            for part in reversed(value.value) if isinstance(value, yaml.SequenceNode) else [value]:
+                if not isinstance(part, yaml.MappingNode):
+                    self.faults.append(Fault("only mappings can be merged", self.span(part)))
+                    continue
+                merged |= {k.value if isinstance(k, yaml.ScalarNode) else id(k): (k, v) for k, v in self.flattened(part)}
+        self.merged += len(merged)
+        if self.merged > MAXIMUM_VALUES:
+            raise _TooMany(f"more than {MAXIMUM_VALUES} values")
+        self.flat[id(node)] = [*merged.values(), *own]
+        return self.flat[id(node)]
+
     def scalar(self, loader: Any, node: Any) -> Any:
         try:
             return loader.construct_object(node, deep=True)
-        except ValueError as err:  # e.g. an integer of more digits than Python reads
+        except (ValueError, LookupError) as err:  # e.g. an integer of more digits than Python reads, !!bool maybe
             self.faults.append(Fault(f"cannot be read: {err}", self.span(node)))
-        except yaml.MarkedYAMLError as err:  # e.g. a tag !like_this
+        except yaml.MarkedYAMLError as err:  # a lone <<, a text that is said to be a list
             self.fault(err)
         return None

@@ -1,9 +1,9 @@
 """`zonda plan --audit`: does what was left out stay within its bound?
 
-A short slice of the scan is simulated in full, and once more for each effect that the plan drops or coarsens, with the same
-random numbers, through the same filters. The bounds are those that the operators state for the slice. An actual error
-violates its bound where it exceeds it by more than two of its own standard errors, which follow from its scatter between
-parts of the slice.
+A slice of the scan, short enough for its cost, is simulated in full, and once more for each effect that the plan drops or
+coarsens, with the same random numbers, through the same filters. The bounds are those that the operators state for the slice. An
+actual error violates its bound where it exceeds it by more than two of its own standard errors, which follow from its scatter
+between parts of the slice.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pydantic import Field
 
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
+from ..focalplane import Focalplane
 from ..operator import Operator
 from ..pipeline import Companion
 from .context import Context
@@ -32,32 +33,72 @@ from .structure import Structure
 PARTS = 8
 """Parts of the slice whose scatter gives the standard error."""
 
-SECONDS = 60.0
-"""Length of the slice."""
+SECONDS, SHORTEST = 60.0, 8.0
+"""Longest slice, and the shortest before detectors are left out, s."""
+
+COST = 40.0
+"""CPU seconds [reference machine] that an audit may take, all its runs: the slice is chosen by it."""
 
 ROUNDING = 1e-6
 """Of the stream's rms: differences below are float32 arithmetic in another order, not the effect."""
 
 
 class Slice(Operator):
-    """Keep the first samples of the first observations: the same random numbers, less of them."""
+    """Keep the first samples of the first observations, and every so many detectors: random numbers are addressed, not drawn in
+    order, so that all runs over a slice see the same."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     observations: int = Field(1, ge=1)
     """How many are kept."""
     seconds: float = Field(SECONDS, gt=0)
     """How long they last, s."""
+    every: int = Field(1, ge=1)
+    """Every so many detectors are kept, the outermost four too."""
 
     def observe(self, data: Data) -> None:
         """Cut."""
-        data.observations[:] = [_cut(o, self.seconds) for o in data.observations[: self.observations]]
+        data.observations[:] = [_cut(o, self.seconds, self.every) for o in data.observations[: self.observations]]
 
 
-def _cut(o: Observation, seconds: float) -> Observation:
+def _cut(o: Observation, seconds: float, every: int) -> Observation:
     n = min(o.n_samples, max(1, round(seconds * o.sample_rate)))
-    return dataclasses.replace(
+    o = dataclasses.replace(
         o, seconds=o.seconds[:n], boresight_azel=o.boresight_azel[:n], boresight_radec=o.boresight_radec[:n], flags=o.flags[:n]
     )
+    if every == 1:
+        return o
+    plane = o.focalplane
+    outer = [int(f(v)) for v in (plane.xi, plane.eta) for f in (np.argmin, np.argmax)]
+    kept = np.unique(np.r_[np.arange(0, len(plane), every), outer])
+    chosen = {f.name: _taken(getattr(plane, f.name), kept) for f in dataclasses.fields(plane)}
+    return dataclasses.replace(o, focalplane=Focalplane(**chosen), detector_flags=o.detector_flags[kept])
+
+
+def _taken(values: Any, index: NDArray[np.intp]) -> Any:
+    return values[index] if isinstance(values, np.ndarray) else [values[k] for k in index]
+
+
+@dataclass(frozen=True)
+class Extent:
+    """A slice: seconds of the first scan, and every how many detectors."""
+
+    seconds: float
+    every: int = 1
+
+
+def extent(made: Plan, runs: int) -> Extent:
+    """The longest slice for which that many runs, each beside one of the sky alone, take no more than `COST`.
+
+    Set-up (reading, convolving, laying out) is counted once for each run; what remains buys samples. A slice is not made shorter
+    than `SHORTEST` for it: detectors are left out instead.
+    """
+    o, estimates = made.context.first, made.costs
+    fixed = sum(c.fixed + c.once for c in estimates.values())
+    rate = 2 * sum(c.per_sample for c in estimates.values())
+    samples = max(COST / max(runs, 1) - fixed, 0.25 * COST / max(runs, 1)) / max(rate, 1e-9)
+    seconds = min(max(samples / (o.n_detectors * o.sample_rate), SHORTEST), SECONDS, o.duration)
+    every = max(1, math.ceil(seconds * o.sample_rate * o.n_detectors / samples))
+    return Extent(seconds, min(every, max(o.n_detectors // 64, 1)))
 
 
 @dataclass(frozen=True)
@@ -109,14 +150,19 @@ class Audit:
 
 
 def audit(
-    file: PipelineFile, made: Plan, *, threads: int | None = None, seconds: float = SECONDS, observations: int = 1
+    file: PipelineFile, made: Plan, *, threads: int | None = None, seconds: float | None = None, observations: int = 1
 ) -> Audit:
-    """Compare every decision of ``made`` with the full simulation of a slice of ``file``."""
+    """Compare every decision of ``made`` with the full simulation of a slice of ``file``, chosen by cost (`extent`) where no
+    ``seconds`` are given."""
     chosen = [d for d in made.decided if d.chosen > 0]
-    part = sliced(file, seconds, observations)
+    size = extent(made, len(chosen) + 2) if seconds is None else Extent(seconds)
+    seconds = size.seconds
+    part = sliced(file, seconds, observations, size.every)
     whole = Structure(tuple(o.label for o in part.pipeline().operators), tuple(part.runs), ())
     whole_plan = plan(part, prune_all=False)
-    words = f"the first {seconds:g} s of {observations} scan{'s' if observations > 1 else ''}"
+    words = f"the first {seconds:.3g} s of {observations} scan{'s' if observations > 1 else ''}"
+    if size.every > 1:
+        words += f", every {size.every}th detector"
     fewer = tuple(label for label in whole.operators if label in made.structure.operators or label == "Slice")
     if not chosen and fewer == whole.operators:
         return Audit((), words)
@@ -143,7 +189,7 @@ def audit(
     return Audit(tuple(rows), words)
 
 
-def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1) -> PipelineFile:
+def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, every: int = 1) -> PipelineFile:
     """The same pipeline over a slice, without what writes or draws, with a run of the sky alone."""
     steps: list[Step] = []
     for step in file.steps:
@@ -151,7 +197,7 @@ def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1) 
         if o.at_end or o.main_run_only:
             continue
         if "boresight" not in o.provides and steps and "boresight" in steps[-1].operator.provides:
-            steps.append(Step("Slice", Slice(seconds=seconds, observations=observations)))
+            steps.append(Step("Slice", Slice(seconds=seconds, observations=observations, every=every)))
         steps.append(step)
     sky = any("sky" in s.operator.provides for s in steps) and any(
         s.operator.provides & {"atmosphere", "white", "pink"} for s in steps

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,12 @@ from .structure import Structure, selected
 DEEP = 0.9
 """Quantile of the hits over the covered map: its deeper part has the least noise, so what holds there holds everywhere."""
 
-CELLS, POINTS, DETECTORS = 32, 4096, 96
-"""Hits are counted on CELLS x CELLS cells from at most POINTS instants and DETECTORS detectors of each scan."""
+CELLS, POINTS, DETECTORS = 32, 8192, 96
+"""Hits are counted on CELLS x CELLS cells from at most about POINTS instants of all scans and DETECTORS detectors of each."""
+
+
+LEAKS = 1.5
+"""Factor on what passes a brick wall: a scan has ends."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,31 @@ class Context:
         """Largest rms of one sample's fluctuation, all components, K."""
         return math.sqrt(sum(t.rms**2 + t.noise**2 + (t.peak or 0.0) ** 2 for t in self.traits.values()))
 
+    @cached_property
+    def passed(self) -> float:
+        """Largest rms of one sample's fluctuation behind the high-pass filter, K: `LEAKS` of what a brick wall on whole scans
+        leaves of it, for scans that do not repeat."""
+        return self.weighted(lambda f: 1.0, self.cut, math.inf) * (LEAKS if self.cut > 0 else 1.0)
+
+    def weighted(self, weight: Callable[[float], float], low: float, high: float) -> float:
+        """sqrt(int S w^2 df) over a range of frequencies [Hz], K; S of all components, w <= 1 rising or falling (its larger end
+        of each step of the grid counts)."""
+        if low <= 0 and high == math.inf:
+            return self.fluctuation
+        top = min(high, 0.5 * self.first.sample_rate)
+        grid = np.geomspace(max(low, 1e-4 * top), top, 40)
+        if high < math.inf:
+            grid = np.r_[0.0, grid]
+        total = 0.0
+        for t in self.traits.values():
+            parts = np.array([t.faster(float(f)) if t.faster else t.rms for f in grid]) ** 2
+            noise = t.noise**2 * np.maximum(1 - 2 * grid / self.first.sample_rate, 0.0)
+            above = parts + noise + (t.peak or 0.0) ** 2 * (1 if high == math.inf else 1 - grid / top)
+            w = np.array([weight(float(f)) ** 2 for f in grid])
+            last = above[-1] * w[-1] if high == math.inf else 0.0
+            total += float(np.maximum(above[:-1] - above[1:], 0.0) @ np.maximum(w[:-1], w[1:])) + last
+        return math.sqrt(total)
+
     @property
     def peak(self) -> float:
         """Largest brightness of the sky, K; 0 where there is none."""
@@ -119,12 +149,12 @@ class Context:
         """Amplitude that the filters pass at a frequency, Hz."""
         return math.prod(t.response(frequency) for t in self.traits.values() if t.response)
 
-    @property
+    @cached_property
     def cut(self) -> float:
         """Frequency below which the filters pass less than a tenth, Hz; 0: there is none."""
         grid = np.geomspace(1e-4, 0.5 * self.first.sample_rate, 400)
-        passed = [f for f in grid if self.response(float(f)) >= 0.1]
-        return 0.0 if not passed or passed[0] == grid[0] else float(passed[0])
+        passed = next((f for f in grid if self.response(float(f)) >= 0.1), grid[0])
+        return 0.0 if passed == grid[0] else float(passed)
 
     def in_map(self, tod: float, correlated: float, common: bool) -> float:
         """Map rms of an error of rms ``tod`` in the stream, K.
@@ -197,8 +227,9 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     weights: list[NDArray[np.float64]] = []
     speeds = []
     centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
+    number = max(POINTS // len(observations), 64)
     for o in observations:
-        times = np.unique(np.linspace(0, o.n_samples - 1, min(POINTS, o.n_samples)).astype(int))
+        times = np.unique(np.linspace(0, o.n_samples - 1, min(number, o.n_samples)).astype(int))
         rows = np.unique(np.linspace(0, o.n_detectors - 1, min(DETECTORS, o.n_detectors)).astype(int))
         turn = centre.T @ rotation_matrices(o.boresight_radec[times])
         plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
@@ -213,8 +244,11 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     where, weight = np.concatenate(points, axis=1), np.concatenate(weights)
     reach = np.maximum(np.ptp(where, axis=1), pixel)
     cells = np.maximum(1, np.minimum(CELLS, np.floor(reach / pixel))).astype(int)
-    counts, xs, ys = np.histogram2d(where[0], where[1], bins=list(cells), weights=weight)
-    area = max(float((xs[1] - xs[0]) * (ys[1] - ys[0])), pixel**2)
+    low = where.min(axis=1)
+    side = np.maximum(np.ptp(where, axis=1) / cells, 1e-15)
+    column, row = (np.minimum(((where[k] - low[k]) / side[k]).astype(np.int64), cells[k] - 1) for k in (0, 1))
+    counts = np.bincount(column * cells[1] + row, weight)
+    area = max(float(side[0] * side[1]), pixel**2)
     hits = counts[counts > 0] * min(1.0, pixel**2 / area)
     speed = float(np.median(np.concatenate(speeds))) if speeds else 0.0
     return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed)

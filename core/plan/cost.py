@@ -102,7 +102,9 @@ class Prediction:
         return self.startup + sum(self.seconds.values())
 
 
-def predict(context: Context, costs: Mapping[str, Cost | None], threads: int, item: int, memory: int) -> Prediction:
+def predict(
+    context: Context, costs: Mapping[str, Cost | None], threads: int, item: int, memory: int, portable: bool = False
+) -> Prediction:
     """Of one run of the pipeline and its companions.
 
     Parameters
@@ -113,8 +115,10 @@ def predict(context: Context, costs: Mapping[str, Cost | None], threads: int, it
         As in `Settings`.
     item
         Bytes of one sample of a stream.
+    portable
+        On the reference machine, not on this one.
     """
-    factors = calibrate()
+    factors = dict.fromkeys(REFERENCE, 1.0) if portable else calibrate()
     seconds = {}
     for label, cost in costs.items():
         if cost is None:

@@ -117,6 +117,8 @@ class Traits:
         Adds this much white noise: rms of one sample of the calibrated stream, K.
     rms
         Adds a fluctuation of at most this rms to the calibrated stream, K (the smooth mean apart).
+    faster
+        The rms of what of it is faster than a frequency [Hz], K; None: that of all of it.
     peak
         Adds a sky of at most this brightness, K; None: it adds no sky, or does not know.
     pixel
@@ -129,6 +131,7 @@ class Traits:
 
     noise: float = 0.0
     rms: float = 0.0
+    faster: Callable[[float], float] | None = None
     peak: float | None = None
     pixel: float = 0.0
     response: Callable[[float], float] | None = None

@@ -65,6 +65,8 @@ class Plan:
         White noise: rms of one sample and of a map pixel (0: no map), K; samples per pixel in the deep part of the map.
     prediction, unpruned
         With the plan, and with everything on.
+    costs
+        Of the operators that state one, as the pipeline asks for them.
     """
 
     structure: Structure
@@ -76,6 +78,7 @@ class Plan:
     unpruned: Prediction
     context: Context
     pruned: bool = True
+    costs: Mapping[str, Cost] = dataclasses.field(default_factory=dict)
 
     @property
     def operators(self) -> tuple[str, ...]:
@@ -122,6 +125,7 @@ def plan(
     threads: int | None = None,
     memory: int | None = None,
     measure: bool = False,
+    portable: bool = False,
 ) -> Plan:
     """Plan a pipeline file.
 
@@ -135,6 +139,8 @@ def plan(
         False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
     measure
         Run a slice of a few seconds to find the cost of operators that do not state it.
+    portable
+        Decide as on the reference machine, so that every machine makes the same plan.
 
     Raises
     ------
@@ -162,7 +168,7 @@ def plan(
         from .audit import measured
 
         costs |= measured(file, [label for label, cost in costs.items() if cost is None])
-    now = predict(context, costs, *settings)
+    now = predict(context, costs, *settings, portable=portable)
     decided = _decide(effects, kept, forced, allowed, now, context, prune_all)
     spent = {m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed}
     noise = (context.noise, context.map_noise, context.coverage.hits if context.coverage else 0.0)
@@ -170,7 +176,8 @@ def plan(
     unpruned = _unpruned(pipeline, scene, structure, everything, context, estimates, now, settings)
     planning = time.process_time() - begin
     prediction, unpruned = (dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned))
-    return Plan(structure, tuple(decided), allowed, spent, noise, prediction, unpruned, context, prune_all)
+    known = {label: cost for label, cost in costs.items() if cost is not None}
+    return Plan(structure, tuple(decided), allowed, spent, noise, prediction, unpruned, context, prune_all, known)
 
 
 def _decide(
@@ -296,6 +303,8 @@ def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
     rms = context.fluctuation * 2.0**-24 / math.sqrt(3.0)
     formula = "2^-24 / sqrt(3) x rms of the stream, independent between samples"
     bound = context.bound(rms)
+    if context.noise > 0:
+        bound["psd"] = (rms / context.noise) ** 2  # both are white
     if pipeline.precision == "float32":
         return [Effect("precision", (full("float32"),), bound, formula)]
     carries_mean = context.cut == 0 and any("atmosphere" in o.provides for o in context.operators)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.files import own_data
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,8 @@ TEMPERATURE_MARGIN = 15.0
 PRESSURE_MARGIN = 1.3
 """Extrapolation above the highest pressure or below the lowest one, in steps of the table (a factor 0.72 each)."""
 THIN_AIR = 50.0
-"""Pa: above this height air absorbs too little for its temperature to matter, and any temperature is accepted."""
+"""Pa: above this height air absorbs too little for its temperature to matter, and any temperature is taken as the nearest that
+the table has. The air of a `Profile` ends below, at 75 Pa: only other users of the table come here."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class AbsorptionTable:
     """
 
     def __init__(self, path: Path) -> None:
-        with np.load(path) as file:
+        with own_data(path) as file:
             self._code = np.cumsum(file["difference"], axis=-1, dtype=np.uint16)
             self._low, self._high = file["low"].astype(np.float64), file["high"].astype(np.float64)
             self.frequency: Array = file["frequency"].astype(np.float64)
@@ -116,6 +118,7 @@ class AbsorptionTable:
             for k, tap in enumerate(taps):
                 total += tap[:, None] * log[:, row, k]
         dry, water, water_high, ozone = np.exp(total) * 1e-4
+        # In the margins the ratios are those of the edge: their mean over a cell stays 1, its ozone is what it is.
         code, upper = self._ozone_code[..., cells], np.clip(upper_weight, 0.0, 1.0)[:, None]
         log_ratio = code[:, below] * (1 - upper) + code[:, below + 1] * upper
         ratio = RATIO_LOW * np.exp(log_ratio * (math.log(RATIO_HIGH / RATIO_LOW) / 255))
@@ -129,8 +132,11 @@ class AbsorptionTable:
         if (x < grid[0] - (PRESSURE_MARGIN - 1) * step).any():
             worst, limit = pressure.max() / 100, self.pressure[0] / 100 * 0.72 ** (1 - PRESSURE_MARGIN)
             raise InputError(f"a pressure of {worst:.5g} hPa is above the absorption table's limit of {limit:.5g} hPa")
-        below = np.clip(np.searchsorted(grid, x) - 1, 0, len(grid) - 2)
-        return below, np.minimum((x - grid[below]) / step, PRESSURE_MARGIN)
+        if (x > grid[-1] + (PRESSURE_MARGIN - 1) * step).any():  # no air below `weather.TOP` is as thin as the shipped table's
+            worst, limit = pressure.min() / 100, self.pressure[-1] / 100 * 0.72 ** (PRESSURE_MARGIN - 1)
+            raise InputError(f"a pressure of {worst:.5g} hPa is below the absorption table's limit of {limit:.5g} hPa")
+        below = np.clip(np.searchsorted(grid, x) - 1, 0, len(grid) - 2)  # the first and last step also serve the margins
+        return below, (x - grid[below]) / step
 
     def _temperature_weights(self, pressure: Array, temperature: Array, row: NDArray[np.intp]) -> Array:
         """Lagrange weights in 1/temperature on the nodes of each layer's row. (n_temperature, n_layer)."""

@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core import hdf5_files
 from zonda.core.errors import InputError
+from zonda.core.files import reading
 from zonda.core.weather import Column
 
 from .humidity import from_relative, from_specific, ozone_from_mass
@@ -59,6 +61,9 @@ HIGHEST = 20000.0
 HALF_CELL = 0.13
 """deg that the place may lie outside the grid: half a cell of ERA5's own."""
 
+DRIEST = 1e-9
+"""kg/kg, or % of relative humidity: less is taken as this, which is 1e-5 mm of water in the whole column."""
+
 GET = "`zonda weather fetch SITE --time TIME --output era5.nc` gets such a file, or the Climate Data Store's pages do"
 
 
@@ -95,6 +100,7 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
             h2o = from_specific(column("q", logarithm=True))
         else:
             h2o = from_relative(column("r", logarithm=True) / 100, pressure, temperature)
+        o3 = column("o3") if "o3" in file else None
         return Column(
             pressure=pressure,
             height=column("z") / GRAVITY,
@@ -103,16 +109,29 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
             wind_east=column("u"),
             wind_north=column("v"),
             ozone_pressure=pressure if "o3" in file else None,
-            ozone=ozone_from_mass(np.maximum(column("o3"), 0.0)) if "o3" in file else None,
-            stated=f"ERA5 from {path.name}, {time}" + ("" if "o3" in file else " (ozone of the standard atmosphere)"),
+            ozone=ozone_from_mass(np.maximum(o3, 0.0)) if o3 is not None else None,
+            stated=f"ERA5 from {path.name}, {time}"
+            + (f" ({'; '.join(remarks)})" if (remarks := _remarks(file.below_none, o3)) else ""),
         )
 
 
-class _File:
-    """What NetCDF-3 and NetCDF-4 have in common."""
+def _remarks(water_below_none: int, o3: Array | None) -> list[str]:
+    """What ERA5's packing and spectral transform leave: slightly negative water and ozone, which are taken as none."""
+    ozone_below_none = 0 if o3 is None else int(np.count_nonzero(o3 < 0))
+    found = ["ozone of the standard atmosphere"] if o3 is None else []
+    found += [f"{water_below_none} negative values of the humidity taken as none"] if water_below_none else []
+    return found + ([f"{ozone_below_none} negative levels of ozone taken as none"] if ozone_below_none else [])
 
-    def __init__(self, variables: Any, dimensions: dict[str, list[str]]) -> None:
-        self._variables, self._dimensions = variables, dimensions
+
+class _File:
+    """What NetCDF-3 and NetCDF-4 have in common.
+
+    ``below_none``: how many values below 0 were raised to `DRIEST` before their logarithm was taken.
+    """
+
+    def __init__(self, variables: Any, dimensions: dict[str, list[str]], place: str) -> None:
+        self._variables, self._dimensions, self._place = variables, dimensions, place
+        self.below_none = 0
 
     def __contains__(self, name: str) -> bool:
         return name in self._dimensions
@@ -126,6 +145,8 @@ class _File:
 
     def values(self, name: str, where: Any = ()) -> Array:
         """Unpacked values, NaN where they are missing."""
+        if hasattr(self._variables[name], "dims"):
+            hdf5_files.check_size(self._variables[name], self._place)
         raw = np.asarray(self._variables[name][where])
         missing = [self.attribute(name, key) for key in ("_FillValue", "missing_value")]
         out = raw.astype(np.float64) * float(self.attribute(name, "scale_factor", 1.0)) + float(
@@ -143,7 +164,10 @@ class _File:
             for j, b in weights["lat"].items():
                 for k, c in weights["lon"].items():
                     column = self._column(name, axes, {"time": i, "lat": j, "lon": k}, place)
-                    total = total + a * b * c * (np.log(np.maximum(column, 1e-9)) if log else column)
+                    if log:
+                        self.below_none += int(np.count_nonzero(column < 0))
+                        column = np.log(np.maximum(column, DRIEST))
+                    total = total + a * b * c * column
         return np.asarray(np.exp(total) if log else total)
 
     def _column(self, name: str, axes: dict[str, str], at: dict[str, int], place: str) -> Array:
@@ -170,30 +194,18 @@ class _File:
 def _opened(path: Path, place: str) -> Iterator[_File]:
     import h5py
 
-    try:
-        if h5py.is_hdf5(path):
-            opened = h5py.File(path, "r")
-        else:
-            from scipy.io import netcdf_file
+    kind, cure = "NetCDF", f"a GRIB file must be converted, a zip file unpacked; {GET}"
+    with reading(place, kind, cure):
+        of_hdf5 = path.is_file() and h5py.is_hdf5(path)
+    if of_hdf5:
+        with hdf5_files.opened(path, place, kind, cure) as file:
+            sets = {name: file[name] for name in file if isinstance(file.get(name), h5py.Dataset)}
+            yield _File(sets, {name: [_label(d) for d in item.dims] for name, item in sets.items()}, place)
+        return
+    from scipy.io import netcdf_file
 
-            opened = netcdf_file(path, "r", mmap=False)
-    except (OSError, TypeError, ValueError, EOFError, IndexError) as err:
-        raise _unreadable(err, place) from None
-    with opened as file:
-        try:
-            if isinstance(file, h5py.File):
-                sets = {name: item for name, item in file.items() if isinstance(item, h5py.Dataset)}
-                yield _File(sets, {name: [_label(d) for d in item.dims] for name, item in sets.items()})
-            else:
-                yield _File(file.variables, {name: list(v.dimensions) for name, v in file.variables.items()})
-        except OSError as err:
-            raise _unreadable(err, place) from None
-
-
-def _unreadable(err: Exception, place: str) -> InputError:
-    text = str(err).splitlines()[0] if str(err) else type(err).__name__
-    cure = f"a GRIB file must be converted, a zip file unpacked; {GET}"
-    return InputError(f"cannot be read as NetCDF: {text}", place=place, cure=cure)
+    with reading(place, kind, cure), netcdf_file(path, "r", mmap=False) as file:
+        yield _File(file.variables, {name: list(v.dimensions) for name, v in file.variables.items()}, place)
 
 
 def _label(dimension: Any) -> str:

@@ -13,15 +13,18 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.instrument import Band
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
 
+from .averaging import shares
 from .band import BandAtmosphere, _BandTransfer
-from .geometry import tracks
+from .geometry import Track, axes, crossing, rays, tracks
 from .nodes import LayerModel, differential_rms, some
 from .plan import make_plan
 from .turbulence import FIDELITIES
@@ -31,6 +34,11 @@ if TYPE_CHECKING:
     from zonda.core.plan.context import Context
 
     from .layers import AtmosphereLayers, Layer
+
+Floats = NDArray[np.float64]
+
+INSTANTS = 200
+"""Of a scan at which the speed through the air is looked at."""
 
 SAFETY = 1.25
 """Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
@@ -61,17 +69,42 @@ class Air:
     kelvin: float
     stretch: float
     elevations: tuple[float, float]
+    speeds: list[Floats]
     points: dict[float, float] = field(default_factory=dict)
     planning: dict[str, float] = field(default_factory=dict)
+    averages: dict[str, list[float]] = field(default_factory=dict)
 
     @property
     def rms(self) -> float:
         """Of one calibrated sample, K."""
         return self.kelvin * math.sqrt(sum(m.amplitude**2 * v for m, v in zip(self.models, self.variances, strict=True)))
 
+    def faster(self, layer: int, frequency: float) -> float:
+        """rms of what of a layer is faster than a frequency [Hz], K.
+
+        Along a ray at speed v the covariance exp(-(v t)^2 / 4 e) has the share erfc(2 pi f sqrt(e) / v) beyond f.
+        """
+        from scipy.special import erfc
+
+        e, w = self.components[layer]
+        argument = 2 * math.pi * frequency * np.divide.outer(np.sqrt(e), np.maximum(self.speeds[layer], 1e-6))
+        return self.kelvin * self.models[layer].amplitude * math.sqrt(max(float(w @ erfc(argument).mean(1)), 0.0))
+
+    @cached_property
+    def components(self) -> list[tuple[Floats, Floats]]:
+        """Covariance of each layer as sum w exp(-r^2 / 4 e)."""
+        return [m.gaussian() for m in self.models]
+
 
 def air(operator: AtmosphereLayers, observation: Observation) -> Air:
-    """See `Air`."""
+    """See `Air`. Worked out once for the last observation that was asked for."""
+    known = operator._looked.get("air")
+    if known is None or known[0] is not observation or known[1] != operator:
+        known = operator._looked["air"] = (observation, operator.model_copy(), _air(operator, observation))
+    return known[2]
+
+
+def _air(operator: AtmosphereLayers, observation: Observation) -> Air:
     from .layers import _model, _turbulence
 
     track = operator._tracks.get(observation.name) or tracks([observation])[0]
@@ -80,7 +113,8 @@ def air(operator: AtmosphereLayers, observation: Observation) -> Air:
     layers = operator._layers(profile)
     models = [_model(operator, layer, track, observation) for layer in layers]
     variances = [_turbulence(operator, observation, n, m).variance for n, m in enumerate(models)]
-    low, high = float(observation.elevation.min()), float(observation.elevation.max())
+    elevation = observation.elevation
+    low, high = float(elevation.min()), float(elevation.max())
     plane = observation.focalplane
     step = 1e-3
     slope = float(band.emission_difference(pwv, pwv * step, low)) / step
@@ -91,12 +125,29 @@ def air(operator: AtmosphereLayers, observation: Observation) -> Air:
     if operator.pwv_rms_after_beam:
         scale /= math.sqrt(sum(m.amplitude**2 * v for m, v in zip(models, variances, strict=True)))
     stretch = 1 / math.sin(track.elevation) if track.kind == "horizontal" else 1.0
-    return Air(band, profile, pwv, layers, models, variances, scale * abs(slope) * share, stretch, (low, high))
+    speeds = _speeds(observation, track, layers)
+    return Air(band, profile, pwv, layers, models, variances, scale * abs(slope) * share, stretch, (low, high), speeds)
+
+
+def _speeds(o: Observation, track: Track, layers: list[Layer]) -> list[Floats]:
+    """Speeds [m/s] of the boresight's ray through the air of each layer, at some instants of the scan."""
+    if o.n_samples < 2:
+        return [np.zeros(1)] * len(layers)
+    at = np.unique(np.linspace(0, o.n_samples - 2, INSTANTS).astype(int))
+    both = np.stack([at, at + 1], axis=1).ravel()
+    x = track.unroll(crossing(rays(axes(o.boresight_azel[both]), np.zeros(1), np.zeros(1)))[:, 0]).reshape(2, -1, 2)
+    velocity = (x[:, :, 1] - x[:, :, 0]) * o.sample_rate
+    return [np.hypot(*(layer.height * velocity - (track.drift @ layer.wind)[:, None])) for layer in layers]
 
 
 def atmosphere_traits(operator: AtmosphereLayers, observation: Observation) -> Traits:
-    """rms of the fluctuation."""
-    return Traits(rms=air(operator, observation).rms)
+    """rms of the fluctuation, and of what of it is faster than a frequency."""
+    a = air(operator, observation)
+
+    def faster(frequency: float) -> float:
+        return min(math.sqrt(sum(a.faster(k, frequency) ** 2 for k in range(len(a.models)))), a.rms)
+
+    return Traits(rms=a.rms, faster=faster)
 
 
 def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimate:
@@ -134,13 +185,14 @@ def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list
         "rms left of the layer after subtraction of the detectors' mean" if context.removes_common else "rms behind the beam"
     )
     effects = []
+    averages, spectra = _averages(operator, context, a), _spectral_shares(context, a)
     for k, (layer, model) in enumerate(zip(a.layers, a.models, strict=True)):
         rms = SAFETY * left_of_layer(context, a, k)
-        common = True  # detectors differ by less than they share: their errors do not average
-        bound = context.bound(rms, _correlated(operator, context, model, layer.wind), common)
+        bound = context.bound(rms, _correlated(operator, context, model, layer.wind), common=True)
+        bound["map_rms"] = min(bound["map_rms"], averages[k] * rms)
         opacity = _opacity_share(a) * operator.pwv_rms * model.amplitude * math.sqrt(a.variances[k])
         bound |= context.sky_error(opacity)
-        bound["psd"] = SAFETY * (a.kelvin * model.amplitude) ** 2 * a.variances[k] / max(a.rms, 1e-30) ** 2
+        bound["psd"] = min(SAFETY**2 * spectra[k], 1.0)
         choices = [full(f"at {layer.height:.0f} m")]
         if k in operator.omit:
             choices = [full(f"at {layer.height:.0f} m: left out by the pipeline")]
@@ -149,6 +201,40 @@ def _layer_effects(operator: AtmosphereLayers, context: Context, a: Air) -> list
             choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound, formula=text, seconds=seconds))
         effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
     return effects
+
+
+def _averages(operator: AtmosphereLayers, context: Context, a: Air) -> list[float]:
+    """See `averaging.shares`; worked out once for an observation."""
+    key = str(context.coverage)
+    if key not in a.averages:
+        a.averages[key] = shares(operator, context, a)
+    return a.averages[key]
+
+
+def _average(operator: AtmosphereLayers, context: Context, a: Air) -> float:
+    """Of all layers together: rms in a pixel over that in a sample, of an error in proportion to the fluctuation."""
+    left = [left_of_layer(context, a, k) for k in range(len(a.models))]
+    total = math.sqrt(sum(x * x for x in left))
+    mapped = math.sqrt(sum((x * y) ** 2 for x, y in zip(left, _averages(operator, context, a), strict=True)))
+    return mapped / total if total > 0 else 1.0
+
+
+def _spectral_shares(context: Context, a: Air) -> list[float]:
+    """Largest share that each layer has of the stream's power in a range of frequency (20 from 1 / duration to Nyquist),
+    white noise included."""
+    o = context.first
+    grid = np.geomspace(1 / o.duration, o.sample_rate / 2, 21) if o.duration * o.sample_rate > 4 else np.array([0.0, 1.0])
+    power = np.array([[a.faster(k, float(f)) ** 2 for f in grid] for k in range(len(a.models))])
+    each = np.maximum(power[:, :-1] - power[:, 1:], 0.0)
+    total = each.sum(axis=0) + context.noise**2 * 2 * np.diff(grid) / o.sample_rate
+    return [float(v) for v in (each / np.maximum(total, 1e-300)).max(axis=1)]
+
+
+def _in_proportion(operator: AtmosphereLayers, context: Context, a: Air, share: float, seen: float, correlated: float) -> Any:
+    """Bound of an error that is ``share`` of the fluctuation, which has the rms ``seen`` in a sample."""
+    bound = context.bound(share * seen, correlated, common=True)
+    bound["map_rms"] = min(bound["map_rms"], SAFETY * share * seen * _average(operator, context, a))
+    return bound | {"psd": 2 * share + share**2}
 
 
 def _points(operator: AtmosphereLayers, context: Context, a: Air, tolerance: float) -> float:
@@ -211,7 +297,7 @@ def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Ef
     effects = [Effect("detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text)]
     fidelity = FIDELITIES[operator.fidelity]
     seen = left if context.removes_common else a.rms
-    wrong = context.bound(0.5 * fidelity.structure_error * seen, correlated, True)
+    wrong = _in_proportion(operator, context, a, 0.5 * fidelity.structure_error, seen, correlated)
     text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
     effects.append(Effect("turbulence lattice", (full(f"{operator.fidelity}, {_lattice(operator):g} of the beam"),), wrong, text))
     return effects
@@ -239,7 +325,7 @@ def _spectral(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effe
         text = "|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer " + (
             "at the band's centre alone" if other is one else "without ozone"
         )
-        effects.append(Effect(name, (full(what),), context.bound(share * seen, correlated, True), text))
+        effects.append(Effect(name, (full(what),), _in_proportion(operator, context, a, share, seen, correlated), text))
     return effects
 
 
@@ -260,7 +346,7 @@ def _slopes(context: Context, a: Air) -> list[Effect]:
     share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max()) / float(a.band.transmission(a.pwv, low))
     size = context.bound(emission * share, context.first.duration, True)
     gone = "removed analytically by the high-pass filter" if context.cut > 0 else "in float64 beside the stream"
-    noise = context.bound(opacity / 2 * context.noise)
+    noise = context.bound(opacity / 2 * context.noise) | {"psd": opacity}
     return [
         Effect("mean emission with elevation", (full(gone),), size, "difference of the band's emission over the elevations seen"),
         Effect("opacity with elevation", (full("calibrated at the current elevation"),), noise | context.sky_error(opacity),

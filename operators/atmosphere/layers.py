@@ -171,6 +171,7 @@ class AtmosphereLayers(Operator):
     _source: Any = PrivateAttr(None)
     _tracks: dict[str, Track] = PrivateAttr(default_factory=dict)
     _air: dict[Any, tuple[Profile, BandAtmosphere]] = PrivateAttr(default_factory=dict)
+    _looked: dict[str, Any] = PrivateAttr(default_factory=dict)
 
     @field_validator("spectra")
     @classmethod

@@ -66,7 +66,7 @@ class LinesOfSight:
     def __init__(self, observation: Observation, track: Track, step: int, first: int, count: int) -> None:
         self.step, self.first, self.count = step, first, count
         index = step * (first + np.arange(count, dtype=np.int64))
-        self.seconds = float(observation.seconds[0]) + index / observation.sample_rate
+        self.seconds = observation.seconds_at(index)
         axes = axes_at(observation.boresight_azel, index, step)  # (n, 3 components, 3 axes)
         # Components of u before normalization: rows (east, north, up), columns (1, xi, eta).
         linear = np.stack([axes[:, :, 2], -axes[:, :, 1], -axes[:, :, 0]], axis=2)

@@ -197,17 +197,25 @@ def _spline_table() -> tuple[Floats, Floats]:
     density = np.exp(-u * u) / np.sqrt(np.pi) * (u[1] - u[0])
     out = np.empty_like(q)
     for n, ratio in enumerate(q):
-        w = u * ratio
+        w = u[600:] * ratio  # even in w
         b = 3 / (2 + np.cos(w))
         # Images of frequencies far above Nyquist: fold w to (-pi, pi] and name its own image m.
         own = np.round(w / (2 * np.pi))
-        folded = w - 2 * np.pi * own
+        half = (w - 2 * np.pi * own) / 2
+        top = np.sin(half) ** 4 * b
+        tiny = np.abs(half) < 1e-12
+        half[tiny], top[tiny] = 1.0, 0.0
+        base = np.where(tiny, 1.0, top / half**4)  # sinc^4 b of the image at the folded frequency itself
         error = np.zeros_like(w)
-        here = np.sinc(w / (2 * np.pi)) ** 4 * b
-        for m in range(-8, 9):
-            image = np.sinc((folded + 2 * np.pi * m) / (2 * np.pi)) ** 4 * b
-            error += np.where(m == own, 0.0, image**2)
-        out[n] = density @ (error + (1 - here) ** 2)
+        for m in range(1, 9):
+            for shift in (m * np.pi, -m * np.pi):
+                fourth = ((half + shift) ** 2) ** 2
+                error += 1 / (fourth * fourth)
+        error = error * top**2 + np.where(own == 0, 0.0, base**2)
+        here = np.where(own == 0, base, np.where(tiny, 0.0, top / np.where(w == 0, 1.0, w / 2) ** 4))
+        error -= np.where((own != 0) & (np.abs(own) <= 8), here**2, 0.0)
+        values = error + (1 - here) ** 2
+        out[n] = 2 * density[600:] @ values - density[600] * values[0]
     return np.log(q), np.log(out)
 
 

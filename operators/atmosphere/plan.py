@@ -105,11 +105,16 @@ def make_plan(
     tried: dict[int, tuple[list[float], float]] = {}
 
     def path_errors(step: int) -> tuple[list[float], float]:
-        """Of the position in each layer [m], and of the elevation [rad]."""
+        """Of the position in each layer [m], and of the elevation [rad].
+
+        Between steps samples count as a comb: where they are none, the wind moves on by its speed times their `jitter`.
+        """
         if step not in tried:
             delta_x, delta_el = path.errors(step) if step > 1 else (np.zeros(2), 0.0)
             stretched = track.matrix @ delta_x if track.cone is None else delta_x
-            tried[step] = [float(abs(stretched * m.height).max()) for m in models], delta_el
+            late = observation.jitter if step > 1 else 0.0
+            blown = [float(np.hypot(*(track.drift @ wind))) * late for wind in winds]
+            tried[step] = [float(abs(stretched * m.height).max()) + b for m, b in zip(models, blown, strict=True)], delta_el
         return tried[step]
 
     late_allowed = tolerance * rms * (1.0 if nodes.shape else math.sqrt(2.0))

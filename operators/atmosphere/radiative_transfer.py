@@ -99,6 +99,8 @@ class Layers:
     def opacity(self, cross_sections: CrossSections) -> Array:
         """(n, n_frequency) vertical opacity of each layer, neper."""
         k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
+        # Linear in the mixing ratio, falling to 0.8 of its dry value at 0.05 at most: it is positive up to 0.25, which no air
+        # holds (a source of more than 0.1 is refused), so nothing is cut.
         water_section = np.maximum(k.water + water * k.water_self, 0.0)
         return self.molecules[:, None] * ((1 - water) * k.dry_air + water * water_section + ozone * k.ozone)
 

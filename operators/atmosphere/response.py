@@ -72,7 +72,7 @@ class Response:
         self._s = ((low + high) / 2, 2 / max(high - low, 1e-9))
         self._range = y_low, y_high
 
-        def elevation(s: Floats) -> Floats:
+        def elevation(s: Floats) -> Floats:  # lines of sight beyond are refused: this cuts the widened range, and rounding
             return np.asarray(np.arcsin(np.clip(s, bottom, top)), np.float64)
 
         def column(y: Floats, s: Floats) -> Floats:

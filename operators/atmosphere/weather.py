@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.files import own_data
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
 
@@ -96,7 +97,7 @@ class WaterDistribution:
         above = self.below if self.above is None else self.above
         reach = math.log(PWV_MAX) - centre
         most = normal.cdf(reach / (above if reach > 0 else self.below))
-        deviate = normal.inv_cdf(min(max(quantile * most, 1e-300), 1 - 1e-16))
+        deviate = normal.inv_cdf(min(max(quantile * most, 1e-300), 1 - 1e-16))  # a quantile of 0 or 1 is 37 or 8 sigma away
         return min(math.exp(centre + deviate * (above if deviate > 0 else self.below)), PWV_MAX)
 
 
@@ -187,6 +188,7 @@ class Profile:
         if self.wind_east_spread is None or self.wind_north_spread is None:
             return self
         squared = self.wind_east**2 + self.wind_north**2
+        # (1 um/s)^2 where there is no spread, and none of the wind: adds nothing, divides
         variance = np.maximum((self.wind_east_spread**2 + self.wind_north_spread**2) / 2, 1e-12)
         speed = np.sqrt(squared + variance * (1 + 0.386 * np.exp(-squared / (2 * variance))))
         median = np.sqrt(squared)
@@ -252,14 +254,14 @@ def check_pwv(pwv: float) -> None:
 @lru_cache(maxsize=1)
 def climatologies() -> tuple[str, ...]:
     """Names of the embedded climatologies, sorted."""
-    with np.load(CLIMATOLOGY) as file:
+    with own_data(CLIMATOLOGY) as file:
         return tuple(sorted({key.split("/")[0] for key in file.files}))
 
 
 @lru_cache(maxsize=8)
 def coefficients(name: str) -> dict[str, NDArray[np.float32]]:
     """The arrays of one embedded climatology by quantity, as data/README.md lists them."""
-    with np.load(CLIMATOLOGY) as file:
+    with own_data(CLIMATOLOGY) as file:
         return {key.split("/")[1]: file[key] for key in file.files if key.startswith(f"{name}/")}
 
 
@@ -338,6 +340,7 @@ def on_heights(column: Column, site: Site) -> Profile:
         A site far below the column's lowest level, or above its highest.
     """
     column, altitude = _continued(column), site.altitude
+    whole: Array | None = None
     if not column.height[0] - EXTRAPOLATION_MAX <= altitude < column.height[-1]:
         low, who = altitude < column.height[0], column.stated or "its weather"
         where = f"more than {EXTRAPOLATION_MAX:g} m below the lowest" if low else "above the highest"
@@ -363,13 +366,14 @@ def on_heights(column: Column, site: Site) -> Profile:
     top = column.temperature[-1]
     warming = np.minimum(STRATOSPHERE_LAPSE * above, max(STRATOPAUSE_TEMPERATURE - top, 0.0))
     temperature = linear(column.temperature) + lapse * below + warming
-    h2o = np.exp(linear(np.log(np.maximum(column.h2o, 1e-12))))
+    h2o = np.exp(linear(np.log(np.maximum(column.h2o, 1e-12))))  # a logarithm of dry air: 6e-9 mm of water in the whole column
     mean = np.where(above > 0, (temperature + top) / 2, temperature)  # of the air between the outermost level and z
     log_pressure = linear(np.log(column.pressure)) - GRAVITY * (above + below) / (DRY_AIR_GAS_CONSTANT * mean)
     if column.ground_temperature is not None:
         temperature = temperature + (column.ground_temperature - temperature[0]) * np.exp(-height / INVERSION_DEPTH)
         saturated = saturation_pressure(temperature) / np.exp(log_pressure)
-        h2o = np.where(height < 5 * INVERSION_DEPTH, np.minimum(h2o, saturated), h2o)
+        cold = (height < 5 * INVERSION_DEPTH) & (h2o > saturated)
+        whole, h2o = h2o, np.where(cold, saturated, h2o)
     if column.ozone_pressure is None or column.ozone is None:
         o3 = ozone(np.exp(log_pressure))
     else:
@@ -388,6 +392,10 @@ def on_heights(column: Column, site: Site) -> Profile:
         wind_north_spread=spread(column.wind_north_spread),
         stated=(("weather", column.stated),) if column.stated else (),
     )
+    if whole is not None and cold.any():
+        lost = 1 - made.pwv / replace(made, h2o=whole).pwv
+        text = f"cut to saturation at {np.count_nonzero(cold)} levels of the inversion, which takes {lost:.2%} of the column"
+        made = replace(made, stated=(*made.stated, ("water near the ground", text)))
     if log_vapour_spread is None:
         return made
     low, high = (replace(made, h2o=made.h2o * np.exp(sign * log_vapour_spread)).pwv for sign in (-1, 1))

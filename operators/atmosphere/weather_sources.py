@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from zonda.core.configuration.files import InputPath
 from zonda.core.errors import InputError
 from zonda.core.random import normals, stream_key, uniforms
 from zonda.core.weather import Column, WeatherSource
 
 from .era5 import read_era5
+from .humidity import saturation_pressure
 from .profile_table import read_table
 from .standard_atmosphere import standard_column
 from .weather import Profile, check_pwv, climatology_column, on_heights
@@ -109,7 +112,19 @@ def air_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, 
     profile = on_heights(standard_column(site) if without_climatology else weather.column(site, time), site)
     profile, how = _water(profile, weather, seed, pwv)
     profile, wind = _wind(profile, weather, seed)
-    return replace(profile, stated=(*profile.stated, ("water", how), ("wind", wind)))
+    return replace(profile, stated=(*profile.stated, ("water", how), *_supersaturated(profile), ("wind", wind)))
+
+
+def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:
+    """What is said of air that holds more water than saturates it: it is taken as it is."""
+    saturated = saturation_pressure(profile.temperature) / profile.pressure
+    over = profile.h2o > saturated * (1 + 1e-9)
+    if not over.any():
+        return ()
+    most = float((profile.h2o / saturated)[over].max())
+    share = 1 - replace(profile, h2o=np.minimum(profile.h2o, saturated)).pwv / profile.pwv
+    text = f"at {np.count_nonzero(over)} of {len(over)} levels, up to {most:.0%}; {share:.2%} of the column is above saturation"
+    return (("relative humidity above 100 %", f"{text}; taken as it is"),)
 
 
 def _water(profile: Profile, weather: WeatherSource, seed: int, pwv: float | None) -> tuple[Profile, str]:

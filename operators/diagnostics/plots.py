@@ -280,8 +280,8 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
     values = stream.streams[name]
     finite = values[np.isfinite(values)]
     factor, unit = _unit(float(np.abs(finite).max()) if finite.size else 1.0)
-    steps = np.diff(stream.seconds[:2])
-    width = max(1, round(1.0 / float(steps[0]))) if steps.size and steps[0] > 0 else 1
+    step = float(np.median(np.diff(stream.seconds))) if len(stream.seconds) > 1 else 0.0  # samples need not be a comb
+    width = max(1, round(1.0 / step)) if step > 0 else 1
     whole = values.shape[1] // width * width
     centres = stream.seconds[:whole].reshape(-1, width).mean(axis=1)
     for k, detector in enumerate(stream.names):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
@@ -13,7 +13,7 @@ from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
-from zonda.core.data import Block, Data, Observation
+from zonda.core.data import Block, Data, Observation, Tally
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.operators.io.streams import StreamsAsked
@@ -181,7 +181,6 @@ class PowerSpectrum(Operator):
                 state.found[int(d)] = found
 
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
-        key = data.product(self.name or ("spectrum" if self.label == type(self).__name__ else self.label))
         if state.frequency is None:
             observation.tally.count(self.label, "scans too short for a power spectrum", 1)
             return
@@ -192,21 +191,44 @@ class PowerSpectrum(Operator):
             psd[name] = np.mean(rows, axis=0)
         count = len(state.found)
         white = 2 * float(np.mean(observation.focalplane.net[sorted(state.found)] ** 2))
-        new = Spectrum(state.frequency, psd, state.independent * count, white, self.label, count)
+        self._add(data, Spectrum(state.frequency, psd, state.independent * count, white, self.label, count), observation.tally)
+
+    @property
+    def _key(self) -> str:
+        return self.name or ("spectrum" if self.label == type(self).__name__ else self.label)
+
+    def _add(self, data: Data, new: Spectrum, tally: Tally) -> None:
+        """Take the mean of all scans, each with the same weight."""
+        key = data.product(self._key)
         old = data.products.get(key)
         if old is None:
             data.products[key] = new
         elif (
             old.frequency.shape == new.frequency.shape
             and np.allclose(old.frequency, new.frequency, rtol=1e-12)
-            and old.psd.keys() == psd.keys()
+            and old.psd.keys() == new.psd.keys()
         ):
-            n = old.observations
-            merged = {k: (old.psd[k] * n + new.psd[k]) / (n + 1) for k in psd}
-            level = (old.white_level * n + white) / (n + 1)
-            data.products[key] = Spectrum(old.frequency, merged, old.averages + new.averages, level, self.label, count, n + 1)
+            n, m = old.observations, new.observations
+            merged = {k: (old.psd[k] * n + new.psd[k] * m) / (n + m) for k in old.psd}
+            level = (old.white_level * n + new.white_level * m) / (n + m)
+            averages = old.averages + new.averages
+            data.products[key] = Spectrum(old.frequency, merged, averages, level, self.label, new.detectors, n + m)
         else:
-            observation.tally.count(self.label, "scans of another length left out of the mean spectrum", 1)
+            tally.count(self.label, "scans of another length left out of the mean spectrum", new.observations)
+
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """The mean so far."""
+        mean: Spectrum | None = data.products.pop(data.product(self._key), None)
+        if mean is None:
+            return None
+        return {
+            "frequency": mean.frequency, "psd": dict(mean.psd), "averages": mean.averages, "white_level": mean.white_level,
+            "detectors": mean.detectors, "observations": mean.observations,
+        }  # fmt: skip
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Into the mean of all scans."""
+        self._add(data, Spectrum(**part, label=self.label), data.tally)
 
 
 def _divisor(block: Block, detector: int) -> Floats:

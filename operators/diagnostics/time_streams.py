@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
@@ -111,5 +112,23 @@ class TimeStreams(Operator):
         for name in [s for s, values in state.streams.items() if np.isnan(values).all()]:
             del state.streams[name]
             observation.tally.count(self.label, f"stream {name} is absent at this step", 1)
-        key = self.name or ("time_streams" if self.label == type(self).__name__ else self.label)
-        data.products[data.product(key)] = state
+        data.products[data.product(self._key)] = state
+
+    @property
+    def _key(self) -> str:
+        return self.name or ("time_streams" if self.label == type(self).__name__ else self.label)
+
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """The streams."""
+        kept: TimeStream | None = data.products.pop(data.product(self._key), None)
+        if kept is None:
+            return None
+        return {
+            "seconds": kept.seconds, "streams": dict(kept.streams), "names": list(kept.names), "observation": kept.observation
+        }  # fmt: skip
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Keep those of the first part that has any."""
+        key = data.product(self._key)
+        if key not in data.products:
+            data.products[key] = TimeStream(part["seconds"], part["streams"], part["names"], part["observation"], self.label)

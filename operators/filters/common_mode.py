@@ -8,6 +8,9 @@ G is never formed: one step of the Lanczos iteration (full reorthogonalization, 
 A^T q and A A^T q together. It starts from the detector mean and stops when
 
     |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is removed.                        (2)
+
+The detectors' mean (`method: mean`) is found in one reading (`focal_plane_mean`), so that the stream may be larger than memory
+and disk; the iteration needs it whole.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
 from zonda.core.tiles import TILE_SAMPLES
+
+from . import focal_plane_mean
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -58,7 +63,7 @@ class CommonModeFilter(Operator):
     modes: int = Field(1, ge=1, le=100)
     """How many modes to remove."""
     method: Literal["svd", "mean"] = "svd"
-    """Singular modes, or the plain mean of all detectors at each instant (one mode)."""
+    """Singular modes, or the plain mean of all detectors at each instant (one mode), which streams of any size allow."""
     residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
     """Largest residual of a removed mode, equation (2)."""
     gap: float = Field(0.9, gt=0, lt=1)
@@ -79,23 +84,30 @@ class CommonModeFilter(Operator):
         """Empty modes, filled by `measure`."""
         return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
 
+    def sweeps(self, observation: Observation) -> int:
+        """One reading for the mean; the singular modes want the stream whole."""
+        return 1 if self.method == "mean" else 0
+
     def measure(self, stream: Stream, state: Modes) -> None:
         """Find the modes. Raises PipelineError where float32 cannot carry the remainder."""
         observation, tally, who = stream.observation, stream.observation.tally, self.label
         place = f"{who}, {observation.name}"
-        if stream.means.get("signal") is not None and stream.array.dtype != np.float64:
+        if stream.means.get("signal") is not None and stream.dtype != np.float64:
             raise PipelineError(
                 "the mean emission, tens of kelvin, is still part of the signal and float32 cannot carry it",
                 place=place,
                 cure="put a HighpassFilter before, or set precision: float64",
             )
-        with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-            gram = Gram(stream, pool)
-            for name, dead in (("not finite", gram.not_finite), ("constant", gram.constant)):
-                tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
-                observation.detector_flags[dead] |= FLAG_DEAD
-            found = Ritz.of_mean(gram) if self.method == "mean" else lanczos(gram, self)
-            count = self._choose(found, gram, observation)
+        gram: Gram | Usable
+        if self.method == "mean":
+            gram, found = self._mean(stream)
+        else:
+            with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+                gram = Gram(stream, pool)
+                self._flag(gram, observation)
+                found = lanczos(gram, self)
+                found.count = self._choose(found, gram, observation)
+        count = found.count
         state.detectors, state.times = found.detectors[:count], found.times[:count]
         sizes = np.sqrt(np.maximum(found.values[: self.modes + 1], 0.0) / max(1, gram.n_good * gram.n_used))
         values = ", ".join(f"{s:.4g}" for s in sizes)
@@ -105,13 +117,37 @@ class CommonModeFilter(Operator):
         tally.state(who, f"{observation.name}: modes removed", f"{count} ({found.what})")
         self._check_precision(found, count, gram, stream, place)
 
+    def _flag(self, found: Gram | Usable, observation: Observation) -> None:
+        for name, dead in (("not finite", found.not_finite), ("constant", found.constant)):
+            observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
+            observation.detector_flags[dead] |= FLAG_DEAD
+
+    def _mean(self, stream: Stream) -> tuple[Usable, Ritz]:
+        """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
+        observation = stream.observation
+        good = observation.flags == 0
+        usable = Usable(observation.detector_flags == 0, int(good.sum()))
+        reading = focal_plane_mean.read(stream, usable.use, good)
+        if usable.judge(reading.sums, reading.squares):
+            reading = focal_plane_mean.read(stream, usable.use, good)
+        self._flag(usable, observation)
+        if usable.n_good == 0:
+            found = Ritz.nothing(usable.use.size, stream.shape[1])
+        else:
+            root = np.sqrt(usable.n_good)
+            v = reading.total / root
+            rank = 1 + (reading.least_left > NOTHING * usable.energy)
+            found = Ritz(np.array([v @ v]), (usable.use / root)[None], v[None], np.zeros(1), rank, 1, "detector mean")
+        found.count = min(1, max(0, found.rank - 1))
+        kept = "modes kept because the data do not determine them (rank)"
+        observation.tally.count(self.label, kept, 1 - found.count)
+        return usable, found
+
     def _choose(self, found: Ritz, gram: Gram, observation: Observation) -> int:
         """Number of modes to remove; may replace the modes by the detectors' mean."""
         tally = observation.tally
         wanted = min(self.modes, max(0, found.rank - 1))
         tally.count(self.label, "modes kept because the data do not determine them (rank)", self.modes - wanted)
-        if self.method == "mean":
-            return wanted
         size = np.sqrt(np.maximum(found.values, 0.0))
         following = np.append(size, 0.0)[1:]
         open_gaps = [i + 1 for i in range(wanted) if following[i] <= self.gap * size[i]]
@@ -126,8 +162,8 @@ class CommonModeFilter(Operator):
             return 1
         return determined
 
-    def _check_precision(self, found: Ritz, count: int, gram: Gram, stream: Stream, place: str) -> None:
-        if stream.array.dtype != np.float32 or not count or gram.energy <= 0:
+    def _check_precision(self, found: Ritz, count: int, gram: Gram | Usable, stream: Stream, place: str) -> None:
+        if stream.dtype != np.float32 or not count or gram.energy <= 0:
             return
         left = max(gram.energy - float(found.energies[:count].sum()), 0.0) / gram.energy
         if 0.01 * np.sqrt(left) < ROUNDING:
@@ -169,11 +205,44 @@ class Modes:
     times: Floats
 
 
+class Usable:
+    """Which detectors can take part: ``use`` (n_det,) those not flagged, ``n_used`` the number of good samples.
+
+    Attributes
+    ----------
+    not_finite, constant
+        (n_det,): detectors left out by `judge`.
+    energy
+        Sum of squares of the good detectors.
+    """
+
+    def __init__(self, use: NDArray[np.bool_], n_used: int) -> None:
+        self.use, self.n_used, self.energy = use, n_used, 0.0
+        self.not_finite = self.constant = np.zeros(use.size, bool)
+
+    @property
+    def n_good(self) -> int:
+        """Number of good detectors."""
+        return int(self.use.sum())
+
+    def judge(self, total: Floats, square: Floats) -> bool:
+        """Leave out detectors that are constant or not finite, from their sums (n_det,); whether there are any."""
+        finite = np.isfinite(square)
+        with np.errstate(invalid="ignore"):
+            spread = square - total**2 / max(1, self.n_used)
+        steady = ~(spread > 1e-12 * square)
+        self.not_finite, self.constant = self.use & ~finite, self.use & finite & steady
+        self.use = self.use & finite & ~steady
+        self.energy = float(np.where(self.use, square, 0.0).sum())
+        return bool(self.not_finite.any() or self.constant.any())
+
+
 class Gram:
     """G = A A^T as an operator on vectors over detectors, without flagged samples, flagged and dead detectors.
 
     Work is cut into absolute tiles of `TILE_SAMPLES` samples, whose parts are added in order: the bits do not depend on the
-    number of threads.
+    number of threads. The detectors' moments, which tell the dead ones, are taken on the way of the product that the
+    iteration begins with; where no detector turns out dead, `apply` has it at hand.
     """
 
     def __init__(self, stream: Stream, pool: ThreadPoolExecutor) -> None:
@@ -181,17 +250,38 @@ class Gram:
         self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.flags == 0
         self.n_used = int(self.good_samples.sum())
+        self.whole = stream.means.get("signal") is None and bool(self.good_samples.all())
         use = stream.observation.detector_flags == 0
-        total, square = self._moments()
-        finite = np.isfinite(square)
-        spread = square - total**2 / max(1, self.n_used)
-        steady = ~(spread > 1e-12 * square)
-        self.not_finite = use & ~finite
-        self.constant = use & finite & steady
-        self.use = use & finite & ~steady
-        self.n_good = int(self.use.sum())
-        self.squares = np.where(self.use, square, 0.0)
-        self.energy = float(self.squares.sum())
+        vector = _near_the_mean(use)
+        total, square, image, times = self._pass(vector, np.flatnonzero(use), moments=True)
+        self.usable = Usable(use, self.n_used)
+        self.usable.judge(total, square)
+        self._known = (vector, image, times) if np.array_equal(self.use, use) else None
+
+    @property
+    def use(self) -> NDArray[np.bool_]:
+        """Good detectors."""
+        return self.usable.use
+
+    @property
+    def not_finite(self) -> NDArray[np.bool_]:
+        """See `Usable`."""
+        return self.usable.not_finite
+
+    @property
+    def constant(self) -> NDArray[np.bool_]:
+        """See `Usable`."""
+        return self.usable.constant
+
+    @property
+    def n_good(self) -> int:
+        """See `Usable`."""
+        return self.usable.n_good
+
+    @property
+    def energy(self) -> float:
+        """See `Usable`."""
+        return self.usable.energy
 
     def _tiles(self) -> list[slice]:
         return [slice(a, min(a + TILE_SAMPLES, self.n_samples)) for a in range(0, self.n_samples, TILE_SAMPLES)]
@@ -207,30 +297,31 @@ class Gram:
         copy[:, ~good] = 0
         return copy, 0, copy.shape[1]
 
-    def _moments(self) -> tuple[Floats, Floats]:
-        """Sum and sum of squares of each detector's good samples, (n_det,) each."""
+    def _pass(self, q: Floats, rows: NDArray[np.intp], moments: bool = False) -> tuple[Floats, Floats, Floats, Floats]:
+        """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the stream."""
+        times, tiles = np.zeros(self.n_samples), self._tiles()
+        parts = np.zeros((len(tiles), 3, q.size))
 
-        def work(samples: slice) -> Floats:
-            out = np.zeros((2, self.stream.shape[0]))
-            _moments(*self._tile(samples), out)
-            return out
+        def work(some: range) -> None:
+            if self.whole:  # no tile needs a copy: all in one call
+                samples = slice(tiles[some[0]].start, tiles[some[-1]].stop)
+                _products(
+                    np.asarray(self.stream.array), samples.start, samples.stop, q, rows, times[samples], moments, parts[some[0] :]
+                )
+                return
+            for k in some:
+                _products(*self._tile(tiles[k]), q, rows, times[tiles[k]], moments, parts[k:])
 
-        parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, 2, self.stream.shape[0])
-        with np.errstate(invalid="ignore"):
-            total, square = parts.sum(axis=0)
-        return total, square
+        some = TILES_AT_ONCE
+        list(self.pool.map(work, [range(k, min(k + some, len(tiles))) for k in range(0, len(tiles), some)]))
+        total, square, image = parts.sum(axis=0)
+        return total, square, image, times
 
     def apply(self, q: Floats) -> tuple[Floats, Floats]:
         """(G q, A^T q): shapes (n_det,) and (n_samp,); A^T q is 0 at flagged samples."""
-        times, rows = np.zeros(self.n_samples), np.flatnonzero(self.use)
-
-        def work(samples: slice) -> Floats:
-            out = np.zeros(q.size)
-            _product(*self._tile(samples), q, rows, times[samples], out)
-            return out
-
-        parts = np.array(list(self.pool.map(work, self._tiles()))).reshape(-1, q.size)
-        return parts.sum(axis=0), times
+        if self._known is not None and np.array_equal(q, self._known[0]):
+            return self._known[1], self._known[2]
+        return self._pass(q, np.flatnonzero(self.use))[2:]
 
     def left(self, detectors: Floats, times: Floats) -> float:
         """Energy of A - sum u v^T, formed without cancellation."""
@@ -268,6 +359,8 @@ class Ritz:
     rank: int
     steps: int
     what: str = "singular modes"
+    count: int = 0
+    """How many of them are removed."""
     energies: Floats = field(init=False)
 
     def __post_init__(self) -> None:
@@ -277,26 +370,24 @@ class Ritz:
     def of_mean(cls, gram: Gram) -> Ritz:
         """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
         if gram.n_good == 0:
-            return cls.nothing(gram)
+            return cls.nothing(gram.use.size, gram.n_samples)
         u = gram.use / np.sqrt(gram.n_good)
         _, v = gram.apply(u)
         rank = 1 + (gram.left(u[None], v[None]) > NOTHING * gram.energy)
         return cls(np.array([v @ v]), u[None], v[None], np.zeros(1), rank, 1, "detector mean")
 
     @classmethod
-    def nothing(cls, gram: Gram) -> Ritz:
+    def nothing(cls, n_det: int, n_samples: int) -> Ritz:
         """No mode at all: no detector is left."""
-        n_det = gram.use.size
-        return cls(np.zeros(0), np.zeros((0, n_det)), np.zeros((0, gram.n_samples)), np.zeros(0), 0, 0, "no good detector")
+        return cls(np.zeros(0), np.zeros((0, n_det)), np.zeros((0, n_samples)), np.zeros(0), 0, 0, "no good detector")
 
 
 def lanczos(gram: Gram, how: CommonModeFilter) -> Ritz:
     """Leading modes of ``gram`` to ``how.residual``, or to a tenth where the gap is closed and the modes are not removed."""
     n, wanted = gram.n_good, how.modes
     if n == 0:
-        return Ritz.nothing(gram)
-    start = gram.use * (1.0 + 0.01 * _directions(0, gram))
-    basis: list[Floats] = [start / np.linalg.norm(start)]
+        return Ritz.nothing(gram.use.size, gram.n_samples)
+    basis: list[Floats] = [_near_the_mean(gram.use)]
     times: list[Floats] = []
     projected = np.zeros((n, n)) if n <= 4096 else np.zeros((512, 512))
     while True:
@@ -335,28 +426,49 @@ def lanczos(gram: Gram, how: CommonModeFilter) -> Ritz:
                 rank += gram.left(seen @ space, seen @ np.array(times)) > NOTHING * gram.energy
             return Ritz(values, detectors, series, residuals[:k], rank, m)
         if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
-            rest = gram.use * _directions(m, gram)
+            rest = gram.use * _directions(m, gram.use.size)
             for _ in range(2):
                 rest = rest - (space @ rest) @ space
             beta = float(np.linalg.norm(rest))
         basis.append(rest / beta)
 
 
-def _directions(step: int, gram: Gram) -> Floats:
-    """Fixed pseudo-random numbers over detectors (n_det,)."""
-    return normals(stream_key(0, "CommonModeFilter", step), 0, gram.use.size).astype(np.float64)
+def _near_the_mean(use: NDArray[np.bool_]) -> Floats:
+    """A unit vector (n_det,) close to the mean that no mode is orthogonal to."""
+    start = use * (1.0 + 0.01 * _directions(0, use.size))
+    return np.asarray(start / max(float(np.sqrt(start @ start)), 1e-300), np.float64)
 
+
+def _directions(step: int, n_detectors: int) -> Floats:
+    """Fixed pseudo-random numbers over detectors (n_det,)."""
+    return normals(stream_key(0, "CommonModeFilter", step), 0, n_detectors).astype(np.float64)
+
+
+TILES_AT_ONCE = 4
+"""Tiles in one call of the kernel."""
 
 LANES = 32
 
 
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
+    """`_product` (and `_moments`) of the samples start .. stop - 1 tile by tile: v = A^T q; out (n_tile, 3, n_det) takes each
+    tile's sums, sums of squares and A v."""
+    for k in range(-(-(stop - start) // TILE_SAMPLES)):
+        low = start + k * TILE_SAMPLES
+        high = min(low + TILE_SAMPLES, stop)
+        _product(array, low, high, q, rows, v[low - start : high - start], out[k, 2])
+        if moments:
+            _moments(array, low, high, rows, out[k])
+
+
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _moments(array, start, stop, out):  # type: ignore[no-untyped-def]
-    """Adds each row's sum and sum of squares over samples start .. stop - 1 to out (2, n_det)."""
-    n_det, n = array.shape[0], stop - start
+def _moments(array, start, stop, rows, out):  # type: ignore[no-untyped-def]
+    """Adds the sum and sum of squares of each of ``rows`` over samples start .. stop - 1 to out[:2] (2, n_det)."""
+    n = stop - start
     whole = n // LANES * LANES
     first, second = np.empty(LANES), np.empty(LANES)
-    for d in range(n_det):
+    for d in rows:
         row = array[d, start:stop]
         first[:] = 0.0
         second[:] = 0.0

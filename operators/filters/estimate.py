@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from zonda.core.plan.context import LEAKS
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
 
 if TYPE_CHECKING:
@@ -27,13 +28,15 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
     knots = operator.oversampling * operator.frequency * o.duration
     cost = Cost(fixed=0.02 + 2e-8 * knots * o.n_detectors, per_time=5e-8, per_sample=3.1e-9, bytes=64.0 * o.n_samples)
     choices = [full(f"{operator.oversampling:g} knots per cycle of the cut")]
+    cut = operator.frequency
+    near = LEAKS * context.weighted(lambda f: min((f / cut) ** 4, 1.0), 0.0, cut)
     for q in (16.0, 12.0, 8.0):
         if q < operator.oversampling:
-            error = context.fluctuation * (q**-4 + operator.oversampling**-4)
-            bound = context.bound(error, 1 / operator.frequency, common=True)
-            bound |= context.sky_error(q**-4 + operator.oversampling**-4)
-            saved = 2e-8 * (knots - q * operator.frequency * o.duration) * o.n_detectors * len(context.observations)
-            text = "rms of the stream x (q^-4 + q_full^-4), q knots per cycle of the cut"
+            share = q**-4 + operator.oversampling**-4
+            bound = context.bound(near * share, 1 / cut, common=True)
+            bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
+            saved = 2e-8 * (knots - q * cut * o.duration) * o.n_detectors * len(context.observations)
+            text = "1.5 sqrt(int_0^f_cut S (f / f_cut)^8 df) x (q^-4 + q_full^-4), q knots per cycle of the cut"
             choices.append(
                 Choice("coarse", f"{q:g} knots per cycle", {"oversampling": q}, bound=bound, formula=text, seconds=saved)
             )
@@ -53,7 +56,7 @@ START = 1e-3
 def steps(residual: float, modes: int, context: Context) -> int:
     """Steps that a residual takes: each lessens it by the square of the ratio of the noise's singular values to the mode's."""
     n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
-    common = max(context.fluctuation**2 - noise**2, 0.0) * (0.03 if context.cut > 0 else 1.0)  # what a high-pass filter leaves
+    common = max((context.passed / LEAKS) ** 2 - noise**2, 0.0) if context.cut > 0 else context.fluctuation**2
     shrink = min(noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30), 0.5)
     return modes + max(1, math.ceil(math.log(residual / START) / math.log(shrink)))
 
@@ -72,7 +75,7 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
     for residual in (1e-4, 1e-3, 1e-2):
         if residual > operator.residual:
             share = math.sqrt(operator.modes) * (residual + operator.residual) / (1 - operator.gap**2)
-            bound = context.bound(share * context.fluctuation, _slow(context), common=True)
+            bound = context.bound(share * context.passed, _slow(context), common=True) | {"psd": 2 * share + share**2}
             saved = LANCZOS * (count - steps(residual, operator.modes, context)) * context.samples
             choices.append(
                 Choice(
@@ -80,11 +83,11 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
                     f"residual {residual:g}",
                     {"residual": residual},
                     bound=bound | context.sky_error(share),
-                    formula="rms of the stream x residual / (1 - gap^2)",
+                    formula="rms of the stream behind the high-pass filter x residual / (1 - gap^2)",
                     seconds=saved,
                 )
             )
-    size = context.bound(context.fluctuation, _slow(context), common=True)
+    size = context.bound(context.passed, _slow(context), common=True)
     effect = Effect("common-mode residual", tuple(choices), size, "rms of the stream: no common mode removed at all")
     return Estimate((effect,), cost)
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from zonda.core.errors import InputError
 from zonda.core.files import writing
+from zonda.core.fits_files import check_size, opened
 
 from .save_map import ascii_text
 from .time_ordered_data import UNITS, Floats, TimeOrderedData
@@ -170,20 +170,13 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
     InputError
         No such file, not FITS, or one of the tables is missing.
     """
-    from astropy.io import fits
-
     place = f"time-ordered data {path}"
-    try:
-        file = fits.open(path)
-    except FileNotFoundError:
-        raise InputError("no such file", place=place, cure="check the path") from None
-    except OSError as error:
-        raise InputError(f"cannot be read as FITS: {error}", place=place, cure="give a file that SaveTOD wrote") from None
-    with file:
-        try:
-            return _read(file)
-        except KeyError as error:
-            raise InputError(f"is incomplete: {error.args[0]}", place=place, cure="give a file that SaveTOD wrote") from None
+    with opened(path, place, "give a file that SaveTOD wrote, whole") as file:
+        for hdu in file:
+            check_size(path, hdu, place)
+        tod = _read(file)
+    tod.check(place)
+    return tod
 
 
 def _read(file: Any) -> TimeOrderedData:

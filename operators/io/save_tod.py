@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
@@ -113,6 +114,15 @@ class SaveTOD(Operator):
         state.writer.finish()
         publish(state.temporary, state.path)
         data.products.setdefault(data.product("tod_file"), []).append(state.path)
+
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """The names of the files."""
+        files = data.products.pop(data.product("tod_file"), None)
+        return None if files is None else {"files": [str(path) for path in files]}
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Add to the list of files."""
+        data.products.setdefault(data.product("tod_file"), []).extend(Path(path) for path in part["files"])
 
     def discard(self, observation: Observation, state: _State) -> None:
         state.writer.close()

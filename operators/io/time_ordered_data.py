@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
+from zonda.core.errors import InputError
 
 Floats = NDArray[np.floating]
 
@@ -76,6 +77,23 @@ class TimeOrderedData:
     @property
     def n_detectors(self) -> int:
         return len(self.names)
+
+    def check(self, place: str) -> None:
+        """Raise an `InputError` about ``place`` where shapes do not fit each other, or times and pointing are not finite."""
+        n, d = np.shape(self.times)[:1], np.shape(self.names)
+        shapes = {"seconds": n, "times": n, "flags": n, "boresight_azel": (*n, 4), "boresight_radec": (*n, 4)}
+        shapes |= {"quats": (*d, 4), "detector_flags": d}
+        wrong = [name for name, shape in shapes.items() if np.shape(getattr(self, name)) != shape]
+        wrong += [name for name, column in self.columns.items() if np.shape(column) != d]
+        wrong += [name for name, stream in self.streams.items() if stream.shape[:2] != (*d, *n) or stream.dtype.kind not in "fiu"]
+        if wrong or not n or not d:
+            message = f"does not fit together: {', '.join(wrong)} for {len(self.names)} detectors"
+            raise InputError(message, place=place, cure="save it again")
+        numbers = [name for name, shape in shapes.items() if not np.isfinite(getattr(self, name)).all()]
+        if not np.isfinite([self.sample_rate, self.field_of_view, *self.site[1:]]).all() or not self.sample_rate > 0:
+            numbers.append("sample rate, field of view or site")
+        if numbers:
+            raise InputError(f"has NaN or impossible values in {', '.join(numbers)}", place=place, cure="save it again")
 
     @property
     def xi(self) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ import numpy as np
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.files import writing
+from zonda.core.hdf5_files import check_size, opened
 
 from .time_ordered_data import UNITS, Floats, TimeOrderedData
 
@@ -220,33 +221,26 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
     InputError
         No such file, not HDF5, another layout, or an item that TOAST requires is missing.
     """
-    import h5py
-
-    place = f"time-ordered data {path}"
-    try:
-        file = h5py.File(path, "r")
-    except FileNotFoundError:
-        raise InputError("no such file", place=place, cure="check the path") from None
-    except OSError as error:
-        raise InputError(f"cannot be read as HDF5: {error}", place=place, cure="give an HDF5 file in TOAST's layout") from None
-    with file:
+    place, cure = f"time-ordered data {path}", "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it"
+    with opened(path, place, "HDF5 in TOAST's layout", cure) as file:
         version = file.attrs.get("toast_format_version")
         if version != 2:
             raise InputError(
                 f"toast_format_version is {version}, not 2", place=place, cure="save it again with TOAST 3.0 or later"
             )
-        try:
-            return _read(file)
-        except KeyError as error:
-            raise InputError(f"is incomplete: {error.args[0]}", place=place, cure="save it again") from None
+        tod = _read(file, place)
+    tod.check(place)
+    return tod
 
 
-def _read(file: Any) -> TimeOrderedData:
+def _read(file: Any, place: str) -> TimeOrderedData:
     import astropy.units as u
     from astropy.io.misc.hdf5 import read_table_hdf5
     from astropy.table import QTable
 
     instrument, shared, detdata = file["instrument"], file["shared"], file["detdata"]
+    for dataset in (*shared.values(), *(detdata[name] for name in detdata if name != "flags"), instrument["focalplane"]):
+        check_size(dataset, place)
     table = QTable(read_table_hdf5(instrument, path="focalplane", character_as_bytes=False))
     order = {name: k for k, name in enumerate(np.asarray(table["name"]).astype(str))}
     names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -26,7 +27,7 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
 from zonda.core.tiles import TILE_SAMPLES
 
-from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
+from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame, tangent_pixels
 from .map_product import MapProduct
 
 if TYPE_CHECKING:
@@ -47,6 +48,9 @@ MAGIC_BITS = 0x4338000000000000
 
 TOGETHER = 4
 """Detectors that are scattered side by side: successive samples of one often fall in the same pixel and would wait for it."""
+
+AT_ONCE = 256
+"""Samples of 16 detectors whose pixels, values and pointing are in the first cache together."""
 
 DATA, HITS, WEIGHTS, NOISE = range(4)
 OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
@@ -133,26 +137,57 @@ class BinMap(Operator):
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""
+        layout = self.agree(data)
+        if layout is not None:
+            self.lay_out(layout)
+
+    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
+        """Centre, extent and units of the sums: of the first observation, and wide enough for all."""
         if not data.observations:
-            return
+            return before
         first = data.observations[0]
         instrument = first.instrument
-        self._variance = 2.0 ** round(math.log2(instrument.net**2 * first.sample_rate)) if instrument.net > 0 else 2.0**-12
-        self._fwhm = instrument.beam_fwhm
-        self._middle = in_frame(self.centre.icrs() if self.centre else first.centre, self.frame)
-        self._grid = self._healpix(data) if self.nside else self._image(data)
+        if before is None:
+            net = instrument.net
+            found: dict[str, Any] = {
+                "variance": 2.0 ** round(math.log2(net**2 * first.sample_rate)) if net > 0 else 2.0**-12,
+                "fwhm": instrument.beam_fwhm,
+                "frequency": instrument.band.centre,
+                "middle": [float(x) for x in in_frame(self.centre.icrs() if self.centre else first.centre, self.frame)],
+                "fixed": self.nside is None and self.width is not None,
+            }
+        else:
+            found = dict(before)
+            if not math.isclose(found["frequency"], instrument.band.centre, rel_tol=1e-6):
+                raise PipelineError(
+                    f"maps at {found['frequency'] / 1e9:.4g} GHz and {instrument.band.centre / 1e9:.4g} GHz cannot be added up",
+                    place=self.label,
+                    cure="leave the axis over which the band changes out of campaign.combine",
+                )
+        if self.nside:
+            nest = self.ordering == "nested"
+            pixels = covered_healpix(data.observations, self.nside, nest, self.frame)
+            found["pixels"] = np.union1d(found["pixels"], pixels) if "pixels" in found else pixels
+        elif not found["fixed"]:
+            longitude, latitude = found["middle"]
+            reach = covering_extent(data.observations, (longitude, latitude), self.frame)
+            half = found.get("half", (0.0, 0.0))
+            found["half"] = [max(half[0], reach[0]), max(half[1], reach[1])]
+        return found
 
-    def _healpix(self, data: Data) -> HealpixGrid:
-        assert self.nside is not None
-        nest = self.ordering == "nested"
-        return HealpixGrid(self.nside, nest, covered_healpix(data.observations, self.nside, nest, self.frame), self.frame)
+    def lay_out(self, layout: Mapping[str, Any]) -> None:
+        """Make the grid."""
+        longitude, latitude = layout["middle"]
+        self._variance, self._fwhm, self._middle = layout["variance"], layout["fwhm"], (longitude, latitude)
+        if self.nside:
+            self._grid = HealpixGrid(self.nside, self.ordering == "nested", np.asarray(layout["pixels"], np.int64), self.frame)
+        else:
+            self._grid = self._image(layout.get("half", (0.0, 0.0)))
 
-    def _image(self, data: Data) -> TangentGrid:
+    def _image(self, half: Sequence[float]) -> TangentGrid:
         width, height = self.width, self.height if self.height is not None else self.width
-        if width is None or height is None:
-            half_x, half_y = covering_extent(data.observations, self._middle, self.frame)
-            width = width if width is not None else 2 * half_x + 2 * self.pixel
-            height = height if height is not None else 2 * half_y + 2 * self.pixel
+        width = width if width is not None else 2 * half[0] + 2 * self.pixel
+        height = height if height is not None else 2 * half[1] + 2 * self.pixel
         nx, ny = (max(1, math.ceil(side / self.pixel - 1e-6)) for side in (width, height))
         if nx * ny > MOST_PIXELS:
             raise InputError(
@@ -210,16 +245,20 @@ class BinMap(Operator):
             signal.fill(0)
         else:
             signal = block.total("signal") if "signal" in block.means else block.detdata["signal"]
-        begin, rows = block.samples.start, block.detectors
+        begin, end, rows = block.samples.start, block.samples.stop, block.detectors
         xi, eta, use = plane.xi[rows], plane.eta[rows], observation.detector_flags[rows] == 0
-        for start in range(begin, block.samples.stop, TILE_SAMPLES):
-            stop = min(start + TILE_SAMPLES, block.samples.stop)
+        how = (
+            use, state.good[begin:end], state.weight[rows], state.noise[rows], self.noise == "scatter", state.alike,
+            1 / self._variance, sums, dropped, largest,
+        )  # fmt: skip
+        if isinstance(state.grid, TangentGrid):
+            _add_image(signal, state.pointing, begin, xi, eta, *state.grid.shape, *how)
+            return
+        for start in range(begin, end, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, end)
             index = np.empty((len(xi), stop - start), np.int32)
             state.grid.pixels(state.pointing, start, stop, xi, eta, index)
-            _add(
-                signal, start - begin, index, use, state.good[start:stop], state.weight[rows], state.noise[rows],
-                self.noise == "scatter", state.alike, 1 / self._variance, sums, dropped, largest,
-            )  # fmt: skip
+            _add(signal, start - begin, index, *how)
 
     def collect(self, data: Data, observation: Observation, state: Binning) -> None:
         """Add this observation to the even or the odd scans' sums."""
@@ -240,6 +279,21 @@ class BinMap(Operator):
             data.products[key] = Halves(self._n_pixels())
         data.products[key].add(observation, sums, largest, self.label)
 
+    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
+        """The sums, of pixels with hits only."""
+        halves: Halves | None = data.products.pop(data.product(f"{self.label} sums"), None)
+        if halves is None:
+            return None
+        return {**halves.packed(), "variance_unknown": self._variance_unknown}
+
+    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
+        """Add sums: exact, so that their order does not matter but for which scans are even."""
+        key = data.product(f"{self.label} sums")
+        if key not in data.products:
+            data.products[key] = Halves(self._n_pixels())
+        data.products[key].merge(part, self.label)
+        self._variance_unknown |= bool(part["variance_unknown"])
+
     def _n_pixels(self) -> int:
         assert self._grid is not None
         return self._grid.n_pixels
@@ -258,6 +312,8 @@ class BinMap(Operator):
         if self.noise == "scatter":
             alone = int(np.count_nonzero(product.hits == 1))
             data.tally.count(self.label, "pixels with one sample, whose scatter is unknown: noise NaN", alone)
+            equal = int(np.count_nonzero((product.hits > 1) & (product.noise == 0)))
+            data.tally.count(self.label, "pixels whose samples scatter by less than rounding: noise 0", equal)
             if self.smooth is not None:
                 data.tally.count(self.label, "of them left out of the smoothed noise, which is too low around them", alone)
         if self.weights == "inverse_variance" and self._variance_unknown:
@@ -308,6 +364,7 @@ class BinMap(Operator):
         with np.errstate(invalid="ignore", divide="ignore"):
             if self.noise == "net":
                 return np.where(hits > 0, np.sqrt(term) / weight, np.nan)
+            # equal samples leave the rounding of their squares, of either sign: a scatter below it is counted, and 0
             scatter = np.maximum(term / weight - signal**2, 0.0)
             return np.where(hits > 1, np.sqrt(scatter / (hits - 1)), np.nan)
 
@@ -381,14 +438,47 @@ class Halves:
         self.sums[len(self.scans) % 2] += sums
         self.scans.append(observation.name)
         self._largest = np.maximum(self._largest, largest)
+        self._check(f"{label}, {observation.name}")
+
+    def packed(self) -> dict[str, Any]:
+        """As plain values and arrays: numbers of the pixels with hits, and their sums."""
+        used = [np.flatnonzero(half[:, HITS]) for half in self.sums]
+        found: dict[str, Any] = {"scans": list(self.scans), "largest": self._largest}
+        for k, pixels in enumerate(used):
+            found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k][pixels]}
+        return found
+
+    def merge(self, part: Mapping[str, Any], label: str) -> None:
+        """Add what `packed` gave, whose scans follow those that are here. Raises PipelineError as `add`."""
+        shift = len(self.scans) % 2
+        for k in range(2):
+            self.sums[(k + shift) % 2][part[f"pixels_{k}"]] += part[f"sums_{k}"]
+        self.scans += part["scans"]
+        self._largest = np.maximum(self._largest, part["largest"])
+        self._check(label)
+
+    def _check(self, place: str) -> None:
+        """No sum can have overflowed."""
         deepest = float(self.sums[:, :, HITS].sum(axis=0).max(initial=0))
         if deepest * self._largest.max() >= 2.0**62:
             highest = self._largest[DATA] / VALUE
             raise PipelineError(
                 f"{deepest:.0f} samples in one pixel, each up to {highest:.3g} K, overflow the map's fixed-point sums",
-                place=f"{label}, {observation.name}",
+                place=place,
                 cure="make smaller pixels, or put a HighpassFilter before",
             )
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _add_image(signal, h, start, xi, eta, ny, nx, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
+    """`_add` of a block that begins at sample ``start`` to the pixels of an image, found as they are needed."""
+    n = signal.shape[1]
+    space = np.empty(xi.size * AT_ONCE, np.int32)
+    for low in range(0, n, AT_ONCE):
+        high = min(low + AT_ONCE, n)
+        index = space[: xi.size * (high - low)].reshape(xi.size, high - low)
+        tangent_pixels(h, start + low, start + high, xi, eta, ny, nx, index)
+        _add(signal, low, index, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
@@ -396,12 +486,13 @@ def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_var
     """Add samples to the fixed-point sums of their pixels; count what is dropped; note the largest terms.
 
     The last row of ``sums`` takes what is dropped. ``index`` (n_det, n): pixels of the samples first .. first + n - 1 of the
-    block. ``alike``: all detectors weigh the same; the sums of weights and noise follow from the hits.
+    block, like ``good``. ``alike``: all detectors weigh the same; the sums of weights and noise follow from the hits.
     """
     n = index.shape[1]
     flat, columns = sums.reshape(-1), np.uintp(sums.shape[1])
     trash = np.int32(sums.shape[0] - 1)
     lost = sums[trash, HITS]
+    fine = good[first : first + n]
     rows = np.flatnonzero(use)
     dropped[FLAGGED] += n * (use.size - rows.size)
     shifted, cells = np.empty((TOGETHER, n)), np.empty((TOGETHER, n), np.int32)
@@ -411,7 +502,7 @@ def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_var
         for k in range(group.size):
             d = group[k]
             limit, factor, square = _scales(weight[d], per_variance, scatter)
-            high = _units(signal[d, first : first + n], index[d], good, limit, factor, trash, shifted[k], units[k], cells[k])
+            high = _units(signal[d, first : first + n], index[d], fine, limit, factor, trash, shifted[k], units[k], cells[k])
             w, term = np.int64(np.rint(weight[d] * WEIGHT)), np.int64(np.rint(noise[d] * WEIGHT))
             if not alike:
                 for t in range(n):
@@ -428,7 +519,7 @@ def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_var
     if sums[trash, HITS] != lost:
         for d in rows:
             limit, _, _ = _scales(weight[d], per_variance, scatter)
-            _count_dropped(signal[d, first : first + n], index[d], good, limit, dropped)
+            _count_dropped(signal[d, first : first + n], index[d], fine, limit, dropped)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

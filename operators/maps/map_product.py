@@ -127,7 +127,8 @@ class MapProduct:
         quiet = known & np.isfinite(self.noise)
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = convolve((weights * np.where(quiet, self.noise, 0.0)) ** 2, 2.0) / total**2
-        noise = np.where(quiet, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        with np.errstate(invalid="ignore"):  # where the transform's rounding is all there is, the noise is not known
+            noise = np.where(quiet & (variance >= 0), np.sqrt(variance), np.nan)
         half = self.half_difference
         if half is not None:
             half = mean(half, np.isfinite(half))

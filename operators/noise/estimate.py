@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.errors import ZondaError
+from zonda.core.plan.context import LEAKS
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
 
 from .level import NoiseLevel, announced
@@ -35,19 +36,31 @@ def white_traits(level: NoiseLevel, observation: Observation) -> Traits:
 
 
 def pink_traits(pink: PinkNoise, observation: Observation) -> Traits:
-    """rms of one calibrated sample."""
+    """rms of one calibrated sample, and of what of it is faster than a frequency."""
     law, sigma, factor = _law(pink, observation, pink.poles)
-    return Traits(rms=0.0 if law is None else sigma * factor * math.sqrt(law.gain * law.variance))
+    if law is None:
+        return Traits()
+    rate, rms = observation.sample_rate, sigma * factor * math.sqrt(law.gain * law.variance)
+    grid = np.geomspace(1e-9, 0.5, 600)
+    power = np.abs(_amplitude(law, grid)) ** 2
+    above = np.append(np.cumsum((np.diff(grid) * (power[1:] + power[:-1]))[::-1])[::-1], 0.0)  # 2 int_f^(1/2) g |H|^2 df
+
+    def faster(frequency: float) -> float:
+        share = float(np.interp(math.log(max(frequency / rate, 1e-9)), np.log(grid), above))
+        return min(sigma * factor * math.sqrt(share), rms)
+
+    return Traits(rms=rms, faster=faster)
 
 
 def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
-    """Poles of the recursive filter."""
+    """Poles of the recursive filter, and the noise altogether."""
     o = context.first
     law, sigma, factor = _law(pink, o, pink.poles)
     cost = pink_cost(pink.poles)
     if law is None:
         return Estimate((), Cost(per_sample=0.3e-9))
-    whole = sigma * factor * math.sqrt(law.gain * law.variance)
+    level = (sigma * factor) ** 2 / max(context.noise, 1e-30) ** 2
+    common = pink.shared > 0 and not context.removes_common
     choices = [full(f"{pink.poles} poles")]
     for poles in (12, 8, 4):
         if poles >= pink.poles:
@@ -57,15 +70,26 @@ def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
         except ZondaError:
             break
         assert coarse is not None
-        rms = sigma * factor * math.sqrt(difference(law, coarse, context, o.sample_rate, o.duration))
-        common = pink.shared > 0 and not context.removes_common
-        bound = context.bound(rms, correlated=_correlated(context), common=common)
-        bound["psd"] = psd_error(law, coarse, (sigma * factor) ** 2 / max(context.noise, 1e-30) ** 2)
+        power = difference(law, coarse, context, o.sample_rate, o.duration)
+        bound = context.bound(sigma * factor * math.sqrt(power), correlated=_correlated(law, context), common=common)
+        bound["psd"] = psd_error(law, coarse, level)
         text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
         saved = cost.seconds(context.times, o.n_detectors) - pink_cost(poles).seconds(context.times, o.n_detectors)
         choices.append(Choice("coarse", f"{poles} poles", {"poles": poles}, bound=bound, formula=text, seconds=saved))
-    size = context.bound(whole, correlated=o.duration)
-    return Estimate((Effect("poles", tuple(choices), size, "rms of the pink noise before filters"),), cost)
+    rms = pink_traits(pink, o).rms
+    passed = rms
+    if context.cut > 0:
+        traits = pink_traits(pink, o)
+        assert traits.faster is not None
+        passed = LEAKS * traits.faster(context.cut)
+    size = context.bound(passed, correlated=_correlated(law, context), common=common)
+    size["psd"] = level * float(law.response(np.array([0.1 / (o.duration * o.sample_rate)]))[0])
+    text = "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R: high-pass filter"
+    if pink.shared == 0 and not context.kept_streams & pink.provides:
+        # a common part would be what a singular mode consists of: it is not dropped
+        saved = cost.seconds(context.times, o.n_detectors) + 0.5e-9 * context.samples
+        choices.append(Choice("dropped", "none", leave_out=True, bound=size, formula=text, seconds=saved))
+    return Estimate((Effect("poles", tuple(choices), size, text),), cost)
 
 
 def difference(a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float) -> float:
@@ -96,9 +120,21 @@ def _amplitude(law: PowerLawFilter, f: Any) -> Any:
     return math.sqrt(law.gain) * top / np.prod(1 - (1 - law.poles[:, None]) * back, axis=0)
 
 
-def _correlated(context: Context) -> float:
-    """Integral of |rho| of noise that the high-pass filter has freed of what is slower than its cut."""
-    return 1 / context.cut if context.cut > 0 else context.first.duration
+def _correlated(law: PowerLawFilter, context: Context) -> float:
+    """int |rho| dt over all lags, s, of noise that the high-pass filter has freed of what is slower than its cut.
+
+    rho from the power above the cut f_c, on a grid of f_c / 16 up to 256 f_c: what is faster correlates less.
+    """
+    if context.cut <= 0:
+        return context.first.duration
+    cut, rate = context.cut, context.first.sample_rate
+    n = 4096
+    f = np.arange(n + 1) * cut / 16
+    power = np.where((f >= cut) & (f <= rate / 2), law.response(np.maximum(f, cut) / rate), 0.0)
+    if not power.sum() > 0:
+        return 1 / cut
+    rho = np.fft.irfft(power)
+    return float(np.abs(rho / rho[0]).sum() / (2 * f[-1]))
 
 
 def _law(pink: PinkNoise, observation: Observation, poles: int) -> tuple[PowerLawFilter | None, float, float]:

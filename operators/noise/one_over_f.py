@@ -179,7 +179,7 @@ def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
         error=float(error),
         plateau=float(gain * np.prod((zeros / poles) ** 2)),
         variance=float(1 + tap @ covariance @ tap),
-        start=scale[:, None] * vector * np.sqrt(np.maximum(value, 0)),
+        start=scale[:, None] * vector * np.sqrt(np.maximum(value, 0)),  # eigenvalues of a correlation: negative by rounding only
     )
 
 

@@ -17,8 +17,8 @@ from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
 from zonda.core.errors import InputError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
-from zonda.core.random import fill_normals, normals
-from zonda.core.smooth import SmoothField
+from zonda.core.random import TILE, fill_normals, normal_scratch, normal_tile, normals
+from zonda.core.smooth import Series, SmoothField, series_into
 from zonda.core.tiles import TILE_DETECTORS
 
 from .level import NoiseLevel, announced
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.floating[Any]]
+
+NOTHING = np.zeros(0, np.float32)
 
 CHECKPOINT = 1 << 16
 """Samples between the filter states that are kept, so that blocks may be asked for in any order."""
@@ -105,8 +107,8 @@ class PinkNoise(Operator):
         state = _State(factor, level, streams, self.shared)
         if self.shared > 0:
             common = Streams(law, observation.key(self.label, "shared"), observation.key(self.label, "shared", "start"))
-            ones, state.common = np.ones((1, observation.n_samples), np.float32), np.zeros((1, observation.n_samples), np.float32)
-            common.add(0, 0, ones, state.common)
+            state.common = np.zeros((1, observation.n_samples), np.float32)
+            common.add(0, 0, state.common)
         return state
 
     def traits(self, observation: Observation) -> Traits:
@@ -123,15 +125,13 @@ class PinkNoise(Operator):
 
     def exec(self, block: Block, state: Any) -> None:
         """Add noise to ``pink``."""
-        out = block.new("pink")
         if state is None:
+            block.new("pink")
             return
-        amplitude = block.buffer("noise amplitude", block.shape)
-        state.amplitude(block.observation).evaluate(block.detectors, block.samples, out=amplitude)
-        if state.shared > 0:
-            out += amplitude * (np.sqrt(state.shared) * state.common[:, block.samples]).astype(out.dtype)
-            amplitude *= np.sqrt(1 - state.shared)
-        state.streams.add(block.detectors.start, block.samples.start, amplitude, out)
+        out = block.new("pink")
+        level = state.amplitude(block.observation).series(block.detectors, block.samples, out.dtype)
+        shared = state.common[0, block.samples]
+        state.streams.add(block.detectors.start, block.samples.start, out, level, shared, state.shared)
 
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """State the rms."""
@@ -148,6 +148,7 @@ class _State:
     def __init__(self, factor: float, level: NoiseLevel | None, streams: Streams, shared: float) -> None:
         self.factor, self.level, self.streams, self.shared = factor, level, streams, shared
         self.common: NDArray[np.float32] = np.zeros((1, 0), np.float32)
+        """(1, n_samp), or (1, 0) where nothing is shared."""
         self._lock = threading.Lock()
         self._amplitude: SmoothField | None = None
 
@@ -191,16 +192,36 @@ class Streams:
         self._tiles: dict[int, _Tile] = {}
         self._lock = threading.Lock()
 
-    def add(self, detector: int, sample: int, amplitude: Floats, out: Floats) -> None:
-        """Add amplitude * noise to ``out``, both (n_det, n_samp), whose first element is (detector, sample). Thread-safe."""
+    def add(
+        self,
+        detector: int,
+        sample: int,
+        out: Floats,
+        level: Series | None = None,
+        common: NDArray[np.float32] = NOTHING,
+        shared: float = 0.0,
+    ) -> None:
+        """Add level * noise to ``out`` (n_det, n_samp), whose first element is (detector, sample). Thread-safe.
+
+        ``level``: of the same detectors and samples; absent: 1. ``common`` (n_samp,): a stream that makes up the share
+        ``shared`` of the variance.
+        """
         end = detector + out.shape[0]
+        if level is None:
+            n_samples = sample + out.shape[1]
+            ones = SmoothField.constant(np.ones(out.shape[0]), n_samples)
+            level = ones.series(slice(0, out.shape[0]), slice(sample, n_samples), out.dtype)
+        shares = np.sqrt(np.array([1 - shared, shared])).astype(out.dtype)
         for number in range(detector // TILE_DETECTORS, -(-end // TILE_DETECTORS)):
             origin = number * TILE_DETECTORS
             low, high = max(detector, origin), min(end, origin + TILE_DETECTORS)
             rows = slice(low - detector, high - detector)
-            self._add_tile(number, low - origin, sample, amplitude[rows], out[rows])
+            part = Series(level.lines[rows], level.first, level.basis)
+            self._add_tile(number, low - origin, sample, part, common, shares, out[rows])
 
-    def _add_tile(self, number: int, lane: int, sample: int, amplitude: Floats, out: Floats) -> None:
+    def _add_tile(
+        self, number: int, lane: int, sample: int, level: Series, common: NDArray[np.float32], shares: Floats, out: Floats
+    ) -> None:
         with self._lock:
             tile = self._tiles.get(number)
             if tile is None:
@@ -208,14 +229,13 @@ class Streams:
         with tile.lock:
             nearest = max(k for k in tile.kept if k <= sample)
             state = tile.kept[nearest].copy()
-            nothing = out[:0]
+            law = self._rate, self._tap
             for start, stop in _pieces(nearest, sample):
-                _filter(self.key, number, start, stop - start, state, self._rate, self._tap, 0, nothing, nothing)
+                _filter(self.key, number, start, stop - start, state, *law, 0, *level, common[:0], shares, out[:0])
                 self._keep(tile, stop, state)
             for start, stop in _pieces(sample, sample + out.shape[1]):
                 part = slice(start - sample, stop - sample)
-                target = amplitude[:, part], out[:, part]
-                _filter(self.key, number, start, stop - start, state, self._rate, self._tap, lane, *target)
+                _filter(self.key, number, start, stop - start, state, *law, lane, *level, common[part], shares, out[:, part])
                 self._keep(tile, stop, state)
 
     def _keep(self, tile: _Tile, sample: int, state: NDArray[np.float32]) -> None:
@@ -238,21 +258,38 @@ def _pieces(start: int, stop: int) -> list[tuple[int, int]]:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _filter(key, tile, start, n, state, rate, tap, lane, amplitude, out):  # type: ignore[no-untyped-def]
-    """Equation (2) of `one_over_f` for 16 detectors x n samples; adds amplitude * y of those from ``lane`` on to ``out``.
+def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, basis, common, shares, out):  # type: ignore[no-untyped-def]
+    """Equation (2) of `one_over_f` for 16 detectors x n samples; adds level * y of those from ``lane`` on to ``out``.
 
     ``state`` (K, 16), K a multiple of 4, is moved on by n samples. Deviate 16 t + lane of stream ``tile`` drives sample t.
+    ``lines, cell, basis``: the `Series` of the level. Where there is a ``common`` stream, shares[0] y + shares[1] common
+    takes the place of y.
     """
     x = np.empty(16 * _CHUNK, np.float32)
+    words, bits, _ = normal_scratch()
+    level, mixed = np.empty(_CHUNK, out.dtype), np.empty(_CHUNK, out.dtype)
     for done in range(0, n, _CHUNK):
         m = min(_CHUNK, n - done)
-        fill_normals(key, tile, nb.int64(16) * (nb.int64(start) + done), x[: 16 * m])
+        origin = nb.int64(16) * (nb.int64(start) + done)
+        if origin % TILE == 0 and 16 * m % TILE == 0:
+            for k in range(16 * m // TILE):
+                normal_tile(key, tile, origin // TILE + k, words, bits, x[k * TILE : (k + 1) * TILE])
+        else:
+            fill_normals(key, tile, origin, x[: 16 * m])
         for k in range(0, rate.size, 4):
             _four_sections(x[: 16 * m], state[k : k + 4].ravel(), rate[k : k + 4], tap[k : k + 4])
         for d in range(uint64(out.shape[0])):
-            row, level = out[d, done : done + m], amplitude[d, done : done + m]
-            for t in range(uint64(m)):
-                row[t] += level[t] * x[uint64(16) * t + uint64(lane) + d]
+            row, size = out[d, done : done + m], level[:m]
+            series_into(lines[d], cell, basis, start + done, size)
+            if common.size:
+                shared = common[done : done + m]
+                for t in range(uint64(m)):
+                    mixed[t] = shares[0] * x[uint64(16) * t + uint64(lane) + d] + shares[1] * shared[t]
+                for t in range(uint64(m)):
+                    row[t] += size[t] * mixed[t]
+            else:
+                for t in range(uint64(m)):
+                    row[t] += size[t] * x[uint64(16) * t + uint64(lane) + d]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numba as nb
 import numpy as np
+from numba import uint64
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
 from zonda.core.operator import Operator
-from zonda.core.random import fill_normals
-from zonda.core.smooth import SmoothField
+from zonda.core.random import TILE, normal_scratch, normal_tile
+from zonda.core.smooth import SmoothField, series_into
 
 from .level import NoiseLevel, announce, scatter_factors
 from .models import FixedNet, NoiseModel, noise_model
@@ -90,9 +91,10 @@ class WhiteNoise(Operator):
 
     def exec(self, block: Block, state: Any) -> None:
         """Add noise to ``white``."""
-        amplitude = block.buffer("noise amplitude", block.shape)
-        state.amplitude(block.observation).evaluate(block.detectors, block.samples, out=amplitude)
-        _add_normals(state.key, block.detectors.start, block.samples.start, amplitude, block.new("white"))
+        add = "white" in block.detdata
+        out = block.new("white", zero=False)
+        level = state.amplitude(block.observation).series(block.detectors, block.samples, out.dtype)
+        _add_normals(state.key, block.detectors.start, block.samples.start, *level, add, out)
 
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """State the level."""
@@ -119,11 +121,22 @@ class _State:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add_normals(key, first, start, amplitude, out):  # type: ignore[no-untyped-def]
-    """out[d, t] += amplitude[d, t] n, n = normal deviate start + t of stream first + d."""
-    deviates = np.empty(out.shape[1], np.float32)
+def _add_normals(key, first, start, lines, cell, basis, add, out):  # type: ignore[no-untyped-def]
+    """out[d, t] = (or, to ``add``, +=) level n: level the `Series` (lines, cell, basis) of detector first + d at sample
+    start + t, n normal deviate start + t of stream first + d."""
+    words, bits, tile = normal_scratch()
+    level = np.empty(TILE, out.dtype)
+    stop = start + out.shape[1]
     for d in range(out.shape[0]):
-        fill_normals(key, first + d, start, deviates)
-        row, level = out[d], amplitude[d]
-        for t in range(nb.uint64(row.size)):  # unsigned: vectorized
-            row[t] += level[t] * deviates[t]
+        for number in range(start // TILE, -(-stop // TILE)):
+            origin = number * TILE
+            low, high = max(start, origin), min(stop, origin + TILE)
+            normal_tile(key, first + d, number, words, bits, tile)
+            deviates, row, size = tile[low - origin : high - origin], out[d, low - start : high - start], level[: high - low]
+            series_into(lines[d], cell, basis, low, size)
+            if add:
+                for t in range(uint64(row.size)):  # unsigned: vectorized
+                    row[t] += size[t] * deviates[t]
+            else:
+                for t in range(uint64(row.size)):
+                    row[t] = size[t] * deviates[t]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from .transform import CelestialTransform, unit_vectors
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
-    from zonda.core.data import Data, Observation
+    from zonda.core.data import Observation
 
 Floats = NDArray[np.float64]
 
@@ -45,6 +45,8 @@ class PointingBackAndForth(Pointing):
     """Largest acceleration on the sky in a turnaround."""
     flag_turnarounds: bool = False
     """Flag the samples in turnarounds (bit value 2), so that no map uses them; without it they are used like all others."""
+
+    slows: ClassVar[dict[str, tuple[int, int]]] = {"speed": (-1, 1), "acceleration": (-1, 2)}
 
     @property
     def turnaround(self) -> float:
@@ -90,19 +92,3 @@ class PointingBackAndForth(Pointing):
     def state(self, observation: Observation) -> None:
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
         observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()))
-
-    def observe(self, data: Data) -> None:
-        telescope = data.scene.instrument.telescope
-        for name, limit, unit in (
-            ("speed", telescope.speed_max, "arcsec/s"),
-            ("acceleration", telescope.acceleration_max, "arcsec/s2"),
-        ):
-            asked = getattr(self, name)
-            if limit is not None and asked > limit:
-                raise PointingError(
-                    f"{name} is {np.degrees(asked) * 3600:.4g} {unit}; "
-                    f"{telescope.name}'s largest is {np.degrees(limit) * 3600:.4g} {unit}",
-                    place=self.label,
-                    cure=f"lower {name}",
-                )
-        super().observe(data)

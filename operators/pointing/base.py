@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -13,21 +15,27 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
-from zonda.core.data import Observation
 from zonda.core.errors import PointingError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.random import normals, stream_key
 
-from .limits import check_elevation, check_motion
+from .limits import Moved, check_elevation, excess, lower_elevation
+from .motion import POINTS, Peak, Quantity, motion, rate_text
+from .observed import centre_of, observed, state_times
+from .samples_per_beam import Sampled
 from .transform import CelestialTransform, unit_vectors
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
-    from zonda.core.data import Data
+    from zonda.core.data import Data, Observation
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
 
 Floats = NDArray[np.float64]
+
+SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
+"""By `Pointing.check`: scans of a step, and instants of all of them."""
 
 _OFFSET_SIZE = math.radians(1 / 60)
 _BOX = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
@@ -70,6 +78,10 @@ class Pointing(Operator):
     """Side of the box of `offsets: box`."""
     sample_rate: Hertz | None = Field(None, gt=0, le=1e6)
     """Read-out rate; the instrument's where absent."""
+    jitter: Seconds = quantity("0 s", ge=0, le=1)
+    """rms by which samples are taken early or late (Gaussian, known: the times in the products are the true ones)."""
+    check_limits: Literal["error", "warn"] = "error"
+    """What a scan beyond the telescope's speed, acceleration or jerk is: an error, or a warning that the report repeats."""
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
     """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
 
@@ -83,6 +95,9 @@ class Pointing(Operator):
             if max(abs(v) for pair in self.offsets for v in pair) > 0.1:
                 raise ValueError("offsets must be below 0.1 rad (5.7 deg)")
         return self
+
+    slows: ClassVar[dict[str, tuple[int, int]]] = {}
+    """Parameters that make a scan easier for the telescope: -1 to lower, 1 to raise it; and the power of 1/s in its unit."""
 
     # -- what a subclass gives --
 
@@ -114,6 +129,26 @@ class Pointing(Operator):
     # -- the scans --
 
     def observe(self, data: Data) -> None:
+        self._observe(data, range(self.scans), self.sample_rate or data.scene.instrument.sample_rate)
+
+    def check(self, data: Data) -> list[str]:
+        """Some of the scans at some instants: elevation, speed and acceleration, samples per beam."""
+        rate = self.sample_rate or data.scene.instrument.sample_rate
+        looked = sorted({round(k) for k in np.linspace(0, self.scans - 1, min(self.scans, SCANS_LOOKED_AT))})
+        coarse = min(rate, max(INSTANTS_LOOKED_AT / (len(looked) * self.scan_duration), 1 / self.scan_duration))
+        self._seconds(max(min(round(self.scan_duration * rate), POINTS), 1), rate, self._jitter_key(data, 0))
+        first = len(data.observations)
+        self.model_copy(update={"jitter": 0.0})._observe(data, looked, coarse)
+        made = data.observations[first:]
+        elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
+        part = "" if len(looked) == self.scans else f" ({len(looked)} of them looked at)"
+        lines = [f"{self.scans} scan{'s' if self.scans > 1 else ''} from {made[0].start}{part}"]
+        lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
+        motion = Moved.SAID + Sampled.SAID
+        return lines + [f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(motion)]
+
+    def _observe(self, data: Data, which: Sequence[int], rate: float) -> None:
+        """Append the scans ``which``, sampled at ``rate`` [Hz]."""
         scene = data.scene
         target = self.target or scene.target
         if target is None:
@@ -122,61 +157,141 @@ class Pointing(Operator):
                 place=self.label,
                 cure="give the scene or this operator a target, e.g. 05h00m00s +20d00m00s",
             )
-        begin = scene.time
+        begin, before = scene.time, len(data.observations)
         if data.observations:
             last = data.observations[-1]
             begin = last.start.shifted(last.duration + self.gap)
-        for k in range(self.scans):
+        moved, sampled = Moved(scene.instrument.telescope), Sampled()
+        for k in which:
             start = begin.shifted(k * (self.scan_duration + self.gap))
-            data.observations.append(self._scan(data, target, start, self._offset(k), len(data.observations)))
+            observation = self._scan(data, target, start, self._offset(k), before + k, rate, moved)
+            sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
+            data.observations.append(observation)
+        for what, text in [*moved.statements(), *sampled.statements()]:
+            for observation in data.observations[before:]:
+                observation.tally.state(self.label, what, text)
+        for text in [*moved.warnings(), *sampled.warnings()]:
+            warnings.warn(f"{self.label}: {text}", stacklevel=3)
 
-    def _scan(self, data: Data, target: Target, start: Instant, offset: tuple[float, float], index: int) -> Observation:
+    def _jitter_key(self, data: Data, index: int) -> NDArray[np.uint32]:
+        return stream_key(data.scene.seed, self.label, "jitter", index)
+
+    def _scan(
+        self,
+        data: Data,
+        target: Target,
+        start: Instant,
+        offset: tuple[float, float],
+        index: int,
+        rate: float,
+        moved: Moved,
+    ) -> Observation:
         scene, instrument = data.scene, data.scene.instrument
         focalplane = instrument.focalplane()
-        rate = self.sample_rate or instrument.sample_rate
-        seconds = np.arange(max(round(self.scan_duration * rate), 1)) / rate
+        seconds = self._seconds(max(round(self.scan_duration * rate), 1), rate, self._jitter_key(data, index))
         beam = float(focalplane.fwhm.min())
         transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
 
         horizontal = self.directions(transform, target, offset, seconds)
-        middle = np.array([(seconds[0] + seconds[-1]) / 2])
-        if target.frame == "horizontal":
-            towards = transform.icrs(unit_vectors([-target.longitude], [target.latitude]), middle)[0]
-            centre = (math.atan2(towards[1], towards[0]) % (2 * math.pi), math.atan2(towards[2], math.hypot(*towards[:2])))
-        else:
-            centre = target.icrs()
+        centre = centre_of(transform, target, seconds)
         place = f"{self.label}, scan {index} from {start}"
         total = self.scans * self.scan_duration + (self.scans - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)
-        check_motion(horizontal, rate, instrument.telescope, place)
 
-        azel, radec = transform.boresight(horizontal, seconds)
-        observation = Observation(
-            name=f"scan-{index:03d}",
-            index=index,
-            site=scene.site,
-            instrument=instrument,
-            focalplane=focalplane,
-            start=start,
-            seconds=seconds,
-            sample_rate=rate,
-            boresight_azel=azel,
-            boresight_radec=radec,
-            centre=centre,
-            seed=scene.seed,
-            flags=self.flag(seconds),
-        )
-        error = f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every {transform.spacing:g} s)"
-        observation.tally.state(self.label, "interpolation error of the pointing", error)
-        observation.tally.state(self.label, "Earth orientation", transform.source)
-        if not transform.orientation_known:
-            warnings.warn(f"{self.label}: Earth orientation at {start}: {transform.source}", stacklevel=2)
+        observation = observed(self.label, scene, index, start, seconds, rate, transform, horizontal, centre, self.flag(seconds))
+        self._check_motion(observation, transform, target, offset, None if self.jitter else horizontal, place, moved)
+        if self.jitter > 0:
+            state_times(self.label, observation)
         if (wanted := self.scan_duration * rate) < 0.5:
             observation.tally.state(
                 self.label, f"{observation.name}: shorter than a sample", f"{wanted:.2g} of one; one is taken"
             )
         self.state(observation)
         return observation
+
+    def _seconds(self, n: int, rate: float, key: NDArray[np.uint32]) -> Floats:
+        """When the samples are taken."""
+        seconds = np.arange(n) / rate
+        if self.jitter == 0:
+            return seconds
+        seconds += self.jitter * normals(key, 0, n).astype(np.float64)
+        if (np.diff(seconds) <= 0).any():
+            raise PointingError(
+                f"a jitter of {self.jitter * 1e3:.4g} ms makes samples change places: they come every {1e3 / rate:.4g} ms",
+                place=self.label,
+                cure=f"lower jitter to {100 / rate:.3g} ms",
+            )
+        return seconds
+
+    # -- what the telescope can do --
+
+    def _check_motion(
+        self,
+        observation: Observation,
+        transform: CelestialTransform,
+        target: Target,
+        offset: tuple[float, float],
+        horizontal: Floats | None,
+        place: str,
+        moved: Moved,
+    ) -> None:
+        """Compare the track with the telescope's limits; raise where it exceeds one that it must keep."""
+        rate, limits = observation.sample_rate, moved.limits
+        length = observation.n_samples / rate
+
+        def track(scan: Pointing, step: float) -> Floats:
+            return scan.directions(transform, target, offset, np.arange(max(round(length / step), 1), dtype=np.float64) * step)
+
+        def of(scan: Pointing) -> dict[Quantity, Peak]:
+            coarse = min(rate, POINTS / length)
+            return motion(track(scan, 1 / coarse), coarse, limits, lambda step: track(scan, step))
+
+        found = of(self) if horizontal is None else motion(horizontal, rate, limits, lambda step: track(self, step))
+        over = excess(found, limits)
+        if over and self.check_limits == "error":
+            cure = self._that_fits(found, over, lambda scan: not excess(of(scan), limits))
+            raise PointingError(moved.too_fast(next(iter(over)), found), place=place, cure=cure)
+        moved.add(observation.name, found)
+
+    def _that_fits(self, found: dict[Quantity, Peak], over: dict[Quantity, float], fits: Callable[[Pointing], bool]) -> str:
+        """Values of the scan's own parameters at which it exceeds no limit, each tried on the track itself."""
+        alone = [self._slower([name], fits) for name in self.slows]
+        cures = [text for text in alone if text] or [text for text in (self._slower(list(self.slows), fits),) if text]
+        if (elevation := lower_elevation(found, over)) is not None:
+            cures.append(f"an elevation below {math.floor(10 * math.degrees(elevation)) / 10:g} deg")
+        other = "scan more slowly, or in larger curves" if self.slows else "choose another target or time"
+        fitting = f"this would fit: {', or '.join(cures)}" if cures else other
+        return f"{fitting} (check_limits: warn simulates it as it is)"
+
+    def _slower(self, names: Sequence[str], fits: Callable[[Pointing], bool]) -> str:
+        """``names`` with values, all changed by one factor (at most 1000), at which the scan fits; empty where none does."""
+
+        def values(share: float) -> dict[str, float]:
+            found = {}
+            for name in names:
+                sign, _ = self.slows[name]
+                value = math.degrees(getattr(self, name)) * 3600 * 10.0 ** (3 * share * sign)
+                unit = 10.0 ** (math.floor(math.log10(value)) - 2)  # three digits, on the safe side
+                found[name] = math.radians((math.floor if sign < 0 else math.ceil)(value / unit) * unit / 3600)
+            return found
+
+        def allowed(name: str, value: float) -> bool:
+            return all(value <= getattr(m, "le", math.inf) for m in type(self).model_fields[name].metadata)
+
+        def good(share: float) -> bool:
+            tried = values(share)
+            with suppress(PointingError):  # e.g. turnarounds so long that they reach round the sky
+                return all(allowed(*item) for item in tried.items()) and fits(self.model_copy(update=tried))
+            return False
+
+        enough = next((share for share in (1 / 8, 1 / 4, 1 / 2, 1.0) if names and good(share)), None)
+        if enough is None:
+            return ""
+        too_little = 0.0
+        for _ in range(8):
+            middle = (enough + too_little) / 2
+            enough, too_little = (middle, too_little) if good(middle) else (enough, middle)
+        return " with ".join(f"{name} {rate_text(value, self.slows[name][1])}" for name, value in values(enough).items())
 
     def _offset(self, k: int) -> tuple[float, float]:
         if self.offsets == "none":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,8 @@ class PointingDaisy(Pointing):
     """a of equation (1): amplitude of the inner daisy, as a fraction of `radius`."""
     phase: Angle = quantity("0 rad")
     """phi at the start of each scan."""
+
+    slows: ClassVar[dict[str, tuple[int, int]]] = {"speed": (-1, 1), "radius": (1, 0)}
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
         phi = self.phase + self.speed * seconds / self.radius

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import PointingError
 
+from .motion import Peak, Quantity, rate_text
 from .transform import CelestialTransform, unit_vectors
 
 if TYPE_CHECKING:
@@ -74,28 +76,88 @@ def _room(horizontal: Floats, transform: CelestialTransform, target: Target) -> 
     return max(float(lower.max()), 0.0), max(float(-lower.min()), 0.0)
 
 
-def check_motion(horizontal: Floats, rate: float, telescope: Telescope, place: str) -> None:
-    """Raise PointingError where the boresight (n, 3), sampled at ``rate`` [Hz], outruns the telescope.
+LIMITS: dict[Quantity, str] = {
+    ("azimuth", 1): "azimuth_speed_max",
+    ("azimuth", 2): "azimuth_acceleration_max",
+    ("azimuth", 3): "azimuth_jerk_max",
+    ("elevation", 1): "elevation_speed_max",
+    ("elevation", 2): "elevation_acceleration_max",
+    ("elevation", 3): "elevation_jerk_max",
+    ("sky", 1): "speed_max",
+    ("sky", 2): "acceleration_max",
+}
+"""Fields of a `Telescope`."""
 
-    Speed and acceleration are those of the two axes, (azimuth' cos(elevation), elevation'), by finite differences.
-    """
-    azimuth = np.unwrap(np.arctan2(horizontal[:, 1], horizontal[:, 0]))
-    elevation = np.arctan2(horizontal[:, 2], np.hypot(horizontal[:, 0], horizontal[:, 1]))
-    for order, limit, what, unit in (
-        (1, telescope.speed_max, "speed", "arcsec/s"),
-        (2, telescope.acceleration_max, "acceleration", "arcsec/s2"),
-    ):
-        if limit is None or len(horizontal) <= order:
-            continue
-        along = np.diff(azimuth, order) * np.cos(elevation[order - 1 : len(elevation) - 1])
-        fastest = float(np.hypot(along, np.diff(elevation, order)).max()) * rate**order
-        if fastest > limit * (1 + 1e-6):
-            raise PointingError(
-                f"the scan reaches {'a speed' if order == 1 else 'an acceleration'} of {np.degrees(fastest) * 3600:.4g} {unit}; "
-                f"{telescope.name}'s largest {what} is {np.degrees(limit) * 3600:.4g} {unit}",
-                place=place,
-                cure="scan more slowly, or in larger curves",
-            )
+WORDS = {1: "speed", 2: "acceleration", 3: "jerk"}
+
+ROUNDING = 1e-6
+"""Share by which a figure may exceed its limit: a scan that was laid out to reach it exactly is none too fast."""
+
+
+def excess(found: dict[Quantity, Peak], limits: dict[Quantity, float]) -> dict[Quantity, float]:
+    """By how much each limit is exceeded, a factor > 1, the worst first."""
+    ratio = {q: found[q].figure / limit for q, limit in limits.items() if q in found}
+    over = {q: r for q, r in ratio.items() if r > 1 + ROUNDING}
+    return dict(sorted(over.items(), key=lambda item: -(item[1] ** (1 / item[0][1]))))
+
+
+def lower_elevation(found: dict[Quantity, Peak], over: dict[Quantity, float]) -> float | None:
+    """Elevation [rad] at which the scan would fit, where only the azimuth axis is too fast: it turns by 1 / cos(elevation)."""
+    if any(axis != "azimuth" for axis, _ in over):
+        return None
+    cosine = min(1.0, max(r * math.cos(found[q].elevation) for q, r in over.items()))
+    return math.acos(cosine) if cosine < 0.99 else None
+
+
+class Moved:
+    """The largest speeds, accelerations and jerks of several scans, and the telescope's limits to them."""
+
+    SAID = ("largest speed", "largest acceleration", "over the limit")
+    """How its statements begin."""
+
+    def __init__(self, telescope: Telescope) -> None:
+        self.telescope = telescope
+        self.limits = {q: limit for q, name in LIMITS.items() if (limit := getattr(telescope, name)) is not None}
+        """Those that the telescope states, rad/s^order."""
+        self._found: dict[Quantity, Peak] = {}
+        self._where: dict[Quantity, str] = {}
+
+    def add(self, name: str, found: dict[Quantity, Peak]) -> None:
+        """Take a scan into account."""
+        for q, peak in found.items():
+            if q not in self._found or peak.figure > self._found[q].figure:
+                self._found[q], self._where[q] = peak, name
+
+    def too_fast(self, quantity: Quantity, found: dict[Quantity, Peak], name: str = "the scan") -> str:
+        """What the scan does that the telescope does not."""
+        (axis, order), peak = quantity, found[quantity]
+        word = WORDS[order]
+        where = f"{peak.second:.4g} s after its start, at elevation {np.degrees(peak.elevation):.2f} deg"
+        whose = "on the sky" if axis == "sky" else f"of the {axis} axis"
+        reaches = f"{name} reaches {'an' if word == 'acceleration' else 'a'} {word} {whose} of {rate_text(peak.figure, order)}"
+        limit = rate_text(self.limits[quantity], order)
+        return f"{reaches} ({where}); {self.telescope.name}'s largest {word} {whose} is {limit}"
+
+    def warnings(self) -> list[str]:
+        """Each limit that is exceeded (with ``check_limits: warn``)."""
+        return [self.too_fast(q, self._found, self._where[q]) for q in excess(self._found, self.limits)]
+
+    def statements(self) -> list[tuple[str, str]]:
+        """(what, text) for the tally."""
+        said = []
+        for order in (1, 2):
+            parts = []
+            for axis in ("azimuth", "elevation", "sky"):
+                peak, limit = self._found.get((axis, order)), self.limits.get((axis, order))
+                if peak is not None and (limit or axis != "sky"):
+                    share = f" ({100 * peak.figure / limit:.3g} % of {rate_text(limit, order)})" if limit else ""
+                    parts.append(f"{axis} {rate_text(peak.figure, order)}{share}")
+            if parts:
+                none = "" if self.limits else f"; {self.telescope.name} states no limits"
+                said.append((f"largest {WORDS[order]} of the axes", ", ".join(parts) + none))
+        for (axis, order), text in zip(excess(self._found, self.limits), self.warnings(), strict=True):
+            said.append((f"over the limit of {axis} {WORDS[order]} (check_limits: warn)", text))
+        return said
 
 
 def _range(low: float, high: float) -> str:

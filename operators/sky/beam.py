@@ -41,7 +41,8 @@ SPLINE_MARGIN = 4
 """Grid points beyond the reach, for the 4 x 4 coefficients of the last sample."""
 SIGMA = 1.0 / np.sqrt(8.0 * np.log(2.0))
 TINY = 1e-20
-"""K: smaller coefficients are set to zero, so that float32 denormals never slow the sampling."""
+"""Coefficients smaller than this share of the largest are set to zero, so that float32 denormals never slow the sampling. A
+sample is a mean of 16 coefficients: it changes by no more than this share of the image's peak, 1e12 below float32's rounding."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class Convolved:
     Attributes
     ----------
     coefficients
-        Of the values minus ``outside``, by type name (``float32``, ``float64``), each (ny, nx) in C order.
+        Of the values minus ``outside``, by type name (``float32``, ``float64``), each (ny, nx) in C order; the values between
+        which is interpolated where that is linear.
     to_grid
         (3, 3): homogeneous input pixel (0-based) to homogeneous grid point.
     bounds
@@ -70,9 +72,17 @@ class Convolved:
 
 
 def convolve(
-    values: Floats, jacobian: Floats, fwhm: float, outside: float, pixels_per_fwhm: float = PIXELS_PER_FWHM
+    values: Floats,
+    jacobian: Floats,
+    fwhm: float,
+    outside: float,
+    pixels_per_fwhm: float = PIXELS_PER_FWHM,
+    linear: bool = False,
 ) -> Convolved:
-    """Equations (1) and (2) for ``values`` (ny, nx), ``jacobian`` J (2, 2) [rad per pixel] and ``fwhm`` [rad]; 0: no beam."""
+    """Equations (1) and (2) for ``values`` (ny, nx), ``jacobian`` J (2, 2) [rad per pixel] and ``fwhm`` [rad]; 0: no beam.
+
+    ``linear``: for linear interpolation, whose mean response sinc^2(k h) along each axis is divided out (`linear`).
+    """
     from scipy import fft
     from scipy.ndimage import spline_filter
 
@@ -87,9 +97,14 @@ def convolve(
     grid[pad_y : pad_y + rows * qy : qy, pad_x : pad_x + columns * qx : qx] = (values - outside) * (qx * qy)
     if fwhm > 0:
         kx, ky = np.float64(qx) * np.fft.rfftfreq(nx), np.float64(qy) * np.fft.fftfreq(ny)[:, None]  # cycles per input pixel
-        grid = fft.irfft2(fft.rfft2(grid) * _transfer(covariance, kx, ky, across < SMOOTH_BELOW), (ny, nx))
-    grid = spline_filter(grid, 3, mode="mirror")
-    grid[np.abs(grid) < TINY] = 0.0
+        transfer = _transfer(covariance, kx, ky, across < SMOOTH_BELOW)
+        if linear:
+            transfer /= np.sinc(kx / qx) ** 2 * np.sinc(ky / qy) ** 2
+        grid = fft.irfft2(fft.rfft2(grid) * transfer, (ny, nx))
+    if not linear:
+        grid = spline_filter(grid, 3, mode="mirror")
+    size = np.abs(grid)
+    grid[size < TINY * size.max(initial=0.0)] = 0.0
     return Convolved(
         coefficients={"float64": grid, "float32": grid.astype(np.float32)},
         to_grid=np.array([[qx, 0.0, pad_x], [0.0, qy, pad_y], [0.0, 0.0, 1.0]]),

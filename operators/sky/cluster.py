@@ -119,6 +119,7 @@ def projected(radius: Floats, mass: float, redshift: float) -> Floats:
     r = nodes[:, None] * np.cosh(reach[:, None] * (abscissa + 1.0) / 2.0)
     values = reach * ((pressure(r, mass, redshift) * r) @ weights)  # both halves of the line of sight
     spline = CubicSpline(np.log(nodes), values)
+    # Within a parsec of the centre the value is that of 1 pc: 1e-6 of r500, far inside any pixel.
     return np.asarray(np.where(radius < edge, spline(np.log(np.clip(radius, nodes[0], edge))), 0.0))
 
 

@@ -7,7 +7,6 @@ keys and the parameters that would mend it.
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.files import first_line
+from zonda.core.fits_files import check_size, opened
 
 Floats = NDArray[np.float64]
 
@@ -127,54 +128,18 @@ def read_map(
     InputError
         Unreadable file; no map in it; unit, scale or position missing; unknown unit; NaN; a cube.
     """
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
-
     place = f"sky map {path}"
-    cure = "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AstropyWarning)
-            with fits.open(path, memmap=False, ignore_missing_simple=False) as hdus:
-                for hdu in hdus:
-                    if _is_healpix(hdu):
-                        return _healpix(path, hdu, unit, pixel_size, centred, missing)
-                    if hdu.is_image and hdu.header.get("NAXIS", 0) > 0:
-                        _check_length(path, hdu)
-                        values = np.asarray(hdu.data, np.float64)
-                        return _image(place, values, hdu.header, unit, pixel_size, centred, missing)
-    except FileNotFoundError:
-        raise InputError("no such file", place=place, cure="check the path; relative paths start at the pipeline file") from None
-    except IsADirectoryError:
-        raise InputError("is a folder, not a file", place=place, cure="give the FITS file's path") from None
-    except PermissionError:
-        raise InputError("permission denied", place=place, cure="make the file readable") from None
-    except (OSError, ValueError, TypeError, KeyError, IndexError, EOFError, fits.VerifyError) as err:
-        raise InputError(f"cannot be read as FITS: {_cause(err)}", place=place, cure=cure) from err
+    with opened(path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again") as hdus:
+        for hdu in hdus:
+            if _is_healpix(hdu):
+                check_size(path, hdu, place)
+                table = _columns(hdu)
+                return _healpix(place, hdu.header, *table, unit, pixel_size, centred, missing)
+            if hdu.is_image and hdu.header.get("NAXIS", 0) > 0:
+                check_size(path, hdu, place)
+                values = np.asarray(hdu.data, np.float64)
+                return _image(place, values, hdu.header, unit, pixel_size, centred, missing)
     raise InputError("holds no image and no HEALPix table", place=place, cure="give a FITS file with a two-dimensional image")
-
-
-def _cause(err: BaseException) -> str:
-    """The line of an error's text that says why: wcslib begins with the line of its own source code."""
-    lines = [line for line in str(err).splitlines() if line.strip() and not line.startswith("ERROR ")]
-    return (lines or [type(err).__name__])[0].strip().rstrip(".")
-
-
-def _check_length(path: Path, hdu: Any) -> None:
-    """Raise OSError where an uncompressed file ends before its data do."""
-    info = hdu.fileinfo()
-    if info is None or Path(path).suffix.lower() in (".gz", ".bz2", ".xz", ".z", ".zip"):
-        return
-    needed, found = info["datLoc"] + _data_bytes(hdu.header), Path(path).stat().st_size
-    if found < needed:
-        raise OSError(f"the file is truncated: {found} bytes, its header promises at least {needed}")
-
-
-def _data_bytes(header: Any) -> int:
-    size = abs(int(header.get("BITPIX", 8))) // 8
-    for k in range(1, int(header.get("NAXIS", 0)) + 1):
-        size *= int(header.get(f"NAXIS{k}", 0))
-    return size
 
 
 # -------------------------------------------------------------------------------------------------------------- units
@@ -325,7 +290,7 @@ def _geometry(
         matrix = np.asarray(wcs.pixel_scale_matrix)
     except Exception as err:  # wcslib has a dozen exception classes of its own
         raise InputError(
-            f"the WCS is broken: {_cause(err)}", place=place, cure="check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"
+            f"the WCS is broken: {first_line(err)}", place=place, cure="check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"
         ) from err
     if not np.isfinite([*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]).all() or np.linalg.det(matrix) == 0.0:
         raise InputError("the WCS is singular: its pixels have no area", place=place, cure="check CDELT1, CDELT2, PC and CD")
@@ -411,17 +376,28 @@ def _is_healpix(hdu: Any) -> bool:
     )
 
 
+def _columns(hdu: Any) -> tuple[Floats, NDArray[np.int64] | None]:
+    """Values of the first map of a table, and the pixels they belong to where the table says."""
+    explicit = hdu.columns.names[0].upper() in ("PIXEL", "PIXELS", "PIX", "INDEX")
+    values = np.asarray(hdu.data.field(int(explicit)), np.float64).ravel()
+    return values, np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else None
+
+
 def _healpix(
-    path: Path, hdu: Any, given: str | None, pixel_size: float | None, centred: bool, missing: Literal["error", "zero"]
+    place: str,
+    header: Any,
+    values: Floats,
+    pixels: NDArray[np.int64] | None,
+    given: str | None,
+    pixel_size: float | None,
+    centred: bool,
+    missing: Literal["error", "zero"],
 ) -> HealpixMap:
     import healpy
 
-    place = f"sky map {path}"
     if pixel_size is not None or centred:
         name = "centre" if centred else "pixel_size"
         raise InputError(f"{name} does not apply to a HEALPix map", place=place, cure=f"remove {name}")
-    header = hdu.header
-    _check_length(path, hdu)
     ordering = str(header.get("ORDERING", "")).upper()
     if not ordering.startswith(("RING", "NEST")):
         raise InputError(
@@ -434,14 +410,11 @@ def _healpix(
             place=place,
             cure="set the header key COORDSYS to C (ICRS), G or E",
         )
-    column = 1 if hdu.columns.names[0].upper() in ("PIXEL", "PIXELS", "PIX", "INDEX") else 0
     notes: dict[str, str] = {}
-    unit, factor = _unit(place, header, f"TUNIT{column + 1}", given, notes)
+    unit, factor = _unit(place, header, "TUNIT1" if pixels is None else "TUNIT2", given, notes)
     if unit == "Jy/beam":
         raise InputError("HEALPix maps in Jy/beam are not read", place=place, cure="convert the map to MJy/sr or K_RJ")
-    values = np.asarray(hdu.data.field(column), np.float64).ravel()
-    if column == 1:
-        pixels = np.asarray(hdu.data.field(0), np.int64).ravel()
+    if pixels is not None:
         nside = int(header.get("NSIDE", 0))
         order = np.argsort(pixels, kind="stable")
         pixels, values = pixels[order], values[order]

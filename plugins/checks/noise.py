@@ -42,7 +42,7 @@ def first_sample() -> Measured:
     """variance of the very first sample of 20000 detectors"""
     law, n = power_law_filter(1e-3, 1.0, 8), 20_000
     streams, out = Streams(law, stream_key(5, "a"), stream_key(5, "b")), np.zeros((20_000, 1), np.float32)
-    streams.add(0, 0, np.ones_like(out), out)
+    streams.add(0, 0, out)
     ratio = float((out.astype(np.float64) ** 2).mean()) / law.variance
     return abs(ratio - 1) / math.sqrt(2 / n), f"{ratio:.4f} of theory"
 
@@ -56,10 +56,9 @@ def a_week() -> Measured:
     law, n_det, day = power_law_filter(1e-4, 1.0, 8), 16, 864_000
     streams = Streams(law, stream_key(6, "a"), stream_key(6, "b"))
     out, total = np.zeros((n_det, day), np.float32), 0.0
-    ones = np.ones_like(out)
     for number in range(7):
         out[...] = 0
-        streams.add(0, number * day, ones, out)
+        streams.add(0, number * day, out)
         total = float((out.astype(np.float64) ** 2).mean())
     f = np.r_[np.linspace(0, 1e-4, 2000, endpoint=False), np.geomspace(1e-4, 0.5, 20_000)]
     power = law.response(f) / law.gain
@@ -75,7 +74,7 @@ def no_period() -> float:
     days = []
     for number in (0, 1, 6):
         out = np.zeros((n_det, day), np.float32)
-        streams.add(0, number * day, np.ones_like(out), out)
+        streams.add(0, number * day, out)
         days.append(out.astype(np.float64) / math.sqrt(law.variance))
     f = np.r_[np.linspace(0, 1e-2, 2000, endpoint=False), np.geomspace(1e-2, 0.5, 20_000)]
     power = law.response(f) / law.gain / law.variance
@@ -92,7 +91,7 @@ def float32_states() -> float:
     for f_min, slope in ((1e-5, 1.0), (1e-8, 1.0), (1e-7, 2.0), (1e-5, 3.0)):
         law = power_law_filter(f_min, slope, 8)
         out = np.zeros((16, n), np.float32)
-        Streams(law, stream_key(7, "a"), stream_key(7, "b")).add(0, 0, np.ones_like(out), out)
+        Streams(law, stream_key(7, "a"), stream_key(7, "b")).add(0, 0, out)
         exact = normals(stream_key(7, "a"), 0, 16 * n).reshape(n, 16).T.astype(np.float64)
         first = law.start @ normals(stream_key(7, "b"), 0, 8 * 16).reshape(8, 16)
         for q, z, s in zip(law.poles, law.zeros, first, strict=True):

@@ -38,7 +38,7 @@ ERROR = 1e-9
 """rad."""
 
 
-def _erfa(sky: Floats, start: Instant, seconds: Floats, site: Site) -> Floats:
+def erfa_horizontal(sky: Floats, start: Instant, seconds: Floats, site: Site) -> Floats:
     """Horizontal directions (n, 3) north, west, up of ICRS unit vectors (n, 3), from UTC calendar dates."""
     import erfa
 
@@ -57,7 +57,8 @@ def _erfa(sky: Floats, start: Instant, seconds: Floats, site: Site) -> Floats:
     return unit_vectors(-azimuth, np.pi / 2 - zenith)
 
 
-def _angle(a: Floats, b: Floats) -> float:
+def angle(a: Floats, b: Floats) -> float:
+    """Largest angle between directions (n, 3), rad."""
     return float(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)).max())
 
 
@@ -77,7 +78,7 @@ def over_a_day() -> float:
             seconds = np.round(rng.uniform(0, 86400, 300), 6)
             sky = unit_vectors(rng.uniform(0, 2 * np.pi, 300), np.arcsin(rng.uniform(-1, 1, 300)))
             transform = CelestialTransform(site, start, 86400.0)
-            worst = largest(worst, _angle(transform.horizontal(sky, seconds), _erfa(sky, start, seconds, site)))
+            worst = largest(worst, angle(transform.horizontal(sky, seconds), erfa_horizontal(sky, start, seconds, site)))
     return worst
 
 
@@ -89,7 +90,7 @@ def exact_start() -> Measured:
         early = Instant.parse("2027-01-15T03:04:05.678901234Z")
         late = Instant(early.nanoseconds + shift)
         one = CelestialTransform(SITES[0], early, 500.0).horizontal(sky, np.array([shift / 1e9]))
-        worst = largest(worst, _angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1))))
+        worst = largest(worst, angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1))))
     return worst, "0.24 us, the rounding of 1.8e9 s in float64, would be 1.7e-11 rad"
 
 
@@ -112,7 +113,7 @@ def leap_second() -> float:
             0.5, 0.2, 0.0, 0.0, 0.0, 0.0, utc1, utc2, earth.ut1_utc, site.longitude, site.latitude, site.altitude,
             earth.x, earth.y, 0.0, 0.0, 0.0, 1.0,
         )  # fmt: skip
-        worst = largest(worst, _angle(transform.horizontal(sky, np.array([elapsed])), unit_vectors(-azimuth, np.pi / 2 - zenith)))
+        worst = largest(worst, angle(transform.horizontal(sky, np.array([elapsed])), unit_vectors(-azimuth, np.pi / 2 - zenith)))
     return worst
 
 
@@ -133,7 +134,9 @@ def poles_of_the_sky() -> float:
         sky = unit_vectors(np.full(25, 1.0), np.full(25, math.radians(declination)))
         up = transform.horizontal(sky, seconds)
         _, radec = transform.boresight(up, seconds)
-        worst = largest(worst, _angle(up, _erfa(sky, WHEN, seconds, SITES[0])), _angle(rotation_matrices(radec)[:, :, 2], sky))
+        worst = largest(
+            worst, angle(up, erfa_horizontal(sky, WHEN, seconds, SITES[0])), angle(rotation_matrices(radec)[:, :, 2], sky)
+        )
     return worst
 
 
@@ -145,9 +148,9 @@ def zenith_crossing() -> float:
     o, _ = _observe(PointingStare(scan_duration="60 s", target=f"{ra!r} rad {dec!r} rad"), time=WHEN.shifted(-30))
     sky = unit_vectors(np.full(o.n_samples, ra), np.full(o.n_samples, dec))
     some = slice(None, None, 50)
-    up = _erfa(sky[some], o.start, o.seconds[some], SITES[0])
+    up = erfa_horizontal(sky[some], o.start, o.seconds[some], SITES[0])
     return largest(
-        _angle(rotation_matrices(o.boresight_azel)[some, :, 2], up), _angle(rotation_matrices(o.boresight_radec)[:, :, 2], sky)
+        angle(rotation_matrices(o.boresight_azel)[some, :, 2], up), angle(rotation_matrices(o.boresight_radec)[:, :, 2], sky)
     )
 
 
@@ -164,7 +167,7 @@ def low_and_wrapping() -> float:
         o, _ = _observe(operator, target=target, time="2024-11-25T00:30Z")
         some = slice(None, None, 60)
         azel, radec = (rotation_matrices(q)[some, :, 2] for q in (o.boresight_azel, o.boresight_radec))
-        worst = largest(worst, _angle(azel, _erfa(radec, o.start, o.seconds[some], SITES[0])))
+        worst = largest(worst, angle(azel, erfa_horizontal(radec, o.start, o.seconds[some], SITES[0])))
     return worst
 
 

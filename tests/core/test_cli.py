@@ -186,6 +186,18 @@ error: unknown key 'valu' for Ones
     assert not (here / "out").exists()
 
 
+def test_check_points_the_telescope(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "mustang2_cluster"]) == 0
+    out = capsys.readouterr().out
+    assert "    5 scans from 2024-11-25T07:00:00Z\n    elevation: 61.1" in out
+    assert re.search(r"largest speed of the axes: azimuth 16\d\.?\d* arcsec/s \([\d.]+ % of 0.6 deg/s\)", out)
+    assert re.search(r"samples per FWHM of 8.5 arcsec: 15\.\d", out)
+    assert cli.main(["check", "mustang2_cluster", "--set", "time=2024-11-25T18:00"]) == 2
+    assert "GBT reaches 5 deg to 88 deg" in capsys.readouterr().err
+    assert cli.main(["check", "mustang2_cluster", "--set", "PointingDaisy.speed=0.5 deg/s"]) == 2
+    assert "this would fit: speed" in capsys.readouterr().err
+
+
 def test_plugins(here: Path, plugin: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["plugins"]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
@@ -281,23 +293,46 @@ def test_a_fault_of_the_program_shows_its_traceback(here: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX does")
-def test_interrupted(here: Path) -> None:
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_interrupted(here: Path, number: str) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here.parent / "site-packages"), *sys.path])}
     command = [*RUN, "run", "p.yaml", "--set", "Total.after=sleep"]
 
     def listen() -> None:  # a shell starts background jobs with Ctrl-C ignored, which children inherit
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env=environment, preexec_fn=listen, **pipes) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.Signals[number])
         out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 128 + signal.Signals[number]
     assert err.endswith("interrupted: unfinished files were removed\n")
     assert out == ""
     assert [p for p in here.rglob("*") if p.is_file()] == [here / "p.yaml"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX does")
+def test_signals_that_are_ignored_or_handled_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    seen = {}
+
+    def command(*arguments: object, **options: object) -> None:
+        seen.update({number: signal.getsignal(number) for number in before})
+
+    monkeypatch.setattr(cli.zonda, "main", command)
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        assert cli.main([]) == 0
+        assert seen[signal.SIGHUP] is signal.SIG_IGN
+        assert callable(seen[signal.SIGTERM])
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @pytest.mark.parametrize(

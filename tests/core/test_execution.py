@@ -141,14 +141,22 @@ class Sink(Operator):
 CHAIN = [Source(), Smooth(width=3), Demean(), Smooth(width=700), FocalPlaneMean(), Smooth(width=2500), Scale(), Sink()]
 
 
-def run(operators, obs, **settings):
+def execute(operators, obs, room=None, **settings):
+    """The execution, the signal it keeps, the products. ``room``: bytes that streams may take, where not half of the memory."""
     operators = [o.model_copy() for o in operators]
     for i, o in enumerate(operators):
         o._label = f"{type(o).__name__}.{i}"
     data = Data(scene=None)
     nothing = lambda **k: None  # noqa: E731
-    Execution(operators, obs, Settings(**settings), Timer(), ["signal"]).run(data, nothing, nothing)
-    return obs.detdata["signal"], data
+    execution = Execution(operators, obs, Settings(**settings), Timer(), ["signal"])
+    if room is not None:
+        execution._store._room = room
+    execution.run(data, nothing, nothing)
+    return execution, obs.detdata["signal"], data
+
+
+def run(operators, obs, **settings):
+    return execute(operators, obs, **settings)[1:]
 
 
 def reference(obs, chain=CHAIN):
@@ -165,10 +173,68 @@ def test_blocks_halos_threads_and_spilling_change_no_bit():
     want = reference(observation())
     size = want.size * 4
     for memory, threads in ((1 << 30, 1), (3 * size, 3), (int(1.9 * size), 1), (int(1.9 * size), 3)):
-        obs = observation()
-        got, data = run(CHAIN, obs, memory=memory * threads, threads=threads)
-        assert np.array_equal(got, want)
-        assert (data.products["seen"] == 1).all()
+        for prefer in ("spilled", "again"):
+            obs = observation()
+            got, data = run(CHAIN, obs, memory=memory * threads, threads=threads, prefer=prefer)
+            assert np.array_equal(got, want)
+            assert (data.products["seen"] == 1).all()
+
+
+class Peek(Operator):
+    """Make no stream: count how often each sample is seen, and tell the tally."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"seen"})
+
+    def prepare(self, observation):
+        return np.zeros((observation.n_detectors, observation.n_samples), int)
+
+    def exec(self, block, state):
+        state[block.detectors, block.samples] += 1
+        assert not block.again
+
+    def collect(self, data, observation, state):
+        data.products[self.label] = state
+
+
+class Tell(Source):
+    """A source that counts its samples."""
+
+    def exec(self, block, state):
+        super().exec(block, state)
+        block.observation.tally.count(self.label, "samples made", block.shape[0] * block.shape[1])
+
+
+class Level(Operator):
+    """Subtract the mean of the whole stream, found by sweeps."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "all"
+
+    def prepare(self, observation):
+        return {}
+
+    def sweeps(self, observation):
+        return 2
+
+    def measure(self, stream, state):
+        for _ in range(2):
+            seen = np.zeros(stream.shape, int)
+            total = np.zeros(stream.shape[0])
+
+            def tiles(detectors, samples, part):
+                return [part[:, k : k + TILE_SAMPLES].sum(axis=1, dtype=float) for k in range(0, part.shape[1], TILE_SAMPLES)]
+
+            for detectors, samples, parts in stream.sweep(tiles):
+                seen[detectors, samples] += 1
+                for part in parts:
+                    total[detectors] += part
+            assert (seen == 1).all()
+        state["mean"] = total.sum() / seen.size
+
+    def exec(self, block, state):
+        block.detdata["signal"] -= block.dtype(state["mean"])
 
 
 class Square(Operator):
@@ -194,6 +260,82 @@ def test_pieces_of_a_block_change_no_bit(coupled):
         got, data = run(chain, observation(), memory=memory, threads=threads)
         assert np.array_equal(got, want)
         assert (data.products["seen"] == 1).all()
+
+
+CHAINS_MADE_AGAIN = {
+    "whole scans": [Tell(), Peek(), Demean(), Peek(), Level(), Sink()],
+    "margins": [Tell(), Smooth(width=40), Peek(), Level(), Smooth(width=4000), Level(), Peek(), Sink()],
+    "focal plane": [Tell(), Square(), Peek(), Level(), FocalPlaneMean(), Square(), Peek(), Level(), Sink()],
+}
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("name", CHAINS_MADE_AGAIN)
+def test_streams_made_again_change_no_bit_and_are_counted_once(name, threads):
+    """Steps that make no stream see every sample once, in whichever reading comes first; so does the tally."""
+    chain = CHAINS_MADE_AGAIN[name]
+    want, _ = run(chain, observation(), memory=1 << 30)
+    size = 4 * want.size
+    for prefer, said in (("again", "made again"), ("spilled", "spilled")):
+        obs = observation()
+        memory = threads * int(1.9 * size)
+        execution, got, data = execute(chain, obs, memory=memory, threads=threads, prefer=prefer, room=size // 2)
+        assert np.array_equal(got, want)
+        assert any(said in what for _, what, _ in obs.tally)
+        assert all((seen == 1).all() for seen in data.products.values())
+        assert obs.tally.get("Tell.0", "samples made") == want.size
+        assert 0 < execution.ledger.peak <= memory
+
+
+def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
+    chain = [Source(), Demean(), Scale(), Sink()]
+    obs = observation()
+    size = 4 * obs.n_detectors * obs.n_samples
+    run(chain, obs, memory=int(1.9 * size), prefer="again")
+    assert any("spilled" in what for _, what, _ in obs.tally)
+    monkeypatch.setattr("zonda.core.streams.free_disk", lambda: 1000)
+    with pytest.raises(PipelineError, match=r"(?s)neither in memory nor on the disk.*Scale.2 reads it as a whole.*--memory 15MB"):
+        run(chain, observation(), memory=int(1.9 * size))
+    level = [Source(), Demean(), Level(), Sink()]
+    run(level, observation(), memory=int(1.9 * size), prefer="spilled")  # the disk has no room: made again
+
+
+def test_the_quicker_way_is_taken(monkeypatch):
+    """Equation (1) of `core.streams`: 2 N b / D against k N c / threads."""
+    from zonda.core.streams import choose
+
+    said = {
+        "samples": 1000, "readings": 2, "hindrance": "", "threads": 1, "prefer": None, "place": "", "ceiling": ""
+    }  # fmt: skip
+    # by disk 2 x 4000 B / 4 kB/s = 2 s
+    assert choose("s", 4000, rate=4e3, cost=0.9e-3, **said)[0] == "again"
+    assert choose("s", 4000, rate=4e3, cost=1.1e-3, **said)[0] == "spilled"
+    assert choose("s", 4000, rate=4e3, cost=1.1e-3, **{**said, "threads": 2})[0] == "again"
+
+
+def test_the_ceiling_of_the_process_leaves_what_is_not_held_already():
+    from zonda.core.machine import resident_memory
+
+    obs = observation()
+    size = 4 * obs.n_detectors * obs.n_samples
+    chain = [Source(), Demean(), Level(), Sink()]
+    execution, got, _ = execute(chain, obs, memory=1 << 30, ceiling=resident_memory() + 3 * size // 2)
+    assert execution.settings.memory <= 2 * size
+    assert np.array_equal(got, run(chain, observation())[0])
+    with pytest.raises(PipelineError, match="raise --memory to"):
+        run(chain, observation(), memory=1 << 30, ceiling=1000)
+
+
+def test_a_stream_made_again_has_no_array():
+    class Greedy(Level):
+        """Reads the array after all."""
+
+        def measure(self, stream, state):
+            stream.array  # noqa: B018
+
+    obs = observation()
+    with pytest.raises(PipelineError, match="nowhere held as a whole"):
+        run([Source(), Greedy(), Sink()], obs, memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples), prefer="again")
 
 
 def test_margins_that_reach_the_ends_leave_the_source_alone():

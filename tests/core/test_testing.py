@@ -47,9 +47,16 @@ def test_sky_map_keeps_the_contract():
     check_operator(operators.get("SkyMap")(file=file))
 
 
+def test_recorded_pointing_keeps_the_contract(tmp_path):
+    t = np.arange(400) / 20
+    columns = [1732518000 + t, 10 + 0.01 * np.sin(t), 45 + 0.01 * np.cos(t)]
+    np.savetxt(tmp_path / "scan.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header="time [s], az [deg], el [deg]")
+    check_operator(operators.get("PointingRecorded")(file=tmp_path / "scan.csv"))
+
+
 def test_none_is_forgotten():
     own = {c.name for r in (operators, mapmakers) for c in r.candidates() if c.distribution == "zonda"}
-    assert own == {*BUILT_IN, "SkyMap"}
+    assert own == {*BUILT_IN, "SkyMap", "PointingRecorded"}
 
 
 class Good(Operator):

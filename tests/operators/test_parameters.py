@@ -19,6 +19,7 @@ from astropy.io import fits
 from pydantic import ValidationError
 
 import zonda
+from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.registry import mapmakers, noise_models, operators
 from zonda.core.site import Site
@@ -71,6 +72,19 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
             image.header["TEMPSCAL"] = "K_RJ"
         image.writeto(folder / f"{name}.fits")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
+    seen = Data(scene())
+    operators.get("PointingStare")(scan_duration="1 s").observe(seen)
+    az, el = (float(np.degrees(v[0])) for v in (seen.observations[0].azimuth, seen.observations[0].elevation))
+    for name, seconds in (
+        ("scan", 12),
+        ("other", 13),
+        ("long", 30),
+    ):  # to and fro about where the target stands, with a gap of 4 s
+        t = np.arange(0, seconds, 0.02)
+        t = t[(t < 3) | (t > 7)]
+        columns = [1732518000 + t, az + 0.02 * np.sin(t), el + 0.01 * np.cos(t)]
+        head = "time [s], az [deg], el [deg]"
+        np.savetxt(folder / f"{name}.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=head)
     return folder
 
 
@@ -135,6 +149,8 @@ POINTING = {
     "offset_size": ({"offsets": "box"}, {"offset_size": "30 arcsec"}),
     "sample_rate": ({}, {"sample_rate": "40 Hz"}),
     "interpolation_error": ({"scan_duration": "30 s"}, {"interpolation_error": 1e-9}),
+    "jitter": ({}, {"jitter": "1 ms"}),
+    "check_limits": ({"check_limits": "warn"}, {"check_limits": "error"}),
 }
 
 CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
@@ -151,6 +167,13 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "speed": ({}, {"speed": "20 arcsec/s"}),
         "acceleration": ({}, {"acceleration": "30 arcsec/s2"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
+    },
+    "PointingRecorded": {
+        "file": ({}, {"file": "other.csv"}),
+        "clock": ({}, {"clock": "scene"}),
+        "split": ({}, {"split": "2 s"}),
+        "target": ({}, {"target": "05h00m10s +20d00m00s"}),
+        "interpolation_error": ({"file": "long.csv"}, {"interpolation_error": 1e-9}),
     },
     "SkyMap": {
         "file": ({}, {"file": "flux.fits"}),
@@ -263,6 +286,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
 }  # fmt: skip
 
 CHAINS = {
+    "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
     "AtmosphereLayers": ["AtmosphereLayers"],
     "WhiteNoise": ["WhiteNoise"],
@@ -287,6 +311,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "PointingDaisy": SCAN,
     "PointingStare": {"scan_duration": "12 s"},
     "PointingBackAndForth": TURN,
+    "PointingRecorded": {"file": "scan.csv"},
 }
 
 
@@ -310,6 +335,10 @@ REFUSALS = {
     ("SkyMap", "missing"): "NaN",
     ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
     ("SaveMap", "overwrite"): "is there already",
+    ("PointingRecorded", "clock"): "is too large",
+    ("PointingDaisy", "check_limits"): "dish's largest speed of the azimuth axis",
+    ("PointingStare", "check_limits"): "dish's largest speed of the azimuth axis",
+    ("PointingBackAndForth", "check_limits"): "dish's largest speed of the azimuth axis",
 }
 """What a changed parameter is answered with, where it is not another result."""
 
@@ -320,14 +349,16 @@ ALL = [pytest.param(name, field, id=f"{name}.{field}") for name, cases in CASES.
 def test_every_parameter_of_every_operator(name: str, field: str, maps: Path, tmp_path: Path, known: dict[str, Any]) -> None:
     needs, change = CASES[name][field]
     case = f"{name} {needs}"
+    slow = {"telescope": {"azimuth_speed_max": "1 arcsec/s"}} if field == "check_limits" else {}
+    where = scene(instrument=instrument(**slow))
     if case not in known or field == "overwrite":
-        known[case] = outcome(chain(name, maps, **needs), scene(), tmp_path / "before")
+        known[case] = outcome(chain(name, maps, **needs), where, tmp_path / "before")
     folder = tmp_path / ("before" if field == "overwrite" else "after")
     if (name, field) in REFUSALS:
         with pytest.raises((ZondaError, ValidationError), match=REFUSALS[name, field]):
-            outcome(chain(name, maps, **(needs | change)), scene(), folder)
+            outcome(chain(name, maps, **(needs | change)), where, folder)
     else:
-        assert not same(known[case], outcome(chain(name, maps, **(needs | change)), scene(), folder))
+        assert not same(known[case], outcome(chain(name, maps, **(needs | change)), where, folder))
 
 
 @pytest.fixture(scope="module")
@@ -424,6 +455,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "elevation_max": {"elevation_max": "20 deg"},
         "speed_max": {"speed_max": "10 arcsec/s"},
         "acceleration_max": {"acceleration_max": "1 arcsec/s2"},
+        "azimuth_speed_max": {"azimuth_speed_max": "10 arcsec/s"},
+        "azimuth_acceleration_max": {"azimuth_acceleration_max": "1 arcsec/s2"},
+        "azimuth_jerk_max": {"azimuth_jerk_max": "1 arcsec/s3"},
+        "elevation_speed_max": {"elevation_speed_max": "10 arcsec/s"},
+        "elevation_acceleration_max": {"elevation_acceleration_max": "1 arcsec/s2"},
+        "elevation_jerk_max": {"elevation_jerk_max": "1 arcsec/s3"},
     },
     "band": {"low": {"low": "80 GHz"}, "high": {"high": "112 GHz"}, "file": {"low": None, "high": None, "file": "band.txt"}},
     "background_limited": {
@@ -441,8 +478,14 @@ SETTINGS: dict[str, dict[str, Any]] = {
 LIMITS = {
     ("telescope", "elevation_min"): "reaches 80 deg to 88 deg",
     ("telescope", "elevation_max"): "reaches 5 deg to 20 deg",
-    ("telescope", "speed_max"): "largest speed is 10 arcsec/s",
-    ("telescope", "acceleration_max"): "largest acceleration is 1 arcsec/s2",
+    ("telescope", "speed_max"): "largest speed on the sky is 10 arcsec/s",
+    ("telescope", "acceleration_max"): "largest acceleration on the sky is 1 arcsec/s2",
+    ("telescope", "azimuth_speed_max"): "largest speed of the azimuth axis is 10 arcsec/s",
+    ("telescope", "azimuth_acceleration_max"): "largest acceleration of the azimuth axis is 1 arcsec/s2",
+    ("telescope", "azimuth_jerk_max"): "largest jerk of the azimuth axis is 1 arcsec/s3",
+    ("telescope", "elevation_speed_max"): "largest speed of the elevation axis is 10 arcsec/s",
+    ("telescope", "elevation_acceleration_max"): "largest acceleration of the elevation axis is 1 arcsec/s2",
+    ("telescope", "elevation_jerk_max"): "largest jerk of the elevation axis is 1 arcsec/s3",
     ("background_limited", "reference"): "'detector'",
 }
 """What is refused with which message."""

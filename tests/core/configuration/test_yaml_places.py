@@ -55,13 +55,24 @@ def test_merged_keys_may_be_overridden() -> None:
     [
         ("a: [1, 2\nb: 3\n", "not valid YAML", 1, 1),
         ("a: 1\n\tb: 2\n", "not valid YAML", 1, 0),
-        ("a: !point 3\n", "not valid YAML", 0, 3),
+        ("a: !point 3\n", "the tag !point is not known", 0, 3),
         ("a: *nowhere\n", "not valid YAML", 0, 3),
         ("a: 1\n---\nb: 2\n", "not valid YAML", 1, 0),
         ("a: b\x07\n", "not valid YAML", 0, 4),
         ("? [1, 2]\n: 3\n", "a key must be plain text", 0, 2),
         ("a: &a [*a]\n", "an alias may not stand inside what it names", 0, 3),
-        (f"a: {'9' * 5000}\n", "cannot be read", 0, 3),
+        (f"a: {'9' * 5000}\n", "cannot be read: a number of 5000 digits", 0, 3),
+        (f"a: 0x{'f' * 5000}\n", "cannot be read: a number of 5002 digits", 0, 3),
+        ("a: !!python/name:os.system ''\n", "the tag !!python/name:os.system is not known", 0, 3),
+        ("a: !!python/object/apply:os.system [id]\n", "the tag !!python/object/apply:os.system is not known", 0, 3),
+        ("a: !!set {b}\n", "the tag !!set is not known", 0, 3),
+        ("a: !!timestamp 99\n", "the tag !!timestamp is not known", 0, 3),
+        ("a: !!bool maybe\n", "cannot be read: ", 0, 3),
+        ("a: {<<: [1]}\n", "only mappings can be merged", 0, 9),
+        ("[" * 100_000, "not valid YAML: nested deeper than 64 levels", 0, 64),
+        ("a: " + "[" * 5000 + "]" * 5000, "not valid YAML: nested deeper than 64 levels", 0, 66),
+        ("".join(f"{' ' * k}a:\n" for k in range(2000)), "not valid YAML: nested deeper than 64 levels", 64, 64),
+        ("a0: &a0 [1]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}]\n" for k in range(1, 100)), "not valid YAML: nested deeper", 0, 9),
     ],
 )
 def test_bad_text(text: str, message: str, line: int, column: int) -> None:
@@ -74,6 +85,34 @@ def test_exploding_aliases_are_refused() -> None:
     text = "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
     text += "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12))
     assert "more than 100000 values" in read(text).faults[0].message
+
+
+def test_exploding_merges_stay_small() -> None:
+    """Every key once: PyYAML's own list of merged keys has 2e8 members here."""
+    text = "x0: &x0 {a: 1, b: 2}\n"
+    text += "".join(f"x{k}: &x{k} {{<<: [{', '.join([f'*x{k - 1}'] * 10)}], c{k}: {k}}}\n" for k in range(1, 9))
+    document = read(text)
+    assert document.faults == []
+    assert document.value["x8"] == {"a": 1, "b": 2} | {f"c{k}": k for k in range(1, 9)}
+
+
+def test_long_lists_are_refused_before_they_are_built() -> None:
+    assert "more than 100000 values" in read(f"a: [{'1, ' * 1_000_000}]").faults[0].message
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("{<<: {b: 1}, b: 2}", {"b": 2}),
+        ("{b: 2, <<: {b: 1, c: 3}}", {"b": 2, "c": 3}),
+        ("{<<: [{b: 1}, {b: 2, c: 3}]}", {"b": 1, "c": 3}),
+        ("{<<: {<<: {b: 1, c: 1}, c: 2}, d: 3}", {"b": 1, "c": 2, "d": 3}),
+    ],
+)
+def test_merging_is_that_of_yaml(text: str, value: Any) -> None:
+    import yaml
+
+    assert read(text).value == value == yaml.safe_load(text)
 
 
 def test_empty() -> None:

@@ -238,6 +238,9 @@ def test_limits_are_named():
     deep = Layers(np.array([3e5, 1e5]), np.full(2, 280.0), np.zeros(1), np.zeros(1), np.array([0.0, 1e4]))
     with pytest.raises(InputError, match=r"pressure of 2000 hPa is above .* limit of 1158\.7 hPa"):
         spectrum(deep, ZENITH)
+    thin = Layers(np.array([9.0, 5.0]), np.full(2, 250.0), np.zeros(1), np.zeros(1), np.array([6e4, 7e4]))
+    with pytest.raises(InputError, match=r"pressure of 0\.07 hPa is below .* limit of 0\.13378 hPa"):
+        spectrum(thin, ZENITH)
 
 
 class Thin(AbsorptionTable):

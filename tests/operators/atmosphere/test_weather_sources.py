@@ -505,3 +505,52 @@ def test_dry_air_keeps_the_shape_of_its_water() -> None:
     np.testing.assert_allclose(dry.scaled(usual.pwv).h2o, usual.h2o, rtol=1e-6)
     with pytest.raises(InputError, match="no water at all"):
         dataclasses.replace(usual, h2o=0 * usual.h2o).scaled(1e-3)
+
+
+# ---------------------------------------------------------------------------------------------------------- what is cut or kept
+
+
+def said(profile, what):
+    return dict(profile.stated).get(what)
+
+
+def test_water_above_saturation_is_said(tmp_path):
+    moist = table(tmp_path, TABLE.replace("-18, 20", "-18, 115"))
+    text = said(air_of(moist, here(), NIGHT, 1), "relative humidity above 100 %")
+    levels, of, most = (int(n) for n in text.replace(" %", "%").replace(":", "").split("%")[0].replace("at ", "").replace(
+        " of ", " ").replace(" levels, up to ", " ").split())  # fmt: skip
+    assert (of, 1 <= levels < 20, 110 <= most <= 115) == (61, True, True)
+    assert text.endswith("above saturation; taken as it is")
+    dry = air_of(table(tmp_path, TABLE), here(), NIGHT, 1)
+    assert said(dry, "relative humidity above 100 %") is None
+    # a PWV that is asked for scales the water, past saturation where it must
+    wet = air_of(table(tmp_path, TABLE).model_copy(update={"pwv": Pwv.parse("50 mm")}), here(), NIGHT, 1)
+    assert "taken as it is" in said(wet, "relative humidity above 100 %")
+
+
+def test_water_that_an_inversion_cannot_hold_is_cut_and_said():
+    cold = profile(sites.create("amundsen_scott"), Instant.parse("2024-07-01T00:00Z"))
+    over = cold.h2o * cold.pressure / humidity.saturation_pressure(cold.temperature)
+    assert over[:8].max() <= 1 + 1e-9
+    text = said(cold, "water near the ground")
+    assert text is None or "cut to saturation at" in text
+    column = Climatology().column(sites.create("amundsen_scott"), Instant.parse("2024-07-01T00:00Z"))
+    wetter = dataclasses.replace(column, h2o=column.h2o * 3)
+    from zonda.operators.atmosphere.weather import on_heights
+
+    made = on_heights(wetter, sites.create("amundsen_scott"))
+    assert "levels of the inversion, which takes" in said(made, "water near the ground")
+
+
+def test_negative_water_and_ozone_of_era5_are_said(tmp_path):
+    def change(values):
+        values["q"][:, 3] = -1e-7
+        values["o3"][:, :2] = -1e-9
+        return values
+
+    files.new_layout(tmp_path / "a.nc", change=change)
+    stated = Era5(file=tmp_path / "a.nc").column(here(), NIGHT).stated
+    assert "negative values of the humidity taken as none" in stated
+    assert "2 negative levels of ozone taken as none" in stated
+    files.new_layout(tmp_path / "b.nc")
+    assert "negative" not in Era5(file=tmp_path / "b.nc").column(here(), NIGHT).stated

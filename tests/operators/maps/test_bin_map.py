@@ -354,3 +354,16 @@ def test_noise_that_is_not_known_is_counted(bench):
     observation.focalplane.net[:] = 0
     run = bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
     assert run.tally["BinMap", "weights"] == "uniform: every NET is 0"
+
+
+def test_equal_samples_have_no_scatter_and_are_counted(bench):
+    """A constant signal: what is left of its squares is rounding, of either sign."""
+    run = bench.run([BinMap(pixel="4 arcsec", noise="scatter")], bench.observation(7, 3000), {"signal": np.full((7, 3000), 0.3)})
+    several = run.map.hits > 1
+    counted = int(run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"])
+    assert counted == np.count_nonzero(run.map.noise[several] == 0) > 0
+    assert np.isfinite(run.map.noise[several]).all()
+    assert run.map.noise[several].max() < 1e-6
+    rng = np.random.default_rng(1).normal(0, 1e-3, (7, 3000))
+    run = bench.run([BinMap(pixel="4 arcsec", noise="scatter")], bench.observation(7, 3000), {"signal": rng})
+    assert run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"] == "0"

@@ -102,7 +102,7 @@ def test_variance_and_stationarity(slope):
     streams = Streams(law, stream_key(5, "a"), stream_key(5, "b"))
     for sample in (0, 3000):
         out = np.zeros((n_det, 1), np.float32)
-        streams.add(0, sample, np.ones_like(out), out)
+        streams.add(0, sample, out)
         variance = (out.astype(np.float64) ** 2).mean()
         assert variance == pytest.approx(law.variance, rel=4.5 * np.sqrt(2 / n_det))
 
@@ -112,11 +112,11 @@ def test_long_series_keeps_its_variance():
     law = power_law_filter(1e-4, 1.0, 8)
     n, n_det = 1 << 20, 4
     streams = Streams(law, stream_key(6, "a"), stream_key(6, "b"))
-    out, ones = np.zeros((n_det, 1 << 16), np.float32), np.ones((n_det, 1 << 16), np.float32)
+    out = np.zeros((n_det, 1 << 16), np.float32)
     total = np.zeros(2)
     for start in range(0, 4 * n, out.shape[1]):
         out[...] = 0
-        streams.add(0, start, ones, out)
+        streams.add(0, start, out)
         total[start >= 2 * n] += (out.astype(np.float64) ** 2).sum()
     # Var(sample variance) = 2 int C^2 dt / T per series, and int C^2 dt = int P^2 df (two-sided).
     frequency = np.r_[np.linspace(0, 1e-4, 2000, endpoint=False), np.geomspace(1e-4, 0.5, 20_000)]
@@ -133,7 +133,7 @@ def test_float32_states_are_enough(f_min, slope):
     law, n = power_law_filter(f_min, slope, 8), 1 << 15
     streams = Streams(law, stream_key(7, "a"), stream_key(7, "b"))
     out = np.zeros((16, n), np.float32)
-    streams.add(0, 0, np.ones_like(out), out)
+    streams.add(0, 0, out)
     exact = normals(stream_key(7, "a"), 0, 16 * n).reshape(n, 16).T.astype(np.float64)
     first = law.start @ normals(stream_key(7, "b"), 0, 8 * 16).reshape(8, 16)
     for q, z, s in zip(law.poles, law.zeros, first, strict=True):
@@ -153,13 +153,13 @@ LAW = power_law_filter(1e-3, 1.0, 6)
 def test_any_order_of_any_blocks_gives_the_same_bits(data):
     n_det, n = 20, 3000
     whole = np.zeros((n_det, n), np.float32)
-    Streams(LAW, stream_key(8, "a"), stream_key(8, "b")).add(0, 0, np.ones_like(whole), whole)
+    Streams(LAW, stream_key(8, "a"), stream_key(8, "b")).add(0, 0, whole)
     streams = Streams(LAW, stream_key(8, "a"), stream_key(8, "b"))
     for _ in range(4):
         d, t = data.draw(st.integers(0, n_det - 1)), data.draw(st.integers(0, n - 1))
         rows, columns = data.draw(st.integers(1, n_det - d)), data.draw(st.integers(1, n - t))
         part = np.zeros((rows, columns), np.float32)
-        streams.add(d, t, np.ones_like(part), part)
+        streams.add(d, t, part)
         assert np.array_equal(part, whole[d : d + rows, t : t + columns])
 
 
@@ -167,14 +167,14 @@ def test_checkpoints():
     """Blocks beyond several checkpoints, visited backwards and by threads at once; only checkpoints and one end are kept."""
     n = 3 * CHECKPOINT + 4096
     whole = np.zeros((16, n), np.float32)
-    Streams(LAW, stream_key(9, "a"), stream_key(9, "b")).add(0, 0, np.ones_like(whole), whole)
+    Streams(LAW, stream_key(9, "a"), stream_key(9, "b")).add(0, 0, whole)
     streams = Streams(LAW, stream_key(9, "a"), stream_key(9, "b"))
     result = np.zeros_like(whole)
 
     def visit(starts):
         for start in starts:
             part = np.zeros((16, min(8192, n - start)), np.float32)
-            streams.add(0, start, np.ones_like(part), part)
+            streams.add(0, start, part)
             result[:, start : start + part.shape[1]] = part
 
     starts = list(range(0, n, 8192))[::-1]

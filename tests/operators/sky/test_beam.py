@@ -95,3 +95,15 @@ def test_distinct_beams():
     np.testing.assert_array_equal(index, [2, 0, 2, 0, 1])
     values, index = distinct(np.full(5, 4.1e-5))
     assert values.tolist() == [4.1e-5]
+
+
+def test_a_faint_map_is_not_set_to_zero() -> None:
+    """What is flushed is a share of the image's own peak: a map of 1e-25 K keeps its shape."""
+    values = np.zeros((41, 41))
+    values[20, 20] = 1.0
+    jacobian = np.diag([-1.0, 1.0]) * 1e-5
+    bright, faint = (convolve(values * scale, jacobian, 3e-5, 0.0).coefficients["float64"] for scale in (1.0, 1e-25))
+    assert faint == pytest.approx(bright * 1e-25, rel=1e-12, abs=1e-45)
+    assert np.count_nonzero(faint) == np.count_nonzero(bright) > 100
+    size = np.abs(bright[bright != 0])
+    assert size.min() >= 1e-20 * size.max()

@@ -1,0 +1,1 @@
+"""Many observations as tasks on any engine."""

@@ -1,0 +1,211 @@
+"""What works on tasks: anything with the interface of `concurrent.futures.Executor`."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from ..errors import PipelineError
+from ..execution import available_memory, available_threads
+from .settings import Engine, Tls
+
+
+@dataclass
+class Pool:
+    """An executor at work.
+
+    Attributes
+    ----------
+    executor
+        Takes tasks. None: this process is one of MPI's workers, and has done its part.
+    workers
+        Tasks that run at once.
+    ahead
+        Tasks that may wait in the executor's own queue, so that no worker is idle while results are noted down.
+    threads, memory
+        For each task; None: the worker decides (all it may use).
+    remake
+        A new executor in place of a broken one; None where there is no such thing.
+    """
+
+    executor: Executor | None
+    workers: int
+    ahead: int = 0
+    threads: int | None = None
+    memory: int | None = None
+    remake: Callable[[], Executor] | None = None
+
+
+class SerialExecutor(Executor):
+    """Runs each call at once, in this thread."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """The finished future of the call."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as err:
+            future.set_exception(err)
+        return future
+
+
+@contextlib.contextmanager
+def engine(
+    name: Engine,
+    *,
+    workers: int | None = None,
+    threads: int | None = None,
+    memory: int | None = None,
+    scheduler: str | None = None,
+    tls: Tls | None = None,
+) -> Iterator[Pool]:
+    """Open an engine.
+
+    Parameters
+    ----------
+    workers
+        Of ``processes``; default: as many as CPUs. MPI and Dask have those that were started.
+    threads, memory
+        For each task; default: the machine's CPUs, and half of its free memory, shared among the workers.
+
+    Raises
+    ------
+    PipelineError
+        Where a package is missing, or the scheduler of Dask is not named or cannot be reached.
+    """
+    if name == "serial":
+        yield Pool(SerialExecutor(), 1, 0, threads, memory)
+    elif name == "processes":
+        with _processes(workers, threads, memory) as pool:
+            yield pool
+    elif name == "mpi":
+        with _mpi(threads, memory) as pool:
+            yield pool
+    else:
+        with _dask(scheduler, tls, threads, memory) as pool:
+            yield pool
+
+
+@contextlib.contextmanager
+def _processes(workers: int | None, threads: int | None, memory: int | None) -> Iterator[Pool]:
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    count = workers or available_threads()
+    threads = threads or max(1, available_threads() // count)
+    memory = memory or available_memory() // 2 // count
+    made: list[ProcessPoolExecutor] = []
+
+    def make() -> Executor:
+        for old in made:
+            _end(old)
+        pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=begin_worker)
+        made[:] = [pool]
+        return pool
+
+    try:
+        yield Pool(make(), count, 1, threads, memory, make)
+    except BaseException:
+        for pool in made:
+            _end(pool)
+        raise
+    for pool in made:
+        pool.shutdown()
+
+
+def begin_worker() -> None:
+    """In a new worker process: leave Ctrl-C to the main process, and end when that is gone, however it went."""
+    from ..compiled import ensure_cache, one_blas_thread
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    one_blas_thread()
+    ensure_cache()
+    from multiprocessing import connection, parent_process
+
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _end(pool: Any) -> None:
+    """End the processes of a pool, at work or not."""
+    processes = list((getattr(pool, "_processes", None) or {}).values())
+    for process in processes:
+        process.terminate()
+    pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
+    try:
+        from mpi4py import MPI
+        from mpi4py.futures import MPICommExecutor
+    except ImportError as err:
+        raise _missing("mpi4py", "mpi", err) from None
+    size = MPI.COMM_WORLD.Get_size()
+    if size < 2:
+        raise PipelineError(
+            "there is one MPI process alone, which leaves no worker",
+            place="engine mpi",
+            cure="start at least two: mpiexec -n 8 zonda run FILE --engine mpi",
+        )
+    here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).Get_size()  # processes on this machine
+    with MPICommExecutor(MPI.COMM_WORLD, root=0) as executor:
+        mine = max(1, here - 1) if size == here else here
+        threads = threads or max(1, available_threads() // mine)
+        yield Pool(cast(Executor | None, executor), size - 1, size - 1, threads, memory or available_memory() // 2 // mine)
+
+
+@contextlib.contextmanager
+def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: int | None) -> Iterator[Pool]:
+    try:
+        import distributed
+    except ImportError as err:
+        raise _missing("dask.distributed", "dask", err) from None
+    if scheduler is None:
+        raise PipelineError(
+            "no Dask scheduler is named",
+            place="engine dask",
+            cure="write campaign.scheduler: tcp://host:8786, or use --scheduler; zonda connects nowhere of itself",
+        )
+    options: dict[str, Any] = {"timeout": 20, "set_as_default": False}
+    if "://" in scheduler or not Path(scheduler).is_file():
+        options["address"] = scheduler
+    else:
+        options["scheduler_file"] = scheduler
+    if tls is not None:
+        options["security"] = distributed.Security(
+            tls_ca_file=tls.ca_file, tls_client_cert=tls.cert, tls_client_key=tls.key, require_encryption=True
+        )
+    try:
+        client = distributed.Client(**options)
+    except (OSError, ValueError, TypeError) as err:
+        why = str(err).splitlines()[0] if str(err) else type(err).__name__
+        raise PipelineError(
+            f"cannot reach the Dask scheduler: {why}", place=scheduler, cure="is it running, and are the certificates right?"
+        ) from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=600)
+        except TimeoutError:
+            raise PipelineError("the Dask scheduler has had no worker for ten minutes", place=scheduler) from None
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        each = threads or min(int(w["nthreads"]) for w in workers)
+        yield Pool(client.get_executor(pure=False, retries=0), max(1, len(workers)), len(workers), each, memory)
+
+
+def _missing(package: str, extra: str, err: ImportError) -> PipelineError:
+    return PipelineError(f"{package} cannot be imported: {err}", place=f"engine {extra}", cure=f"pip install 'zonda[{extra}]'")

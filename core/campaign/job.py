@@ -1,0 +1,161 @@
+"""What a campaign consists of: worked out once, before the first task starts, and the same for every engine and every resumption.
+
+``campaign.json`` in the output folder holds it. A task is named by a hash of all that its product depends on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from ..errors import InputError
+from ..files import write_text
+
+FORMAT = 1
+FILE = "campaign.json"
+LOG = "jobs.sqlite"
+TASKS = "tasks"
+"""Folder of partial products and layouts."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Some scans of one entry.
+
+    Attributes
+    ----------
+    number
+        Its place in the campaign, and in the order of the reduction.
+    key
+        Hash of what its product depends on.
+    pipeline
+        Number of its pipeline in `Job.pipelines`.
+    combination
+        Number of what it is co-added into.
+    entry
+        Number of its entry in the campaign.
+    scans
+        Positions of its scans among those of its entry.
+    before
+        Number of scans of the combination before it.
+    seed, time
+        Of its scene; the time in ns since 1970 (`Instant`).
+    samples
+        Detectors x samples.
+    about
+        Its place on the campaign's axes, for tables.
+    """
+
+    number: int
+    key: str
+    pipeline: int
+    combination: int
+    entry: int
+    scans: tuple[int, ...]
+    before: int
+    seed: int
+    time: int
+    samples: int
+    about: str
+
+    @property
+    def product(self) -> str:
+        """Name of its partial product."""
+        return f"{self.number:06d}-{self.key[:16]}.npz"
+
+
+@dataclass(frozen=True)
+class Combination:
+    """What is co-added into one set of products: in ``folder`` ('': the output folder), from tasks that share a layout."""
+
+    name: str
+    folder: str
+    layout: str
+    """Digest of the layout's file."""
+
+    def layout_file(self, number: int) -> str:
+        """Name of the layout's file."""
+        return f"layout-{number:04d}.npz"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A whole campaign.
+
+    Attributes
+    ----------
+    pipelines
+        Planned pipelines, every default filled in, as YAML.
+    plans
+        What was left out or coarsened, for headers: by pipeline.
+    source
+        The campaign's own YAML, every default filled in: one text for each pipeline file.
+    files
+        The pipeline files: path and digest of the text; input files: path, size and time of change.
+    """
+
+    name: str
+    version: str
+    command: str
+    retries: int
+    keep_tasks: bool
+    pipelines: tuple[str, ...]
+    plans: tuple[tuple[tuple[str, ...], ...], ...]
+    source: tuple[str, ...]
+    files: Mapping[str, str]
+    combinations: tuple[Combination, ...]
+    tasks: tuple[Task, ...] = field(repr=False)
+
+    @property
+    def samples(self) -> int:
+        """Of all tasks."""
+        return sum(task.samples for task in self.tasks)
+
+    def tasks_of(self, combination: int) -> list[Task]:
+        """In the order of the reduction."""
+        return [task for task in self.tasks if task.combination == combination]
+
+    def write(self, folder: Path) -> None:
+        """Into its folder, atomically. Raises `OutputError`."""
+        text = json.dumps({"format": FORMAT, **asdict(self)}, indent=None, separators=(",", ":"))
+        write_text(folder / FILE, json.dumps({"digest": _digest(text)}) + "\n" + text + "\n")
+
+    @classmethod
+    def read(cls, folder: Path) -> Job:
+        """The campaign in a folder. Raises `InputError` where there is none, or its file is damaged or of another format."""
+        path = folder / FILE
+        try:
+            head, _, text = path.read_text(encoding="utf-8").partition("\n")
+            if json.loads(head)["digest"] != _digest(text.rstrip("\n")):
+                raise ValueError("its checksum is wrong")
+            values = json.loads(text)
+            if values.pop("format") != FORMAT:
+                raise ValueError("it is of another format")
+            combinations = tuple(Combination(**c) for c in values.pop("combinations"))
+            tasks = tuple(Task(**{**t, "scans": tuple(t["scans"])}) for t in values.pop("tasks"))
+            pipelines, source = tuple(values.pop("pipelines")), tuple(values.pop("source"))
+            plans = tuple(tuple(tuple(row) for row in plan) for plan in values.pop("plans"))
+            return cls(**values, pipelines=pipelines, source=source, plans=plans, combinations=combinations, tasks=tasks)
+        except FileNotFoundError:
+            raise InputError("holds no campaign", place=str(folder), cure="zonda run FILE --output DIR begins one") from None
+        except (OSError, ValueError, KeyError, TypeError) as err:
+            cure = f"remove {folder} and run the campaign again: its tasks cannot be told without this file"
+            raise InputError(f"cannot be used: {err}", place=str(path), cure=cure) from None
+
+
+def key_of(version: str, pipeline: str, seed: int, time: int, scans: tuple[int, ...], first: bool, layout: str) -> str:
+    """Hash of all that a task's product depends on."""
+    parts = [version, pipeline, seed, time, list(scans), first, layout]
+    return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()
+
+
+def digest_of_text(text: str) -> str:
+    """BLAKE2b of a text."""
+    return _digest(text)
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

@@ -1,0 +1,175 @@
+"""The job log: an SQLite file that the main process alone writes, and anybody may read.
+
+No write-ahead log, which shared file systems do not bear: the ordinary rollback journal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InputError
+from ..files import output_error, writing
+
+STATES = ("waiting", "claimed", "done", "failed")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is known of a task.
+
+    Attributes
+    ----------
+    attempts
+        How often it was begun since it was last put off.
+    error
+        Of the last attempt that failed, also where a later one was done.
+    """
+
+    number: int
+    state: str
+    attempts: int
+    error: str
+    host: str
+    seconds: float
+    samples: int
+    digest: str
+
+
+WAITING = Row(-1, "waiting", 0, "", "", 0.0, 0, "")
+"""Of a task that no log knows."""
+
+
+class Log:
+    """An open job log. Raises `OutputError` where it cannot be written, `InputError` where it is damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with self._told():
+            self._db = sqlite3.connect(path, isolation_level=None, timeout=30)
+            self._db.execute("PRAGMA journal_mode = DELETE")
+            self._db.execute(
+                "CREATE TABLE IF NOT EXISTS tasks (number INTEGER PRIMARY KEY, state TEXT NOT NULL, attempts INTEGER NOT NULL, "
+                "error TEXT NOT NULL, host TEXT NOT NULL, seconds REAL NOT NULL, samples INTEGER NOT NULL, digest TEXT NOT NULL)"
+            )
+
+            self._db.execute("CREATE TABLE IF NOT EXISTS combined (number INTEGER PRIMARY KEY)")
+
+    def combined(self) -> set[int]:
+        """Combinations whose products are written."""
+        with self._told():
+            return {int(row[0]) for row in self._db.execute("SELECT number FROM combined")}
+
+    def combine(self, number: int) -> None:
+        """A combination's products are written."""
+        with self._transaction():
+            self._db.execute("INSERT OR IGNORE INTO combined VALUES (?)", (number,))
+
+    def begin(self, tasks: Iterable[tuple[int, int]]) -> None:
+        """Enter tasks (number, samples) that are not there yet, as waiting."""
+        with self._transaction():
+            self._db.executemany("INSERT OR IGNORE INTO tasks VALUES (?, 'waiting', 0, '', '', 0, ?, '')", tasks)
+
+    def claim(self, numbers: Iterable[int]) -> None:
+        """Tasks are given to workers."""
+        with self._transaction():
+            self._db.executemany(
+                "UPDATE tasks SET state = 'claimed', attempts = attempts + 1 WHERE number = ?", [(n,) for n in numbers]
+            )
+
+    def done(self, number: int, host: str, seconds: float, digest: str) -> None:
+        """A task's product is there."""
+        with self._transaction():
+            self._db.execute(
+                "UPDATE tasks SET state = 'done', host = ?, seconds = ?, digest = ? WHERE number = ?",
+                (host, seconds, digest, number),
+            )
+
+    def failed(self, number: int, host: str, seconds: float, error: str, again: bool) -> None:
+        """An attempt failed; ``again``: the task waits for another one."""
+        with self._transaction():
+            self._db.execute(
+                "UPDATE tasks SET state = ?, host = ?, seconds = ?, error = ?, digest = '' WHERE number = ?",
+                ("waiting" if again else "failed", host, seconds, error, number),
+            )
+
+    def put_off(self, numbers: Iterable[int], error: str = "") -> None:
+        """Tasks wait again, with all their attempts before them. ``error``: why, where that is worth telling."""
+        with self._transaction():
+            self._db.executemany(
+                "UPDATE tasks SET state = 'waiting', attempts = 0, digest = '', error = CASE WHEN ?1 = '' THEN error ELSE ?1 END "
+                "WHERE number = ?2",
+                [(error, n) for n in numbers],
+            )
+
+    def rows(self) -> list[Row]:
+        """All tasks, in order."""
+        with self._told():
+            return _rows(self._db)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with self._told():
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+            except BaseException:
+                with contextlib.suppress(sqlite3.Error):
+                    self._db.execute("ROLLBACK")
+                raise
+            self._db.execute("COMMIT")
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            with writing(self.path):
+                yield
+        except sqlite3.DatabaseError as err:
+            raise _error(err, self.path) from None
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of a log that another process may be writing. Raises `InputError` where it is damaged."""
+    for mode in ("ro", "rw"):  # a log whose writer was killed must be mended first, which takes leave to write
+        try:
+            database = sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True, timeout=30)
+            try:
+                return _rows(database)
+            finally:
+                database.close()
+        except sqlite3.OperationalError as err:
+            failure: sqlite3.DatabaseError = err
+        except sqlite3.DatabaseError as err:
+            failure = err
+            break
+    raise damaged(path, failure)
+
+
+def damaged(path: Path, err: Exception) -> InputError:
+    """The error of a log that cannot be read."""
+    return InputError(f"is damaged: {err}", place=str(path), cure=f"zonda resume {path.parent} makes it anew from what is there")
+
+
+def _rows(database: sqlite3.Connection) -> list[Row]:
+    columns = "number, state, attempts, error, host, seconds, samples, digest"
+    found = [Row(*values) for values in database.execute(f"SELECT {columns} FROM tasks ORDER BY number")]
+    if any(row.state not in STATES or not isinstance(row.number, int) for row in found):
+        raise sqlite3.DatabaseError("it holds what is no state of a task")
+    return found
+
+
+def _error(err: sqlite3.DatabaseError, path: Path) -> Exception:
+    text = str(err)
+    if isinstance(err, sqlite3.OperationalError) and "malformed" not in text:
+        import errno
+
+        number = errno.ENOSPC if "full" in text else errno.EROFS if "readonly" in text else None
+        return output_error(OSError(number, text) if number else OSError(text), path)
+    return damaged(path, err)

@@ -1,0 +1,199 @@
+"""One task: some scans of one entry, to a file of partial products. The same bits wherever and whenever it runs."""
+
+from __future__ import annotations
+
+import os
+import resource
+import socket
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
+from . import parts
+from .job import TASKS, Task
+
+if TYPE_CHECKING:
+    from ..configuration.pipeline_file import PipelineFile
+
+POINTS = 512
+"""Boresight directions that are kept of a scan for pictures and tables; of those beyond `SCANS`, 16."""
+SCANS = 32
+
+
+@dataclass(frozen=True)
+class Order:
+    """A task as it is sent to a worker: everything it needs but the files.
+
+    Attributes
+    ----------
+    task, pipeline
+        What to do: the task and its planned pipeline as YAML.
+    layout, layout_digest
+        File of the layouts.
+    folder
+        The campaign's output folder, as the worker sees it.
+    threads, memory
+        For this task; None: all of the machine's.
+    version
+        Of the zonda that sends it.
+    """
+
+    task: Task
+    pipeline: str
+    layout: str
+    layout_digest: str
+    folder: str
+    threads: int | None
+    memory: int | None
+    version: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task.
+
+    Attributes
+    ----------
+    digest
+        Of the product's content; empty where it failed.
+    error
+        What went wrong, as shown to the user; empty where nothing did.
+    final
+        Whether trying again cannot help.
+    stop
+        Whether the other tasks would fail alike.
+    seconds
+        Wall time.
+    peak
+        Largest resident memory of the worker so far, bytes.
+    """
+
+    number: int
+    host: str
+    seconds: float
+    digest: str = ""
+    error: str = ""
+    final: bool = False
+    stop: bool = False
+    peak: int = 0
+
+
+def perform(order: Order) -> Outcome:
+    """Do a task. Never raises an `Exception`: what fails is told in the outcome."""
+    begin, number, host = time.monotonic(), order.task.number, f"{socket.gethostname()}:{os.getpid()}"
+    try:
+        from zonda import __version__
+
+        if __version__ != order.version:
+            raise PipelineError(
+                f"this worker has zonda {__version__}, the campaign {order.version}", place=host, cure="install the same one"
+            )
+        digest = _run(order)
+    except ZondaError as err:
+        final = isinstance(err, PipelineError | PointingError)
+        stop = isinstance(err, OutputError | _NotCombined)
+        return Outcome(number, host, time.monotonic() - begin, error=str(err), final=final, stop=stop, peak=_peak())
+    except Exception as err:
+        import traceback
+
+        text = "".join(traceback.format_exception(err)).rstrip()
+        stop = isinstance(err, OSError)
+        return Outcome(number, host, time.monotonic() - begin, error=text, stop=stop, peak=_peak())
+    return Outcome(number, host, time.monotonic() - begin, digest, peak=_peak())
+
+
+def product_path(folder: Path, task: Task) -> Path:
+    """Where a task's partial product is."""
+    return folder / TASKS / task.product
+
+
+def entry_folder(folder: Path, task: Task) -> Path:
+    """Where a task's own files are (time streams): those of one entry together."""
+    return folder / "entries" / f"{task.entry:06d}"
+
+
+class _NotCombined(PipelineError):
+    """A product that no operator packs."""
+
+
+def _run(order: Order) -> str:
+    from ..configuration.time import Instant
+    from ..pipeline import Part
+    from .prepare import scene_of
+
+    task, folder = order.task, Path(order.folder)
+    file = _file(order.pipeline)
+    layouts = _layouts(order.layout, order.layout_digest)
+    part = Part(task.scans, layouts, first=task.before == 0)
+    pipeline = file.pipeline()
+    data = pipeline.run(
+        scene_of(file, task.seed, Instant(task.time)),
+        output=entry_folder(folder, task),
+        threads=order.threads,
+        memory=order.memory,
+        provenance={"resolved_yaml": order.pipeline},
+        part=part,
+    )
+    if data.products:
+        raise _NotCombined(
+            f"the product {sorted(data.products)[0]!r} cannot be combined with those of other observations",
+            place=file.header.name,
+            cure="its operator needs pack() and merge() to take part in a campaign; run the observations one by one",
+        )
+    scans = [_thinned(o, k + task.before, task.entry) for k, o in enumerate(data.observations)]
+    tally = data.tally
+    tree = {
+        "packed": part.packed,
+        "scans": scans,
+        "counts": [list(row) for row in tally.counts()],
+        "figures": [list(row) for row in tally.figures()],
+    }
+    return parts.write(product_path(folder, task), task.key, tree)
+
+
+@lru_cache(4)
+def _file(text: str) -> PipelineFile:
+    """A pipeline, kept by the worker with what its operators remember (maps that were read and convolved)."""
+    from ..configuration.pipeline_file import parse
+
+    return parse(text, name="campaign")
+
+
+@lru_cache(4)
+def _layouts(path: str, digest: str) -> Mapping[str, Any]:
+    try:
+        layouts: Mapping[str, Any] = parts.read(Path(path), "layout", digest)["layouts"]
+    except InputError as err:
+        raise InputError(err.message, place=err.place, cure="can this worker see the campaign's folder?") from None
+    return layouts
+
+
+def _thinned(observation: Any, number: int, entry: int) -> dict[str, Any]:
+    """What a report tells of a scan, with a few of its boresight directions."""
+    import numpy as np
+
+    n = observation.n_samples
+    some = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)
+    elevation = observation.elevation
+    some = np.unique([*some, elevation.argmin(), elevation.argmax()])
+    return {
+        "name": f"{entry:06d}/{observation.name}",
+        "start": observation.start.nanoseconds,
+        "n_samples": n,
+        "n_detectors": observation.n_detectors,
+        "sample_rate": observation.sample_rate,
+        "seconds": observation.seconds[some],
+        "azel": observation.boresight_azel[some],
+        "radec": observation.boresight_radec[some],
+        "centre": list(observation.centre),
+        "flagged": [int(np.count_nonzero(observation.flags)), int(np.count_nonzero(observation.detector_flags))],
+    }
+
+
+def _peak() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -1,0 +1,119 @@
+"""The detectors' mean at each instant, found in one reading of a stream of any size, or two.
+
+    m_t = (1 / n) sum_d x_dt  over the n good detectors                                                      (1)
+
+The sum runs over the `TILE_DETECTORS` detectors of a tile, then over the tiles in order, in float64: it has the same bits
+however the stream is cut. A second reading is made only where the first finds detectors that must not take part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Stream
+from zonda.core.tiles import TILE_DETECTORS, TILE_SAMPLES
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass
+class Reading:
+    """What one reading of a stream gives.
+
+    Attributes
+    ----------
+    total
+        (n_samp,): sum over the detectors in use; 0 at flagged samples.
+    low, high
+        (n_samp,): the least and the largest value among them.
+    sums, squares
+        (n_det,): of each detector's good samples.
+    """
+
+    total: Floats
+    low: Floats
+    high: Floats
+    sums: Floats
+    squares: Floats
+
+    @property
+    def least_left(self) -> float:
+        """Lower bound of the energy that is left without the mean: sum_t (high - low)^2 / 2, no cancellation in it."""
+        seen = self.high > self.low
+        return float(0.5 * ((self.high[seen] - self.low[seen]) ** 2).sum())
+
+
+def read(stream: Stream, use: Mask, good: Mask) -> Reading:
+    """One sweep over a stream. ``use`` (n_det,), ``good`` (n_samp,): which detectors and samples take part."""
+    n_det, n_samp = stream.shape
+    reading = Reading(np.zeros(n_samp), np.full(n_samp, np.inf), np.full(n_samp, -np.inf), np.zeros(n_det), np.zeros(n_det))
+    field = stream.means.get(stream.name)
+
+    def look(detectors: slice, samples: slice, part: NDArray[np.floating]) -> tuple[Floats, Floats, Floats]:
+        rows, n = part.shape
+        sums = np.zeros((-(-rows // TILE_DETECTORS), n))
+        range_of = np.empty((2, n))
+        range_of[0], range_of[1] = np.inf, -np.inf
+        moments = np.zeros((-(-n // TILE_SAMPLES), 2, rows))
+        for k, start in enumerate(range(0, n, TILE_SAMPLES)):
+            stop = min(start + TILE_SAMPLES, n)
+            at = slice(samples.start + start, samples.start + stop)
+            tile, here = part, (start, stop)
+            if field is not None or not good[at].all():
+                tile, here = part[:, start:stop].astype(np.float64), (0, stop - start)
+                if field is not None:
+                    tile += field.evaluate(detectors, at)
+                tile[:, ~good[at]] = 0
+            _look(tile, *here, use[detectors], sums[:, start:stop], range_of[:, start:stop], moments[k])
+        return sums, range_of, moments
+
+    for detectors, samples, (sums, range_of, moments) in stream.sweep(look):
+        for tile in sums:
+            reading.total[samples] += tile
+        np.minimum(reading.low[samples], range_of[0], out=reading.low[samples])
+        np.maximum(reading.high[samples], range_of[1], out=reading.high[samples])
+        for first, second in moments:
+            reading.sums[detectors] += first
+            reading.squares[detectors] += second
+    return reading
+
+
+LANES = 32
+"""Partial sums of a detector's moments: fixed, so that bits do not depend on the machine's vectors."""
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _look(part, start, stop, use, sums, range_of, moments):  # type: ignore[no-untyped-def]
+    """Add samples start .. stop - 1 of ``part`` to ``sums`` (tiles, n), ``range_of`` (2, n) and ``moments`` (2, n_det)."""
+    n = stop - start
+    whole = n // LANES * LANES
+    first, second = np.empty(LANES), np.empty(LANES)
+    low, high = range_of[0], range_of[1]
+    for d in range(part.shape[0]):
+        row = part[d, start:stop]
+        if use[d]:
+            total = sums[d // TILE_DETECTORS]
+            for t in range(n):
+                x = np.float64(row[t])
+                total[t] += x
+                low[t] = min(low[t], x)
+                high[t] = max(high[t], x)
+        first[:] = 0.0
+        second[:] = 0.0
+        for base in range(0, whole, LANES):
+            x = row[base : base + LANES]
+            for i in range(LANES):
+                y = np.float64(x[i])
+                first[i] += y
+                second[i] += y * y
+        for t in range(whole, n):
+            first[0] += row[t]
+            second[0] += np.float64(row[t]) ** 2
+        for i in range(LANES):
+            moments[0, d] += first[i]
+            moments[1, d] += second[i]

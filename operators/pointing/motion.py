@@ -1,0 +1,113 @@
+"""How fast a scan moves: speed, acceleration and jerk of the axes, and of the beam on the sky, from its track.
+
+Finite differences of the track over a step h are means of the derivatives over at most k h: they never exceed the largest
+derivative (mean value theorem), and fall short of it by O(h^2). What is missing is estimated from steps h and 2 h (Richardson):
+
+    error = |max D_h - max D_2h| / 3                                                                        (1)
+
+The step is halved until the error is below `ACCURACY` for every figure that has a limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+ACCURACY = 0.01
+"""Error (1) aimed at, of the figure or of 0.3 of its limit, whichever is more."""
+
+POINTS, MOST_POINTS = 1 << 16, 1 << 20
+"""Points of the track that are looked at first, and at most."""
+
+SHORTEST_STEP = 1e-3
+"""s: rounding (4e-16 rad) is below 4e-9 rad/s^2 of acceleration and 1e-5 rad/s^3 of jerk at this step."""
+
+Quantity = tuple[str, int]
+"""Axis (``azimuth``, ``elevation`` or ``sky``) and order of the derivative (1 to 3)."""
+
+QUANTITIES: tuple[Quantity, ...] = (
+    *((axis, order) for axis in ("azimuth", "elevation") for order in (1, 2, 3)),
+    ("sky", 1),
+    ("sky", 2),
+)
+"""What is measured. On the sky the azimuth counts times the cosine of the elevation."""
+
+
+class Peak(NamedTuple):
+    """A largest derivative of the track."""
+
+    figure: float
+    """rad/s^order."""
+    second: float
+    """s since the start of the scan: where it is reached."""
+    elevation: float
+    """rad, there."""
+    error: float
+    """Equation (1): what the figure may fall short by, rad/s^order."""
+
+
+def motion(
+    horizontal: Floats, rate: float, limits: Mapping[Quantity, float], finer: Callable[[float], Floats]
+) -> dict[Quantity, Peak]:
+    """The largest derivatives of a track.
+
+    Parameters
+    ----------
+    horizontal
+        Directions (n, 3) north, west, up at ``rate`` [Hz].
+    limits
+        Those quantities that must be known within `ACCURACY`, with their limits [rad/s^order].
+    finer
+        The same track in steps of so many seconds, where samples are too far apart.
+    """
+    stride = 1 << max(0, math.ceil(math.log2(max(len(horizontal) / POINTS, rate * SHORTEST_STEP, 1e-9))))
+    step = stride / rate
+    while True:
+        track = horizontal[::stride] if stride else finer(step)
+        found = _peaks(track, step)
+        known = all(found[q].error <= ACCURACY * max(found[q].figure, 0.3 * limit) for q, limit in limits.items() if q in found)
+        points = 2 * len(track)
+        enough = known and (found or not limits)
+        if enough or step / 2 < SHORTEST_STEP or points > max(MOST_POINTS, len(horizontal)) or len(horizontal) < 2:
+            return found
+        stride, step = stride // 2, step / 2
+
+
+def _peaks(track: Floats, step: float) -> dict[Quantity, Peak]:
+    azimuth = np.unwrap(np.arctan2(-track[:, 1], track[:, 0]))
+    elevation = np.arctan2(track[:, 2], np.hypot(track[:, 0], track[:, 1]))
+    found = {}
+    for axis, order in QUANTITIES:
+        fine = _derivative(azimuth, elevation, axis, order, step)
+        if not len(fine):
+            continue
+        k, largest = int(fine.argmax()), float(fine.max())
+        coarse = [_derivative(azimuth[first::2], elevation[first::2], axis, order, 2 * step) for first in (0, 1)]
+        error = abs(largest - max((float(d.max()) for d in coarse if len(d)), default=0.0)) / 3
+        there = float(elevation[min(k + order // 2, len(elevation) - 1)])
+        found[axis, order] = Peak(largest, (k + order / 2) * step, there, error)
+    return found
+
+
+def _derivative(azimuth: Floats, elevation: Floats, axis: str, order: int, step: float) -> Floats:
+    """Magnitude of the ``order``-th difference quotient, (n - order,)."""
+    if axis == "azimuth":
+        return np.asarray(abs(np.diff(azimuth, order)) / step**order)
+    if axis == "elevation":
+        return np.asarray(abs(np.diff(elevation, order)) / step**order)
+    first = order // 2
+    cosine = np.cos(elevation[first : first + max(len(elevation) - order, 0)])
+    return np.asarray(np.hypot(np.diff(azimuth, order) * cosine, np.diff(elevation, order)) / step**order)
+
+
+def rate_text(value: float, order: int) -> str:
+    """An angle, speed, acceleration or jerk [rad/s^order] in degrees, or in arcseconds where it is small."""
+    degrees = math.degrees(value)
+    number, unit = (degrees, "deg") if degrees >= 0.1 else (degrees * 3600, "arcsec")
+    return f"{number:.4g} {unit}" + (f"/s{order if order > 1 else ''}" if order else "")

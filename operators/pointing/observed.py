@@ -1,0 +1,91 @@
+"""What every pointing step makes of directions at instants: an `Observation`, and what must be said of it."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Observation
+
+from .transform import unit_vectors
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.target import Target
+    from zonda.core.configuration.time import Instant
+    from zonda.core.scene import Scene
+
+    from .transform import CelestialTransform
+
+Floats = NDArray[np.float64]
+
+
+def observed(
+    label: str,
+    scene: Scene,
+    index: int,
+    start: Instant,
+    seconds: Floats,
+    rate: float,
+    transform: CelestialTransform,
+    horizontal: Floats,
+    centre: tuple[float, float],
+    flags: NDArray[np.uint8],
+) -> Observation:
+    """The scan that looks at ``horizontal`` (n, 3) north, west, up at ``seconds`` (n,) since ``start``."""
+    instrument = scene.instrument
+    azel, radec = transform.boresight(horizontal, seconds)
+    observation = Observation(
+        name=f"scan-{index:03d}",
+        index=index,
+        site=scene.site,
+        instrument=instrument,
+        focalplane=instrument.focalplane(),
+        start=start,
+        seconds=seconds,
+        sample_rate=rate,
+        boresight_azel=azel,
+        boresight_radec=radec,
+        centre=centre,
+        seed=scene.seed,
+        flags=flags,
+    )
+    beam = float(observation.focalplane.fwhm.min())
+    error = f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every {transform.spacing:g} s)"
+    observation.tally.state(label, "interpolation error of the pointing", error)
+    observation.tally.state(label, "Earth orientation", transform.source)
+    if not transform.orientation_known:
+        warnings.warn(f"{label}: Earth orientation at {start}: {transform.source}", stacklevel=4)
+    return observation
+
+
+def centre_of(transform: CelestialTransform, target: Target, seconds: Floats) -> tuple[float, float]:
+    """ICRS (ra, dec) of a target; of an az/el one where it points to in the middle of the scan."""
+    if target.frame != "horizontal":
+        return target.icrs()
+    middle = np.array([(seconds[0] + seconds[-1]) / 2])
+    x, y, z = transform.icrs(unit_vectors([-target.longitude], [target.latitude]), middle)[0]
+    return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
+
+
+def state_times(label: str, observation: Observation) -> None:
+    """State how far the samples' times are from a comb, and what those steps make of it that count samples."""
+    late = observation.departures
+    rms, most, rate = observation.jitter, float(abs(late).max()), observation.sample_rate
+    step = np.diff(observation.seconds) * rate
+    at_nyquist = math.pi * rate * rms
+    observation.tally.state(
+        label,
+        f"{observation.name}: times of the samples",
+        f"depart from a comb of {rate:.6g} Hz by {rms * 1e3:.3g} ms rms, {most * 1e3:.3g} ms at most "
+        f"(intervals of {step.min():.3g} to {step.max():.3g} of the mean); pointing and atmosphere follow them",
+    )
+    observation.tally.state(
+        label,
+        f"{observation.name}: noise and filters take the samples as a comb",
+        f"a component at frequency f is off by at most 2 pi f {rms * 1e3:.3g} ms of its rms: "
+        f"{2 * math.pi * rms:.1e} at 1 Hz, {min(at_nyquist, 2.0):.1e} at {rate / 2:.4g} Hz",
+    )

@@ -1,0 +1,144 @@
+"""The scan that a telescope really made."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.target import Target
+from zonda.core.configuration.units import Fraction, Seconds
+from zonda.core.errors import PointingError
+from zonda.core.knobs import Knob
+from zonda.core.operator import Operator
+
+from .observed import centre_of, observed, state_times
+from .recording import Clock, Comb, Recording, Scan, comb, read
+from .samples_per_beam import Sampled
+from .transform import CelestialTransform, unit_vectors
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.time import Instant
+    from zonda.core.data import Data, Observation
+    from zonda.core.plan.context import Context
+    from zonda.core.plan.estimate import Estimate
+
+Floats = NDArray[np.float64]
+
+ANOTHER_DAY = 86400.0
+"""s between the record and the scene's time from which a run warns: the weather is the scene's."""
+
+
+class PointingRecorded(Operator):
+    """Simulate on a real scan: times and directions of the boresight, read from a file.
+
+    HDF5 in TOAST's layout (what `SaveTOD` writes, too) or with datasets ``time``, ``az`` and ``el`` (or ``ra`` and ``dec``,
+    ICRS; attribute ``units``), a FITS table with such columns, or CSV that begins with ``time [s], az [deg], el [deg]``; a
+    column ``flags`` is kept. Azimuth and elevation are where the beam looks: the pointing model is applied.
+
+    Times need not be a perfect comb. Pointing and atmosphere follow them as they are; noise and filters count samples. Gaps
+    and rows that are not numbers become flagged samples: their noise and atmosphere go on, no map uses them, filters bridge
+    them. All is counted. The telescope's limits of speed are not checked: it did move like that.
+    """
+
+    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    knobs: ClassVar[tuple[Knob, ...]] = (
+        Knob("interpolation_error", (0.1, 0.01, 1e-3, 1e-4), "celestial transformation interpolated between nodes in time"),
+    )
+
+    file: InputPath
+    """HDF5, FITS table or CSV."""
+    clock: Clock = "unix"
+    """What times count: seconds since 1970 UTC (unix), days (mjd, UTC), or seconds since the scene's time (scene). Files of
+    `SaveTOD` carry their own start."""
+    split: Seconds = quantity("60 s", gt=0)
+    """A longer gap ends the scan; what follows is another observation. Shorter ones are flagged samples."""
+    target: Target | None = None
+    """Centre of the map; the scene's target where absent, or else the middle of the scan."""
+    interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
+    """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
+
+    def check(self, data: Data) -> list[str]:
+        """What is in the file."""
+        recording, found = self._read()
+        lines = []
+        for scan in found.scans:
+            seconds = scan.seconds[-1] - scan.seconds[0]
+            good = scan.flags == 0
+            text = f"{len(scan.seconds)} samples at {scan.rate:.6g} Hz, {seconds:.1f} s"
+            if recording.frame == "azel" and good.any():
+                low, high = np.degrees([scan.latitude[good].min(), scan.latitude[good].max()])
+                text += f", elevation {low:.2f} to {high:.2f} deg"
+            lines.append(text)
+        return lines + [f"{what}: {number}" for what, number in found.counts.items() if number]
+
+    def observe(self, data: Data) -> None:
+        """Append an observation for each part of the record without long gaps."""
+        recording, found = self._read()
+        first = len(data.observations)
+        start = recording.start or data.scene.time
+        apart = abs(data.scene.time.seconds_since(start))
+        if apart > ANOTHER_DAY:
+            text = f"the record begins {start}, the weather is that of {data.scene.time}"
+            warnings.warn(f"{self.label}: {text}: set the scene's time", stacklevel=2)
+        sampled = Sampled()
+        for scan in found.scans:
+            observation = self._observation(data, start, scan, recording, len(data.observations))
+            sampled.add(observation, observation.sample_rate)
+            data.observations.append(observation)
+        for what, number in found.counts.items():
+            data.observations[first].tally.count(self.label, what, number)
+        for what, text in sampled.statements():
+            for observation in data.observations[first:]:
+                observation.tally.state(self.label, what, text)
+        for text in sampled.warnings():
+            warnings.warn(f"{self.label}: {text}", stacklevel=2)
+
+    def estimate(self, context: Context) -> Estimate:
+        """As of other pointing steps."""
+        from .estimate import pointing_estimate
+
+        return pointing_estimate(self, context)
+
+    def _read(self) -> tuple[Recording, Comb]:
+        recording = read(self.file, self.clock)
+        return recording, comb(recording, self.split, f"{self.label}, {self.file}")
+
+    def _observation(self, data: Data, begin: Instant, scan: Scan, recording: Recording, index: int) -> Observation:
+        scene, telescope = data.scene, data.scene.instrument.telescope
+        start, seconds = begin.shifted(float(scan.seconds[0])), scan.seconds - scan.seconds[0]
+        beam = float(scene.instrument.focalplane().fwhm.min())
+        transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
+        if recording.frame == "azel":
+            horizontal = unit_vectors(-scan.longitude, scan.latitude)
+        else:
+            horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
+        elevation = np.arctan2(horizontal[:, 2], np.hypot(horizontal[:, 0], horizontal[:, 1]))
+        outside = (elevation < telescope.elevation_min - 1e-9) | (elevation > telescope.elevation_max + 1e-9)
+        if (wrong := np.flatnonzero(outside & (scan.flags == 0))).size:
+            limits = f"{np.degrees(telescope.elevation_min):g} deg to {np.degrees(telescope.elevation_max):g} deg"
+            where = f"elevation {np.degrees(elevation[wrong[0]]):.2f} deg, {seconds[wrong[0]]:.4g} s after {start}"
+            raise PointingError(
+                f"the boresight is at {where}; {telescope.name} reaches {limits}",
+                place=f"{self.label}, {self.file}",
+                cure="flag these rows, or correct site, clock, units or the telescope's limits",
+            )
+        target = self.target or scene.target
+        centre = centre_of(transform, target, seconds) if target else _middle(transform, horizontal, seconds, scan.flags == 0)
+        observation = observed(
+            self.label, scene, index, start, seconds, scan.rate, transform, horizontal, centre, scan.flags.copy()
+        )
+        state_times(self.label, observation)
+        return observation
+
+
+def _middle(transform: CelestialTransform, horizontal: Floats, seconds: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
+    """ICRS (ra, dec) of the mean direction."""
+    some = np.flatnonzero(good)[:: max(1, int(good.sum()) // 10_000)]
+    x, y, z = transform.icrs(horizontal[some], seconds[some]).mean(axis=0)
+    return float(np.arctan2(y, x) % (2 * np.pi)), float(np.arctan2(z, np.hypot(x, y)))

@@ -1,0 +1,118 @@
+"""From axes to entries: which there are, their seeds and nights, and what is wrong with them."""
+
+from __future__ import annotations
+
+import pytest
+
+from zonda.core.campaign.entries import TURN, entries, separate
+from zonda.core.campaign.settings import Campaign
+from zonda.core.configuration.diagnostics import ConfigurationError
+from zonda.core.configuration.pipeline_file import parse
+from zonda.core.configuration.time import Instant
+from zonda.core.errors import InputError
+
+START = Instant.parse("2024-11-25T07:00")
+
+
+def expand(seed=7, **campaign):
+    def time_of(settings):
+        given = [s.partition("=")[2].strip('"') for s in settings if s.startswith("time=")]
+        return Instant.parse(given[0]) if given else START
+
+    return entries(Campaign.model_validate(campaign), seed, time_of)
+
+
+def test_a_grid_is_every_combination_with_the_first_axis_slowest():
+    found = expand(grid={"site": ["a", "b"], "PointingDaisy.radius": ["1 arcmin", "2 arcmin"]}, realizations=2)
+    points = [tuple(e.values.values()) for e in found]
+    radii = ("1 arcmin", "2 arcmin")
+    assert points == [(s, r, k) for s in ("a", "b") for r in radii for k in (0, 1)]
+    assert found[0].settings == ('site="a"', 'PointingDaisy.radius="1 arcmin"')
+    assert {e.combination for e in found} == {()}
+
+
+def test_a_list_is_one_after_the_other_and_crosses_the_grid():
+    found = expand(
+        observations=[{"time": "2024-11-25T07:00"}, {"time": "2024-11-26T07:00", "seed": 9}], grid={"site": ["a", "b"]}
+    )
+    assert [(e.values["observation"], e.values["site"]) for e in found] == [(0, "a"), (0, "b"), (1, "a"), (1, "b")]
+    assert [e.time.seconds_since(START) for e in found] == [0, 0, 86400, 86400]
+    assert [e.seed for e in found[::2]] == [7, 9]
+
+
+def test_what_is_co_added_has_its_own_random_numbers_and_what_is_compared_the_same():
+    found = expand(grid={"site": ["a", "b"]}, realizations=3, combine=["realization"])
+    by_site = {site: [e.seed for e in found if e.values["site"] == site] for site in "ab"}
+    assert by_site["a"] == by_site["b"]
+    assert by_site["a"][0] == 7  # the first is the plain run
+    together = expand(grid={"site": ["a", "b"]}, realizations=3)
+    assert len({e.seed for e in together}) == 6
+
+
+def test_seeds_do_not_collide_with_neighbours():
+    seeds = [separate(s, k) for s in range(50) for k in range(200)]
+    assert len(set(seeds)) == len(seeds)
+    assert all(0 <= s < 2**63 for s in seeds)
+    assert separate(8, 1) == separate(8, 1) != separate(9, 1)
+
+
+def test_explicit_seeds_are_as_they_are():
+    assert [e.seed for e in expand(grid={"seed": [3, 4]})] == [3, 4]
+
+
+def test_nights_are_whole_turns_of_the_earth():
+    found = expand(nights=3)
+    assert [e.time.seconds_since(START) for e in found] == pytest.approx([0, TURN, 2 * TURN], abs=1e-8)
+    between = expand(nights={"start": "2024-11-23", "stop": "2024-12-01", "every": 2})
+    assert [e.values["night"] for e in between] == [-2, 0, 2, 4]
+    with pytest.raises(InputError, match="no observation begins between"):
+        expand(nights={"start": "2024-11-25T08:00", "stop": "2024-11-25T09:00"})
+
+
+def test_a_target_is_at_the_same_place_on_the_next_night():
+    """But for a day of precession and aberration, below 1 arcsec."""
+    import numpy as np
+
+    import zonda
+
+    def azimuth(time):
+        scene = zonda.Scene(site="green_bank", instrument="mustang2", time=time, target="05h +20d")
+        data = zonda.core.data.Data(scene=scene)
+        zonda.PointingStare(scan_duration="1 s").observe(data)
+        return data.observations[0].azimuth[0]
+
+    first = azimuth(START)
+    assert abs(azimuth(expand(nights=2)[1].time) - first) < np.radians(2 / 3600)
+    assert abs(azimuth(START.shifted(86400)) - first) > np.radians(0.5)
+
+
+@pytest.mark.parametrize(
+    ("campaign", "words", "place"),
+    [
+        ("{grid: {sed: [1]}}", ["nothing is called 'sed'", "did you mean 'seed'?"], "18:19"),
+        ("{grid: {site: [green_bank, greenbank]}}", ["unknown site 'greenbank'", "did you mean 'green_bank'?"], "18:38"),
+        ("{grid: {BinMap.pixel: [4 arcsec, 2 s]}}", ["BinMap, pixel: expected an angle"], "18:46"),
+        ("{grid: {BinMap.pixle: [4 arcsec]}}", ["unknown key 'pixle' for BinMap", "did you mean 'pixel'?"], "18:19"),
+        ("{observations: [{time: now}]}", ["cannot read 'now' as a time"], "18:34"),
+        ("{realization: 2}", ["unknown key 'realization'", "did you mean 'realizations'?"], "18:12"),
+        ("{engine: dsk}", ["did you mean 'dask'?"], "18:20"),
+        ("{nights: 2, combine: [site]}", ["which is no axis of this campaign; its axes: night"], "18:11"),
+        ("{grid: {name: [a, b]}}", ["'name' cannot change from one entry to the next"], "18:19"),
+        ("{scheduler: 'tcp://a:1'}", ["scheduler is for engine: dask"], "18:11"),
+        ("{nights: {start: 2024-11-25}}", ["give a number of nights, or start and stop"], "18:20"),
+    ],
+)
+def test_mistakes_are_shown_at_their_place(bench, campaign, words, place):
+    path = bench.file(campaign)
+    with pytest.raises(ConfigurationError) as caught:
+        parse(path.read_text(), name="p.yaml")
+    text = caught.value.render()
+    assert f"p.yaml:{place}" in text, text
+    assert all(word in text for word in words), text
+
+
+def test_resolved_campaign_reads_back(bench):
+    text = bench.file("{grid: {seed: [1, 2]}, nights: {start: 2024-11-24, stop: 2024-11-29}, combine: [night]}").read_text()
+    file = parse(text)
+    again = parse(file.resolved_yaml())
+    assert again.header.campaign == file.header.campaign

@@ -1,0 +1,321 @@
+"""Campaigns from the command line: the same bits in any order, failures, resumption."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import threading
+from concurrent.futures import Executor, Future
+
+import pytest
+
+from zonda.core.campaign import run as campaign
+from zonda.core.campaign.engines import Pool, SerialExecutor
+from zonda.core.campaign.job import Job
+from zonda.core.campaign.log import Log, read
+from zonda.core.campaign.task import Outcome, perform
+
+SERIAL = ("--engine", "serial", "--threads", 1)
+
+
+class Shuffled(Executor):
+    """Takes all tasks first, then does them in a random order."""
+
+    def __init__(self, expected, seed):
+        self.expected, self.seed, self.calls = expected, seed, []
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        self.calls.append((future, fn, args))
+        if len(self.calls) == self.expected:
+            threading.Thread(target=self.work, args=(self.calls,)).start()
+            self.calls, self.expected = [], 1
+        return future
+
+    def work(self, calls):
+        random.Random(self.seed).shuffle(calls)
+        for future, fn, args in calls:
+            future.set_result(fn(*args))
+
+
+def states(folder):
+    return [row.state for row in read(folder / "jobs.sqlite")]
+
+
+def test_products(undisturbed):
+    names = {p.name for p in undisturbed.iterdir()}
+    assert names == {"campaign.json", "jobs.sqlite", "map.fits", "noise_map.fits", "resolved.yaml"}
+    from astropy.io import fits
+
+    with fits.open(undisturbed / "map.fits") as file:
+        assert file[0].header["NSCANS"] == 12
+        assert file["HITS"].data.sum() <= 12 * 300 * 19
+        assert "nights:" in "".join(str(card) for card in file[0].header["HISTORY"])
+
+
+def test_processes_give_the_same_bits(undisturbed, bench):
+    for workers in (2, 7):
+        out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", workers)
+        assert bench.planes(out) == bench.planes(undisturbed)
+        assert bench.planes(out, "noise_map.fits") == bench.planes(undisturbed, "noise_map.fits")
+
+
+def test_any_order_of_completion_gives_the_same_bits(undisturbed, bench, monkeypatch):
+    for seed in (1, 2):
+        monkeypatch.setattr("zonda.core.campaign.engines.SerialExecutor", lambda seed=seed: Shuffled(12, seed))
+        monkeypatch.setattr("zonda.core.campaign.engines.Pool", lambda ex, *rest: Pool(ex, 12, 0, 1, None))
+        out = bench.run(bench.CAMPAIGN, *SERIAL)
+        assert bench.planes(out) == bench.planes(undisturbed)
+
+
+def test_tasks_of_whole_entries_give_the_same_bits(undisturbed, bench):
+    out = bench.run("{nights: 3, realizations: 2, task: entry}", *SERIAL)
+    assert len(Job.read(out).tasks) == 6
+    assert bench.planes(out) == bench.planes(undisturbed)
+
+
+def test_a_tree_of_several_levels_gives_the_same_maps(undisturbed, bench, monkeypatch):
+    monkeypatch.setattr("zonda.core.campaign.reduce.FAN", 2)
+    assert bench.planes(bench.run(bench.CAMPAIGN, *SERIAL)) == bench.planes(undisturbed)
+
+
+def test_scans_as_tasks_are_the_plain_run(bench):
+    """One entry is an ordinary run: same maps, same mean spectrum, same tally."""
+    plain, split = bench.new(), bench.new()
+    file = bench.file("null")
+    assert bench.command("run", file, "--output", plain, "--no-prune") == 0
+    assert bench.command("run", file, "--output", split, "--no-prune", *SERIAL) == 0
+    assert bench.planes(plain) == bench.planes(split)
+    from astropy.io import fits
+
+    tallies = []
+    for out in (plain, split):
+        with fits.open(out / "map.fits") as opened:
+            tallies.append([tuple(row) for row in opened["TALLY"].data if row["WHAT"].startswith("samples")])
+    assert tallies[0] == tallies[1]
+
+
+def test_one_set_of_products_for_each_combination(bench):
+    out = bench.run("{grid: {PointingDaisy.radius: [1 arcmin, 2 arcmin]}, realizations: 2, combine: [realization]}", *SERIAL)
+    folders = sorted(p.name for p in out.iterdir() if p.is_dir())
+    assert folders == ["PointingDaisy.radius=1-arcmin", "PointingDaisy.radius=2-arcmin"]
+    assert bench.planes(out / folders[0]) != bench.planes(out / folders[1])
+
+
+def test_several_files(bench):
+    one, two = bench.file("null", name="one.yaml"), bench.file("null", ("seed: 1", "seed: 2"), name="two.yaml")
+    out = bench.new()
+    assert bench.command("run", one, two, "--output", out, *SERIAL) == 0
+    assert bench.planes(out / "one") != bench.planes(out / "two")
+
+
+def test_time_streams_spectra_pictures_and_report(bench):
+    more = "  - SaveMap\n  - SaveTOD\n  - TimeStreams\n  - Plots\n  - Report\n"
+    out = bench.run("{nights: 2}", *SERIAL, changes=(("  - SaveMap\n", more),))
+    assert len(list(out.glob("entries/*/tod_*.h5"))) == 4
+    assert {"map.png", "power_spectra.png", "tod.png", "scan.png", "report.html"} <= {p.name for p in out.iterdir()}
+    assert "000001/scan-001" in (out / "report.html").read_text()
+
+
+def test_other_bands_are_not_co_added(bench, capsys):
+    assert bench.run("{grid: {instrument: [gbt, atlast]}}", *SERIAL, status=2)
+    assert "cannot be added up" in capsys.readouterr().err
+
+
+# ---- failures
+
+
+def failing(times, error="it broke", **more):
+    """A stand-in for `perform` that fails so many times for task 3, or always (-1)."""
+    left = [times]
+
+    def work(order):
+        if order.task.number == 3 and left[0]:
+            left[0] -= 1
+            return Outcome(3, "here", 0.1, error=error, **more)
+        return perform(order)
+
+    return work
+
+
+def test_a_failed_task_is_tried_again(undisturbed, bench, monkeypatch):
+    monkeypatch.setattr(campaign, "perform", failing(2))
+    out = bench.run(bench.CAMPAIGN, *SERIAL)
+    row = read(out / "jobs.sqlite")[3]
+    assert (row.state, row.attempts, row.error) == ("done", 3, "it broke")
+    assert bench.planes(out) == bench.planes(undisturbed)
+
+
+def test_tries_are_bounded_and_resume_goes_on(undisturbed, bench, monkeypatch, capsys):
+    monkeypatch.setattr(campaign, "perform", failing(-1))
+    out = bench.run(bench.CAMPAIGN, *SERIAL, status=2)
+    assert "1 of 12 tasks failed; the first is 3: it broke" in capsys.readouterr().err
+    assert states(out) == ["done"] * 3 + ["failed"] + ["done"] * 8
+    assert read(out / "jobs.sqlite")[3].attempts == 3
+    assert not (out / "map.fits").exists()
+    assert bench.command("status", out) == 0
+    shown = capsys.readouterr().out
+    assert "failed   1" in shown
+    assert "it broke" in shown
+    monkeypatch.setattr(campaign, "perform", perform)
+    before = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
+    monkeypatch.setattr(campaign.shutil, "rmtree", lambda *a, **k: None)
+    monkeypatch.setattr(campaign, "discard", lambda *a: None)
+    assert bench.command("resume", out, *SERIAL) == 0
+    after = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
+    assert {name: after[name] for name in before} == before  # what was done was not done again
+    assert bench.planes(out) == bench.planes(undisturbed)
+    assert states(out) == ["done"] * 12
+
+
+def test_what_cannot_succeed_is_not_tried_again(bench, monkeypatch):
+    monkeypatch.setattr(campaign, "perform", failing(-1, final=True))
+    out = bench.run(bench.CAMPAIGN, *SERIAL, status=2)
+    assert read(out / "jobs.sqlite")[3].attempts == 1
+
+
+def test_an_exception_leaves_a_campaign_that_resumes(undisturbed, bench, monkeypatch):
+    def interrupted(order):
+        if order.task.number == 5:
+            raise KeyboardInterrupt
+        return perform(order)
+
+    monkeypatch.setattr(campaign, "perform", interrupted)
+    out = bench.run(bench.CAMPAIGN, *SERIAL, status=130)
+    assert states(out) == ["done"] * 5 + ["waiting"] * 7
+    assert not (out / ".zonda-lock").exists()
+    monkeypatch.setattr(campaign, "perform", perform)
+    assert bench.command("run", bench.folder / "p.yaml", "--output", out, *SERIAL) == 2  # unfinished: not thrown away
+    assert bench.command("resume", out, *SERIAL) == 0
+    assert bench.planes(out) == bench.planes(undisturbed)
+
+
+def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypatch):
+    submit, killed = campaign._submit, []
+
+    def and_kill(pool, order):
+        future = submit(pool, order)
+        if order.task.number == 4 and not killed:
+            killed.append(True)
+            for process in list(pool.executor._processes.values()):
+                os.kill(process.pid, signal.SIGKILL)
+        return future
+
+    monkeypatch.setattr(campaign, "_submit", and_kill)
+    out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", 2)
+    assert killed
+    rows = read(out / "jobs.sqlite")
+    assert any(row.attempts == 2 and "killed" in row.error for row in rows)
+    assert bench.planes(out) == bench.planes(undisturbed)
+
+
+def half(bench, monkeypatch):
+    """A campaign of which tasks 0 to 4 are done."""
+    monkeypatch.setattr(campaign, "perform", lambda order: Outcome(0, "", 0.0, error="no", final=True) if order.task.number > 4
+                        else perform(order))  # fmt: skip
+    out = bench.run(bench.CAMPAIGN, *SERIAL, status=2)
+    monkeypatch.setattr(campaign, "perform", perform)
+    return out
+
+
+def test_damaged_products_are_made_again(undisturbed, bench, monkeypatch, capsys):
+    out = half(bench, monkeypatch)
+    products = sorted((out / "tasks").glob("0000*.npz"))
+    assert len(products) == 5
+    products[0].write_bytes(products[0].read_bytes()[:-100])
+    products[1].unlink()
+    products[2].write_bytes(products[3].read_bytes())
+    (out / "tasks" / "layout-0000.npz").write_bytes(b"")
+    (out / "tasks" / ".left.part.npz").write_bytes(b"half")
+    capsys.readouterr()
+    assert bench.command("resume", out, *SERIAL) == 0
+    assert "3 partial products were missing or damaged" in capsys.readouterr().err
+    assert bench.planes(out) == bench.planes(undisturbed)
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a data base" * 100, None, "short"])
+def test_a_damaged_log_is_made_anew(undisturbed, bench, monkeypatch, damage):
+    out = half(bench, monkeypatch)
+    path = out / "jobs.sqlite"
+    if damage is None:
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:5000] if damage == "short" else damage)
+    done = []
+    monkeypatch.setattr(campaign, "perform", lambda order: done.append(order.task.number) or perform(order))
+    assert bench.command("resume", out, *SERIAL) == 0
+    assert sorted(done) == [5, 6, 7, 8, 9, 10, 11]
+    assert bench.planes(out) == bench.planes(undisturbed)
+
+
+def test_resume_refuses_what_has_changed(bench, monkeypatch, capsys):
+    out = half(bench, monkeypatch)
+    text = (bench.folder / "p.yaml").read_text()
+    (bench.folder / "p.yaml").write_text(text + "\n# changed\n")
+    assert bench.command("resume", out, *SERIAL) == 2
+    assert "has changed or is gone" in capsys.readouterr().err
+    (bench.folder / "p.yaml").write_text(text)
+    (out / "resolved.yaml").write_text("seed: 3\n")
+    assert bench.command("resume", out, *SERIAL) == 2
+    assert "resolved.yaml is not what it was" in capsys.readouterr().err
+    assert bench.command("resume", out, *SERIAL, "--anyway") == 0
+
+
+def test_resume_of_what_is_no_campaign(bench, tmp_path, capsys):
+    assert bench.command("resume", tmp_path) == 2
+    assert "holds no campaign" in capsys.readouterr().err
+    (tmp_path / "campaign.json").write_text('{"digest": "0"}\n{}\n')
+    for name in ("resume", "status"):
+        assert bench.command(name, tmp_path) == 2
+        assert "checksum is wrong" in capsys.readouterr().err
+
+
+def test_resume_of_a_finished_campaign_does_nothing(bench, undisturbed, monkeypatch):
+    before = bench.planes(undisturbed)
+    monkeypatch.setattr(campaign, "perform", None)
+    monkeypatch.setattr(campaign, "combine", None)
+    assert bench.command("resume", undisturbed, *SERIAL) == 0
+    assert bench.planes(undisturbed) == before
+
+
+def test_shares_of_an_array(undisturbed, bench, capsys):
+    file, out = bench.file(bench.CAMPAIGN), bench.new()
+    for k in (2, 1, 3):
+        assert bench.command("run", file, "--output", out, *SERIAL, "--task", f"{k}/3") == 0
+    assert not (out / "map.fits").exists()
+    capsys.readouterr()
+    assert bench.command("status", out, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["counts"] == {"waiting": 0, "claimed": 0, "done": 12, "failed": 0}
+    assert {t["entry"] for t in found["tasks"]} >= {"night=2, realization=1"}
+    assert bench.command("resume", out, *SERIAL) == 0
+    assert bench.planes(out) == bench.planes(undisturbed)
+    assert bench.command("run", bench.file("{nights: 2}"), "--output", out, *SERIAL, "--task", "1/3") == 2
+    assert "holds another campaign" in capsys.readouterr().err
+
+
+def test_an_operator_that_cannot_be_combined_is_named(bench, monkeypatch, capsys):
+    from zonda.operators.diagnostics.power_spectrum import PowerSpectrum
+
+    monkeypatch.setattr(PowerSpectrum, "pack", lambda self, data, first: None)
+    out = bench.run(bench.CAMPAIGN, *SERIAL, "--no-prune", status=2)
+    assert "'spectrum' cannot be combined" in capsys.readouterr().err
+    assert states(out).count("failed") == 1  # the others would fail alike: they are not tried
+
+
+def test_every_transition_is_in_the_log(tmp_path):
+    log = Log(tmp_path / "jobs.sqlite")
+    log.begin([(0, 10), (1, 20)])
+    log.claim([0, 1])
+    assert [(r.state, r.attempts) for r in log.rows()] == [("claimed", 1)] * 2
+    log.failed(0, "h", 1.0, "no", again=True)
+    log.claim([0])
+    log.done(0, "h", 2.0, "abc")
+    log.failed(1, "h", 1.0, "no", again=False)
+    assert [(r.state, r.attempts, r.error, r.digest) for r in log.rows()] == [("done", 2, "no", "abc"), ("failed", 1, "no", "")]
+    log.put_off([1], "because")
+    assert (log.rows()[1].state, log.rows()[1].attempts, log.rows()[1].error) == ("waiting", 0, "because")
+    log.close()
+    assert isinstance(SerialExecutor().submit(len, "ab").result(), int)

@@ -1,0 +1,258 @@
+"""Simulating on a recorded scan: irregular times, gaps and rows that are not numbers."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zonda.core.configuration.time import Instant
+from zonda.core.data import Data
+from zonda.core.errors import InputError, PointingError, ZondaError
+from zonda.core.projection import rotation_matrices
+from zonda.operators.pointing.daisy import PointingDaisy
+from zonda.operators.pointing.recorded import PointingRecorded
+from zonda.operators.pointing.recording import FLAGGED, NOT_RECORDED, Recording, comb, read
+from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
+
+UNIX = 1732518000.0  # 2024-11-25T07:00:00Z
+NAN = np.nan
+
+
+def recording(seconds: Any, flags: Any = None) -> Recording:
+    t = np.array(seconds, float)
+    return Recording(Instant.parse("2024-11-25T07:00Z"), t, 0.3 + 0.01 * t, 0.8 + 0 * t, "azel",
+                     np.zeros(len(t), bool) if flags is None else np.asarray(flags))  # fmt: skip
+
+
+def write_csv(path: Path, t: Any, az: Any, el: Any, header: str = "time [s], az [deg], el [deg]") -> Path:
+    np.savetxt(path, np.transpose([t, az, el]), fmt="%.12f", delimiter=",", header=header, comments="")
+    return path
+
+
+# ---- the comb
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(2, 300),
+    st.floats(0, 0.2),
+    st.floats(1e-3, 1.0),
+    st.sets(st.integers(1, 298), max_size=100),
+    st.integers(0, 2**31),
+)
+def test_every_row_keeps_its_time_and_direction(n: int, jitter: float, step: float, missing: set[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    there = np.array([k for k in range(n) if k not in missing or k in (0, n - 1)])
+    t = step * (there + jitter * rng.uniform(-1, 1, len(there)))
+    given_rows = recording(t)
+    if len(there) < 3 or np.median(np.diff(there)) != 1:
+        return  # then the commonest interval is another
+    scans = comb(given_rows, 1e9, "test").scans
+    assert len(scans) == 1
+    (scan,) = scans
+    assert len(scan.seconds) == there[-1] - there[0] + 1
+    slots = there - there[0]
+    good = np.flatnonzero(scan.flags == 0)
+    assert np.array_equal(good, slots)
+    assert np.array_equal(scan.seconds[slots], given_rows.seconds)
+    assert scan.longitude[slots] == pytest.approx(given_rows.longitude, abs=1e-14)
+    assert (np.diff(scan.seconds) > 0).all()
+    assert abs(1 / scan.rate - step) <= 2 * 0.2 * step / (len(scan.seconds) - 1) + 1e-12
+
+
+def test_nothing_is_repaired_silently() -> None:
+    t = np.arange(2000) / 100
+    rows = recording(t)
+    rows.longitude[[50, 51, 900]] = NAN
+    rows.latitude[77] = NAN
+    rows.seconds[300] = NAN  # its sample is missing, then
+    rows.seconds[400] = 1.0  # back in time
+    rows.seconds[500] = rows.seconds[499] + 1e-4  # far too early
+    rows.flags[[10, 11]] = True
+    keep = np.r_[0:1000, 1150:2000]  # a gap of 1.5 s
+    cut = Recording(rows.start, rows.seconds[keep], rows.longitude[keep], rows.latitude[keep], "azel", rows.flags[keep])
+    found = comb(cut, 60.0, "test")
+    (scan,) = found.scans
+    assert len(scan.seconds) == 2000
+    assert found.counts == {
+        "rows without a time, dropped": 1,
+        "rows out of order or repeated, dropped": 1,
+        "rows closer than half a sample to the one before, dropped": 1,
+        "rows alone between gaps, dropped": 0,
+        "samples in gaps, flagged": 153,
+        "samples whose row is not a number, flagged": 4,
+        "samples flagged in the file": 2,
+    }
+    expected = np.zeros(2000, np.uint8)
+    expected[[10, 11]] = FLAGGED
+    expected[[50, 51, 900, 77, 300, 400, 500, *range(1000, 1150)]] = NOT_RECORDED
+    assert np.array_equal(scan.flags, expected)
+    assert scan.seconds == pytest.approx(t, abs=1e-12)
+    assert np.isfinite(scan.longitude).all()
+    # in two where the gap is too long to be bridged
+    one, two = comb(cut, 1.0, "test").scans
+    assert (len(one.seconds), len(two.seconds)) == (1000, 850)
+
+
+def test_what_is_no_comb_is_refused() -> None:
+    t = np.cumsum(np.random.default_rng(1).exponential(0.01, 1000))
+    with pytest.raises(InputError, match=r"intervals between rows vary by \d+ % of a sample"):
+        comb(recording(t), 60, "test")
+    with pytest.raises(InputError, match="1 rows with increasing times"):
+        comb(recording([0.0]), 60, "test")
+    with pytest.raises(InputError, match="no two directions next to each other"):
+        comb(Recording(None, np.arange(9.0), np.full(9, NAN), np.zeros(9), "azel", np.zeros(9, bool)), 60, "test")
+
+
+# ---- files
+
+
+def test_a_simulated_scan_read_back_is_the_same_scan(observe: Callable[..., Data], tmp_path: Path) -> None:
+    """SaveTOD's HDF5 and FITS files carry exact times: the boresight comes back to 1e-15, samples to the last bit of time."""
+    import zonda
+
+    made = observe(PointingDaisy(scan_duration="30 s"))
+    (o,) = made.observations
+    for fmt, suffix in (("hdf5", "h5"), ("fits", "fits")):
+        steps = [PointingDaisy(scan_duration="30 s", jitter="0.5 ms"), zonda.WhiteNoise(), zonda.Efficiency()]
+        from zonda.operators.io.save_tod import SaveTOD
+
+        data = zonda.Pipeline([*steps, SaveTOD(format=fmt)]).run(made.scene, output=tmp_path / fmt, threads=1)
+        (first,) = data.observations
+        (again,) = observe(PointingRecorded(file=tmp_path / fmt / f"tod_scan-000.{suffix}")).observations
+        assert again.start == first.start.shifted(float(first.seconds[0]))
+        assert again.seconds == pytest.approx(first.seconds - first.seconds[0], abs=1e-9)
+        assert again.jitter == pytest.approx(0.5e-3, rel=0.05)  # of 3000: 1.3 % standard error
+        assert again.centre == first.centre
+        for name in ("boresight_azel", "boresight_radec"):
+            a, b = (rotation_matrices(getattr(x, name)) for x in (again, first))
+            assert np.abs(a - b).max() < 1e-12  # 1 ns of rounding of the start at 58 arcsec/s: 3e-13
+        assert not again.flags.any()
+    assert first.seconds == pytest.approx(o.seconds, abs=5e-3)
+
+
+@pytest.mark.parametrize("kind", ["csv", "fits", "hdf5"])
+def test_tables(kind: str, observe: Callable[..., Data], tmp_path: Path) -> None:
+    t = np.arange(500) / 50
+    az, el = 120 + 0.1 * np.sin(t), 45 + 0.05 * np.cos(t)
+    path = tmp_path / f"scan.{kind}"
+    if kind == "csv":
+        write_csv(path, UNIX + t, az, el)
+    elif kind == "fits":
+        columns = [fits.Column("TIME", "D", unit="s", array=UNIX + t), fits.Column("AZ", "D", unit="deg", array=az),
+                   fits.Column("EL", "D", unit="deg", array=el), fits.Column("X", "3D", array=np.zeros((500, 3)))]  # fmt: skip
+        fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(path)
+    else:
+        import h5py
+
+        with h5py.File(path, "w") as file:
+            for name, values, unit in (("time", UNIX + t, "s"), ("azimuth", np.radians(az), "rad"), ("elevation", el, "deg")):
+                file.create_dataset(name, data=values).attrs["units"] = unit
+    (o,) = observe(PointingRecorded(file=path), target=None).observations
+    assert str(o.start) == "2024-11-25T07:00:00Z"
+    assert o.sample_rate == pytest.approx(50, rel=1e-8)
+    assert o.seconds == pytest.approx(t, abs=3e-7)  # 0.24 us: all that a float64 holds at 1.7e9 s
+    assert np.degrees(o.azimuth) == pytest.approx(az, abs=1e-8)
+    assert np.degrees(o.elevation) == pytest.approx(el, abs=1e-8)
+    distance = np.hypot((o.ra - o.centre[0]) * np.cos(o.dec), o.dec - o.centre[1])
+    assert distance.max() < np.radians(0.15)
+
+
+def test_clocks_and_celestial_rows(observe: Callable[..., Data], tmp_path: Path) -> None:
+    t = np.arange(200) / 20
+    ra, dec = 75 + 0.01 * np.sin(t), 20 + 0.01 * np.cos(t)
+    mjd = write_csv(tmp_path / "mjd.csv", 60639 + (7 * 3600 + t) / 86400, ra, dec, "mjd, ra [deg], dec [deg]")
+    (o,) = observe(PointingRecorded(file=mjd, clock="mjd")).observations
+    assert abs(o.start.seconds_since(Instant.parse("2024-11-25T07:00Z"))) < 2e-6
+    assert np.degrees(o.ra) == pytest.approx(ra, abs=1e-9)
+    assert np.degrees(o.dec) == pytest.approx(dec, abs=1e-9)
+    since = write_csv(tmp_path / "since.csv", t, ra, dec, "# time [s], ra [deg], dec [deg]")
+    (o,) = observe(PointingRecorded(file=since, clock="scene")).observations
+    assert str(o.start) == "2024-11-25T07:00:00.123456789Z"
+    assert np.array_equal(o.seconds, np.round(t, 12))
+    with pytest.raises(InputError, match="is not of our days as seconds since 1970"):
+        observe(PointingRecorded(file=since))
+    with pytest.warns(UserWarning, match="the weather is that of 2024-11-29"):
+        observe(PointingRecorded(file=mjd, clock="mjd"), time="2024-11-29T07:00Z")
+
+
+def test_bad_files(tmp_path: Path) -> None:
+    t = np.arange(10.0)
+    for header, message in (
+        ("time [s], az, el [deg]", "az has no unit"),
+        ("time [s], az [s], el [deg]", "'s' is no unit of az"),
+        ("time [s], x [deg], y [deg]", "has no column ra and dec; columns: time, x, y"),
+        ("time [s], az [deg]", "the first line names 2 columns, the rows have 3"),
+        ("time [s], az [deg], el [rad]", r"el is 2578.\d+ deg in row 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read(write_csv(tmp_path / "bad.csv", UNIX + t, 10 * t, 45 + 0 * t, header), "unix")
+    (tmp_path / "ragged.csv").write_text("time [s], az [deg], el [deg]\n1,2,3\n1,2\n")
+    with pytest.raises(InputError, match="cannot be read as CSV"):
+        read(tmp_path / "ragged.csv", "unix")
+    (tmp_path / "half.h5").write_bytes(b"\x89HDF\r\n\x1a\nrest")
+    with pytest.raises(InputError, match="cannot be read"):
+        read(tmp_path / "half.h5", "unix")
+    (tmp_path / "binary.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(ZondaError):
+        read(tmp_path / "binary.csv", "unix")
+
+
+def test_a_rotated_boresight_is_refused(tmp_path: Path) -> None:
+    import h5py
+
+    from zonda.operators.pointing.transform import from_angles, multiply
+
+    t = np.arange(20) / 10
+    turned = multiply(from_angles(-1 + 0 * t, 0.8 + 0 * t), np.tile([0, 0, np.sin(0.05), np.cos(0.05)], (20, 1)))
+    with h5py.File(tmp_path / "turned.h5", "w") as file:
+        for name, values in (("times", UNIX + t), ("azimuth", 1 + 0 * t), ("elevation", 0.8 + 0 * t), ("boresight_azel", turned)):
+            file.create_dataset(f"shared/{name}", data=values)
+    with pytest.raises(InputError, match=r"rotated by up to 5\.73 deg about itself"):
+        read(tmp_path / "turned.h5", "unix")
+
+
+def test_outside_the_telescopes_range(observe: Callable[..., Data], tmp_path: Path) -> None:
+    t = np.arange(100.0)
+    path = write_csv(tmp_path / "low.csv", UNIX + t, 10 + 0 * t, np.where(t == 60, 3, 45))
+    with pytest.raises(PointingError, match=r"the boresight is at elevation 3.00 deg, 60 s after .*GBT reaches 5 deg to 90 deg"):
+        observe(PointingRecorded(file=path))
+    write_csv(path, UNIX + t, 10 + 0 * t, np.where(t == 60, NAN, 45))
+    (o,) = observe(PointingRecorded(file=path)).observations
+    assert np.flatnonzero(o.flags).tolist() == [60]
+    assert o.tally.get("PointingRecorded", "samples whose row is not a number, flagged") == 1
+
+
+# ---- jitter
+
+
+def test_jitter_moves_the_pointing_by_speed_times_delay(observe: Callable[..., Data]) -> None:
+    """The direction of every sample is that of the path at its own time, and the delays have the rms asked for."""
+    scan = PointingDaisy(scan_duration="60 s", jitter="1 ms")
+    (o,) = observe(scan).observations
+    assert o.jitter == pytest.approx(1e-3, rel=0.03)  # of 6000: 0.9 % standard error
+    assert abs(o.departures.mean()) < 1e-12
+    assert np.array_equal(o.seconds, observe(scan).observations[0].seconds)
+    assert not np.array_equal(o.seconds, observe(scan, seed=5).observations[0].seconds)
+    transform = CelestialTransform(o.site, o.start, 60.0)
+    x, y = scan.path(o.seconds)
+    ra0, dec0 = o.centre
+    east, north = np.array([-np.sin(ra0), np.cos(ra0), 0]), np.array(
+        [-np.sin(dec0) * np.cos(ra0), -np.sin(dec0) * np.sin(ra0), np.cos(dec0)]
+    )  # fmt: skip
+    sky = unit_vectors(ra0, dec0) + x[:, None] * east + y[:, None] * north
+    sky /= np.linalg.norm(sky, axis=1)[:, None]
+    assert np.abs(rotation_matrices(o.boresight_azel)[:, :, 2] - transform.horizontal(sky, o.seconds)).max() < 1e-12
+    said = {what: text for _, what, text in o.tally}
+    assert "depart from a comb of 100 Hz by 1" in said["scan-000: times of the samples"]
+    assert "of its rms" in said["scan-000: noise and filters take the samples as a comb"]
+
+
+def test_too_much_jitter_is_refused(observe: Callable[..., Data]) -> None:
+    with pytest.raises(PointingError, match="a jitter of 5 ms makes samples change places: they come every 10 ms"):
+        observe(PointingDaisy(scan_duration="60 s", jitter="5 ms"))
