@@ -99,6 +99,7 @@ class Layer:
 class _Drawn:
     """What `AtmosphereLayers.prepare` made of one observation."""
 
+    operator: AtmosphereLayers
     state: AtNodes
     means: dict[str, SmoothField]
     tally: Tally
@@ -210,8 +211,8 @@ class AtmosphereLayers(Operator):
         What is drawn at nodes is kept for the companion runs, which see the same air, unless it is larger than the pointing.
         """
         key = f"{self.label} drawn"
-        if key in observation.resolved:
-            drawn: _Drawn = observation.resolved[key]
+        drawn: _Drawn | None = observation.resolved.get(key)
+        if drawn is not None and drawn.operator is self:
             observation.smooth.update(drawn.means)
             observation.tally.update(drawn.tally)
             return drawn.state
@@ -220,7 +221,7 @@ class AtmosphereLayers(Operator):
             state = self._prepare(observation)
             if isinstance(state, AtNodes) and state.nbytes <= observation.boresight_azel.nbytes:
                 means = {name: observation.smooth[name] for name in ("atmosphere", "transmission")}
-                observation.resolved[key] = _Drawn(state, means, observation.tally)
+                observation.resolved[key] = _Drawn(self, state, means, observation.tally)
         finally:
             whole.update(observation.tally)
             observation.tally = whole
