@@ -4,7 +4,8 @@
 """
 
 KERNELS = (
-    "zonda.core.smooth _evaluate f8:2C f8:2C f8:2C i8 f8:2C",
+    "zonda.core.smooth _lines f8:2C f8:2C i8 f8:2C",
+    "zonda.core.smooth _evaluate f8:2C i8 f8:2C i8 f8:2C",
     "zonda.core.random fill_normals u4:1C i8 i8 f4:1C",
     "zonda.operators.atmosphere.lines_of_sight _on_plane f8:2C i8 f8:1C f8:1C f8:1C f8:2C f8:2C f8:2C",
     "zonda.operators.atmosphere.sampling _boxes f8:2C f8:2C",
@@ -17,16 +18,15 @@ KERNELS = (
     "zonda.operators.atmosphere.sampling _interpolate f8:1C f8:2C f8:2C f8:1C f8:1C i8 i8 i8 i8 u8:2C f8:1C f8:2C",
     "zonda.operators.atmosphere.response _polynomials f8:2C f8:2C f8:2C f8 f8 f8 f8 f8 f8 f8:2C",
     "zonda.core.smooth _prefilter f8:2C f8:1C f8:2C",
-    "zonda.operators.noise.pink _filter u4:1C i8 i8 i8 f4:2C f4:1C f4:1C i8 f4:2C f4:2C",
+    "zonda.core.smooth _lines f8:2C f8:2C i8 f4:2C",
+    "zonda.operators.noise.pink _filter u4:1C i8 i8 i8 f4:2C f4:1C f4:1C i8 f4:2C i8 f4:2C f4:1C f4:1C f4:2C",
     "zonda.operators.sky.sampling _sample f8:2C f8:2C f4:1C f4:1C i8:1C f4:1C i8 i8 f8:1C u1:2C f4:1C f4:2C",
-    "zonda.core.smooth _evaluate f8:2C f8:2C f4:2C i8 f4:2C",
-    "zonda.operators.noise.white _add_normals u4:1C i8 i8 f4:2C f4:2C",
+    "zonda.core.smooth _evaluate f4:2C i8 f4:2C i8 f4:2C",
+    "zonda.operators.noise.white _add_normals u4:1C i8 i8 f4:2C i8 f4:2C b1 f4:2C",
     "zonda.operators.optics.efficiency _calibrate f4:2C f4:2C f4:2C f4:2C f4:2C f4:2C f4:2C f4:1C f4:1C f4:1C b1 f4 f4:2C",
     "zonda.operators.filters.highpass _spread f4:2C i8:1C f4:2C f8:2C",
     "zonda.operators.filters.highpass _subtract f4:2C i8:1C f4:2C f4:2C",
-    "zonda.operators.filters.common_mode _moments f4:2C i8 i8 f8:2C",
-    "zonda.operators.filters.common_mode _product f4:2C i8 i8 f8:1C i8:1C f8:1C f8:1C",
+    "zonda.operators.filters.common_mode _products f4:2C i8 i8 f8:1C i8:1C f8:1C b1 f8:3C",
     "zonda.operators.filters.common_mode _remove f4:2C f8:1C f8:1C",
-    "zonda.operators.maps.grid tangent_pixels f8:2C i8 i8 f8:1C f8:1C i8 i8 i4:2C",
-    "zonda.operators.maps.bin_map _add f4:2C i8 i4:2C b1:1C u1:1C f8:1C f8:1C b1 b1 f8 i8:2C i8:1C f8:1C",
+    "zonda.operators.maps.bin_map _add_image f4:2C f8:2C i8 f8:1C f8:1C i8 i8 b1:1C u1:1C f8:1C f8:1C b1 b1 f8 i8:2C i8:1C f8:1C",
 )
