@@ -845,7 +845,7 @@ def test_wind_along_across_and_against_the_scan(direction: float) -> None:
 
 
 def test_companion_runs_look_through_the_air_that_was_drawn():
-    observation, operator = observe(), AtmosphereLayers(pwv=PWV)
+    observation, operator = observe(), AtmosphereLayers(pwv="7.7 mm")
     first = operator.prepare(observation)
     assert isinstance(first, AtNodes)
     rows, means = list(observation.tally), dict(observation.smooth)
@@ -853,4 +853,4 @@ def test_companion_runs_look_through_the_air_that_was_drawn():
     assert operator.prepare(observation) is first
     assert list(observation.tally) == rows
     assert observation.smooth == means
-    assert AtmosphereLayers(pwv=2 * PWV).prepare(observation) is not first  # another operator's is not taken
+    assert AtmosphereLayers(pwv="15 mm").prepare(observation) is not first  # another operator's is not taken
