@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import os
 import signal
 import sys
@@ -219,11 +220,14 @@ def run(
 
     one_blas_thread()
     ensure_cache()
+    click.get_current_context().call_on_close(gc.enable)
+    gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
     pipeline = pipelines[0]
     file = _load(pipeline, settings)
     if len(pipelines) > 1 or file.header.campaign is not None or engine or workers or scheduler or share:
         if verify or only:
             raise click.UsageError(f"{'--verify' if verify else '--only'} is for one run, not for a campaign")
+        gc.enable()
         from .campaign import command as campaign
 
         campaign.run(
@@ -232,10 +236,11 @@ def run(
             command=_command(pipelines, settings, keep, drop, no_prune),
         )  # fmt: skip
         return
+    from .compile_ahead import Helper
     from .files import check_output_folder, write_text
     from .lock import lock
     from .plan import table
-    from .plan.planner import plan
+    from .plan.remembered import outcome
 
     if only and verify:
         raise click.UsageError("--verify measures the whole pipeline: leave --only out")
@@ -251,13 +256,18 @@ def run(
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
     click.get_current_context().with_resource(lock(folder))
-    made = plan(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
+    helper = Helper()
+    click.get_current_context().call_on_close(helper.close)
+    made = outcome(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
     click.echo(table.line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
     command = _command(pipelines, settings, keep, drop, no_prune, only)
-    provenance = {"resolved_yaml": resolved, "command": command, "plan": table.short(made)}
+    provenance = {"resolved_yaml": resolved, "command": command, "plan": made.short}
+    gc.freeze()
+    gc.enable()
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, ceiling=memory, provenance=provenance)
+    helper.succeeded()
     write_text(folder / "resolved.yaml", resolved)
     counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
     lost = {(who, what) for who, what in counts if what != "samples binned"}

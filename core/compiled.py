@@ -28,6 +28,11 @@ def ensure_cache() -> None:
     warnings.warn("compiled code cannot be kept for the next run; set NUMBA_CACHE_DIR to a folder that lasts", stacklevel=2)
 
 
+def cache_folder() -> str:
+    """Where compiled code is kept, as far as the environment says; empty: beside the source, or in the user's cache folder."""
+    return os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or ""
+
+
 def one_blas_thread() -> None:
     """Let BLAS work on one thread, unless the user says otherwise; call it before numpy is imported.
 

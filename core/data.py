@@ -368,6 +368,8 @@ class Data:
     """Folder (Path) that products are written to; None: nothing is written."""
     run: str = ""
     """Name of the companion run in progress; empty in the main run."""
+    threads: int = 1
+    """Threads that the run may use."""
 
     def product(self, name: str) -> str:
         """The key of a product of the run in progress."""

@@ -25,14 +25,16 @@ class Operator(Parameters):
 
     A pipeline calls, in this order:
 
-    1. ``observe(data)`` once, in order: pointing operators append `Observation`s.
+    1. ``observe(data)`` once, in order: pointing operators append `Observation`s. `at_end` operators come first: what they refuse
+       (an output folder) is refused at once.
     2. For each observation, ``configure(observation)`` of every operator (resolve values that others need: efficiencies,
        NET), then ``prepare(observation) -> state`` of every operator (draw turbulence, build coefficients).
     3. ``exec(block, state)`` for every block. Called from several threads at once: the state is read only, or guarded.
        Its result may depend on absolute detector and sample indices only, never on where the block begins or ends. A block may
        come again (`Block.again`) where the streams between operators do not fit in memory; one that makes no stream is spared.
     4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
-    5. ``finalize(data)`` once at the end of the run: turn sums into products, write files.
+    5. ``finalize(data)`` once at the end of the run: turn sums into products, write files. After it `at_end` operators see
+       ``after_run(data)``.
 
     A campaign (`core.campaign`) shares the observations out among tasks. What `observe` works out from all of them comes from
     `agree` and `lay_out`; between `collect` and `finalize`, `pack` takes a task's partial products out of ``data.products`` and
@@ -161,6 +163,10 @@ class Operator(Parameters):
 
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """Add this observation's partial products to ``data.products``."""
+
+    def after_run(self, data: Data) -> None:
+        """Called for `at_end` operators after the main run and after each companion run: time to begin with what `finalize` will
+        do, in the background, as far as it depends on products that are there and will not change."""
 
     def discard(self, observation: Observation, state: Any) -> None:
         """Undo what `prepare` and `exec` began (temporary files): called instead of `collect` when the run fails."""

@@ -315,9 +315,12 @@ class Pipeline:
             dtype=np.float64 if self.precision == "float64" else np.float32,
             progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
         )
+        data.threads = settings.threads
         timer = Timer()
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:
+            timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
+        for operator in sorted(self.operators, key=lambda o: not o.at_end):  # what only acts at the end may refuse at once
             start = time.thread_time()
             if part is None or not (operator.at_end or operator.label in part.layouts):
                 operator.observe(data)  # pointing steps append observations; map makers lay out the grid of all of them
@@ -389,6 +392,9 @@ class Pipeline:
             data.run = run
             for operator in self._selected(run):
                 self._finalize(operator, data, timer, hooks)
+            for operator in self.operators:
+                if operator.at_end:
+                    operator.after_run(data)
         data.run = ""
         for operator in self.operators:
             if operator.at_end:

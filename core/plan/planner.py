@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -80,21 +80,15 @@ class Plan:
     pruned: bool = True
     costs: Mapping[str, Cost] = dataclasses.field(default_factory=dict)
 
+    @property
+    def operators(self) -> tuple[str, ...]:
+        """Labels of the operators that act."""
+        left_out = {d.operator for d in self.decided if d.choice.leave_out}
+        return tuple(label for label in self.structure.operators if label not in left_out)
+
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators left out."""
-        labels = [o.label for o in Pipeline(file.operators, runs=file.runs).operators]
-        settings = self.settings()
-        left_out = {d.operator for d in self.decided if d.choice.leave_out}
-        steps, kept = [], []
-        for label, step in zip(labels, file.steps, strict=True):
-            if label in left_out or label not in self.structure.operators:
-                continue
-            update = settings.get(label, {})
-            steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
-            kept.append(label)
-        runs = {name: run for name, run in file.runs.items() if name in self.structure.runs}
-        header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **settings.get("pipeline", {})})
-        return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
+        return apply(file, self.operators, self.structure.runs, self.settings())
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """Changed parameters by operator. Lists that several effects set are joined."""
@@ -341,6 +335,22 @@ def _check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Se
         if mine and name not in labels and all(len(d.effect.choices) == 1 for d in mine):
             what = "is not simulated" if mine[0].choice.decision == "not simulated" else "has no coarser form"
             raise ZondaError(f"{name!r} cannot be dropped: it {what}", place="zonda plan", cure="leave out --drop for it")
+
+
+def apply(
+    file: PipelineFile, operators: Collection[str], names: Collection[str], settings: Mapping[str, Mapping[str, Any]]
+) -> PipelineFile:
+    """``file`` with these operators (labels) and companion runs only, parameters changed by ``settings``."""
+    labels = [o.label for o in Pipeline(file.operators, runs=file.runs).operators]
+    steps, kept = [], []
+    for label, step in zip(labels, file.steps, strict=True):
+        if label in operators:
+            update = settings.get(label, {})
+            steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
+            kept.append(label)
+    runs = {name: run for name, run in file.runs.items() if name in names}
+    header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **settings.get("pipeline", {})})
+    return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
 
 
 def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:

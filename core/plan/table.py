@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import shutil
 import textwrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .planner import Decided, Plan, describe, figure, kelvin
+
+if TYPE_CHECKING:
+    from .remembered import Outcome
 
 
 def rows(plan: Plan) -> list[dict[str, Any]]:
@@ -87,7 +90,7 @@ def _effects(plan: Plan, metrics: frozenset[str], width: int) -> list[str]:
     return lines
 
 
-def line(plan: Plan) -> str:
+def line(plan: Plan | Outcome) -> str:
     """The prediction in one line."""
     p, u = plan.prediction, plan.unpruned
     words = f"about {_time(p.total)} of CPU time and {p.bytes / 1e9:.2g} GB"

@@ -74,6 +74,11 @@ class AtNodes:
 
     fits = True
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        return sum(f.weights.nbytes + f.coefficients.nbytes for f in self.fields.values())
+
     def drawn(self) -> tuple[int, float, float]:
         """Number of values of the water, their sum, and that of their squares."""
         return self.sums

@@ -21,7 +21,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSecond
-from zonda.core.data import Block, Data, Observation
+from zonda.core.data import Block, Data, Observation, Tally
 from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.knobs import Knob
@@ -93,6 +93,16 @@ class Layer:
     height: float
     amplitude: float
     wind: Floats
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What `AtmosphereLayers.prepare` made of one observation."""
+
+    operator: AtmosphereLayers
+    state: AtNodes
+    means: dict[str, SmoothField]
+    tally: Tally
 
 
 class _Provides:
@@ -196,7 +206,28 @@ class AtmosphereLayers(Operator):
         self._tracks = dict(zip((o.name for o in data.observations), tracks(data.observations), strict=True))
 
     def prepare(self, observation: Observation) -> AtNodes | OfDetectors:
-        """Lay out the turbulence, draw it at the nodes; set the smooth means."""
+        """Lay out the turbulence, draw it at the nodes; set the smooth means.
+
+        What is drawn at nodes is kept for the companion runs, which see the same air, unless it is larger than the pointing.
+        """
+        key = f"{self.label} drawn"
+        drawn: _Drawn | None = observation.resolved.get(key)
+        if drawn is not None and drawn.operator is self:
+            observation.smooth.update(drawn.means)
+            observation.tally.update(drawn.tally)
+            return drawn.state
+        whole, observation.tally = observation.tally, Tally()
+        try:
+            state = self._prepare(observation)
+            if isinstance(state, AtNodes) and state.nbytes <= observation.boresight_azel.nbytes:
+                means = {name: observation.smooth[name] for name in ("atmosphere", "transmission")}
+                observation.resolved[key] = _Drawn(self, state, means, observation.tally)
+        finally:
+            whole.update(observation.tally)
+            observation.tally = whole
+        return state
+
+    def _prepare(self, observation: Observation) -> AtNodes | OfDetectors:
         _check_pointing(observation)
         track = self._tracks.get(observation.name) or tracks([observation])[0]
         profile, band = self._weather(observation)

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
@@ -19,6 +24,7 @@ from zonda.operators.io.save_map import output_folder
 from zonda.operators.maps.image import Image
 from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 
+from .artist import Artist
 from .plots import SHOWN, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .power_spectrum import Spectrum
 from .time_streams import TimeStream
@@ -63,52 +69,112 @@ class Plots(Operator):
     least_coverage: float = Field(0.1, ge=0, lt=1)
     """Map pixels with fewer samples than this share of the 99th percentile are left grey in the pictures."""
 
+    _artist: Artist | None = PrivateAttr(None)
+    _begun: dict[str, Future[Any]] = PrivateAttr(default_factory=dict)
+
     def observe(self, data: Data) -> None:
-        """Refuse a missing or unwritable output folder before anything is simulated."""
+        """Refuse a missing or unwritable output folder before anything is simulated; let a second process be started."""
         output_folder(data, self.label)
+        self._begun = {}
+        if self._artist is None and data.threads > 1:
+            with suppress(OSError):
+                self._artist = Artist()
+
+    def after_run(self, data: Data) -> None:
+        """Begin with the pictures of what will not change any more."""
+        if self._artist is not None:
+            last = data.run == ["", *data.provenance.get("runs", [])][-1]
+            for drawing in _drawings(data, self._style()):
+                if (drawing.settled or last) and drawing.key not in self._begun:
+                    self._begun[drawing.key] = self._artist.submit(drawing.function, *drawing.arguments())
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(once=3.0 + 0.25 * len(context.observations), bytes=60e6, kernel="python"))
+        return Estimate((), Cost(once=3.0 + 0.25 * len(context.observations), bytes=200e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
-        made = pictures(data, self)
+        try:
+            made = pictures(data, self._style(), self._begun, self._artist)
+        finally:
+            self._begun = {}
+            if self._artist is not None:
+                self._artist.close()
+                self._artist = None
         for picture in made:
             with atomic_path(product_path(folder, picture.name, ".png")) as temporary:
                 temporary.write_bytes(picture.png)
         data.products["pictures"] = made
 
+    def _style(self) -> Plots:
+        """Its parameters alone, for another process."""
+        style = self.model_copy()
+        style._artist, style._begun = None, {}
+        return style
 
-def pictures(data: Data, options: Plots) -> list[Picture]:
-    """Every picture that the products allow, in reading order."""
+
+@dataclass(frozen=True)
+class Drawing:
+    """Pictures to be made by ``function(*arguments())``; ``settled``: from what is there once it can be made,
+    whatever runs follow."""
+
+    key: str
+    function: Callable[..., list[Picture]]
+    arguments: Callable[[], tuple[Any, ...]]
+    settled: bool = True
+
+
+def pictures(
+    data: Data, options: Plots, begun: dict[str, Future[Any]] | None = None, artist: Artist | None = None
+) -> list[Picture]:
+    """Every picture that the products allow, in reading order. ``begun``: by `Drawing.key`, what ``artist`` is drawing."""
+    drawings, coming = list(_drawings(data, options)), dict(begun or {})
+    for drawing in drawings:
+        if artist is not None and drawing.key not in coming:
+            coming[drawing.key] = artist.submit(drawing.function, *drawing.arguments())
     made: list[Picture] = []
+    for drawing in drawings:
+        found = coming[drawing.key].result() if drawing.key in coming else None
+        made += drawing.function(*drawing.arguments()) if found is None else found
+    return made
+
+
+def _drawings(data: Data, options: Plots) -> Iterator[Drawing]:
+    """What there is to draw, in reading order."""
     maps = maps_of(data.products)
     before = _steps_before(data)
     for name, image in data.products.items():
         if isinstance(image, Image) and "/" not in name:
-            made.append(_input(name, image))
+            yield Drawing(f"input {name}", _input, partial(tuple, (name, image)))
     for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
         if not name.startswith("source_free/") and maps[name].contents == "all":
-            made.append(_map(name, maps[name], options))
+            yield Drawing(f"map {name}", _map, partial(tuple, (name, maps[name], options)))
     for name, product in maps.items():
         if "/" not in name:
-            made.append(_coverage(name, product))
+            yield Drawing(f"coverage {name}", _coverage, partial(tuple, (name, product)))
         if noise_sources(maps, name):
-            made.append(_noise(name, maps, options))
+            sources = {k: maps[k] for k in (name, f"source_free/{name}") if k in maps}
+            yield Drawing(f"noise {name}", _noise, partial(tuple, (name, sources, options)), settled=False)
     if data.observations:
-        ax = plot_scan(data.observations)
-        made.append(Picture("scan", "Boresight track", "The boresight about the target, one line per scan.", _png(ax)))
+        yield Drawing("scan", _scan, partial(_tracks, data))
     for name, product in data.products.items():
         if isinstance(product, Spectrum):
-            made.append(_spectra(name, product, before.get(product.label, "")))
+            yield Drawing(f"spectra {name}", _spectra, partial(tuple, (name, product, before.get(product.label, ""))))
         elif isinstance(product, TimeStream):
-            made.extend(_streams(name, product, before.get(product.label, "")))
+            yield Drawing(f"streams {name}", _streams, partial(tuple, (name, product, before.get(product.label, ""))))
         elif isinstance(product, Transfer):
-            made.append(_transfer(name, product))
-    return made
+            yield Drawing(f"transfer function {name}", _transfer, partial(tuple, (name, product)))
+
+
+def _tracks(data: Data) -> tuple[list[Any]]:
+    """What `plot_scan` reads of the observations: they themselves cannot be sent to another process."""
+    tracks = []
+    for o in data.observations:
+        ra, dec, _ = o.derotate("boresight_radec")
+        tracks.append(SimpleNamespace(name=o.name, centre=o.centre, n_samples=o.n_samples, ra=ra, dec=dec))
+    return (tracks,)
 
 
 def _steps_before(data: Data) -> dict[str, str]:
@@ -122,19 +188,22 @@ def _steps_before(data: Data) -> dict[str, str]:
 
 
 def _png(ax: Any) -> bytes:
+    """What ``figure.savefig`` writes, without its rehearsal: it draws everything once more to find the layout."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     stream = io.BytesIO()
-    ax.figure.savefig(stream, format="png", metadata={"Software": "zonda"})
+    FigureCanvasAgg(ax.figure).print_png(stream, metadata={"Software": "zonda"})  # type: ignore[no-untyped-call]
     return stream.getvalue()
 
 
-def _input(name: str, image: Image) -> Picture:
+def _input(name: str, image: Image) -> list[Picture]:
     step = -(-max(image.values.shape) // LARGEST)
     values, wcs = image.values[::step, ::step], image.wcs
     if step > 1:
         wcs = wcs.slice((slice(None, None, step), slice(None, None, step)))
     ax = plot_map(values, wcs, title="Input: the sky before the beam")
     caption = "The input map, before beam, opacity and filters."
-    return Picture(product_path("", name).name, "Input", caption, _png(ax))
+    return [Picture(product_path("", name).name, "Input", caption, _png(ax))]
 
 
 def _shown(product: MapProduct, options: Plots) -> tuple[MapProduct, str]:
@@ -195,7 +264,7 @@ def _draw(
     return _png(ax)
 
 
-def _map(name: str, product: MapProduct, options: Plots) -> Picture:
+def _map(name: str, product: MapProduct, options: Plots) -> list[Picture]:
     run, _, key = name.rpartition("/")
     shown, how = _shown(product, options)
     title = {"": "Map", "noiseless": "Map of the noiseless run"}.get(run, f"Map of run {run}")
@@ -206,14 +275,14 @@ def _map(name: str, product: MapProduct, options: Plots) -> Picture:
     }.get(run, "A companion run.")
     limit = _limit(shown.signal, shown, SHOWN if run == "noiseless" else 99.7)
     png = _draw(name, shown, {"signal": shown.signal}, {"signal": _titled(title, how)}, options, limit)
-    return Picture(product_path("", name).name, title, f"{meaning} {how[0].upper()}{how[1:]}.", png)
+    return [Picture(product_path("", name).name, title, f"{meaning} {how[0].upper()}{how[1:]}.", png)]
 
 
 def _titled(title: str, how: str) -> str:
     return f"{title}, {how.removesuffix(' for this picture')}"
 
 
-def _noise(name: str, maps: dict[str, MapProduct], options: Plots) -> Picture:
+def _noise(name: str, maps: dict[str, MapProduct], options: Plots) -> list[Picture]:
     product = maps[name]
     planes: dict[str, Any] = {}
     titles: dict[str, str] = {}
@@ -235,22 +304,29 @@ def _noise(name: str, maps: dict[str, MapProduct], options: Plots) -> Picture:
         text += (
             f" Weighted rms within the dotted circle of {np.degrees(options.central_diameter) * 60:.3g}′: {', '.join(figures)}."
         )
-    return Picture(product_path("", f"noise_{name}").name, "Noise", text, png)
+    return [Picture(product_path("", f"noise_{name}").name, "Noise", text, png)]
 
 
-def _coverage(name: str, product: MapProduct) -> Picture:
+def _coverage(name: str, product: MapProduct) -> list[Picture]:
     flat = MapView.of(name, product).flat()
     ax = plot_coverage(flat.planes["hits"], flat.wcs)
     suffix = "" if name == "map" else f"_{name}"
-    return Picture(
-        f"coverage{suffix}",
-        "Coverage",
-        f"{int(product.hits.sum()):,} samples in {int((product.hits > 0).sum()):,} pixels.",
-        _png(ax),
-    )
+    return [
+        Picture(
+            f"coverage{suffix}",
+            "Coverage",
+            f"{int(product.hits.sum()):,} samples in {int((product.hits > 0).sum()):,} pixels.",
+            _png(ax),
+        )
+    ]
 
 
-def _spectra(name: str, spectrum: Spectrum, before: str) -> Picture:
+def _scan(observations: list[Any]) -> list[Picture]:
+    ax = plot_scan(observations)
+    return [Picture("scan", "Boresight track", "The boresight about the target, one line per scan.", _png(ax))]
+
+
+def _spectra(name: str, spectrum: Spectrum, before: str) -> list[Picture]:
     where = f"after {before}" if before else f"at step {spectrum.label}"
     ax = plot_spectra(spectrum, title=f"Power spectra of the time streams {where}")
     many = f"{spectrum.detectors} detectors and {spectrum.observations} scan{'s' if spectrum.observations > 1 else ''}"
@@ -258,10 +334,10 @@ def _spectra(name: str, spectrum: Spectrum, before: str) -> Picture:
     if "signal" in spectrum.psd:
         caption += " The signal holds the mean emission too, which changes as the scan moves in elevation."
     suffix = "" if name == "spectrum" else f"_{product_path('', name).name}"
-    return Picture(f"power_spectra{suffix}", "Power spectra", caption, _png(ax))
+    return [Picture(f"power_spectra{suffix}", "Power spectra", caption, _png(ax))]
 
 
-def _transfer(name: str, transfer: Transfer) -> Picture:
+def _transfer(name: str, transfer: Transfer) -> list[Picture]:
     whose = "the sky alone" if transfer.modes == "sky" else "the complete data"
     caption = (
         "The map of the sky alone through all filters against the same map without filters, by angular scale: the ratio of "
@@ -269,7 +345,7 @@ def _transfer(name: str, transfer: Transfer) -> Picture:
         f"dashed, the ratio of amplitudes. Dotted, the beam. Singular modes of {whose}."
     )
     ax = plot_transfer(transfer, title=f"Transfer function, singular modes of {whose}")
-    return Picture(product_path("", name).name, "Transfer function", caption, _png(ax))
+    return [Picture(product_path("", name).name, "Transfer function", caption, _png(ax))]
 
 
 def _streams(name: str, stream: TimeStream, before: str) -> list[Picture]:

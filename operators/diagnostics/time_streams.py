@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -44,7 +43,6 @@ class TimeStream:
     names: list[str]
     observation: str
     label: str
-    lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
 
 class TimeStreams(Operator):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +20,8 @@ Floats = NDArray[np.float64]
 
 ARCMIN = math.pi / 180 / 60
 FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
+SMALL = 1 << 20
+"""Pixels of a map whose distances from the centre are kept."""
 
 
 @dataclass
@@ -84,19 +87,13 @@ class MapProduct:
 
     def distance(self) -> Floats:
         """Angle [rad] of every pixel from the centre, shape of ``signal``."""
-        lon, lat = self.centre
         if self.header is not None:
-            y, x = np.indices(self.signal.shape)
-            wcs = self.wcs
-            there = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0)))
-            phi, theta = there.reshape(2, *self.signal.shape)
-        else:
-            import healpy
+            find = _tangent_distance if self.signal.size <= SMALL else _tangent_distance.__wrapped__
+            return find(self.header.tostring(), self.signal.shape, self.centre)
+        import healpy
 
-            colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
-            theta = np.pi / 2 - colatitude
-        half = np.sin((theta - lat) / 2) ** 2 + np.cos(theta) * np.cos(lat) * np.sin((phi - lon) / 2) ** 2
-        return np.asarray(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1))))
+        colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
+        return _angle(phi, np.pi / 2 - colatitude, self.centre)
 
     def rms(self, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal") -> float:
         """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre (the central arcmin).
@@ -206,3 +203,22 @@ class MapProduct:
         if self.half_difference is not None:
             rows.append(("half-difference rms there", f"{self.rms(of='half_difference'):.3g} {self.unit}"))
         return html_table("Map", rows)
+
+
+@lru_cache(maxsize=1)  # the maps of all runs share it
+def _tangent_distance(header: str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
+    from astropy.io.fits import Header
+    from astropy.wcs import WCS
+
+    y, x = np.indices(shape)
+    phi, theta = np.radians(np.array(WCS(Header.fromstring(header)).wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
+    found = _angle(phi, theta, centre)
+    found.flags.writeable = False
+    return found
+
+
+def _angle(phi: Floats, theta: Floats, centre: tuple[float, float]) -> Floats:
+    """Angle [rad] of directions (longitude, latitude) from the centre."""
+    lon, lat = centre
+    half = np.sin((theta - lat) / 2) ** 2 + np.cos(theta) * np.cos(lat) * np.sin((phi - lon) / 2) ** 2
+    return np.asarray(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1))))

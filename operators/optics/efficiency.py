@@ -172,7 +172,9 @@ def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, i
                 for t in range(m):
                     clipped += not one + x[t] >= opaque
             if sky.shape[0]:
-                row[:] = gain[d] * sky[d, begin : begin + m]
+                a = sky[d, begin : begin + m]
+                for t in range(m):  # an expression of arrays would take 2 s more to compile
+                    row[t] = gain[d] * a[t]
                 if wet.shape[0] and not instantaneous:
                     x = wet[d, begin : begin + m]
                     for t in range(m):

@@ -842,3 +842,15 @@ def test_wind_along_across_and_against_the_scan(direction: float) -> None:
     foreshortened = np.array([wind[0], wind[1] * np.sin(np.radians(50.0))])
     expected = np.hypot(-speed - foreshortened[0], -foreshortened[1])
     np.testing.assert_allclose(step, expected, atol=0.03 * speed)  # the path is an arc: 1.5 deg of azimuth
+
+
+def test_companion_runs_look_through_the_air_that_was_drawn():
+    observation, operator = observe(), AtmosphereLayers(pwv="7.7 mm")
+    first = operator.prepare(observation)
+    assert isinstance(first, AtNodes)
+    rows, means = list(observation.tally), dict(observation.smooth)
+    observation.tally, observation.smooth = type(observation.tally)(), {}  # as a run begins
+    assert operator.prepare(observation) is first
+    assert list(observation.tally) == rows
+    assert observation.smooth == means
+    assert AtmosphereLayers(pwv="15 mm").prepare(observation) is not first  # another operator's is not taken

@@ -12,6 +12,7 @@ from astropy.wcs import WCS
 from matplotlib.figure import Figure
 
 from zonda.core.errors import OutputError
+from zonda.operators.diagnostics import plot_operators
 from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.operators.diagnostics.plots import plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
 from zonda.operators.diagnostics.power_spectrum import Spectrum
@@ -230,6 +231,56 @@ def test_every_picture_is_written(data, products, make_observation):
     assert "even minus odd scans" in noise.caption
     assert "run without the sky" in noise.caption
     assert "smoothed by 9″" in noise.caption
+
+
+def test_a_second_process_draws_the_same(data, products, make_observation):
+    data.observations.append(make_observation(500))
+    data.products.update(products)
+    Plots().finalize(data)
+    alone = data.products.pop("pictures")
+    data.products = {name: product for name, product in products.items() if "/" not in name}
+    data.threads = 2
+    data.provenance["runs"] = {"noiseless": {}, "source_free": {}}
+    operator = Plots()
+    operator.observe(data)
+    operator.after_run(data)  # of the main run
+    begun = set(operator._begun)
+    assert begun == {"input input", "map map", "coverage map", "scan", "spectra spectrum", "streams time_streams"}
+    data.products.update({"noiseless/map": products["noiseless/map"]})
+    data.run = "noiseless"
+    operator.after_run(data)
+    assert set(operator._begun) == begun | {"map noiseless/map"}
+    data.products.update(products)
+    data.run = "source_free"
+    operator.after_run(data)
+    assert set(operator._begun) == begun | {"map noiseless/map", "noise map"}
+    answers = {key: future.result() for key, future in operator._begun.items()}
+    assert all(answers.values())
+    operator.finalize(data)
+    assert operator._artist is None
+    assert sorted(data.products["pictures"], key=lambda p: p.name) == sorted(alone, key=lambda p: p.name)
+
+
+def test_what_the_second_process_fails_at_is_drawn_here(data, products):
+    data.products.update(products)
+    data.threads = 2
+    operator = Plots()
+    operator.observe(data)
+    operator._artist._process.kill()
+    operator.after_run(data)
+    operator.finalize(data)
+    assert {p.name for p in data.products["pictures"]} >= {"input", "map", "noise_map"}
+
+
+def test_the_bytes_are_those_of_savefig(values, wcs):
+    import io
+
+    def figure():
+        return plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC, circle=60 * ARCSEC)
+
+    stream = io.BytesIO()
+    figure().figure.savefig(stream, format="png", metadata={"Software": "zonda"})
+    assert plot_operators._png(figure()) == stream.getvalue()
 
 
 def test_only_what_is_there_is_drawn(data):

@@ -1,0 +1,174 @@
+"""From the command to the maps: what a first and a second `zonda run mustang2_cluster` take, stage by stage.
+
+python benchmarks/startup.py             first run with empty caches, then the best of three further runs
+python benchmarks/startup.py --kernels   write core/kernels.py, the list of what a first run compiles in two processes
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+PIPELINE = "mustang2_cluster"
+
+
+def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dict[str, Any]:
+    """Run the command in this process; (wall, CPU of this process) by stage. ``compiled``: see `listen`."""
+    start, begun = float(os.environ["ZONDA_STARTED"]), 0.0  # wall clock of the command; CPU counts from nothing
+    rows: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
+    last = [start, begun]
+
+    def mark(stage: str) -> None:
+        now = [time.time(), time.process_time()]
+        rows[stage][0] += now[0] - last[0]
+        rows[stage][1] += now[1] - last[1]
+        last[:] = now
+
+    from zonda.core import cli
+
+    def after(module: Any, name: str, stage: str, before: str = "") -> None:
+        usual = getattr(module, name)
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            if before:
+                mark(before)
+            try:
+                return usual(*arguments, **named)
+            finally:
+                mark(stage)
+
+        setattr(module, name, call)
+
+    if compiled is not None:
+        listen(compiled)
+    after(cli, "_load", "read the pipeline file")
+    mark("Python and the command line")
+    import zonda.core.plan.remembered as remembered
+    from zonda.core.execution import Execution
+    from zonda.core.pipeline import Pipeline
+
+    mark("import zonda, numpy, numba, pydantic")
+    after(remembered, "outcome", "plan")
+    usual = Execution.run
+
+    def run(self: Any, data: Any, *arguments: Any) -> None:
+        mark("point the telescope, lay out the map")
+        usual(self, data, *arguments)
+        mark(f"run {data.run or 'main'}")
+
+    Execution.run = run  # type: ignore[method-assign]
+    finalize = Pipeline._finalize
+
+    def finish(self: Any, operator: Any, *arguments: Any) -> None:
+        finalize(self, operator, *arguments)
+        mark(type(operator).__name__ if operator.at_end else "finish the maps")
+
+    Pipeline._finalize = finish  # type: ignore[method-assign]
+    status = cli.main(["run", pipeline, "--output", folder])
+    mark("the rest")
+    if status:
+        raise SystemExit(status)
+    return {"stages": rows}
+
+
+def listen(compiled: list[Any]) -> None:
+    """Note every kernel of zonda that is compiled or loaded: module, name, types, own CPU seconds, whether within another."""
+    import numba.core.event as events
+
+    from zonda.core.compile_ahead import text_of
+
+    class Listener(events.Listener):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self.open: list[list[Any]] = []
+
+        def on_start(self, event: Any) -> None:
+            self.open.append([time.process_time(), 0.0])
+
+        def on_end(self, event: Any) -> None:
+            begun, inside = self.open.pop()
+            took = time.process_time() - begun
+            if self.open:
+                self.open[-1][1] += took
+            function = event.data["dispatcher"].py_func
+            if function.__module__.startswith("zonda."):
+                types = [text_of(t) for t in event.data["args"]]
+                compiled.append([function.__module__, function.__name__, types, took - inside, bool(self.open)])
+
+    events.register("numba:compile", Listener())
+
+
+def child(folder: Path, caches: Path, pipeline: str, kernels: bool = False) -> dict[str, Any]:
+    """One run in a process of its own."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(caches / "numba"), "ZONDA_CACHE_DIR": str(caches / "zonda")}
+    result = folder / "result.json"
+    begun, used = time.time(), os.times()
+    environment["ZONDA_STARTED"] = repr(begun)
+    command = [sys.executable, __file__, "--child", str(folder), "--pipeline", pipeline, *(["--listen"] if kernels else [])]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    wall, now = time.time() - begun, os.times()
+    cpu = now.children_user + now.children_system - used.children_user - used.children_system
+    return {**json.loads(result.read_text()), "wall": wall, "cpu": cpu}
+
+
+def write(rows: list[list[str]]) -> None:
+    """core/kernels.py: its docstring, and ``rows`` (module, name, types)."""
+    path = Path(__file__).parents[1] / "core" / "kernels.py"
+    head = path.read_text().partition("KERNELS")[0]
+    lines = dict.fromkeys(f'    "{" ".join(row)}",' for row in rows)
+    path.write_text(f"{head}KERNELS = (\n" + "\n".join(lines) + "\n)\n")
+
+
+def table(title: str, run: dict[str, Any]) -> str:
+    """One run as Markdown."""
+    lines = [f"| {title} | wall s | CPU s |", "|---|---:|---:|"]
+    for stage, (wall, cpu) in run["stages"].items():
+        if wall >= 0.005:
+            lines.append(f"| {stage} | {wall:.2f} | {cpu:.2f} |")
+    lines.append(f"| **the command, all processes** | **{run['wall']:.2f}** | **{run['cpu']:.2f}** |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pipeline", default=PIPELINE)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--kernels", action="store_true", help="write core/kernels.py")
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    parser.add_argument("--listen", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        compiled: list[Any] | None = [] if options.listen else None
+        found = stages(options.child, options.pipeline, compiled)
+        Path(options.child, "result.json").write_text(json.dumps({**found, "compiled": compiled}))
+        return
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place, "out")
+        folder.mkdir()
+        if options.kernels:
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # one processor: nothing is compiled elsewhere
+            made = child(folder, Path(place, "caches"), options.pipeline, kernels=True)["compiled"]
+            rows = [[m, n, *t] for m, n, t, _, inside in made if not inside and None not in t]
+            write(rows)
+            for module, name, types, seconds, _ in sorted(made, key=lambda row: -row[3]):
+                print(f"{seconds:6.2f} s  {module}.{name} {', '.join(map(str, types))}")
+            print(f"{sum(row[3] for row in made):6.2f} s of CPU time in all")
+            return
+        first = child(folder, Path(place, "caches"), options.pipeline)
+        runs = [child(folder, Path(place, "caches"), options.pipeline) for _ in range(options.repeats)]
+        second = min(runs, key=lambda run: run["wall"])
+        print(table("First run, nothing compiled", first), table("Second run", second), sep="\n\n")
+        print(f"\nCompilation took {first['wall'] - second['wall']:.1f} s of the first run.")
+
+
+if __name__ == "__main__":
+    main()

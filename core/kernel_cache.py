@@ -1,0 +1,180 @@
+"""Where zonda's compiled kernels are kept: one file for each kernel, types of arguments and processor; see `install`.
+
+numba's own cache keeps an index beside numbered files. Two first runs at once may give one number to two kernels, so that the
+next run loads the wrong machine code; a truncated file ends the run with a traceback; and a kernel stays as it was compiled
+when a function of another module that it calls has changed. Here a file's name is a hash of all that its content depends on,
+its content is checked by a hash, and it is written under another name first. So files are written by any number of runs at
+once, damaged ones are compiled again, and nothing stale is ever loaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import secrets
+import warnings
+from contextlib import suppress
+from pathlib import Path
+from types import CodeType
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import caching, dispatcher
+from numba.core.serialize import dumps
+
+FORMAT = 1
+_DIGEST = 16
+SUFFIX = ".zkc"
+
+
+def install() -> None:
+    """Let zonda's kernels be kept as described here; those of other packages stay with numba. Call it before any is defined."""
+    if not hasattr(dispatcher, "FunctionCache") or dispatcher.FunctionCache is _cache_of:
+        return
+    dispatcher.FunctionCache = _cache_of
+
+
+def _cache_of(function: Any) -> Any:
+    if str(function.__module__).partition(".")[0] == "zonda":
+        with suppress(AttributeError, TypeError):  # a numba whose inside has changed: its own cache serves
+            return KernelCache(function)
+    return caching.FunctionCache(function)
+
+
+class KernelCache(caching.FunctionCache):  # type: ignore[misc]
+    """Kept code of one kernel."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        self._cache_file = KernelFiles(self._cache_path, self._impl.filename_base, function)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled kernel, or None where it must be compiled; a damaged file is removed with a warning."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # what unpickling and linking of damaged code may raise has no end
+            self._cache_file.give_up()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled kernel; where the disk is full or read-only it is compiled again next time."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            warnings.warn(f"compiled code cannot be kept for the next run: {error.strerror or error}", stacklevel=2)
+
+
+class KernelFiles:
+    """The files of one kernel; the part of numba's cache that `KernelCache` replaces.
+
+    Parameters
+    ----------
+    folder
+        Where they are.
+    base
+        What their names begin with.
+    function
+        The Python function.
+    """
+
+    def __init__(self, folder: str, base: str, function: Any) -> None:
+        self.folder, self.base, self.function = Path(folder), base, function
+        self._meaning = b""
+        self._last: Path | None = None
+
+    def path(self, key: Any) -> Path:
+        """Of the file for ``key``: (signature, processor, hashes of the function)."""
+        if not self._meaning:
+            self._meaning = meaning(self.function)
+        name = hashlib.blake2b(self._meaning + repr(key).encode(), digest_size=16).hexdigest()
+        return self.folder / f"{self.base}.{name}{SUFFIX}"
+
+    def load(self, key: Any) -> Any:
+        """What was kept under ``key``, or None."""
+        path = self._last = self.path(key)
+        try:
+            content = path.read_bytes()
+        except OSError:
+            return None
+        body = memoryview(content)[_DIGEST:]
+        if hashlib.blake2b(body, digest_size=_DIGEST).digest() != content[:_DIGEST]:
+            self.give_up()
+            return None
+        return pickle.loads(body)
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep ``data`` under ``key``: whole, or not at all. Raises OSError."""
+        path, body = self.path(key), dumps(data)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
+        try:
+            temporary.write_bytes(hashlib.blake2b(body, digest_size=_DIGEST).digest() + body)
+            os.replace(temporary, path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+
+    def give_up(self) -> None:
+        """Remove the file that was asked for last, and say so."""
+        warnings.warn("compiled code in the cache was damaged; it is compiled again", stacklevel=2)
+        if self._last is not None:
+            with suppress(OSError):
+                self._last.unlink(missing_ok=True)
+
+    def flush(self) -> None:
+        """Remove all."""
+        for path in self.folder.glob(f"{self.base}.*{SUFFIX}"):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def meaning(function: Any) -> bytes:
+    """Hash of all that machine code made of ``function`` depends on, but for types and processor: the code and the constants
+    of it and of the kernels that it calls, their options, and the versions of what compiles them."""
+    digest = hashlib.blake2b(digest_size=16)
+    digest.update(_text((FORMAT, numba.__version__, llvmlite.__version__, np.__version__)).encode())
+    _add(digest, function, set())
+    return digest.digest()
+
+
+def _add(digest: Any, function: Any, seen: set[Any]) -> None:
+    if function in seen:
+        return
+    seen.add(function)
+    code = function.__code__
+    kernel = function.__globals__.get(function.__name__)
+    options = getattr(kernel, "targetoptions", {}) if getattr(kernel, "py_func", None) is function else {}
+    digest.update(_text((function.__module__, function.__qualname__, code, function.__defaults__, options)).encode())
+    for name in sorted(_names(code) & function.__globals__.keys()):
+        value = function.__globals__[name]
+        if hasattr(value, "py_func"):  # a kernel
+            _add(digest, value.py_func, seen)
+        elif isinstance(value, np.ndarray):
+            digest.update(_text((name, value.dtype.str, value.shape)).encode() + value.tobytes())
+        elif isinstance(value, (bool, int, float, complex, str, bytes, tuple, np.generic)):
+            digest.update(_text((name, value)).encode())
+
+
+def _text(value: Any) -> str:
+    """`repr` that is the same in every process."""
+    if isinstance(value, CodeType):
+        return _text((value.co_code, value.co_names, value.co_varnames, value.co_consts))
+    if isinstance(value, dict):
+        return f"{{{sorted((_text(k), _text(v)) for k, v in value.items())}}}"
+    if isinstance(value, (set, frozenset)):
+        return f"{{{sorted(map(_text, value))}}}"
+    if isinstance(value, (tuple, list)):
+        return f"({', '.join(map(_text, value))})"
+    return repr(value)
+
+
+def _names(code: CodeType) -> set[str]:
+    """Names that a function and those inside it look up."""
+    found = set(code.co_names)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            found |= _names(constant)
+    return found

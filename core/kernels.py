@@ -1,0 +1,32 @@
+"""Kernels that the shipped pipelines use, in the order of their first use: module, name, types (`compile_ahead.text_of`).
+
+`python benchmarks/startup.py --kernels` writes this file.
+"""
+
+KERNELS = (
+    "zonda.core.smooth _lines f8:2C f8:2C i8 f8:2C",
+    "zonda.core.smooth _evaluate f8:2C i8 f8:2C i8 f8:2C",
+    "zonda.core.random fill_normals u4:1C i8 i8 f4:1C",
+    "zonda.operators.atmosphere.lines_of_sight _on_plane f8:2C i8 f8:1C f8:1C f8:1C f8:2C f8:2C f8:2C",
+    "zonda.operators.atmosphere.sampling _boxes f8:2C f8:2C",
+    "zonda.operators.atmosphere.sampling _extent f8:1C f8:3C f8:1C f8:1C",
+    "zonda.operators.atmosphere.sampling _mark f8:1C f8:3C f8:1C f8:1C i8 i8 i8 i8 u1:2C",
+    "zonda.core.random fill_lattice_normals u4:1C i8 i8 f4:2C",
+    "zonda.operators.atmosphere.turbulence _convolve f4:2C f4:2C f4:2C",
+    "zonda.operators.atmosphere.turbulence _upsample f4:2C i8 i8 f4:1C f4:2C i8 i8",
+    "zonda.operators.atmosphere.turbulence _prefilter f4:2C f4:1C f4:2C",
+    "zonda.operators.atmosphere.sampling _interpolate f8:1C f8:2C f8:2C f8:1C f8:1C i8 i8 i8 i8 u8:2C f8:1C f8:2C",
+    "zonda.operators.atmosphere.response _polynomials f8:2C f8:2C f8:2C f8 f8 f8 f8 f8 f8 f8:2C",
+    "zonda.core.smooth _prefilter f8:2C f8:1C f8:2C",
+    "zonda.core.smooth _lines f8:2C f8:2C i8 f4:2C",
+    "zonda.operators.noise.pink _filter u4:1C i8 i8 i8 f4:2C f4:1C f4:1C i8 f4:2C i8 f4:2C f4:1C f4:1C f4:2C",
+    "zonda.operators.sky.sampling _sample f8:2C f8:2C f4:1C f4:1C i8:1C f4:1C i8 i8 f8:1C u1:2C f4:1C f4:2C",
+    "zonda.core.smooth _evaluate f4:2C i8 f4:2C i8 f4:2C",
+    "zonda.operators.noise.white _add_normals u4:1C i8 i8 f4:2C i8 f4:2C b1 f4:2C",
+    "zonda.operators.optics.efficiency _calibrate f4:2C f4:2C f4:2C f4:2C f4:2C f4:2C f4:2C f4:1C f4:1C f4:1C b1 f4 f4:2C",
+    "zonda.operators.filters.highpass _spread f4:2C i8:1C f4:2C f8:2C",
+    "zonda.operators.filters.highpass _subtract f4:2C i8:1C f4:2C f4:2C",
+    "zonda.operators.filters.common_mode _products f4:2C i8 i8 f8:1C i8:1C f8:1C b1 f8:3C",
+    "zonda.operators.filters.common_mode _remove f4:2C f8:1C f8:1C",
+    "zonda.operators.maps.bin_map _add_image f4:2C f8:2C i8 f8:1C f8:1C i8 i8 b1:1C u1:1C f8:1C f8:1C b1 b1 f8 i8:2C i8:1C f8:1C",
+)

@@ -1,0 +1,130 @@
+"""A plan that was made before: a run of the same file with the same program need not make it again.
+
+What a run takes from a plan is kept in the user's cache folder under a hash of all that the plan depends on: the resolved file,
+the options, the input files (place, time, size), every file of the program, the versions of what it uses, and the processor.
+Nothing is remembered where other distributions provide operators, models or tables, whose insides are not known here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from .. import user_cache
+from ..configuration.pipeline_file import PipelineFile
+from ..discovery import HOST, discover, normalized
+from ..execution import available_memory, available_threads
+from ..pipeline import versions
+from ..program import fingerprint
+from . import table
+from .cost import Prediction
+from .planner import apply, plan
+
+KIND = "plan"
+FOREIGN = ("operators", "mapmakers", "noise_models", "spectra", "weather_sources")
+"""Groups of entry points whose components decide what a plan says."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run takes from a `Plan`; attributes as there.
+
+    Attributes
+    ----------
+    operators, runs
+        Labels of the operators, and names of the companion runs, that act.
+    settings
+        Changed parameters by operator.
+    short
+        Rows for headers and the report (`table.short`).
+    """
+
+    operators: tuple[str, ...]
+    runs: tuple[str, ...]
+    settings: Mapping[str, Mapping[str, Any]]
+    short: list[tuple[str, str, str, str]]
+    prediction: Prediction
+    unpruned: Prediction
+
+    def apply(self, file: PipelineFile) -> PipelineFile:
+        """See `Plan.apply`."""
+        return apply(file, self.operators, self.runs, self.settings)
+
+
+def outcome(
+    file: PipelineFile,
+    *,
+    keep: Sequence[str] = (),
+    drop: Sequence[str] = (),
+    prune_all: bool = True,
+    threads: int | None = None,
+    memory: int | None = None,
+) -> Outcome:
+    """What `plan` finds, from memory where it is there. Arguments and errors as of `plan`."""
+    options = {"keep": list(keep), "drop": list(drop), "prune_all": prune_all, "threads": threads or available_threads()}
+    options["memory"] = memory or f"about 2^{math.log2(available_memory()):.0f}"  # it says where streams fit, no more
+    key = _key(file, options)
+    found = _read(user_cache.recall(KIND, key)) if key else None
+    if found is not None:
+        return found
+    made = plan(file, keep=keep, drop=drop, prune_all=prune_all, threads=threads, memory=memory)
+    fresh = Outcome(made.operators, made.structure.runs, made.settings(), table.short(made), made.prediction, made.unpruned)
+    if key:
+        user_cache.remember(KIND, key, {**asdict(fresh), **{k: list(getattr(fresh, k)) for k in ("operators", "runs")},
+                                        "short": [list(row) for row in fresh.short],
+                                        "prediction": _plain(fresh.prediction), "unpruned": _plain(fresh.unpruned)})  # fmt: skip
+    return fresh
+
+
+def _plain(prediction: Prediction) -> dict[str, Any]:
+    return {**asdict(prediction), "unknown": list(prediction.unknown), "bytes": float(prediction.bytes)}
+
+
+def _read(value: Any) -> Outcome | None:
+    """The outcome that was remembered; None where it is not one."""
+    try:
+        predictions = [Prediction(**{**value[k], "unknown": tuple(value[k]["unknown"])}) for k in ("prediction", "unpruned")]
+        rows = [(str(a), str(b), str(c), str(d)) for a, b, c, d in value["short"]]
+        return Outcome(tuple(value["operators"]), tuple(value["runs"]), dict(value["settings"]), rows, *predictions)
+    except (TypeError, KeyError, ValueError):
+        return None
+
+
+def _key(file: PipelineFile, options: Mapping[str, Any]) -> dict[str, Any] | None:
+    """All that the plan depends on; None: not known."""
+    if any(normalized(found.distribution) != HOST for group in FOREIGN for found in discover(f"zonda.{group}")):
+        return None
+    if any(type(o).__module__.partition(".")[0] != HOST for o in file.operators):
+        return None
+    try:
+        files = [(str(p), (s := p.stat()).st_mtime_ns, s.st_size) for p in sorted(set(_paths([file.scene(), *file.operators])))]
+    except OSError:
+        return None  # the plan will say what is wrong with it
+    return {
+        "file": file.resolved_yaml(),
+        "options": options,
+        "inputs": files,
+        "program": fingerprint(),
+        "versions": versions(),
+        "processor": user_cache.processor(),
+    }
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Every path among the parameters."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from _paths(getattr(value, name))
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _paths(item)
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        for item in value:
+            yield from _paths(item)

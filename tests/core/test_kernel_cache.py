@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import errno
+import importlib.util
+import os
+import subprocess
+import sys
+import warnings
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
+
+from zonda.core import kernel_cache
+from zonda.core.kernel_cache import SUFFIX, KernelCache, KernelFiles, meaning
+from zonda.core.registry import mapmakers, operators
+
+INNER = """
+import numba as nb
+FACTOR = {factor}
+
+@nb.njit(nogil=True, cache=True)
+def inner(x):
+    return FACTOR * x
+"""
+OUTER = """
+import numba as nb
+from zonda.toy_inner import inner
+
+@nb.njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def outer(x):
+    return inner(x) + 1
+"""
+PROCESS = """
+import importlib.util, sys, warnings
+warnings.simplefilter("error")
+import zonda.core.kernel_cache as cache
+cache.install()
+for name in ("toy_inner", "toy_outer"):
+    spec = importlib.util.spec_from_file_location(f"zonda.{name}", f"{sys.argv[1]}/{name}.py")
+    module = sys.modules[f"zonda.{name}"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+print(module.outer(2.0), module.outer(2), sum(module.outer.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    import numba
+
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    kernel_cache.install()
+    write(tmp_path)
+    return tmp_path
+
+
+def write(folder: Path, factor: float = 3.0) -> None:
+    (folder / "toy_inner.py").write_text(INNER.format(factor=factor))
+    (folder / "toy_outer.py").write_text(OUTER)
+
+
+def fresh(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """`outer`, as a new process would have it."""
+    for name in ("toy_inner", "toy_outer"):
+        spec = importlib.util.spec_from_file_location(f"zonda.{name}", folder / f"{name}.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module: ModuleType = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, f"zonda.{name}", module)
+        spec.loader.exec_module(module)
+    return module.outer
+
+
+def kept(folder: Path, name: str = "") -> list[Path]:
+    return sorted(p for p in folder.rglob("*") if name in p.name and SUFFIX in p.name)
+
+
+def hits(kernel: Any) -> int:
+    return sum(kernel.stats.cache_hits.values())
+
+
+def test_compiled_once(folder, monkeypatch):
+    first, second = fresh(folder, monkeypatch), None
+    assert (first(2.0), hits(first)) == (7.0, 0)
+    second = fresh(folder, monkeypatch)
+    assert (second(2.0), hits(second)) == (7.0, 1)
+    assert len(kept(folder, "outer")) == 1
+
+
+@pytest.mark.parametrize("damage", [b"", b"short", "half", "flipped", "pickle"])
+def test_a_damaged_file_is_compiled_again(folder, monkeypatch, damage):
+    assert fresh(folder, monkeypatch)(2.0) == 7.0
+    (path,) = kept(folder, "outer")
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    if damage == "half":
+        damage = whole[:middle]
+    elif damage == "flipped":
+        damage = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+    elif damage == "pickle":  # the digest is right, what it stands for is not
+        import hashlib
+
+        body = b"no pickle"
+        damage = hashlib.blake2b(body, digest_size=16).digest() + body
+    path.write_bytes(damage)
+    again = fresh(folder, monkeypatch)
+    with pytest.warns(UserWarning, match="was damaged; it is compiled again"):
+        assert again(2.0) == 7.0
+    assert hits(again) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mended = fresh(folder, monkeypatch)
+        assert (mended(2.0), hits(mended)) == (7.0, 1)
+
+
+def test_a_change_in_a_called_kernel_counts(folder, monkeypatch):
+    """numba looks at the file of the kernel alone, and would give 7 again."""
+    assert fresh(folder, monkeypatch)(2.0) == 7.0
+    write(folder, factor=4.0)
+    assert fresh(folder, monkeypatch)(2.0) == 9.0
+
+
+def test_a_full_disk_is_no_error(folder, monkeypatch):
+    def full(self, key, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(KernelFiles, "save", full)
+    with pytest.warns(UserWarning, match="cannot be kept for the next run: No space left"):
+        assert fresh(folder, monkeypatch)(2.0) == 7.0
+
+
+def test_a_failed_save_leaves_nothing(tmp_path, monkeypatch):
+    def fail(source, target):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="Input"):
+        KernelFiles(str(tmp_path), "base", kept).save("key", 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def run(folder: Path, **environment: str) -> subprocess.Popen[str]:
+    clean = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    return subprocess.Popen(
+        [sys.executable, "-c", PROCESS, str(folder)],
+        env={**clean, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_first_runs_at_once(tmp_path):
+    """Same answers, no warning, a file for each kernel and type, however strings are hashed."""
+    write(tmp_path)
+    for expected in ("0", "2"):
+        processes = [run(tmp_path, PYTHONHASHSEED=str(k)) for k in range(3)]
+        for process in processes:
+            out, err = process.communicate()
+            assert (out.split()[:2], err) == (["7.0", "7.0"], "")
+            if expected == "2":
+                assert out.split()[2] == expected
+    assert len(kept(tmp_path)) == 4
+
+
+def test_another_processor_has_its_own_files(tmp_path):
+    write(tmp_path)
+    for number, processor in enumerate(("", "generic"), 1):
+        out, err = run(tmp_path, **({"NUMBA_CPU_NAME": processor} if processor else {})).communicate()
+        assert (out.split(), err) == (["7.0", "7.0", "0"], "")
+        assert len(kept(tmp_path)) == 4 * number
+
+
+def test_beside_a_read_only_installation_the_user_keeps_it(tmp_path):
+    program, caches = tmp_path / "program", tmp_path / "home"
+    program.mkdir()
+    write(program)
+    (program / "__pycache__").touch()  # a file: no folder can be made, not even by root
+    for expected in ("0", "2"):
+        out, err = run(program, XDG_CACHE_HOME=str(caches), HOME=str(caches), PYTHONDONTWRITEBYTECODE="1").communicate()
+        assert (out.split(), err) == (["7.0", "7.0", expected], "")
+    assert kept(program) == []
+    assert len(kept(caches)) == 4
+
+
+def test_meaning_covers_options_and_constants(folder, monkeypatch):
+    outer = fresh(folder, monkeypatch)
+    before = meaning(outer.py_func)
+    assert meaning(outer.py_func) == before
+    monkeypatch.setitem(outer.targetoptions, "fastmath", {"contract"})
+    assert meaning(outer.py_func) != before
+
+
+def test_kernels_of_others_stay_with_numba():
+    def kernel(x):
+        return x
+
+    assert type(kernel_cache._cache_of(kernel)) is FunctionCache
+
+
+def test_every_kernel_is_kept_this_way():
+    for registry in (operators, mapmakers):
+        for name in registry:
+            registry.get(name)
+    for name in ("zonda.operators.atmosphere.era5", "zonda.operators.pointing.transform"):
+        import_module(name)
+    found = {
+        id(value): value
+        for module in [m for n, m in sys.modules.items() if n.startswith("zonda.")]
+        for value in vars(module).values()
+        if isinstance(value, Dispatcher) and value.py_func.__module__ in sys.modules
+    }
+    ours = [k for k in found.values() if k.py_func.__module__.startswith("zonda.") and "toy_" not in k.py_func.__module__]
+    assert len(ours) > 30
+    assert [k for k in ours if not isinstance(k._cache, KernelCache)] == []

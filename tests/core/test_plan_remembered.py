@@ -1,0 +1,89 @@
+"""A plan that is remembered is the plan that would be made."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import zonda
+from zonda.core.configuration import locate
+from zonda.core.plan import remembered, table
+from zonda.core.plan.planner import plan
+from zonda.core.plan.remembered import outcome
+
+SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """The shipped pipeline with a sky map of its own, and an empty memory."""
+    monkeypatch.setenv("ZONDA_CACHE_DIR", str(tmp_path / "cache"))
+    shipped = Path(str(locate.shipped()["mustang2_cluster"]))
+    shutil.copytree(shipped.parent / "data", tmp_path / "data")
+    shutil.copy(shipped, tmp_path)
+    return zonda.load(tmp_path / shipped.name, overrides=SHORT)
+
+
+@pytest.fixture
+def no_planning(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise RuntimeError("planned again")
+
+    def switch():
+        monkeypatch.setattr(remembered, "plan", refuse)
+
+    return switch
+
+
+def test_the_same_as_planned(file, no_planning):
+    made = plan(file)
+    first = outcome(file)
+    no_planning()
+    again = outcome(file)
+    assert again == first
+    assert again.short == table.short(made)
+    assert again.apply(file).resolved_yaml() == made.apply(file).resolved_yaml()
+    assert table.line(again).startswith("about ")
+
+
+def test_what_it_depends_on_makes_it_anew(file, tmp_path, no_planning, monkeypatch):
+    outcome(file)
+    no_planning()
+    changes = [
+        lambda: outcome(file, drop=["poles"]),
+        lambda: outcome(file, prune_all=False),
+        lambda: outcome(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "seed=1"])),
+        lambda: outcome(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "AtmosphereLayers.pwv=3 mm"])),
+    ]
+    for change in changes:
+        with pytest.raises(RuntimeError, match="planned again"):
+            change()
+    outcome(file)
+    monkeypatch.setattr(remembered, "fingerprint", lambda: "another program")
+    with pytest.raises(RuntimeError, match="planned again"):
+        outcome(file)
+    monkeypatch.undo()
+
+
+def test_a_changed_input_map(file, tmp_path, no_planning):
+    import os
+
+    outcome(file)
+    no_planning()
+    os.utime(tmp_path / "data" / "merging_cluster.fits", (1, 1))
+    with pytest.raises(RuntimeError, match="planned again"):
+        outcome(file)
+
+
+@pytest.mark.parametrize("value", [None, [], {}, {"operators": 1}, {"operators": [], "runs": [], "settings": {}, "short": [[1]]}])
+def test_foreign_memories_count_as_none(value):
+    assert remembered._read(value) is None
+
+
+def test_others_operators_are_not_remembered(file, monkeypatch):
+    from zonda.core.discovery import Found
+
+    monkeypatch.setattr(remembered, "discover", lambda group: [Found("Mine", "mine:Mine", "zonda-mine", "1")])
+    assert remembered._key(file, {}) is None

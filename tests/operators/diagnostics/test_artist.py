@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import math
+import os
+import warnings
+
+import pytest
+
+from zonda.operators.diagnostics.artist import Artist
+
+
+@pytest.fixture
+def artist():
+    made = Artist()
+    yield made
+    made.close()
+
+
+def test_it_answers_in_order(artist):
+    answers = [artist.submit(math.sqrt, x) for x in (1.0, 4.0, 9.0)]
+    assert [a.result() for a in answers] == [1.0, 2.0, 3.0]
+
+
+def test_failures_warnings_and_what_cannot_be_sent_are_none(artist):
+    assert artist.submit(math.sqrt, -1.0).result() is None
+    assert artist.submit(warnings.warn, "careful").result() is None
+    assert artist.submit(os.getpid).result() != os.getpid()
+    assert artist.submit(math.sqrt, 4.0).result() == 2.0
+    assert artist.submit(lambda: 1).result() is None
+
+
+def test_what_is_printed_does_not_come_between(artist):
+    assert artist.submit(print, "hello").result() is None
+    assert artist.submit(math.sqrt, 4.0).result() == 2.0
+
+
+def test_a_dead_process_is_none(artist):
+    artist._process.kill()
+    artist._process.wait()
+    assert artist.submit(math.sqrt, 4.0).result() is None
+
+
+def test_it_ends_with_its_owner():
+    made = Artist()
+    process = made._process
+    del made
+    assert process.wait(10) is not None
