@@ -124,8 +124,8 @@ def nan_pixels_that_stay(patch: Patch) -> None:
 
 
 def nan_samples_that_count_as_zero(patch: Patch) -> None:
-    add = bin_map._add
-    patch.setattr(bin_map, "_add", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
+    add = bin_map._add_image
+    patch.setattr(bin_map, "_add_image", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
 
 
 def sums_rounded_by_block(patch: Patch) -> None:
