@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import random
+import select
 import shutil
 import signal
 import subprocess
@@ -224,10 +225,21 @@ def forward(place: Path, name: str) -> list[str]:
     return ["run", "c.yaml", "--output", name, "--engine", "serial", "--threads", "1"]
 
 
-def killed(place: Path, nursery: Nursery, name: str, delay: float) -> bool:
-    """Begin or resume, and kill after a while; whether that came in time."""
+def done(place: Path, name: str) -> int:
+    """Number of partial products."""
+    return len(list((place / name / TASKS).glob("[0-9]*.npz")))
+
+
+def killed(place: Path, nursery: Nursery, name: str, moments: random.Random) -> bool:
+    """Begin or resume, and kill at a random moment: after some more tasks and a while; whether that came in time."""
+    before, more, pause = done(place, name), moments.randrange(4), moments.uniform(0, 0.05)
     pid = nursery.begin(*forward(place, name))
-    time.sleep(delay)
+    ended = select.poll()
+    assert nursery.process.stdout is not None
+    ended.register(nursery.process.stdout, select.POLLIN)
+    while done(place, name) < before + more and not ended.poll(2):
+        pass
+    time.sleep(pause)
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, signal.SIGKILL)
     status, said = nursery.end()
@@ -256,13 +268,13 @@ def finish(place: Path, nursery: Nursery, name: str, **options: str) -> str:
 
 
 def test_the_main_process_killed_at_random_moments(place: Path, nursery: Nursery, whole_run: Any) -> None:
-    expected, seconds = whole_run
+    expected = whole_run[0]
     moments, kills, rounds = random.Random(20241121), 0, 0
     while kills < KILLS_OF_THE_MAIN_PROCESS:
         rounds += 1
         name = f"killed-{rounds}"
         while kills < KILLS_OF_THE_MAIN_PROCESS:
-            if not killed(place, nursery, name, moments.uniform(0, 0.4 * seconds)):
+            if not killed(place, nursery, name, moments):
                 break  # it was quicker
             kills += 1
         if not (place / name / "map.fits").exists() or (place / name / TASKS).exists():
