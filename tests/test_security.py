@@ -38,7 +38,7 @@ ALLOWED = {
     ("core/cli.py", "import_module"): "names from a table in the same file",
     ("core/compile_ahead.py", "import_module"): "modules named in core/kernels.py",
     ("core/compile_ahead.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
-    ("core/kernel_cache.py", "pickle.loads"): "machine code that this user compiled, which would be run anyway; as numba's own cache",
+    ("core/kernel_cache.py", "pickle.loads"): "machine code that this user compiled; numba's own cache does the same",
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
     ("core/fits_files.py", "import_module"): "gzip, bz2, lzma, from a table in the same file",
     ("core/hdf5_files.py", "subprocess.run"): "zonda itself, as a child; no shell; the file's path is one argument",
