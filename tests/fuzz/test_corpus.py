@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 HERE = Path(__file__).parent
 FUZZERS = ("yaml", "fits", "hdf5", "text")
-CORPUS = sorted(p for name in FUZZERS for p in (HERE / "corpus" / name).iterdir())
+CORPUS = sorted(p for name in FUZZERS for p in (HERE / "corpus" / name).glob("*"))
 
 
 @cache
