@@ -101,8 +101,5 @@ WORDS = (
 if __name__ == "__main__":
     from zonda.core import hdf5_files
 
-    hdf5_files.PATIENCE = 8.0  # libhdf5 may never come to an end: told before the engine's own limit
-    from zonda.core import hdf5_files
-
     hdf5_files.survey = lambda *_: None  # one process each is too slow
     fuzz("hdf5", target, seeds, longest=60_000, words=WORDS)
