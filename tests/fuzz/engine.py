@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import hashlib
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -118,8 +119,11 @@ def fuzz(
             print(f"\n{name}: {count} inputs in {time.monotonic() - began:.0f} s, {len(told)} kinds of findings", flush=True)
             os._exit(1 if told else 0)
 
+    for found in (CORPUS / name).glob("*"):
+        if not found.name.startswith("hang"):  # what a library hangs on would end the run at once
+            shutil.copy(found, given.work)
     arguments = [
-        sys.argv[0], str(given.work), *([str(CORPUS / name)] if (CORPUS / name).is_dir() else []),
+        sys.argv[0], str(given.work),
         f"-seed={given.seed}", f"-timeout={SECONDS_EACH}", f"-rss_limit_mb={MEGABYTES}", f"-max_len={longest}",
         f"-artifact_prefix={artifacts}/", *([f"-dict={dictionary}"] if words else []), "-verbosity=0", "-print_final_stats=0",
     ]  # fmt: skip
