@@ -36,7 +36,7 @@ PARTS = 8
 SECONDS, SHORTEST = 60.0, 8.0
 """Longest slice, and the shortest before detectors are left out, s."""
 
-COST = 40.0
+COST = 20.0
 """CPU seconds [reference machine] that an audit may take, all its runs: the slice is chosen by it."""
 
 ROUNDING = 1e-6
