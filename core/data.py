@@ -315,6 +315,8 @@ class Stream:
         detector's samples and no sample's detectors are ever out of order, whatever the blocks and threads: what is added up
         tile by tile (`core.tiles`) has the same bits.
         """
+        from .streams import forget_pages
+
         n_det, n_samp = self.shape
         blocks = [
             (slice(d, min(d + SWEEP_DETECTORS, n_det)), slice(t, min(t + SWEEP_SAMPLES, n_samp)))
@@ -323,7 +325,9 @@ class Stream:
         ]
 
         def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
-            return detectors, samples, work(detectors, samples, self.array[detectors, samples])
+            result = work(detectors, samples, self.array[detectors, samples])
+            forget_pages(self.array)
+            return detectors, samples, result
 
         return in_order(one, blocks, self.threads)
 

@@ -225,6 +225,7 @@ def _flag_opaque(label: str, observation: Observation, transmission: SmoothField
         opaque = ~(transmission.weights[rows] @ knots >= OPAQUE)
         dead[rows] = opaque.mean(axis=1) > 0.5
         cell |= opaque[~dead[rows]].any(axis=0)
+    observation.detector_flags[dead] |= FLAG_OPAQUE
     bad = np.repeat(cell[:-1] | cell[1:], transmission.step)[: observation.n_samples]
     observation.flags[bad] |= FLAG_OPAQUE
     observation.tally.count(label, f"detectors flagged: band transmission below {OPAQUE:g}", int(dead.sum()))

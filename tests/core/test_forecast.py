@@ -70,5 +70,5 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
 def test_blocks_that_are_too_large_ask_for_fewer_threads_or_shorter_scans(monkeypatch):
     obs = observation(16, 1_000_000)
     monkeypatch.setattr("zonda.core.forecast.resident_memory", lambda: BASE)
-    with pytest.raises(PipelineError, match=r"(?s)blocks on 4 threads 768 MB.*--threads 1; or split the scan into shorter ones"):
+    with pytest.raises(PipelineError, match=r"(?s)blocks on 4 threads 774 MB.*--threads 1; or split the scan into shorter ones"):
         room(labelled([Source(), Demean(), Sink()]), [obs], Settings(threads=4), 6 * 10**8, "test")
