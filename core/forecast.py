@@ -56,7 +56,7 @@ def forecast(operators: Sequence[Operator], observation: Observation, settings: 
             elsewhere += [f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}" for name in sorted(new)]
             if how == "again":
                 readings = execution.readings(later)
-                again.update({o.label: max(readings, again.get(o.label, 0)) for o in segment.operators})
+                again.update({o.label: max(readings, again.get(o.label, 0)) for o in segment.operators if not o.product_only})
                 source = Source({}, stage, stage.wanted)
                 continue
             size = 0

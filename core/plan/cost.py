@@ -102,7 +102,7 @@ class Prediction:
 def predict(
     context: Context, costs: Mapping[str, Cost | None], threads: int, item: int, memory: int, portable: bool = False
 ) -> Prediction:
-    """Of one run of the pipeline and its companions; streams that memory has no room for are made again as often as they are read.
+    """Of one run of the pipeline and its companions. Streams that memory has no room for may be made again (`forecast`).
 
     Parameters
     ----------
