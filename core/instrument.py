@@ -75,6 +75,10 @@ class Band(Parameters):
         return float(np.trapezoid(self.transmission, self.frequency))
 
 
+GIGAHERTZ_MAX = 1e5
+"""Beyond, a column that was meant to be in GHz is in Hz."""
+
+
 def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     place, cure = f"passband file {path}", "write two columns: frequency in GHz and transmission"
     try:
@@ -85,9 +89,11 @@ def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
         raise InputError(f"cannot be read as numbers: {err}", place=place, cure=cure) from None
     if table.shape[1] != 2 or len(table) < 2:
         raise InputError(f"has {len(table)} rows of {table.shape[1]} columns", place=place, cure=cure)
-    nu, t = table[:, 0] * 1e9, table[:, 1]
     if not np.isfinite(table).all():
         raise InputError("contains NaN or infinity", place=place, cure=cure)
+    if table[:, 0].max() > GIGAHERTZ_MAX:
+        raise InputError(f"has a frequency above {GIGAHERTZ_MAX:g} GHz", place=place, cure=cure)
+    nu, t = table[:, 0] * 1e9, table[:, 1]
     if (np.diff(nu) <= 0).any() or nu[0] <= 0:
         raise InputError("frequencies must be positive and increase", place=place, cure=cure)
     if (t < 0).any() or t.max() <= 0:

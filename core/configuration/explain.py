@@ -103,8 +103,11 @@ def _limit(e: Any, unit: Unit | None, document: Document, path: Path) -> str:
     """``must be at least 5 deg, got -1 deg``, in the unit that the user wrote."""
     key, words = _LIMITS[e["type"]]
     value: Any = document.value
-    for part in path:
-        value = value[part]
+    try:
+        for part in path:
+            value = value[part]
+    except (TypeError, LookupError):  # a key that is there twice: its places are of one, its value of the other
+        value = e["input"]
     limit = e["ctx"][key]
     shown = unit.write_in_unit_of(limit, value) if unit and unit.unit and isinstance(value, str) else f"{limit}"
     return f"must be {words} {shown}, got {value}"

@@ -210,7 +210,7 @@ class AtmosphereLayers(Operator):
 
         What is drawn at nodes is kept for the companion runs, which see the same air, unless it is larger than the pointing.
         """
-        key = f"{self.label} drawn"
+        key = f"{self.label} drawn {observation.seed}"
         drawn: _Drawn | None = observation.resolved.get(key)
         if drawn is not None and drawn.operator is self:
             observation.smooth.update(drawn.means)

@@ -41,6 +41,9 @@ UNITS = {
 }
 """Columns and the units each may have. Humidity is one of relative (mixed phase), density, specific, or mixing ratio (volume)."""
 HUMIDITY = ("relative humidity", "vapour density", "specific humidity", "mixing ratio")
+PRESSURE_MIN = 1e-3
+"""Pa: that of 95 km. Below, the share of water that a humidity gives is not a number one can work with."""
+
 EXAMPLE = "height [m], pressure [hPa], temperature [K], relative humidity [%], wind east [m/s], wind north [m/s]"
 
 
@@ -157,8 +160,9 @@ def _limits(values: dict[str, Array], rows: list[int], place: str) -> None:
 
     height, pressure, temperature = (values[name] for name in ("height", "pressure", "temperature"))
     refuse(np.append(False, np.diff(height) <= 0), "the height does not increase", "sort the rows from the ground up")
+    refuse(pressure < PRESSURE_MIN, f"the pressure is below {PRESSURE_MIN:g} Pa", "check its unit, or leave the row out: no air")
     falls = "the pressure does not fall with height"
-    refuse(np.append(pressure[:1] <= 0, (np.diff(pressure) >= 0) | (pressure[1:] <= 0)), falls, "check pressures and their unit")
+    refuse(np.append(False, np.diff(pressure) >= 0), falls, "check pressures and their unit")
     low, high = TEMPERATURES
     refuse(
         ~((temperature > low) & (temperature < high)), f"the temperature is not between {low:g} and {high:g} K", "check its unit"

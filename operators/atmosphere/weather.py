@@ -431,5 +431,7 @@ def _layer_mean(pressure: Array, mixing_ratio: Array) -> Array:
     low, high = mixing_ratio[:-1], mixing_ratio[1:]
     if not mixing_ratio.all():
         return (low + high) / 2
-    slope = np.log(low / high) / np.log(pressure[:-1] / pressure[1:])
-    return np.asarray((low * pressure[:-1] - high * pressure[1:]) / ((1 + slope) * (pressure[:-1] - pressure[1:])))
+    thickness = np.log(pressure[:-1] / pressure[1:])
+    x = thickness + np.log(low / high)  # (1 + power) x thickness; 0 where the vapour pressure does not change
+    share = np.where(x == 0, 1.0, -np.expm1(-x) / np.where(x == 0, 1.0, x))
+    return np.asarray(low * pressure[:-1] * thickness * share / (pressure[:-1] - pressure[1:]))

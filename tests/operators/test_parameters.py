@@ -187,6 +187,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "scale": ({}, {"scale": 2.0}),
         "spectral_index": ({"file": "flux.fits"}, {"spectral_index": 3.0}),
         "pixels_per_fwhm": ({}, {"pixels_per_fwhm": 8.0}),
+        "interpolation": ({}, {"interpolation": "linear"}),
     },
     "AtmosphereLayers": {
         "pwv": ({}, {"pwv": "5 mm"}),

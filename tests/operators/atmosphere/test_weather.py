@@ -192,3 +192,17 @@ def test_bad_requests_name_cause_and_cure():
             profile(site(), NOVEMBER, pwv)
         with pytest.raises(InputError, match="outside the limits, 0 to 60 mm"):
             profile(site(), NOVEMBER).scaled(pwv)
+
+
+def test_the_mean_of_a_layer_where_the_vapour_pressure_does_not_change():
+    """r = r0 p0 / p between p0 and p1: its mean over mass is r0 p0 ln(p0 / p1) / (p0 - p1), and next to it nearly the same."""
+    pressure, r0 = np.array([900.0, 700.0]), 3e-3
+    exact = r0 * 900.0 * math.log(900.0 / 700.0) / 200.0
+    for power in (-1.0, -1.0 + 1e-12, -1.0 - 1e-9):
+        mixing_ratio = np.array([r0, r0 * (700.0 / 900.0) ** power])
+        assert weather._layer_mean(pressure, mixing_ratio)[0] == pytest.approx(exact, rel=1e-9)
+    # another power against the trapezium rule over 1e4 parts, whose error is 1e-9 here
+    p = np.linspace(700.0, 900.0, 10_001)
+    mixing_ratio = np.array([r0, r0 * (700.0 / 900.0) ** 3.0])
+    mean = np.trapezoid(r0 * (p / 900.0) ** 3.0, p) / 200.0
+    assert weather._layer_mean(pressure, mixing_ratio)[0] == pytest.approx(mean, rel=1e-8)

@@ -434,6 +434,7 @@ def test_table_without_winds_and_with_density(tmp_path):
         ("700, -5", "seven, -5", "line 5: 'seven' is not a number"),
         ("3.0, 700", "1.2, 700", "line 5: the height does not increase"),
         ("3.0, 700", "3.0, 900", "line 5: the pressure does not fall with height"),
+        ("3.0, 700", "3.0, 1e-320", "line 5: the pressure is below 0.001 Pa"),
         ("-18, 20", "-18, -20", "line 6: the relative humidity is negative"),
         ("-18, 20", "-18, 200", "line 6: the relative humidity is above 120 %"),
         ("10, 50", "283, 50", "line 3: the temperature is not between 150 and 340 K"),
