@@ -293,9 +293,6 @@ class Execution:
             hindrance = f"{head.label} reads it as a whole"
         elif {span, following.span} == {"time", "detectors"}:
             hindrance = f"{head.label} needs the other direction whole"
-        heads = [s.operators[0] for s in later]
-        readings = sum(o.sweeps(self.observation) for o in heads if o.couples == "all")
-        readings += round(2 * following.halo / PIECE + 0.4)
         # what is made in order of time at little cost would cost much in any other
         slow = stage.in_time_order and whole_span(following.span, span) == "time"
         rate, cost = DISK_RATE, SAMPLE_COST
@@ -305,7 +302,7 @@ class Execution:
             f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
             size,
             self.observation.n_detectors * self.observation.n_samples,
-            readings=readings,
+            readings=self.readings(later),
             hindrance=hindrance,
             threads=self.settings.threads,
             prefer="spilled" if slow else self.settings.prefer,
@@ -314,6 +311,12 @@ class Execution:
             place=self.observation.name,
             ceiling=self._ceiling_for(2 * (self._store.held + size)),
         )
+
+    def readings(self, later: Sequence[Segment]) -> int:
+        """How often, beyond once, the segments to come read what is passed on to the first of them."""
+        heads = [s.operators[0] for s in later]
+        swept = sum(o.sweeps(self.observation) for o in heads if o.couples == "all")
+        return swept + round(2 * later[0].halo / PIECE + 0.4)
 
     def _cost(self, stage: Stage) -> float:
         """CPU seconds for a sample, from a small block made twice: the first may compile."""

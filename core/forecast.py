@@ -25,11 +25,13 @@ BASE = 230_000_000
 
 @dataclass(frozen=True)
 class Forecast:
-    """Bytes that streams and blocks will take at once; the least budget that would do; what is kept nowhere or on disk."""
+    """Bytes that streams and blocks will take at once; the least budget that would do; what is kept nowhere or on disk; how many
+    times more the operators, by label, act whose streams are made again when they are read."""
 
     bytes: int
     least: int
     elsewhere: tuple[str, ...] = ()
+    again: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
 
 def forecast(operators: Sequence[Operator], observation: Observation, settings: Settings) -> Forecast:
@@ -42,7 +44,7 @@ def forecast(operators: Sequence[Operator], observation: Observation, settings: 
     """
     execution = Execution(operators, observation, settings, Timer(), ())
     segments: list[Segment] = cut(operators, observation)
-    source, held, most, least, elsewhere = Source(), 0, 0, 0, list[str]()
+    source, held, most, least, elsewhere, again = Source(), 0, 0, 0, list[str](), dict[str, int]()
     for number, segment in enumerate(segments):
         later = segments[number + 1 :]
         wanted = set().union(*(o.requires | o.optional for s in later for o in s.operators))
@@ -53,6 +55,8 @@ def forecast(operators: Sequence[Operator], observation: Observation, settings: 
             how, _ = execution.where(stage, sorted(new), size, later, measure=False)
             elsewhere += [f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}" for name in sorted(new)]
             if how == "again":
+                readings = execution.readings(later)
+                again.update({o.label: max(readings, again.get(o.label, 0)) for o in segment.operators if not o.product_only})
                 source = Source({}, stage, stage.wanted)
                 continue
             size = 0
@@ -62,7 +66,7 @@ def forecast(operators: Sequence[Operator], observation: Observation, settings: 
         held += size if later else 0
         nothing = np.empty((0, 0), settings.dtype)
         source = Source.of({name: Stream(name, observation, nothing, {}, 1) for name in stage.wanted}, {})
-    return Forecast(most, least, tuple(elsewhere))
+    return Forecast(most, least, tuple(elsewhere), again)
 
 
 def room(

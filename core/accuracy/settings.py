@@ -19,6 +19,8 @@ Setting = dict[str, str]
 """Values by key, both as ``--set`` takes them: {"PinkNoise.poles": "8"}."""
 
 QUICK_SECONDS, QUICK_SCANS = 30.0, 2
+QUICK_SAMPLES, QUICK_SHORTEST = 6e6, 5.0
+"""Samples of all detectors in all scans above which ``--quick`` makes scans shorter still, down to so many seconds."""
 LENGTH = ("scan_duration", "scans")
 """Parameters of pointing steps that say how long is observed: what `shortened` changes."""
 
@@ -90,7 +92,8 @@ def knobs_of(file: PipelineFile, only: Iterable[str] = ()) -> list[PipelineKnob]
 
 
 def shortened(file: PipelineFile, duration: str | None, quick: bool) -> Setting:
-    """Overrides of the pointing steps' `scan_duration` (and `scans`); ``quick``: at most two scans of 30 s.
+    """Overrides of the pointing steps' `scan_duration` (and `scans`); ``quick``: at most two scans of 30 s,
+    of less where they would hold more than `QUICK_SAMPLES` samples, but not of less than `QUICK_SHORTEST` seconds.
 
     Raises InputError where no pointing step has a `scan_duration`.
     """
@@ -103,13 +106,20 @@ def shortened(file: PipelineFile, duration: str | None, quick: bool) -> Setting:
             continue
         if duration:
             setting[f"{name}.scan_duration"] = duration
-        elif operator.scan_duration > QUICK_SECONDS:
-            setting[f"{name}.scan_duration"] = f"{QUICK_SECONDS:g} s"
+        elif operator.scan_duration > (most := _quick_seconds(file, operator)):
+            setting[f"{name}.scan_duration"] = f"{most:g} s"
         if quick and getattr(operator, "scans", 0) > QUICK_SCANS:
             setting[f"{name}.scans"] = str(QUICK_SCANS)
     if not setting and duration:
         raise InputError("no pointing step has a scan_duration", place="--duration", cure="leave --duration out")
     return setting
+
+
+def _quick_seconds(file: PipelineFile, pointing: Any) -> float:
+    instrument = file.scene().instrument
+    rate = len(instrument.focalplane()) * (getattr(pointing, "sample_rate", None) or instrument.sample_rate)
+    scans = min(max(getattr(pointing, "scans", 1), 1), QUICK_SCANS)
+    return min(max(float(round(QUICK_SAMPLES / (rate * scans))), QUICK_SHORTEST), QUICK_SECONDS)
 
 
 def text(value: Any) -> str:

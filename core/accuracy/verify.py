@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from .child import run
 from .measure import Request, measure
 from .metrics import get
 from .settings import knobs_of, overrides
@@ -61,7 +62,8 @@ def achieved(
 
 
 def retest(front: Front, file: PipelineFile, pipeline: str, points: int | None = None) -> list[Retest]:
-    """Measure the errors of a stored front again (of the ``points`` with the largest errors): errors only, never times.
+    """Measure the errors of a stored front again (of the ``points`` with the largest errors): errors only, never times, and
+    therefore in this process.
 
     Raises InputError where the front is of another pipeline.
     """
@@ -72,7 +74,8 @@ def retest(front: Front, file: PipelineFile, pipeline: str, points: int | None =
     base = (*overrides(front.shorter), f"seed={front.seed}")
 
     def found(setting: dict[str, str]) -> Any:
-        return measure(Request(pipeline, (*base, *overrides(setting)), front.metric, repeats=0)).found[0]
+        request = Request(pipeline, (*base, *overrides(setting)), front.metric, repeats=0)
+        return metric.measure(run(request, metric, None, timed=False)[0])
 
     reference = found(front.reference)
     chosen = sorted((p for p in front.points if p.error > 0), key=lambda p: -p.error)[:points]

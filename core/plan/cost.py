@@ -102,7 +102,7 @@ class Prediction:
 def predict(
     context: Context, costs: Mapping[str, Cost | None], threads: int, item: int, memory: int, portable: bool = False
 ) -> Prediction:
-    """Of one run of the pipeline and its companions.
+    """Of one run of the pipeline and its companions. Streams that memory has no room for may be made again (`forecast`).
 
     Parameters
     ----------
@@ -132,5 +132,11 @@ def predict(
     startup = factors[STARTUP.kernel] * STARTUP.once
     steps = [o for o in context.operators if not o.at_end and "boresight" not in o.provides]
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
-    during = held + forecast(steps, longest, settings).bytes
+    found = forecast(steps, longest, settings)
+    during = held + found.bytes
+    for label, times in found.again.items():  # prepared once, made again
+        if (cost := costs.get(label)) is not None:
+            runs = context.runs.get(label, 1) or 1
+            each = sum(cost.seconds(o.n_samples, o.n_detectors) - cost.fixed for o in context.observations)
+            seconds[label] += factors[cost.kernel] * runs * times * each
     return Prediction(seconds, BASE + max(during, after), unknown, startup, factors)

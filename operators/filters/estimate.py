@@ -26,7 +26,7 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
     """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
     o = context.first
     knots = operator.oversampling * operator.frequency * o.duration
-    cost = Cost(fixed=0.02 + 2e-8 * knots * o.n_detectors, per_time=5e-8, per_sample=3.1e-9, bytes=64.0 * o.n_samples)
+    cost = Cost(fixed=0.02, per_time=5e-8, per_sample=3.1e-9 + 2e-8 * knots / o.n_samples, bytes=64.0 * o.n_samples)
     choices = [full(f"{operator.oversampling:g} knots per cycle of the cut")]
     cut = operator.frequency
     near = LEAKS * context.weighted(lambda f: min((f / cut) ** 4, 1.0), 0.0, cut)

@@ -11,7 +11,8 @@ import pytest
 
 import zonda
 from zonda.core import cli
-from zonda.core.plan.audit import SECONDS, SHORTEST, Audit, Checked, audit, extent, sliced
+from zonda.core.plan.audit import SECONDS, SHORTEST, Audit, Checked, _compare, _Result, audit, extent, sliced
+from zonda.core.plan.estimate import Choice
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
 SET = [a for s in SHORT for a in ("--set", s)]
@@ -136,3 +137,21 @@ def test_a_slice_of_detectors(file):
     assert plane.radius == pytest.approx(whole.radius, rel=0.02)
     assert data.observations[0].n_samples == 200
     assert np.isfinite(data.products["map"].signal).any()
+
+
+class _Map:
+    def __init__(self, signal, hits):
+        self.signal, self.hits = np.asarray(signal), np.asarray(hits)
+
+
+def test_the_sky_is_compared_where_both_maps_hold_the_same_samples():
+    """Three pixels of a hundred with other hits are left out; of twenty, more than a twentieth, nothing is."""
+    choice = Choice("coarse", "test", bound={"peak": 0.5})
+    for n, largest in ((100, 0.25), (20, 3.0)):
+        hits, signal = np.full(n, 7), np.ones(n)
+        other, wrong = hits.copy(), signal.copy()
+        other[:3], wrong[:3], wrong[9] = 6, 4.0, 1.25
+        full, coarse = (_Result([], None, _Map(s, h)) for s, h in ((signal, hits), (wrong, other)))
+        (row,) = [r for r in _compare("sky", choice, full, coarse, None) if r.metric == "peak"]
+        assert row.actual == largest
+        assert row.violated == (n == 20)

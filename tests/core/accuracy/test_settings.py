@@ -69,6 +69,12 @@ def test_shorter_scans(twice):
     assert shortened(quick, None, True) == {}
 
 
+@pytest.mark.parametrize(("name", "seconds"), [("mustang2_cluster", "30 s"), ("atlast_reduced", "5 s"), ("atlast_full", "5 s")])
+def test_quick_scans_of_many_detectors_are_shorter(name, seconds):
+    """223 detectors at 100 Hz, 2 x 30 s: 1.3e6 samples. 3000 at 225 Hz: 6e6 samples are 2 x 4.4 s, and 5 s is the least."""
+    assert shortened(zonda.load(name), None, True)["PointingDaisy.scan_duration"] == seconds
+
+
 def test_a_fragment_is_yaml_and_set_arguments_in_one(twice):
     setting = {"drift.poles": "12", "HighpassFilter.oversampling": "12", "precision": "float32"}
     text = fragment(setting, "a heading")
