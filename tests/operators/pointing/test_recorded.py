@@ -256,3 +256,10 @@ def test_jitter_moves_the_pointing_by_speed_times_delay(observe: Callable[..., D
 def test_too_much_jitter_is_refused(observe: Callable[..., Data]) -> None:
     with pytest.raises(PointingError, match="a jitter of 5 ms makes samples change places: they come every 10 ms"):
         observe(PointingDaisy(scan_duration="60 s", jitter="5 ms"))
+
+
+def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path):
+    """Spreadsheets write one."""
+    path = write_csv(tmp_path / "bom.csv", UNIX + np.arange(20) / 10, np.full(20, 150.0), np.full(20, 45.0))
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(read(path, "unix").seconds) == 20
