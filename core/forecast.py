@@ -99,13 +99,13 @@ def _refuse(operators: Sequence[Operator], parts: Mapping[str, int], blocks: int
     if threads > 1 and blocks * (1 - 1 / threads) >= need - budget:
         cures.append("use --threads 1")
     cures += [f"{o.label}: {o.lighter}" for o in operators if o.lighter and parts[o.label] > 0.1 * need]
-    if blocks > 0.1 * need:
+    if blocks > 0.1 * need and parts["zonda and its libraries"] < budget:
         cures.append("split the scan into shorter ones")
     beyond = f", more than this machine has ({_size(free)})" if need > free else ""
     raise PipelineError(
         f"the run would hold {_size(need)}{beyond}: {largest}; its memory budget is {_size(budget)}",
         place=place,
-        cure="; or ".join(cures),
+        cure="; or ".join(cures or ["use a machine with more memory"]),
     )
 
 

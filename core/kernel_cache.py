@@ -16,7 +16,7 @@ import secrets
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from types import CodeType
+from types import CodeType, FunctionType
 from typing import Any
 
 import llvmlite
@@ -132,8 +132,8 @@ class KernelFiles:
 
 
 def meaning(function: Any) -> bytes:
-    """Hash of all that machine code made of ``function`` depends on, but for types and processor: the code and the constants
-    of it and of the kernels that it calls, their options, and the versions of what compiles them."""
+    """Hash of all that machine code made of ``function`` depends on, but for types and processor: the code and the constants of
+    it, of the kernels that it calls and of what makes its intrinsics; their options; the versions of what compiles them."""
     digest = hashlib.blake2b(digest_size=16)
     digest.update(_text((FORMAT, numba.__version__, llvmlite.__version__, np.__version__)).encode())
     _add(digest, function, set())
@@ -150,8 +150,9 @@ def _add(digest: Any, function: Any, seen: set[Any]) -> None:
     digest.update(_text((function.__module__, function.__qualname__, code, function.__defaults__, options)).encode())
     for name in sorted(_names(code) & function.__globals__.keys()):
         value = function.__globals__[name]
-        if hasattr(value, "py_func"):  # a kernel
-            _add(digest, value.py_func, seen)
+        value = getattr(value, "py_func", getattr(value, "_defn", value))  # of a kernel, of an intrinsic
+        if isinstance(value, FunctionType):
+            _add(digest, value, seen)
         elif isinstance(value, np.ndarray):
             digest.update(_text((name, value.dtype.str, value.shape)).encode() + value.tobytes())
         elif isinstance(value, (bool, int, float, complex, str, bytes, tuple, np.generic)):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +61,7 @@ def run(
                 campaign.share(sources, folder, command, pool, _say, *share, **pruning)
             _say(f"share {share[0]} of {share[1]} is done; when all are: zonda resume {folder}")
         else:
-            with lock(folder):
+            with lock(folder), _told_how_to_go_on(folder):
                 _show(campaign.begin(sources, folder, command, pool, _say, **pruning), verbose)
     click.echo(f"{folder}/")
 
@@ -107,7 +108,7 @@ def resume(
         if pool.executor is None:
             return
         check_output_folder(folder)
-        with lock(folder):
+        with lock(folder), _told_how_to_go_on(folder):
             _show(campaign.resume(folder, pool, _say, anyway=anyway), verbose)
     click.echo(f"{folder}/")
 
@@ -172,6 +173,20 @@ def _campaign_of(job: Job) -> Campaign:
 
     value = yaml_places.load(yaml_places.Source("resolved.yaml", job.source[0])).value
     return Campaign.model_validate((value.get("campaign") if isinstance(value, dict) else None) or {})
+
+
+@contextlib.contextmanager
+def _told_how_to_go_on(folder: Path) -> Iterator[None]:
+    """Name the command that goes on, where a campaign that has begun is interrupted."""
+    from .job import FILE
+
+    try:
+        yield
+    except KeyboardInterrupt:
+        if (folder / FILE).exists():
+            with contextlib.suppress(OSError):
+                _say(f"what is done is kept; to go on: zonda resume {folder}")
+        raise
 
 
 def _say(text: str) -> None:

@@ -101,6 +101,14 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
+    class Workers(ProcessPoolExecutor):
+        """Its processes, which `submit` starts, never see Ctrl-C: not while they import either."""
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            """See `Executor.submit`."""
+            with _ctrl_c_held_back():
+                return super().submit(fn, *args, **kwargs)
+
     count = workers or available_threads()
     threads = threads or max(1, available_threads() // count)
     memory = memory or available_memory() // 2 // count
@@ -109,7 +117,7 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
     def make() -> Executor:
         for old in made:
             _end(old)
-        pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=begin_worker)
+        pool = Workers(count, mp_context=get_context("spawn"), initializer=begin_worker)
         made[:] = [pool]
         return pool
 
@@ -126,11 +134,29 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
         pool.shutdown()
 
 
+@contextlib.contextmanager
+def _ctrl_c_held_back() -> Iterator[None]:
+    """Block SIGINT in this thread and in the processes that it starts, where the system can; one that came is delivered after."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # it unblocks SIGINT when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def begin_worker() -> None:
     """In a new worker process: leave Ctrl-C to the main process, and end when that is gone, however it went."""
     from ..compiled import ensure_cache, one_blas_thread
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     one_blas_thread()
     ensure_cache()
     from multiprocessing import connection, parent_process

@@ -77,8 +77,9 @@ def entries(campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], 
                 if campaign.realizations > 1:
                     place["realization"] = realization
                 combination = tuple((k, v) for k, v in place.items() if not _combined(campaign, k, values))
-                same = used.get((_plain(combination), base), 0)
-                used[_plain(combination), base] = same + 1
+                alike = _plain(tuple(item for item in combination if item[0] != "realization")), base  # never share them
+                same = used.get(alike, 0)
+                used[alike] = same + 1
                 found.append(Entry(place, settings, separate(base, same), moment, combination))
                 if len(found) > MOST_TASKS:
                     raise InputError(f"a campaign of more than {MOST_TASKS} entries", cure="make its axes shorter")

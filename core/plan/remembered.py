@@ -1,7 +1,7 @@
 """A plan that was made before: a run of the same file with the same program need not make it again.
 
 What a run takes from a plan is kept in the user's cache folder under a hash of all that the plan depends on: the resolved file,
-the options, the input files (place, time, size), every file of the program, the versions of what it uses, and the processor.
+the options, the input files (place, times, size), every file of the program, the versions of what it uses, and the processor.
 Nothing is remembered where other distributions provide operators, models or tables, whose insides are not known here.
 """
 
@@ -102,7 +102,7 @@ def _key(file: PipelineFile, options: Mapping[str, Any]) -> dict[str, Any] | Non
     if any(type(o).__module__.partition(".")[0] != HOST for o in file.operators):
         return None
     try:
-        files = [(str(p), (s := p.stat()).st_mtime_ns, s.st_size) for p in sorted(set(_paths([file.scene(), *file.operators])))]
+        files = [(str(p), *_state(p)) for p in sorted(set(_paths([file.scene(), *file.operators])))]
     except OSError:
         return None  # the plan will say what is wrong with it
     return {
@@ -113,6 +113,12 @@ def _key(file: PipelineFile, options: Mapping[str, Any]) -> dict[str, Any] | Non
         "versions": versions(),
         "processor": user_cache.processor(),
     }
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """What changes with a file's content: its times, the second of which nobody sets (``cp -p``, ``touch -r``), and its size."""
+    state = path.stat()
+    return state.st_mtime_ns, state.st_ctime_ns, state.st_ino, state.st_size
 
 
 def _paths(value: Any) -> Iterator[Path]:

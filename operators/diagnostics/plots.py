@@ -278,6 +278,7 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
 def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer function") -> Axes:
     """Share of each angular scale that the filters leave: T with its standard error, and S, the ratio of amplitudes.
 
+    S grows without bound where the beam leaves no sky: above 2 it leaves the picture, so that T can be read.
     Horizontal bars are the rings. The dotted line is the beam's FWHM; the upper axis counts wavelengths.
     """
     ax = _axes(ax, (7.2, 4.6))
@@ -289,7 +290,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     ax.plot(scale, r.amplitude, "--", color=SEQUENCE[1], linewidth=1.2, label="S: ratio of amplitudes")
     ax.set_xscale("log")
     ax.set_xlim(edges[0], edges[-1])
-    top = float(np.nanmax(np.append(r.amplitude, r.transfer), initial=1.0))
+    top = float(np.nanmax(np.append(np.minimum(r.amplitude, 2.0), r.transfer), initial=1.0))
     ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.05 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / arcsec <= edges[0]:
@@ -299,7 +300,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     ax.set_xlabel("angular scale [arcsec]")
     ax.set_ylabel("transfer function")
     ax.grid(which="major", color="0.9", linewidth=0.7)
-    ax.legend(frameon=False, fontsize=9, loc="lower right")
+    ax.legend(frameon=False, fontsize=9, loc="best")
     ax.set_title(title)
     return ax  # type: ignore[no-any-return]
 

@@ -228,6 +228,10 @@ def _scene(data: Data) -> str:
             ("NET on the sky", _spread(plane.net * 1e3, " mK_RJ √s")),
             ("Read-out", f"{rate:.6g} Hz"),
         ]
+    if campaign := data.provenance.get("campaign"):
+        rows.insert(
+            0, ("Campaign", f"{campaign}; this table and the plan are of its first entry, figures of its last, counts of all")
+        )
     for kind, text in (("Site", site.provenance), ("Instrument", instrument.provenance), ("Band", band.provenance)):
         if text:
             rows.append((f"{kind}: source of the numbers", text))

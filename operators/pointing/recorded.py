@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from zonda.core.plan.estimate import Estimate
 
 Floats = NDArray[np.float64]
+
+MOST_CHECKED = 100_000
+"""Samples of a scan that `zonda check` looks at."""
 
 ANOTHER_DAY = 86400.0
 """s between the record and the scene's time from which a run warns: the weather is the scene's."""
@@ -64,10 +68,14 @@ class PointingRecorded(Operator):
     """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
 
     def check(self, data: Data) -> list[str]:
-        """What is in the file."""
+        """What is in the file, and whether the telescope can look there."""
         recording, found = self._read()
-        lines = []
+        lines, start = [], recording.start or data.scene.time
         for scan in found.scans:
+            some = slice(None, None, -(-len(scan.seconds) // MOST_CHECKED))
+            ways = {k: getattr(scan, k)[some] for k in ("seconds", "longitude", "latitude", "flags")}
+            coarse = replace(scan, rate=scan.rate / some.step, **ways)
+            data.observations.append(self._observation(data, start, coarse, recording, len(data.observations)))
             seconds = scan.seconds[-1] - scan.seconds[0]
             good = scan.flags == 0
             text = f"{len(scan.seconds)} samples at {scan.rate:.6g} Hz, {seconds:.1f} s"

@@ -199,7 +199,7 @@ Columns = Mapping[str, tuple[Any, str | None]]
 
 def _csv(path: Path, place: str) -> tuple[Columns, Instant | None]:
     try:
-        with path.open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8-sig") as file:  # spreadsheets begin with a byte order mark
             header = file.readline().lstrip("# ").strip()
             names = [name.strip() for name in header.split(",")]
             table = np.genfromtxt(file, delimiter=",", ndmin=2)

@@ -1,5 +1,6 @@
 """Memory is forecast by the rules of the execution, and what does not fit is refused before anything is prepared."""
 
+import re
 from typing import ClassVar
 
 import numpy as np
@@ -72,3 +73,14 @@ def test_blocks_that_are_too_large_ask_for_fewer_threads_or_shorter_scans(monkey
     monkeypatch.setattr("zonda.core.forecast.resident_memory", lambda: BASE)
     with pytest.raises(PipelineError, match=r"(?s)blocks on 4 threads 774 MB.*--threads 1; or split the scan into shorter ones"):
         room(labelled([Source(), Demean(), Sink()]), [obs], Settings(threads=4), 6 * 10**8, "test")
+
+
+def test_no_cure_is_named_that_cannot_work(monkeypatch):
+    """Less than the libraries take: no shorter scan makes that fit."""
+    obs = observation(16, 1_000_000)
+    monkeypatch.setattr("zonda.core.forecast.resident_memory", lambda: BASE)
+    for free, cure in ((10**10, r"use --memory \d+MB"), (10**8, "use a machine with more memory")):
+        monkeypatch.setattr("zonda.core.forecast.available_memory", lambda free=free: free)
+        with pytest.raises(PipelineError) as refused:
+            room(labelled([Source(), Demean(), Sink()]), [obs], Settings(threads=4), BASE // 2, "test")
+        assert re.fullmatch(cure, refused.value.cure)

@@ -77,6 +77,22 @@ def test_a_changed_input_map(file, tmp_path, no_planning):
         outcome(file)
 
 
+def test_an_input_map_of_other_content_and_the_same_size_and_time(file, tmp_path, no_planning):
+    import os
+
+    path = tmp_path / "data" / "merging_cluster.fits"
+    before = path.stat()
+    outcome(file)
+    no_planning()
+    content = bytearray(path.read_bytes())
+    content[-4000] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert (path.stat().st_mtime_ns, path.stat().st_size) == (before.st_mtime_ns, before.st_size)
+    with pytest.raises(RuntimeError, match="planned again"):
+        outcome(file)
+
+
 @pytest.mark.parametrize("value", [None, [], {}, {"operators": 1}, {"operators": [], "runs": [], "settings": {}, "short": [[1]]}])
 def test_foreign_memories_count_as_none(value):
     assert remembered._read(value) is None

@@ -68,3 +68,21 @@ def test_cores_and_memory_are_shared_among_workers(monkeypatch):
         assert (pool.workers, pool.threads, pool.memory) == (4, 2, 2000)
     with engine("processes") as pool:
         assert (pool.workers, pool.threads) == (8, 1)
+
+
+def test_ctrl_c_does_not_reach_workers_that_start():
+    """A Ctrl-C of the terminal goes to all processes; one that is still importing would show a traceback."""
+    code = (
+        "import os, signal, sys, time\n"
+        "from zonda.core.campaign.engines import engine\n"
+        "if __name__ == '__main__':\n"
+        "    with engine('processes', workers=2) as pool:\n"
+        "        futures = [pool.executor.submit(time.sleep, 0) for _ in range(2)]\n"
+        "        for process in pool.executor._processes.values():\n"
+        "            for _ in range(3):\n"
+        "                os.kill(process.pid, signal.SIGINT)\n"
+        "        print([f.result() for f in futures], signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[None, None] set()\n", "")

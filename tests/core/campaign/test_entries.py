@@ -49,6 +49,18 @@ def test_what_is_co_added_has_its_own_random_numbers_and_what_is_compared_the_sa
     assert len({e.seed for e in together}) == 6
 
 
+@pytest.mark.parametrize("combine", ["all", [], ["night"], ["realization"]])
+def test_realizations_never_share_random_numbers(combine):
+    """Whether they are co-added or not; what is not co-added else does."""
+    found = expand(grid={"site": ["a", "b"]}, nights=2, realizations=3, combine=combine)
+    for site in "ab":
+        for night in (0, 1):
+            seeds = {e.seed for e in found if (e.values["site"], e.values["night"]) == (site, night)}
+            assert len(seeds) == 3
+    shared = {e.seed for e in found if e.values["site"] == "a"} == {e.seed for e in found if e.values["site"] == "b"}
+    assert shared == (combine != "all")
+
+
 def test_seeds_do_not_collide_with_neighbours():
     seeds = [separate(s, k) for s in range(50) for k in range(200)]
     assert len(set(seeds)) == len(seeds)

@@ -116,7 +116,9 @@ def test_time_streams_spectra_pictures_and_report(bench):
     out = bench.run("{nights: 2}", *SERIAL, changes=(("  - SaveMap\n", more),))
     assert len(list(out.glob("entries/*/tod_*.h5"))) == 4
     assert {"map.png", "power_spectra.png", "tod.png", "scan.png", "report.html"} <= {p.name for p in out.iterdir()}
-    assert "000001/scan-001" in (out / "report.html").read_text()
+    report = (out / "report.html").read_text()
+    assert "000001/scan-001" in report
+    assert "this table and the plan are of its first entry" in report
 
 
 def test_other_bands_are_not_co_added(bench, capsys):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -143,6 +145,8 @@ def test_the_picture(transfer, data):
     low, high = ax.get_xlim()
     assert low == pytest.approx(1 / transfer.edges[0] / ARCSEC)
     assert high == pytest.approx(1 / transfer.edges[-1] / ARCSEC)
+    wild = replace(transfer, rings=replace(transfer.rings, amplitude=np.full_like(transfer.rings.amplitude, 50.0)))
+    assert plot_transfer(wild).get_ylim()[1] <= 2.2  # T can still be read
     data.products["transfer_function"] = transfer
     made = {p.name: p for p in pictures(data, Plots())}
     assert made["transfer_function"].png.startswith(b"\x89PNG")

@@ -217,6 +217,17 @@ def test_a_rotated_boresight_is_refused(tmp_path: Path) -> None:
         read(tmp_path / "turned.h5", "unix")
 
 
+def test_outside_the_telescopes_range_is_found_by_check(observe: Callable[..., Data], tmp_path: Path) -> None:
+    t = np.arange(100.0)
+    high = PointingRecorded(file=write_csv(tmp_path / "high.csv", UNIX + t, 10 + 0 * t, 45 + 0 * t))
+    low = PointingRecorded(file=write_csv(tmp_path / "low.csv", UNIX + t, 10 + 0 * t, 3 + 0 * t))
+    data = Data(observe(high).scene)
+    with pytest.raises(PointingError, match=r"the boresight is at elevation 3.00 deg"):
+        low.check(data)
+    assert high.check(data) == ["100 samples at 1 Hz, 99.0 s, elevation 45.00 to 45.00 deg"]
+    assert [o.n_samples for o in data.observations] == [100]
+
+
 def test_outside_the_telescopes_range(observe: Callable[..., Data], tmp_path: Path) -> None:
     t = np.arange(100.0)
     path = write_csv(tmp_path / "low.csv", UNIX + t, 10 + 0 * t, np.where(t == 60, 3, 45))
@@ -256,3 +267,10 @@ def test_jitter_moves_the_pointing_by_speed_times_delay(observe: Callable[..., D
 def test_too_much_jitter_is_refused(observe: Callable[..., Data]) -> None:
     with pytest.raises(PointingError, match="a jitter of 5 ms makes samples change places: they come every 10 ms"):
         observe(PointingDaisy(scan_duration="60 s", jitter="5 ms"))
+
+
+def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path):
+    """Spreadsheets write one."""
+    path = write_csv(tmp_path / "bom.csv", UNIX + np.arange(20) / 10, np.full(20, 150.0), np.full(20, 45.0))
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(read(path, "unix").seconds) == 20
