@@ -13,13 +13,14 @@ import copy
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from .ahead import Ahead, reach
 from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, pieces, trimmed, whole_span, within
 from .data import Block, Data, Floats, Observation, Stream, Tally, in_order
 from .errors import PipelineError
@@ -99,6 +100,10 @@ class Timer:
             return [(*key, seconds) for key, seconds in self.seconds.items()]
 
 
+def _nobody(**what: Any) -> None:
+    """A hook that nobody listens to."""
+
+
 class Execution:
     """One pipeline over one observation."""
 
@@ -114,6 +119,8 @@ class Execution:
         self.operators, self.observation, self.settings, self.timer = list(operators), observation, settings, timer
         self.keep, self.frozen = tuple(keep), frozen
         self.states: dict[str, Any] = {}
+        self.beforehand: Future[None] | None = None
+        self._ahead = Ahead(False)
         self._stop = threading.Event()
         self._local = threading.local()
         self.ledger = Ledger()
@@ -121,21 +128,29 @@ class Execution:
         streams = set(keep).union(*(o.requires | o.optional for o in operators if type(o).exec is not Operator.exec))
         self._streams = frozenset(streams - {"boresight"})
 
-    def run(self, data: Data, before: Callable[..., None], after: Callable[..., None]) -> None:
-        """Configure, prepare, execute and collect; on any failure operators discard what they began."""
+    def run(
+        self,
+        data: Data,
+        before: Callable[..., None],
+        after: Callable[..., None],
+        ahead: Ahead | None = None,
+        following: Execution | None = None,
+    ) -> None:
+        """Configure, prepare, execute and collect; on any failure operators discard what they began.
+
+        ``following``: what ``ahead`` may prepare meanwhile.
+        """
         observation = self.observation
+        self._ahead = ahead or self._ahead
         try:
-            for operator in self.operators:
-                operator.configure(observation)
-            for operator in self.operators:
-                before(operator=operator, observation=observation, stage="prepare")
-                self._same_use(operator.label, "prepare")
-                start = time.thread_time()
-                self.states[operator.label] = operator.prepare(observation)
-                used = time.thread_time() - start
-                self.timer.add(operator.label, "prepare", used)
-                after(operator=operator, observation=observation, stage="prepare", seconds=used)
+            if self.beforehand is not None:
+                self.beforehand.result()
+            else:
+                self._configure()
+            self._prepare(self.operators[len(self.states) :], before, after)
             self._same_use("", "prepared")
+            self._keep_to_ceiling()
+            self._ahead.start(following)
             self._execute(before, after)
             if self.frozen is not None:
                 self.frozen.complete = True
@@ -144,15 +159,44 @@ class Execution:
                 operator.collect(data, observation, self.states[operator.label])
                 self.timer.add(operator.label, "collect", time.thread_time() - start)
         except BaseException:
-            self._stop.set()
-            for operator in self.operators:
-                if operator.label in self.states:
-                    with suppress(Exception):
-                        operator.discard(observation, self.states[operator.label])
+            self.abandon()
             raise
         finally:
             self.states.clear()
             self._store.close()
+
+    def prepare_ahead(self) -> None:
+        """Configure, and prepare what can be prepared while another observation is executed (`core.ahead`); nobody is told."""
+        self._configure()
+        self._prepare(self.operators[: reach(self.operators)], _nobody, _nobody)
+
+    def abandon(self) -> None:
+        """Stop; let operators discard what they began."""
+        self._stop.set()
+        if self.beforehand is not None:
+            self.beforehand.cancel()
+            wait([self.beforehand])
+        for operator in self.operators:
+            if operator.label in self.states:
+                with suppress(Exception):
+                    operator.discard(self.observation, self.states[operator.label])
+        self.states.clear()
+
+    def _configure(self) -> None:
+        for operator in self.operators:
+            operator.configure(self.observation)
+
+    def _prepare(self, operators: Sequence[Operator], before: Callable[..., None], after: Callable[..., None]) -> None:
+        for operator in operators:
+            if self._stop.is_set():
+                return
+            before(operator=operator, observation=self.observation, stage="prepare")
+            self._same_use(operator.label, "prepare")
+            start = time.thread_time()
+            self.states[operator.label] = operator.prepare(self.observation)
+            used = time.thread_time() - start
+            self.timer.add(operator.label, "prepare", used)
+            after(operator=operator, observation=self.observation, stage="prepare", seconds=used)
 
     def _same_use(self, label: str, stage: str) -> None:
         """Let a run with frozen modes use the samples and detectors that the main run used at this point."""
@@ -162,7 +206,6 @@ class Execution:
     # ---- segments
 
     def _execute(self, before: Callable[..., None], after: Callable[..., None]) -> None:
-        self._keep_to_ceiling()
         ordered = [o.label for o in self.operators if o.in_time_order(self.observation, self.states[o.label])]
         segments = cut(self.operators, self.observation, ordered)
         source, begun = Source(), list[Operator]()
@@ -227,7 +270,7 @@ class Execution:
         else:
             stream = source.streams[names[0]]
         before(operator=operator, observation=self.observation, stage="measure")
-        start, others = time.process_time(), self._seconds("exec")
+        start, others = time.process_time(), self._seconds("exec") + self._ahead.seconds()
         state, frozen = self.states[operator.label], self.frozen
         if frozen is not None and frozen.complete:
             operator.measure_frozen(stream, state, frozen.found[operator.label])
@@ -236,7 +279,8 @@ class Execution:
             if frozen is not None and operator.can_freeze:
                 frozen.found[operator.label] = operator.freeze(state)
         self._same_use(operator.label, "measure")
-        used = time.process_time() - start - (self._seconds("exec") - others)  # what makes the stream again is theirs
+        others = self._seconds("exec") + self._ahead.seconds() - others  # what makes the stream again is theirs
+        used = time.process_time() - start - others
         self.timer.add(operator.label, "measure", used)
         after(operator=operator, observation=self.observation, stage="measure", seconds=used)
 

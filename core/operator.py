@@ -55,6 +55,10 @@ class Operator(Parameters):
         ``measure_frozen`` it can take part in companion runs with ``modes: full``.
     main_run_only
         True for operators left out of companion runs (spectra, saved time streams).
+    prepares_ahead
+        True where `configure` and `prepare` may be called for the next observation, from another thread, while `exec`, `measure`
+        and `collect` work on the one before: they change only that observation and what a lock guards. Neither is ever called for
+        two observations at once. A class that overrides one of the two must say so itself; one that overrides none need not.
     at_end
         True for operators that only act in `finalize` (plots, reports): they run once, after all companion runs.
     product_only
@@ -72,6 +76,7 @@ class Operator(Parameters):
     optional: ClassVar[frozenset[str]] = frozenset()
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
     main_run_only: ClassVar[bool] = False
+    prepares_ahead: ClassVar[bool] = False
     at_end: ClassVar[bool] = False
     product_only: ClassVar[bool] = False
     knobs: ClassVar[tuple[Knob, ...]] = ()

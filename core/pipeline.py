@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from . import ahead as preparation
+from .ahead import Ahead
 from .configuration.parameters import Parameters
 from .data import Data, Tally, html_table
 from .errors import PipelineError
@@ -316,6 +318,8 @@ class Pipeline:
             progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
         )
         data.threads = settings.threads
+        listeners = hooks.zonda_before_operator.get_hookimpls() or hooks.zonda_after_operator.get_hookimpls()
+        ahead = Ahead(settings.threads > 1 and not listeners)  # who listens hears of one observation after the other
         timer = Timer()
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:
@@ -331,7 +335,7 @@ class Pipeline:
             raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
         if part is not None and part.scans is not None:
             data.observations = [data.observations[k] for k in part.scans]
-        self._keep_to(ceiling, memory, data, settings)
+        self._keep_to(ceiling, memory, data, settings, ahead)
         pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         freeze = any(run.modes == "full" for run in self.runs.values())
         frozen = [Frozen() if freeze else None for _ in data.observations]
@@ -339,16 +343,28 @@ class Pipeline:
             data.run = run
             steps = self._selected(run)
             same = not run or self.runs[run].modes == "full"
-            for observation, (focalplane, flags, detector_flags), kept in zip(data.observations, pristine, frozen, strict=True):
+
+            def begin(number: int, same: bool = same, run: str = run, steps: list[Operator] = steps) -> Execution:
+                observation, (focalplane, flags, detector_flags) = data.observations[number], pristine[number]
                 before, observation.tally = observation.tally, Tally()
                 if not run:
                     observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
                 observation.focalplane, observation.smooth = focalplane.copy(), {}
                 observation.output = data.output
                 observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
-                execution = Execution(steps, observation, settings, timer, keep if not run else (), kept if same else None)
-                execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator)
-                data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
+                kept = frozen[number] if same else None
+                return Execution(steps, observation, settings, timer, keep if not run else (), kept)
+
+            try:
+                following: Execution | None = begin(0)
+                for number, observation in enumerate(data.observations, 1):
+                    execution = following
+                    assert execution is not None
+                    following = begin(number) if number < len(data.observations) else None
+                    execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, ahead, following)
+                    data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
+            finally:
+                ahead.close()
             for operator in steps:
                 if part is None:
                     self._finalize(operator, data, timer, hooks)
@@ -402,13 +418,17 @@ class Pipeline:
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 
-    def _keep_to(self, ceiling: int | None, memory: int | None, data: Data, settings: Settings) -> None:
+    def _keep_to(self, ceiling: int | None, memory: int | None, data: Data, settings: Settings, ahead: Ahead) -> None:
         """Divide what the process may hold; refuse what does not fit."""
         if ceiling is None and memory is not None:
             return
         budget = ceiling or resident_memory() + available_memory() // 2
         left, products = room(self._selected(""), data.observations, settings, budget, self.name)
         settings.memory = min(left, memory or left)
+        if ahead.on and len(data.observations) > 1:
+            size = preparation.affordable(self._selected(""), data.observations, settings)
+            ahead.on = size is not None
+            settings.memory, products = settings.memory - (size or 0), products + (size or 0)
         settings.ceiling = budget - products
 
     def _finalize(self, operator: Operator, data: Data, timer: Timer, hooks: Any) -> None:

@@ -50,6 +50,7 @@ class Efficiency(Operator):
     """Telescope efficiencies, opacity and calibration: equation (1). Writes ``signal``; the components stay as they are."""
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    prepares_ahead: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
 
     main_beam: Fraction | None = Field(None, gt=0, le=1)
