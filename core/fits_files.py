@@ -88,7 +88,10 @@ def _next_header(file: IO[bytes], place: str) -> int:
                 size = math.prod(found.get(b"NAXIS%d" % k, 0) for k in range(1, found.get(b"NAXIS", 0) + 1))
                 size = size if found.get(b"NAXIS", 0) > 0 else 0
                 size = abs(found.get(b"BITPIX", 8)) // 8 * found.get(b"GCOUNT", 1) * (size + found.get(b"PCOUNT", 0))
-                return 2880 + size if 0 <= size < 2**62 else 0
+                if size < 0:  # astropy would go back in the file and never come to its end
+                    message = "a header claims data of a negative length (NAXISn, PCOUNT, GCOUNT)"
+                    raise InputError(message, place=place, cure="the file is corrupt: copy or make it again")
+                return 2880 + size if size < 2**62 else 0
         if len(block) < 2880:
             return 0
     raise InputError(

@@ -92,7 +92,7 @@ class Plots(Operator):
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(once=3.0 + 0.25 * len(context.observations), bytes=200e6, kernel="python"))
+        return Estimate((), Cost(once=2.0 + 0.25 * len(context.observations), bytes=200e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)

@@ -27,7 +27,7 @@ WHITE = Cost(per_sample=3.3e-9, kernel="random")
 
 def pink_cost(poles: int) -> Cost:
     """The kernel takes poles four at a time."""
-    return Cost(fixed=0.01, per_sample=3.4e-9 + 1.5e-9 * math.ceil(poles / 4), kernel="random")
+    return Cost(fixed=0.01, per_sample=2.4e-9 + 1.05e-9 * math.ceil(poles / 4), kernel="random")
 
 
 def white_traits(level: NoiseLevel, observation: Observation) -> Traits:

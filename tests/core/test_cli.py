@@ -153,7 +153,7 @@ def test_help_lists_commands_of_plugins(here: Path, capsys: pytest.CaptureFixtur
 
 
 def test_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["run", "p.yaml", "--set", "Ones.value=2", "--threads", "2", "--memory", "500MB"]) == 0
+    assert cli.main(["run", "p.yaml", "--set", "Ones.value=2", "--threads", "2", "--memory", "4GB"]) == 0
     out, err = capsys.readouterr()
     assert out == "out/p/\n"
     assert f"Ones: samples: {7 * 4096}" in err
