@@ -210,6 +210,8 @@ class Unit:
 
         try:
             parsed = u.Unit(unit)
+            if isinstance(parsed, u.StructuredUnit):  # "m, s"
+                raise ValueError("several units")
         except (ValueError, TypeError) as err:
             hint = re.search(r"Did you mean ([^?]*)\?", str(err))
             otherwise = f"did you mean {hint[1]}?" if hint else f"expected {self.kind.noun}, e.g. '{self.example}'"
