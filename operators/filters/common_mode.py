@@ -41,6 +41,7 @@ from zonda.core.streams import forget_pages
 from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
+from .focal_plane_mean import LANES, add_moments
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -486,8 +487,6 @@ def _directions(step: int, n_detectors: int) -> Floats:
 TILES_AT_ONCE = 4
 """Tiles in one call of the kernel."""
 
-LANES = 32
-
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
@@ -504,25 +503,9 @@ def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
 def _moments(array, start, stop, rows, out):  # type: ignore[no-untyped-def]
     """Adds the sum and sum of squares of each of ``rows`` over samples start .. stop - 1 to out[:2] (2, n_det)."""
-    n = stop - start
-    whole = n // LANES * LANES
-    first, second = np.empty(LANES), np.empty(LANES)
+    lanes = np.empty((2, LANES))
     for d in rows:
-        row = array[d, start:stop]
-        first[:] = 0.0
-        second[:] = 0.0
-        for base in range(0, whole, LANES):
-            x = row[base : base + LANES]
-            for i in range(LANES):
-                y = np.float64(x[i])
-                first[i] += y
-                second[i] += y * y
-        for t in range(whole, n):
-            first[0] += row[t]
-            second[0] += np.float64(row[t]) ** 2
-        for i in range(LANES):
-            out[0, d] += first[i]
-            out[1, d] += second[i]
+        add_moments(array[d, start:stop], lanes, out[:, d])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})

@@ -88,11 +88,32 @@ LANES = 32
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def add_moments(row, lanes, out):  # type: ignore[no-untyped-def]
+    """Add the sum and the sum of squares of ``row`` (n,) to ``out`` (2,). ``lanes`` (2, LANES): scratch."""
+    n = row.size
+    whole = n // LANES * LANES
+    first, second = lanes[0], lanes[1]
+    first[:] = 0.0
+    second[:] = 0.0
+    for base in range(0, whole, LANES):
+        x = row[base : base + LANES]
+        for i in range(LANES):
+            y = np.float64(x[i])
+            first[i] += y
+            second[i] += y * y
+    for t in range(whole, n):
+        first[0] += row[t]
+        second[0] += np.float64(row[t]) ** 2
+    for i in range(LANES):
+        out[0] += first[i]
+        out[1] += second[i]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
 def _look(part, start, stop, use, sums, range_of, moments):  # type: ignore[no-untyped-def]
     """Add samples start .. stop - 1 of ``part`` to ``sums`` (tiles, n), ``range_of`` (2, n) and ``moments`` (2, n_det)."""
     n = stop - start
-    whole = n // LANES * LANES
-    first, second = np.empty(LANES), np.empty(LANES)
+    lanes = np.empty((2, LANES))
     low, high = range_of[0], range_of[1]
     for d in range(part.shape[0]):
         row = part[d, start:stop]
@@ -103,17 +124,4 @@ def _look(part, start, stop, use, sums, range_of, moments):  # type: ignore[no-u
                 total[t] += x
                 low[t] = min(low[t], x)
                 high[t] = max(high[t], x)
-        first[:] = 0.0
-        second[:] = 0.0
-        for base in range(0, whole, LANES):
-            x = row[base : base + LANES]
-            for i in range(LANES):
-                y = np.float64(x[i])
-                first[i] += y
-                second[i] += y * y
-        for t in range(whole, n):
-            first[0] += row[t]
-            second[0] += np.float64(row[t]) ** 2
-        for i in range(LANES):
-            moments[0, d] += first[i]
-            moments[1, d] += second[i]
+        add_moments(row, lanes, moments[:, d])
