@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -58,6 +59,11 @@ class SerialExecutor(Executor):
         except Exception as err:
             future.set_exception(err)
         return future
+
+
+def engine_failed(err: BaseException) -> bool:
+    """Whether a call did not run to its end for a reason of the engine: a worker that is gone, a scheduler that is not there."""
+    return isinstance(err, BrokenExecutor | CancelledError) or type(err).__module__.partition(".")[0] in ("distributed", "dask")
 
 
 @contextlib.contextmanager
@@ -210,6 +216,7 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
         import distributed
     except ImportError as err:
         raise _missing("dask.distributed", "dask", err) from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a scheduler that is gone is told without its traceback
     if scheduler is None:
         raise PipelineError(
             "no Dask scheduler is named",

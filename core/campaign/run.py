@@ -17,7 +17,7 @@ from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..files import check_output_folder, discard, temporary_sibling, write_text
 from . import log as joblog
 from . import parts
-from .engines import Pool
+from .engines import Pool, engine_failed
 from .job import FILE, LOG, TASKS, Job, Task, digest_of_text
 from .log import Log
 from .prepare import Source, changed, restore_layout
@@ -362,7 +362,14 @@ def _combine(
             ended = set(done)
         for future in ended:
             number = at_work.pop(future)
-            combined = future.result()
+            try:
+                combined = future.result()
+            except (Exception, CancelledError) as err:
+                if not engine_failed(err):
+                    raise
+                raise PipelineError(
+                    f"the engine failed when it combined the maps: {err}", place=str(folder), cure=f"zonda resume {folder}"
+                ) from None
             if combined.error is not None:
                 raise combined.error
             log.combine(number)
@@ -434,7 +441,9 @@ def _clean(folder: Path) -> None:
     """Remove what killed workers left half written."""
     for place in (folder, folder / TASKS, *(folder / "entries").glob("*")):
         for path in place.glob(".*.part*"):
-            if path.is_file():
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
                 discard(path)
 
 
