@@ -370,7 +370,11 @@ class Pipeline:
                     self._finalize(operator, data, timer, hooks)
                 else:
                     part.take(operator, data)
+            if not run:
+                main = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         data.run = ""
+        for observation, (plane, flags, detector_flags) in zip(data.observations, main, strict=True):
+            observation.focalplane, observation.flags, observation.detector_flags = plane, flags, detector_flags
         for operator in self.operators:
             if operator.at_end and part is None:
                 data.provenance["timings"] = timer.rows()  # a report knows of the steps before it

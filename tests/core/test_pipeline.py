@@ -120,6 +120,26 @@ def test_companion_runs_use_the_same_random_numbers(scene):
         assert 0.9 < sky.std() < 1.1
 
 
+class Flag(Operator):
+    """Flags as many samples as the run has an rms in K, and a detector where that is small."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        block.observation.flags[0] = 1
+        block.observation.detector_flags[:] |= np.uint8(not {"white"} & block.detdata.keys())
+
+
+def test_observations_end_with_the_flags_of_the_main_run(scene):
+    """What acts at the end, and whoever has the data, sees those; a companion run may have flagged all detectors."""
+    runs = {"noiseless": {"only": ["sky"]}}
+    data = Pipeline([Point(), Sky(), White(), Sum(), Flag(), Total()], runs=runs).run(scene, threads=1)
+    for observation in data.observations:
+        assert observation.flags[0] == 1
+        assert not observation.detector_flags.any()
+
+
 def test_same_seed_same_bits_two_seeds_incoherent(scene):
     def total(seed, **settings):
         out = Pipeline([Point(scans=1), White(), Sum(), Total()]).run(scene.model_copy(update={"seed": seed}), **settings)
