@@ -370,6 +370,9 @@ class Pipeline:
                     self._finalize(operator, data, timer, hooks)
                 else:
                     part.take(operator, data)
+            for operator in self.operators:
+                if operator.at_end and part is None:
+                    operator.after_run(data)
         data.run = ""
         for operator in self.operators:
             if operator.at_end and part is None:
