@@ -54,6 +54,7 @@ class HighpassFilter(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     prepares_ahead: ClassVar[bool] = True
+    linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
     knobs: ClassVar[tuple[Knob, ...]] = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
