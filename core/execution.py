@@ -462,12 +462,14 @@ class Execution:
         return block
 
     def _exec(self, operators: list[Operator], block: Block) -> None:
+        start = time.thread_time()
         for operator in operators:
             if self._stop.is_set():
                 return
-            start = time.thread_time()
             operator.exec(block, self.states[operator.label])
-            self.timer.add(operator.label, "exec", time.thread_time() - start)
+            now = time.thread_time()
+            self.timer.add(operator.label, "exec", now - start)
+            start = now
 
     def _block(self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool) -> Block:
         """A block with its sources in it: where they are kept (as ``made`` says), copies, or made again.
