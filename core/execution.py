@@ -151,9 +151,9 @@ class Execution:
             self._same_use("", "prepared")
             self._keep_to_ceiling()
             self._ahead.start(following)
+            self._leave_out()
             self._execute(before, after)
-            if self.frozen is not None:
-                self.frozen.complete = True
+            self._keep_out()
             for operator in self.operators:
                 start = time.thread_time()
                 operator.collect(data, observation, self.states[operator.label])
@@ -202,6 +202,22 @@ class Execution:
         """Let a run with frozen modes use the samples and detectors that the main run used at this point."""
         if self.frozen is not None:
             self.frozen.at(self.observation, label, stage)
+
+    def _leave_out(self) -> None:
+        """Let a run with frozen modes leave out the single samples that the main run left out."""
+        if self.frozen is not None and self.frozen.complete:
+            for operator in self.operators:
+                if (kept_out := self.frozen.kept_out.get(operator.label)) is not None:
+                    operator.leave_out(self.states[operator.label], kept_out)
+
+    def _keep_out(self) -> None:
+        """Note what the main run left out."""
+        if self.frozen is not None and not self.frozen.complete:
+            for operator in self.operators:
+                kept_out = operator.keep_out(self.observation, self.states[operator.label])
+                if kept_out is not None:
+                    self.frozen.kept_out[operator.label] = kept_out
+            self.frozen.complete = True
 
     # ---- segments
 
@@ -446,12 +462,14 @@ class Execution:
         return block
 
     def _exec(self, operators: list[Operator], block: Block) -> None:
+        start = time.thread_time()
         for operator in operators:
             if self._stop.is_set():
                 return
-            start = time.thread_time()
             operator.exec(block, self.states[operator.label])
-            self.timer.add(operator.label, "exec", time.thread_time() - start)
+            now = time.thread_time()
+            self.timer.add(operator.label, "exec", now - start)
+            start = now
 
     def _block(self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool) -> Block:
         """A block with its sources in it: where they are kept (as ``made`` says), copies, or made again.

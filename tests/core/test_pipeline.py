@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from pydantic import PrivateAttr
 
 import zonda
 from zonda.core.data import Observation
@@ -99,8 +100,13 @@ class Late(Operator):
     at_end: ClassVar[bool] = True
     requires: ClassVar[frozenset[str]] = frozenset({"total"})
 
+    _told: list = PrivateAttr(default_factory=list)
+
+    def after_run(self, data):
+        self._told.append((data.run, sorted(data.products)))
+
     def finalize(self, data):
-        data.products["seen"] = sorted(data.products)
+        data.products["seen"], data.products["told"] = sorted(data.products), self._told
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +120,11 @@ RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
 def test_companion_runs_use_the_same_random_numbers(scene):
     data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs=RUNS).run(scene, threads=1)
     assert data.products["seen"] == ["noiseless/total", "source_free/total", "total"]
+    assert data.products["told"] == [
+        ("", ["total"]),
+        ("noiseless", ["noiseless/total", "total"]),
+        ("source_free", ["noiseless/total", "source_free/total", "total"]),
+    ]
     for k in range(2):
         whole, sky, noise = (data.products[n][k] for n in ("total", "noiseless/total", "source_free/total"))
         assert np.array_equal(whole, sky + noise)
