@@ -11,7 +11,8 @@ pressure 0). d, a and M are ERFA's (IAU 2006/2000A): at the nodes (1) is astropy
     M(t) = C R_z(-(theta_0 + lambda + omega t)) B(t)                                                         (2)
 
 where all the speed is in the sidereal rotation omega t; what is left, B (a quaternion), v and e, varies over hours and is
-interpolated by the cubics through the four nearest nodes. The error is measured halfway between the nodes, which are doubled until it is met.
+interpolated by the cubics through the four nearest nodes. The error is measured halfway between the nodes, which are doubled
+until it is met.
 
 Horizontal vectors have the axes north, west, up: longitude is minus the azimuth, as in TOAST, so that both frames are
 right-handed and M is a rotation. Aberration also scales the field by up to 1e-4 (13 mas at 2 arcmin), which a boresight
@@ -248,7 +249,7 @@ def _natural(observed: Floats, now: _Nodes) -> Floats:
 
 def _unit(vectors: Floats) -> Floats:
     """Vectors (n, 3) of length one."""
-    return vectors / np.sqrt(np.einsum("ni,ni->n", vectors, vectors))[:, None]
+    return np.asarray(vectors / np.sqrt(np.einsum("ni,ni->n", vectors, vectors))[:, None])
 
 
 def _cubics(nodes: Floats) -> Floats:
