@@ -143,7 +143,6 @@ def verdict(value, limit):
 
 def measure(name, threads, repeat, prototypes=None):
     import numpy as np
-
     from prototypes import Prototype
 
     case = CASES[name]
