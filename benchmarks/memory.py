@@ -22,9 +22,10 @@ from pathlib import Path
 SCENES = {
     "M2, 516 s": {"instrument": "mustang2", "scan_duration": "516 s"},
     "M2, 1 h": {"instrument": "mustang2", "scan_duration": "1 h"},
+    "M2, 2 h, svd": {"instrument": "mustang2", "scan_duration": "2 h", "method": "svd"},  # its stream must be whole: on disk
     "ACT-like, 60 s": {"instrument": "act", "scan_duration": "60 s"},
 }
-BUDGETS = (0.6, 1.0, 4.0)
+BUDGETS = (0.6, 0.8, 1.2, 4.0)
 
 
 class Sampler:
@@ -86,7 +87,7 @@ def one(name, budget, threads):
     from zonda.core.forecast import forecast, room
 
     case = SCENES[name]
-    pipeline, where = chain(case["scan_duration"]), scene(case["instrument"])
+    pipeline, where = chain(case["scan_duration"], case.get("method", "mean")), scene(case["instrument"])
     told = {}
 
     def listen(operators, observations, settings, ceiling, place):

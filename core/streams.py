@@ -260,6 +260,27 @@ def forget_pages(array: Floats) -> None:
         pages.madvise(mmap.MADV_DONTNEED)
 
 
+def columns(array: Floats, samples: slice) -> Floats:
+    """(n_det, n) samples of all detectors as an array of its own.
+
+    A spilled stream's are read from its file: around each page that is touched in a mapping the system maps up to 64 kB, which is
+    most of a stream whose rows are that short.
+    """
+    if not isinstance(array, np.memmap):
+        return np.array(array[:, samples], order="C")
+    found = np.empty((array.shape[0], samples.stop - samples.start), array.dtype)
+    with open(str(array.filename), "rb", buffering=0) as file:
+        for row, part in enumerate(found):
+            file.seek(row * array.strides[0] + samples.start * array.itemsize)
+            left = memoryview(part).cast("B")
+            while left:
+                read = file.readinto(left)
+                if not read:
+                    raise OutputError("was cut short", place=str(array.filename), cure="leave the temporary folder alone")
+                left = left[read:]
+    return found
+
+
 def free_disk() -> int:
     """Bytes that streams may take in the temporary folder."""
     return int(DISK_SHARE * shutil.disk_usage(tempfile.gettempdir()).free)

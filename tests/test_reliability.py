@@ -183,6 +183,34 @@ def test_spilled_streams_have_their_blocks_from_the_start(monkeypatch: pytest.Mo
     store.close()
 
 
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="counts pages of files in /proc")
+def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A system maps 64 kB around every page that is touched: short pieces of many rows would map the whole stream."""
+    from zonda.core.streams import Ledger, Store, columns, forget_pages
+
+    def mapped() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[2]) * os.sysconf("SC_PAGE_SIZE")
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    store = Store(1000, np.float32, [], Ledger())
+    array = store.allocate("signal", (1000, 16384))  # 66 MB
+    array[:] = np.arange(16384, dtype=np.float32) + np.arange(1000, dtype=np.float32)[:, None]
+    forget_pages(array)
+    before = mapped()
+    part = columns(array, slice(2048, 4096))
+    assert mapped() - before < 8 << 20
+    assert not isinstance(part, np.memmap)
+    assert part.flags.c_contiguous
+    assert np.array_equal(part, array[:, 2048:4096])
+    assert np.array_equal(columns(np.asarray(array[:3]), slice(7, 9)), array[:3, 7:9])
+    os.truncate(array.filename, 1000)
+    with pytest.raises(zonda.core.errors.OutputError, match="cut short"):
+        columns(array, slice(2048, 4096))
+    store.close()
+
+
 # ------------------------------------------------------------------------------------------- files and folders that go
 
 

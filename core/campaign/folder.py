@@ -45,8 +45,9 @@ def finished(folder: Path) -> bool:
         job, log = Job.read(folder), Log(folder / LOG)
     except ZondaError:
         return False
-    with contextlib.closing(log):
-        return log.combined() == set(range(len(job.combinations)))
+    with contextlib.closing(log), contextlib.suppress(ZondaError):
+        return len(log.combined(job.layouts)) == len(job.combinations)
+    return False
 
 
 def publish(job: Job, folder: Path) -> None:
@@ -111,7 +112,8 @@ def opened(folder: Path, job: Job, say: Say) -> Log:
         log = open_log(path, job)
         if {row.number for row in log.rows()} != {task.number for task in job.tasks}:
             raise InputError("it is of another campaign", place=str(path))
-        log.combined()
+        log.check()
+        log.combined(job.layouts)
         return log
     except InputError:
         aside = next(p for k in range(1, 1000) if not (p := folder / f"jobs.damaged-{k}.sqlite").exists())

@@ -115,6 +115,11 @@ class Job:
         """Of all tasks."""
         return sum(task.samples for task in self.tasks)
 
+    @property
+    def layouts(self) -> dict[int, str]:
+        """Digests of the combinations' layouts, by number."""
+        return {number: combination.layout for number, combination in enumerate(self.combinations)}
+
     def tasks_of(self, combination: int) -> list[Task]:
         """In the order of the reduction."""
         return [task for task in self.tasks if task.combination == combination]

@@ -6,13 +6,18 @@ No write-ahead log, which shared file systems do not bear: the ordinary rollback
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import sqlite3
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 from ..errors import InputError
 from ..files import output_error, writing
+
+DAMAGE = (sqlite3.Error, UnicodeDecodeError)
+"""What reading a damaged file may raise; the second from the text of the first."""
 
 STATES = ("waiting", "claimed", "done", "failed")
 
@@ -56,17 +61,27 @@ class Log:
                 "error TEXT NOT NULL, host TEXT NOT NULL, seconds REAL NOT NULL, samples INTEGER NOT NULL, digest TEXT NOT NULL)"
             )
 
-            self._db.execute("CREATE TABLE IF NOT EXISTS combined (number INTEGER PRIMARY KEY)")
+            self._db.execute("CREATE TABLE IF NOT EXISTS combined (number INTEGER PRIMARY KEY, layout TEXT NOT NULL)")
 
-    def combined(self) -> set[int]:
-        """Combinations whose products are written."""
+    def check(self) -> None:
+        """Raise `InputError` where the file is damaged, also where nobody has read yet."""
         with self._told():
-            return {int(row[0]) for row in self._db.execute("SELECT number FROM combined")}
+            found = [str(row[0]) for row in self._db.execute("PRAGMA integrity_check")]
+            if found != ["ok"]:
+                raise sqlite3.DatabaseError(found[0])
 
-    def combine(self, number: int) -> None:
+    def combined(self, layouts: Mapping[int, str]) -> set[int]:
+        """Combinations whose products are written. ``layouts``: by number, their layouts' digests, which the log must know."""
+        with self._told():
+            found: dict[int, str] = dict(self._db.execute("SELECT number, layout FROM combined"))
+            if not found.items() <= layouts.items():
+                raise sqlite3.DatabaseError("it names what is no set of products of this campaign")
+            return set(found)
+
+    def combine(self, number: int, layout: str) -> None:
         """A combination's products are written."""
         with self._transaction():
-            self._db.execute("INSERT OR IGNORE INTO combined VALUES (?)", (number,))
+            self._db.execute("INSERT OR IGNORE INTO combined VALUES (?, ?)", (number, layout))
 
     def begin(self, tasks: Iterable[tuple[int, int]]) -> None:
         """Enter tasks (number, samples) that are not there yet, as waiting."""
@@ -140,7 +155,7 @@ class Log:
         try:
             with writing(self.path):
                 yield
-        except sqlite3.DatabaseError as err:
+        except DAMAGE as err:
             raise _error(err, self.path) from None
 
 
@@ -156,8 +171,8 @@ def read(path: Path) -> list[Row]:
         except sqlite3.OperationalError as err:
             if "no such table" in str(err):  # its writer has just begun, or was killed then
                 return []
-            failure: sqlite3.DatabaseError = err
-        except sqlite3.DatabaseError as err:
+            failure: Exception = err
+        except DAMAGE as err:
             failure = err
             break
     raise damaged(path, failure)
@@ -171,16 +186,17 @@ def damaged(path: Path, err: Exception) -> InputError:
 def _rows(database: sqlite3.Connection) -> list[Row]:
     columns = "number, state, attempts, error, host, seconds, samples, digest"
     found = [Row(*values) for values in database.execute(f"SELECT {columns} FROM tasks ORDER BY number")]
-    if any(row.state not in STATES or not isinstance(row.number, int) for row in found):
+    kinds = (int, str, int, str, str, float | int, int, str)
+    if any(row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found):
         raise sqlite3.DatabaseError("it holds what is no state of a task")
     return found
 
 
-def _error(err: sqlite3.DatabaseError, path: Path) -> Exception:
-    text = str(err)
-    if isinstance(err, sqlite3.OperationalError) and "malformed" not in text:
-        import errno
-
-        number = errno.ENOSPC if "full" in text else errno.EROFS if "readonly" in text else None
-        return output_error(OSError(number, text) if number else OSError(text), path)
-    return damaged(path, err)
+def _error(err: Exception, path: Path) -> Exception:
+    """Of the disk, or of another process that holds the file, `OutputError`; all else is damage."""
+    kind = (getattr(err, "sqlite_errorname", None) or "").removeprefix("SQLITE_").partition("_")[0]
+    number = {"FULL": errno.ENOSPC, "READONLY": errno.EROFS, "PERM": errno.EACCES}.get(kind)
+    of_the_header = kind == "READONLY" and os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
+    if of_the_header or (number is None and kind not in ("IOERR", "CANTOPEN", "BUSY", "LOCKED")):
+        return damaged(path, err)
+    return output_error(OSError(number, str(err)) if number else OSError(str(err)), path)

@@ -92,7 +92,7 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False) -> Resul
     clean(folder)
     log = opened(folder, job, say)
     with contextlib.closing(log):
-        combined = log.combined()
+        combined = log.combined(job.layouts)
         for number, combination in enumerate(job.combinations):
             if number not in combined:
                 try:
@@ -173,7 +173,7 @@ def _work(job: Job, folder: Path, log: Log, pool: Pool, say: Say, missing: Itera
         _tell(result, say)
     incomplete = {row.number for row in log.rows() if row.state != "done"}
     digests = {row.number: row.digest for row in log.rows()}
-    combined = log.combined()
+    combined = log.combined(job.layouts)
     ready = [
         number
         for number in range(len(job.combinations))
@@ -340,7 +340,7 @@ def _combine(
                 ) from None
             if combined.error is not None:
                 raise combined.error
-            log.combine(number)
+            log.combine(number, job.combinations[number].layout)
             result.tally += [(job.combinations[number].name, *row) for row in combined.tally]
             if not job.keep_tasks:
                 for task in job.tasks_of(number):

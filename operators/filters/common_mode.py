@@ -37,7 +37,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
-from zonda.core.streams import forget_pages
+from zonda.core.streams import columns, forget_pages
 from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
@@ -286,7 +286,9 @@ class Gram:
         self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.flags == 0
         self.n_used = int(self.good_samples.sum())
-        self.whole = stream.means.get("signal") is None and bool(self.good_samples.all())
+        tile = stream.shape[0] * TILE_SAMPLES * stream.dtype.itemsize
+        self.copied = isinstance(stream.array, np.memmap) and tile <= MOST_COPIED
+        self.whole = stream.means.get("signal") is None and bool(self.good_samples.all()) and not self.copied
         self._known: tuple[Floats, Floats, Floats] | None = None
         if use is not None:
             self.usable = Usable(use, self.n_used)
@@ -329,9 +331,9 @@ class Gram:
     def _tile(self, samples: slice) -> tuple[NDArray[Any], int, int]:
         """An array that holds these samples (mean emission included, zero where flagged), and where in it they are."""
         array, mean, good = np.asarray(self.stream.array), self.stream.means.get("signal"), self.good_samples[samples]
-        if mean is None and good.all():
+        if mean is None and good.all() and not self.copied:
             return array, samples.start, samples.stop
-        copy = np.array(array[:, samples], order="C")
+        copy = columns(self.stream.array if self.copied else array, samples)
         if mean is not None:
             copy += mean.evaluate(slice(0, copy.shape[0]), samples)
         copy[:, ~good] = 0
@@ -484,6 +486,9 @@ def _directions(step: int, n_detectors: int) -> Floats:
     """Fixed pseudo-random numbers over detectors (n_det,)."""
     return normals(stream_key(0, "CommonModeFilter", step), 0, n_detectors).astype(np.float64)
 
+
+MOST_COPIED = 64 << 20
+"""Bytes of a tile of a spilled stream up to which it is read into an array of its own."""
 
 TILES_AT_ONCE = 4
 """Tiles in one call of the kernel."""
