@@ -53,15 +53,20 @@ class LayerModel:
 
     def components(self) -> tuple[Floats, Floats]:
         """(e, w) of equation (1); behind an aperture those of a spectrum that is nowhere smaller (`Aperture.bound`)."""
-        if self.aperture is None:
-            return self.gaussian()
-        square, share = self.aperture.bound()
-        parts = [mixture(self.outer_scale, math.sqrt(v), step=0.5, depth=1e-6) for v in square]
-        return np.concatenate([e for e, _ in parts]), np.concatenate([c * w for c, (_, w) in zip(share, parts, strict=True)])
+        return _components(self)
 
     def gaussian(self) -> tuple[Floats, Floats]:
         """(e, w) behind the Gaussian of ``sigma``."""
         return mixture(self.outer_scale, self.sigma, step=0.5, depth=1e-6)
+
+
+@lru_cache(maxsize=64)
+def _components(layer: LayerModel) -> tuple[Floats, Floats]:
+    if layer.aperture is None:
+        return layer.gaussian()
+    square, share = layer.aperture.bound()
+    parts = [mixture(layer.outer_scale, math.sqrt(v), step=0.5, depth=1e-6) for v in square]
+    return np.concatenate([e for e, _ in parts]), np.concatenate([c * w for c, (_, w) in zip(share, parts, strict=True)])
 
 
 @dataclass(frozen=True)

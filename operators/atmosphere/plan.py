@@ -41,6 +41,9 @@ MEAN_SHARE = 0.1
 WINDOWS = (16, 1 << 14)
 """Number and length [samples] of the parts of a longer scan at which its path is looked at."""
 
+LOOKED_AT = 4096
+"""Samples of a scan whose velocity and elevation are looked at."""
+
 IN_A_CELL = 16
 """Samples between two steps at which the path's error is looked at."""
 
@@ -101,9 +104,10 @@ def make_plan(
         if _mean_error(mean_nodes, xi, eta, band, pwv, elevations) <= allowed:
             break
 
-    velocity, quantiles = path.velocity(track), (np.arange(64) + 0.5) / 64
+    velocity = path.velocity(track)
+    quantiles = (np.arange(64) + 0.5) / 64 * (velocity.shape[1] - 1)
     drifts = ((model.height * velocity - (track.drift @ wind)[:, None]) for model, wind in zip(models, winds, strict=True))
-    speeds = [np.asarray(np.quantile(np.hypot(*v), quantiles), np.float64) for v in drifts]
+    speeds = [np.interp(quantiles, np.arange(v.shape[1]), np.sort(np.hypot(*v))) for v in drifts]
     candidates = candidate_steps(observation.n_samples)
     tried: dict[int, tuple[list[float], float]] = {}
 
@@ -185,37 +189,38 @@ class _Path:
         n, number, length = observation.n_samples, *WINDOWS
         starts = [0] if n <= number * length else np.linspace(0, n - length, number).astype(np.int64).tolist()
         self._windows = [slice(start, min(n, start + length) if len(starts) > 1 else n) for start in starts]
-        u = np.concatenate([rays(axes(observation.boresight_azel[w]), self._xi, self._eta) for w in self._windows], axis=2)
-        self.crossing = crossing(u)
-        self.elevation = np.arcsin(u[2])
-
-    def velocity(self, track: Track, number: int = 4096) -> Floats:
-        """Velocity of the crossing point on the plane per metre of height, 1/s, over the scan: (2, <= number)."""
-        n = self.crossing.shape[2]
-        if n == 1:
-            return np.zeros((2, 1))
-        at = np.unique(np.linspace(0, n - 2, number).astype(np.int64))
+        index = np.concatenate([np.arange(w.start, w.stop) for w in self._windows])
         last = np.cumsum([w.stop - w.start for w in self._windows]) - 1
-        at = at[~np.isin(at, last)]  # the next sample is that of another window
-        ends = track.unroll(self.crossing[:, 0, np.stack([at, at + 1])])
+        some = np.unique(np.linspace(0, max(len(index) - 2, 0), LOOKED_AT).astype(np.int64))
+        self._some = index[some[~np.isin(some, last)]] if n > 1 else index  # the next sample is in the same window
+        self.elevation = np.arcsin(self._rays(self._some)[2])
+
+    def _rays(self, index: NDArray[np.int64] | slice) -> Floats:
+        return rays(axes(self._observation.boresight_azel[index]), self._xi, self._eta)
+
+    def velocity(self, track: Track) -> Floats:
+        """Velocity of the crossing point on the plane per metre of height, 1/s, over the scan: (2, <= LOOKED_AT)."""
+        if self._observation.n_samples == 1:
+            return np.zeros((2, 1))
+        ends = track.unroll(np.stack([crossing(self._rays(self._some + k))[:, 0] for k in (0, 1)], axis=1))
         return np.asarray((ends[:, 1] - ends[:, 0]) * self._observation.sample_rate, np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
         """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points; from `IN_A_CELL`
         samples of each cell."""
-        squares, total, done = np.zeros(9), 0, 0
+        squares, total = np.zeros(9), 0
         each = max(1, step // IN_A_CELL)
         for window in self._windows:
             n = window.stop - window.start
             index = window.start + times_with_margin(n, step)
             u = rays(axes_at(self._observation.boresight_azel, index, step), self._xi, self._eta)
-            here = slice(done, done + n, each)
+            here = self._rays(slice(window.start, window.stop, each))
             some, rows = -(-n // each), 3 * len(self._xi)
-            truth = np.concatenate([self.crossing[:, :, here].reshape(-1, some), self.elevation[:, here]])
+            truth = np.concatenate([crossing(here).reshape(-1, some), np.arcsin(here[2])])
             values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
             spline = SmoothField.from_values(np.eye(rows), values, step // each, some)
             found = ((spline.evaluate(slice(0, rows), slice(0, some)) - truth) ** 2).sum(1)
             squares[:rows] += found
-            total, done = total + some, done + n
+            total += some
         rms = np.sqrt(squares[: 3 * len(self._xi)] / total).reshape(3, -1).max(1)
         return rms[:2], float(rms[2])
