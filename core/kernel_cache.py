@@ -23,6 +23,7 @@ import llvmlite
 import numba
 import numpy as np
 from numba.core import caching, dispatcher
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 FORMAT = 1
@@ -52,9 +53,17 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
         self._cache_file = KernelFiles(self._cache_path, self._impl.filename_base, function)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled kernel, or None where it must be compiled; a damaged file is removed with a warning."""
+        """The compiled kernel, or None where it must be compiled; a damaged file is removed with a warning.
+
+        numba's own first makes its compiler ready (``target_context.refresh()``), half a second of imports. Kept code needs of
+        that only the addresses of the functions that count references: those of numba's other helpers are known from the
+        beginning, but for ``hash`` and ``parallel=True``, which no kernel here uses.
+        """
         try:
-            return super().load_overload(sig, target_context)
+            rtsys.initialize(target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
+            return None
         except Exception:  # what unpickling and linking of damaged code may raise has no end
             self._cache_file.give_up()
             return None
