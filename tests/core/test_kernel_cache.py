@@ -169,7 +169,7 @@ def outer(x):
     total = 0.0
     for row in made[1::2].T.copy():
         total += row[0] * row[-1] + np.arctan2(row[1], math.gamma(row[2] + 1))
-    return total
+    return total + made.sum() + abs(x[0]) + min(1, x.size)
 """
 LOADED = """
 import importlib.util, os, sys
