@@ -7,9 +7,15 @@ from typing import Any
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
 
 FLAGS = ("contract", "nsz")
+
+
+def make_array(kind: Any) -> Any:
+    """numba's, imported where something is compiled: a run whose kernels are kept needs none of its compiler."""
+    from numba.np import arrayobj
+
+    return arrayobj.make_array(kind)
 
 
 @intrinsic

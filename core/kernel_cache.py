@@ -10,9 +10,11 @@ once, damaged ones are compiled again, and nothing stale is ever loaded.
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import pickle
 import secrets
+import sys
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +24,8 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
-from numba.core import caching, dispatcher
+from numba.core import caching, dispatcher, environment
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 FORMAT = 1
@@ -52,9 +55,17 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
         self._cache_file = KernelFiles(self._cache_path, self._impl.filename_base, function)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled kernel, or None where it must be compiled; a damaged file is removed with a warning."""
+        """The compiled kernel, or None where it must be compiled; a damaged file is removed with a warning.
+
+        numba's own first makes its compiler ready (``target_context.refresh()``), half a second of imports. Kept code needs of
+        that only the addresses of the functions that count references: those of numba's other helpers are known from the
+        beginning, but for ``hash`` and ``parallel=True``, which no kernel here uses.
+        """
         try:
-            return super().load_overload(sig, target_context)
+            rtsys.initialize(target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
+            return None
         except Exception:  # what unpickling and linking of damaged code may raise has no end
             self._cache_file.give_up()
             return None
@@ -103,7 +114,7 @@ class KernelFiles:
         if hashlib.blake2b(body, digest_size=_DIGEST).digest() != content[:_DIGEST]:
             self.give_up()
             return None
-        return pickle.loads(body)
+        return _Reader(io.BytesIO(body)).load()
 
     def save(self, key: Any, data: Any) -> None:
         """Keep ``data`` under ``key``: whole, or not at all. Raises OSError."""
@@ -129,6 +140,27 @@ class KernelFiles:
         for path in self.folder.glob(f"{self.base}.*{SUFFIX}"):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
+
+
+class _Reader(pickle.Unpickler):
+    """Reads kept code without importing those of numba's modules that it was made of, e.g. `numba.np.linalg` and with it scipy.
+
+    They are the globals of its environment, which only object mode looks into; what it raises is among its constants.
+    """
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = super().find_class(module, name)
+        return _environment if found is getattr(environment, "_rebuild_env", None) else found
+
+
+def _environment(module: str, constants: Any, name: str) -> Any:
+    if module in sys.modules or not module.startswith("numba.") or environment.lookup_environment(name) is not None:
+        return environment._rebuild_env(module, constants, name)
+    made = environment.Environment({"__name__": module})
+    made.consts[:] = constants
+    made.env_name = name
+    environment.Environment._memo[name] = made
+    return made
 
 
 def meaning(function: Any) -> bytes:

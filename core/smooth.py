@@ -18,6 +18,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .transforms import spline_filter
+
 Floats = NDArray[np.floating]
 
 PAD = 1
@@ -104,13 +106,11 @@ class SmoothField:
         The margin (equal on both sides, inferred from the width) is used by the spline prefilter and then dropped;
         12 coefficients make the edge effect of the mirror boundary < 2e-7.
         """
-        from scipy.ndimage import spline_filter1d
-
         wanted = -(-n_samples // step) + 3
         margin, odd = divmod(values.shape[1] - wanted, 2)
         if margin < 0 or odd:
             raise ValueError(f"values must have {wanted} + 2 * margin columns, got {values.shape[1]}")
-        filtered = spline_filter1d(np.asarray(values, np.float64), 3, axis=1, mode="mirror")
+        filtered = spline_filter(values)
         kept = np.ascontiguousarray(filtered[:, margin : margin + wanted])
         return cls(np.ascontiguousarray(weights, dtype), kept.astype(dtype), step, n_samples)
 

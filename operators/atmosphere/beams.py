@@ -25,7 +25,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import j0, j1
 
 from .covariance import NU
 
@@ -53,6 +52,8 @@ class Aperture:
 
     def transform(self, k: ArrayLike) -> Floats:
         """B(k), k in rad/m: 2 J_1(x) / x for the top hat, x = k D / 2; error < 1e-8 for x < 250."""
+        from scipy.special import j1
+
         x = np.asarray(k, np.float64) * self.diameter / 2
         if self.taper == 0:
             small = x < 1e-4
@@ -90,6 +91,8 @@ class Aperture:
 
     def structure(self, r: ArrayLike, outer_scale: float) -> Floats:
         """Equation (2): half the mean squared difference of two lines of sight ``r`` metres apart. Relative error < 1e-6."""
+        from scipy.special import j0
+
         r = np.atleast_1d(np.asarray(r, np.float64))
         power, k = self._power(outer_scale, float(r.max()))
         x = np.multiply.outer(r, k)
@@ -131,6 +134,7 @@ def _illumination(taper: float) -> tuple[Floats, Floats]:
 def _tapered(taper: float):  # type: ignore[no-untyped-def]
     """B as a function of x = k a, from a table."""
     from scipy.interpolate import CubicSpline
+    from scipy.special import j0
 
     x = np.linspace(0, _LARGEST_X, 12001)
     u, w = _illumination(taper)

@@ -20,7 +20,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gamma, gammainc, gammaincc, kve
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +46,7 @@ def structure(x: ArrayLike) -> Floats:
         up = up * q / (k * (k + NU))
         down = down * q / (k * (k - NU))
         plus, minus = plus + up, minus + down
-    out[near] = gamma(1 - NU) / gamma(1 + NU) * (y / 2) ** (2 * NU) * plus - minus
+    out[near] = math.gamma(1 - NU) / math.gamma(1 + NU) * (y / 2) ** (2 * NU) * plus - minus
     out[~near] = 1 - _tail(x[~near])
     return out
 
@@ -63,7 +62,9 @@ def correlation(x: ArrayLike) -> Floats:
 
 
 def _tail(x: Floats) -> Floats:
-    return np.asarray(2 ** (1 - NU) / gamma(NU) * x**NU * kve(NU, x) * np.exp(-x), np.float64)
+    from scipy.special import kve
+
+    return np.asarray(2 ** (1 - NU) / math.gamma(NU) * x**NU * kve(NU, x) * np.exp(-x), np.float64)
 
 
 def mixture(outer_scale: float, sigma: float, step: float = 0.25, depth: float = 1e-19) -> tuple[Floats, Floats]:
@@ -82,7 +83,7 @@ def mixture(outer_scale: float, sigma: float, step: float = 0.25, depth: float =
 def _density(s: Floats, outer_scale: float) -> Floats:
     """s w(s) of equation (3): the weight per unit of ln s, m2."""
     t = s / outer_scale**2
-    return 4 * np.pi * NU / gamma(NU + 1) * t ** (NU + 1) * np.exp(-t) * outer_scale**2
+    return 4 * np.pi * NU / math.gamma(NU + 1) * t ** (NU + 1) * np.exp(-t) * outer_scale**2
 
 
 def beam_correlation(r: ArrayLike, outer_scale: float, sigma: float) -> Floats:
@@ -120,6 +121,8 @@ def spectrum_between(k2: Floats, outer_scale: float, split: float) -> tuple[Floa
 
     Incomplete gamma functions of nu + 1 at split (k^2 + r0^-2).
     """
+    from scipy.special import gammainc, gammaincc
+
     total = k2 + outer_scale**-2
     power = 4 * np.pi * NU * outer_scale ** (-2 * NU) * total ** (-NU - 1)
     return power * gammainc(NU + 1, split * total), power * gammaincc(NU + 1, split * total)

@@ -32,6 +32,7 @@ from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.transforms import cosine_transform, fast_length
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -199,8 +200,6 @@ class HighpassPlan:
 
     def _low(self, s: Floats) -> Floats:
         """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s, (n_det, M + 3) each."""
-        from scipy.fft import dct
-
         # not with BLAS, whose bits in one row depend on how many rows there are and where it stands among them
         amplitude = np.einsum("dm,km->dk", s, self.modes)
         rest = s - np.einsum("dk,km->dm", amplitude, self.spread_modes)
@@ -210,10 +209,10 @@ class HighpassPlan:
             folded[:, [0, -1]] *= 2
             folded[:, 1] += rest[:, 0]
             folded[:, -2] += rest[:, -1]
-            spectrum = dct(folded, type=1)
+            spectrum = cosine_transform(folded)
             spectrum[:, self.cut :] = 0
             spectrum[:, : self.cut] *= self.response
-            low = dct(spectrum, type=1)
+            low = cosine_transform(spectrum)
             c[:, 1:-1] += low
             c[:, 0] += low[:, 1]
             c[:, -1] += low[:, -2]
@@ -233,14 +232,12 @@ class HighpassPlan:
 
 def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) -> HighpassPlan:
     """The plan for scans of ``n`` samples and a cut at ``frequency`` cycles per sample; the rest as in `HighpassFilter`."""
-    from scipy.fft import next_fast_len
-
     cycles = n * frequency
     cut = max(1, math.ceil(2 * cycles - 1e-9)) if cycles >= 1 else 0
     degree = min(degree if cut else min(degree, 1), n - 1)
     if cut:
         degree = min(degree, cut - 1)
-    knots = int(next_fast_len(max(16, math.ceil(oversampling * cut / 2))))
+    knots = fast_length(max(16, math.ceil(oversampling * cut / 2)), (2, 3, 5, 7, 11))
     if not cut or n < SHORTEST_STEP * knots:
         knots = 0
     position = (np.arange(n) + 0.5) * (knots / n)

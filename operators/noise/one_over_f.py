@@ -28,6 +28,7 @@ value at f_min: a sharp corner is beyond real poles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -51,6 +52,8 @@ _GOOD = 0.02
 """A fit as good as this is not tried again from another first guess."""
 _RIDGE = 1e-4
 """Weight that keeps poles without influence near where they began."""
+_DAMPING, _EVALUATIONS, _CHANGE = 1e-3, 120, 1e-5
+"""Of the fit: first damping, as a share of the largest curvature; most steps; relative change of the misfit that ends it."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +132,6 @@ def _log_power(root: Array, sine: Array) -> Array:
 
 def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
     """Levenberg-Marquardt from poles in geometric progression, ``ends`` of them at the Nyquist end (its cusp needs some)."""
-    from scipy.optimize import least_squares
-
     band = np.geomspace(f_min, 0.5, _N_BAND)
     nyquist = 0.5 - np.geomspace(1e-4, 0.4 * (0.5 - f_min), _N_NYQUIST)
     below = f_min * np.geomspace(1e-3, 0.3, _N_BELOW)
@@ -164,7 +165,7 @@ def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
         return np.vstack([np.hstack(blocks) * _WEIGHTS[:, None], _RIDGE * np.eye(2 * n + 1)])
 
     x0[-1] = -np.mean(misfit(x0)[:_N_BAND])
-    found = least_squares(misfit, x0, jac=jacobian, method="lm", max_nfev=120, xtol=1e-6, ftol=1e-5).x
+    found = _least_squares(misfit, jacobian, x0)
     error = np.abs(np.expm1((misfit(found)[: frequency.size] / _WEIGHTS)[: _N_BAND + _N_NYQUIST])).max()
     poles, zeros = np.sort(roots(found[:n])[0])[::-1], np.sort(roots(found[n:-1])[0])[::-1]
     covariance = _state_covariance(poles, zeros)
@@ -181,6 +182,28 @@ def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
         variance=float(1 + tap @ covariance @ tap),
         start=scale[:, None] * vector * np.sqrt(np.maximum(value, 0)),  # eigenvalues of a correlation: negative by rounding only
     )
+
+
+def _least_squares(misfit: Callable[[Array], Array], jacobian: Callable[[Array], Array], x: Array) -> Array:
+    """Levenberg-Marquardt (Nielsen's damping, Madsen et al. 2004, algorithm 3.16): argmin |misfit|^2 from ``x``."""
+    f, j = misfit(x), jacobian(x)
+    matrix, slope, cost = j.T @ j, j.T @ f, f @ f
+    damping, raised = _DAMPING * matrix.diagonal().max(), 2.0
+    for _ in range(_EVALUATIONS):
+        step = np.linalg.solve(matrix + damping * np.eye(x.size), -slope)
+        f = misfit(x + step)
+        gained, promised = cost - f @ f, step @ (damping * step - slope)
+        if gained > 0:
+            x, j = x + step, jacobian(x + step)
+            matrix, slope, before, cost = j.T @ j, j.T @ f, cost, f @ f
+            damping, raised = damping * max(1 / 3, 1 - (2 * gained / promised - 1) ** 3), 2.0
+            if gained < _CHANGE * before:
+                break
+        elif promised < _CHANGE * cost:
+            break
+        else:
+            damping, raised = damping * raised, 2 * raised
+    return x
 
 
 def _first_guess(f_min: float, slope: float, n: int, ends: int) -> Array:
@@ -202,11 +225,12 @@ def _state_covariance(poles: Array, zeros: Array) -> Array:
 
     Written with D = A - 1, so that nothing cancels for slow poles.
     """
-    from scipy.linalg import solve_triangular
-
     n = poles.size
     drift = np.diag(-poles) + np.tril(np.broadcast_to(zeros - poles, (n, n)), -1)
     eye = np.eye(n)
     system = -(np.kron(drift, eye) + np.kron(eye, drift) + np.kron(drift, drift))  # lower triangular, like drift
-    covariance = solve_triangular(system, np.ones(n * n), lower=True).reshape(n, n)
+    solved = np.ones(n * n)
+    for k in range(n * n):
+        solved[k] = (1 - system[k, :k] @ solved[:k]) / system[k, k]
+    covariance = solved.reshape(n, n)
     return np.asarray((covariance + covariance.T) / 2)

@@ -325,13 +325,25 @@ def _knots(field: SmoothField, step: int, offset: float = 0.0) -> tuple[Floats, 
 
 
 def _spline(known: Floats) -> Floats:
-    """B-spline coefficients (n_node, k) from (first slope, k - 2 values, last slope) per node: the complete cubic spline."""
-    from scipy.linalg import solve_banded
+    """B-spline coefficients (n_node, k) from (first slope, k - 2 values, last slope) per node: the complete cubic spline.
 
-    k = known.shape[1]
-    band = np.zeros((5, k))  # rows: offsets +2, +1, 0, -1, -2
-    band[2, 1:-1], band[1, 2:], band[3, :-2] = 4 / 6, 1 / 6, 1 / 6
-    band[2, 0], band[1, 1], band[0, 2] = -0.5, 0.0, 0.5
-    band[2, -1], band[3, -2], band[4, -3] = 0.5, 0.0, -0.5
-    coefficients: Floats = solve_banded((2, 2), band, known.T).T
-    return np.ascontiguousarray(coefficients)
+    With c_0 and c_(k-1) taken from the slopes, (c_2 - c_0) / 2, what is left of (c_(j-1) + 4 c_j + c_(j+1)) / 6 = v_j is
+    tridiagonal: Gaussian elimination, all nodes at once.
+    """
+    slopes = known[:, [0, -1]]
+    c = np.array(known.T, np.float64)
+    c[1:-1] *= 6
+    c[1], c[-2] = c[1] + 2 * slopes[:, 0], c[-2] - 2 * slopes[:, 1]
+    upper = np.ones(len(c))
+    upper[1] = 2.0  # of the first equation; the last has it below its diagonal
+    pivot = 4.0
+    c[1] /= pivot
+    for j in range(2, len(c) - 1):
+        below = 2.0 if j == len(c) - 2 else 1.0
+        upper[j - 1] /= pivot
+        pivot = 4.0 - below * upper[j - 1]
+        c[j] = (c[j] - below * c[j - 1]) / pivot
+    for j in range(len(c) - 3, 0, -1):
+        c[j] -= upper[j] * c[j + 1]
+    c[0], c[-1] = c[2] - 2 * slopes[:, 0], c[-3] + 2 * slopes[:, 1]
+    return np.ascontiguousarray(c.T)

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.transforms import fast_length, spline_filter, spline_response
 
 Floats = NDArray[np.float64]
 
@@ -85,9 +86,6 @@ def convolve(
 
     ``linear``: for linear interpolation, whose mean response sinc^2(k h) along each axis is divided out (`linear`).
     """
-    from scipy import fft
-    from scipy.ndimage import spline_filter
-
     covariance = (SIGMA * fwhm) ** 2 * np.linalg.inv(jacobian.T @ jacobian)  # pixel^2
     width = np.sqrt(np.diag(covariance))  # sigma in pixels along (x, y)
     across = fwhm / np.linalg.norm(jacobian, axis=0)  # pixels per FWHM along (x, y)
@@ -95,7 +93,7 @@ def convolve(
     _check_size(values.shape, width, across, (qx, qy))
     pad_x, pad_y = (int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy)))
     rows, columns = values.shape
-    ny, nx = fft.next_fast_len(rows * qy + 2 * pad_y, True), fft.next_fast_len(columns * qx + 2 * pad_x, True)
+    ny, nx = fast_length(rows * qy + 2 * pad_y), fast_length(columns * qx + 2 * pad_x)
     grid = np.zeros((ny, nx))
     grid[pad_y : pad_y + rows * qy : qy, pad_x : pad_x + columns * qx : qx] = (values - outside) * (qx * qy)
     if fwhm > 0:
@@ -103,9 +101,11 @@ def convolve(
         transfer = _transfer(covariance, kx, ky, across < SMOOTH_BELOW)
         if linear:
             transfer /= np.sinc(kx / qx) ** 2 * np.sinc(ky / qy) ** 2
-        grid = fft.irfft2(fft.rfft2(grid) * transfer, (ny, nx))
-    if not linear:
-        grid = spline_filter(grid, 3, mode="mirror")
+        else:
+            transfer /= spline_response(kx / qx) * spline_response(ky / qy)
+        grid = np.fft.irfft2(np.fft.rfft2(grid) * transfer, (ny, nx))
+    elif not linear:
+        grid = spline_filter(spline_filter(grid, 0), 1)
     size = np.abs(grid)
     grid[size < TINY * size.max(initial=0.0)] = 0.0
     return Convolved(

@@ -154,6 +154,48 @@ def test_a_change_in_an_intrinsic_counts(tmp_path, monkeypatch):
     assert len({key for key, _ in made}) == 3
 
 
+EVERYTHING = """
+import math
+import numba as nb
+import numpy as np
+
+@nb.njit(nogil=True, cache=True)
+def outer(x):
+    if x.size < 2:
+        raise ValueError("too short")
+    made = np.empty((x.size, 2))
+    for k in range(x.size):
+        made[k, 0], made[k, 1] = np.sin(x[k]) ** 0.7, np.exp(x[k]) % 1.0 + x[k] ** 3
+    total = 0.0
+    for row in made[1::2].T.copy():
+        total += row[0] * row[-1] + np.arctan2(row[1], math.gamma(row[2] + 1))
+    return total + made.sum() + abs(x[0]) + min(1, x.size)
+"""
+LOADED = """
+import importlib.util, os, sys
+import numpy as np
+import zonda.core.kernel_cache as cache
+cache.install()
+spec = importlib.util.spec_from_file_location("zonda.toy_outer", os.path.join(sys.argv[1], "toy_outer.py"))
+module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+found = module.outer(np.linspace(0.1, 2.0, 50))
+try:
+    module.outer(np.ones(1))
+except ValueError as err:
+    print(repr(found), err, "numba.np.linalg" in sys.modules)
+"""
+
+
+def test_a_kept_kernel_is_loaded_without_the_compiler(tmp_path):
+    (tmp_path / "toy_outer.py").write_text(EVERYTHING)
+    command = [sys.executable, "-c", LOADED, str(tmp_path)]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2))
+    assert first.stdout.endswith("too short True\n"), first.stderr
+    assert second.stdout == first.stdout.replace("True", "False"), second.stderr
+
+
 def test_a_full_disk_is_no_error(folder, monkeypatch):
     def full(self, key, data):
         raise OSError(errno.ENOSPC, "No space left on device")

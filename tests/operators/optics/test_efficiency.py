@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zonda.core.smooth import SmoothField
-from zonda.operators.optics.efficiency import OPAQUE, Efficiency, quotient
+from zonda.operators.optics.efficiency import OPAQUE, Efficiency, _spline, quotient
 
 N_DET, N = 19, 5000
 
@@ -178,3 +178,11 @@ def test_an_instantaneous_calibration_that_cannot_divide_is_counted(bench, strea
     assert run.tally["Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06"] == "31"
     mean = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=fields())
     assert ("Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06") not in mean.tally
+
+
+@pytest.mark.parametrize("cells", [1, 2, 3, 50])
+def test_spline_has_the_values_and_the_slopes_at_the_ends(cells):
+    known = np.random.default_rng(cells).normal(size=(2, cells + 3))
+    c = _spline(known)
+    np.testing.assert_allclose((c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6, known[:, 1:-1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose((c[:, [2, -1]] - c[:, [0, -3]]) / 2, known[:, [0, -1]], rtol=0, atol=1e-14)

@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.optimize import least_squares
+
+from zonda.operators.noise.one_over_f import _least_squares, _state_covariance, power_law_filter
+
+
+def test_least_squares_finds_what_scipys_does() -> None:
+    x = np.linspace(0, 3, 40)
+    data = 2 * np.exp(-1.3 * x) + 0.3 + 0.01 * np.random.default_rng(0).normal(size=x.size)
+
+    def misfit(p):
+        return p[0] * np.exp(-p[1] * x) + p[2] - data
+
+    def jacobian(p):
+        return np.stack([np.exp(-p[1] * x), -p[0] * x * np.exp(-p[1] * x), np.ones_like(x)], axis=1)
+
+    start = np.array([1.0, 0.1, 0.0])
+    found, theirs = _least_squares(misfit, jacobian, start), least_squares(misfit, start, jac=jacobian, method="lm").x
+    # it ends where the misfit changes by 1e-5 of itself: |misfit|^2 is flat there, so x is within some 1e-3 of its error bars
+    assert misfit(found) @ misfit(found) == pytest.approx(misfit(theirs) @ misfit(theirs), rel=1e-5)
+    np.testing.assert_allclose(found, theirs, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("f_min", "poles", "percent"), [(1e-5, 4, 18), (1e-5, 8, 1.8), (1e-5, 12, 0.25), (1e-7, 6, 15), (1e-7, 10, 2.5)]
+)
+def test_error_is_that_of_the_table(f_min: float, poles: int, percent: float) -> None:
+    assert 100 * power_law_filter(f_min, 1.0, poles).error == pytest.approx(percent, rel=0.05)
+
+
+def test_covariance_of_the_states() -> None:
+    """S = A S A^T + b b^T with A = 1 + D."""
+    fit = power_law_filter(1e-3, 1.0, 5)
+    n = fit.poles.size
+    step = np.eye(n) + np.diag(-fit.poles) + np.tril(np.broadcast_to(fit.zeros - fit.poles, (n, n)), -1)
+    expected = solve_discrete_lyapunov(step, np.ones((n, n)))
+    np.testing.assert_allclose(_state_covariance(fit.poles, fit.zeros), expected, rtol=1e-8)  # 1 / pole^2 of rounding
