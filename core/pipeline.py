@@ -335,6 +335,8 @@ class Pipeline:
             raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
         if part is not None and part.scans is not None:
             data.observations = [data.observations[k] for k in part.scans]
+        if part is None:
+            self._meanwhile(data, "pointing")
         self._keep_to(ceiling, memory, data, settings, ahead)
         pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         freeze = any(run.modes == "full" for run in self.runs.values())
@@ -363,6 +365,8 @@ class Pipeline:
                     following = begin(number) if number < len(data.observations) else None
                     execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, ahead, following)
                     data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
+                    if part is None:
+                        self._meanwhile(data, "scan")
             finally:
                 ahead.close()
             for operator in steps:
@@ -370,6 +374,8 @@ class Pipeline:
                     self._finalize(operator, data, timer, hooks)
                 else:
                     part.take(operator, data)
+            if part is None:
+                self._meanwhile(data, "run")
         data.run = ""
         for operator in self.operators:
             if operator.at_end and part is None:
@@ -408,9 +414,7 @@ class Pipeline:
             data.run = run
             for operator in self._selected(run):
                 self._finalize(operator, data, timer, hooks)
-            for operator in self.operators:
-                if operator.at_end:
-                    operator.after_run(data)
+            self._meanwhile(data, "run")
         data.run = ""
         for operator in self.operators:
             if operator.at_end:
@@ -430,6 +434,11 @@ class Pipeline:
             ahead.on = size is not None
             settings.memory, products = settings.memory - (size or 0), products + (size or 0)
         settings.ceiling = budget - products
+
+    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
+        for operator in self.operators:
+            if operator.at_end:
+                operator.meanwhile(data, done)
 
     def _finalize(self, operator: Operator, data: Data, timer: Timer, hooks: Any) -> None:
         hooks.zonda_before_operator(operator=operator, observation=None, stage="finalize")

@@ -99,8 +99,11 @@ class Late(Operator):
     at_end: ClassVar[bool] = True
     requires: ClassVar[frozenset[str]] = frozenset({"total"})
 
+    def meanwhile(self, data, done):
+        data.products.setdefault("heard", []).append((data.run, done, len(data.products.get(data.product("total"), []))))
+
     def finalize(self, data):
-        data.products["seen"] = sorted(data.products)
+        data.products["seen"] = sorted(name for name in data.products if name.endswith("total"))
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +121,12 @@ def test_companion_runs_use_the_same_random_numbers(scene):
         whole, sky, noise = (data.products[n][k] for n in ("total", "noiseless/total", "source_free/total"))
         assert np.array_equal(whole, sky + noise)
         assert 0.9 < sky.std() < 1.1
+
+
+def test_what_acts_at_the_end_hears_of_what_is_done(scene):
+    data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs={"again": {"only": ["sky"]}}).run(scene, threads=1)
+    scans = [[(run, "scan", k + 1) for k in range(2)] + [(run, "run", 2)] for run in ("", "again")]
+    assert data.products["heard"] == [("", "pointing", 0), *scans[0], *scans[1]]
 
 
 def test_same_seed_same_bits_two_seeds_incoherent(scene):
