@@ -3,6 +3,7 @@
     python benchmarks/stages.py            # all cases, each in a process of its own
     python benchmarks/stages.py M2         # one case
     python benchmarks/stages.py M2 --threads 2 --repeat 5
+    python benchmarks/stages.py M2 --prototypes FOLDER   # beside the prototypes' chain, run by turns in the same process
 
 The reference is numpy drawing as many float32 normal deviates (``Generator.standard_normal``), the least that any simulation
 of detector noise does with that library: ratios to it compare machines. CPU seconds are those of the whole process, all
@@ -88,7 +89,9 @@ BARS = {
     "common mode": (["CommonModeFilter"], 1.5),
     "binning": (["BinMap"], 2.5),
 }
-"""What prototypes reached on a quiet 2.x GHz Sapphire Rapids core (AVX-512), ns per sample; 1.5 times that is a fair bar."""
+"""What prototypes reached on a quiet 2.x GHz Sapphire Rapids core (AVX-512), ns per sample; 1.5 times that is a fair bar.
+
+The bar of another machine is 1.5 times what the prototypes reach there (``--prototypes``)."""
 
 
 def scene_of(name):
@@ -138,20 +141,27 @@ def verdict(value, limit):
     return f"{value / limit:5.2f} of the limit" + ("" if value <= limit else ": MISSED")
 
 
-def measure(name, threads, repeat):
+def measure(name, threads, repeat, prototypes=None):
     import numpy as np
+    from prototypes import Prototype
 
     case = CASES[name]
     scene = scene_of(name)
     pipeline_of(name, short=True).run(scene, threads=threads)  # imports, compilation
     before = peak_memory()
-    chain, totals, walls, runs = pipeline_of(name), [], [], []
+    chain, totals, walls, runs, theirs = pipeline_of(name), [], [], [], []
+    prototype = Prototype(prototypes, name) if prototypes else None
+    if prototype and prototype.absent:
+        print(f"{name}: without prototypes: {prototype.absent}")
+        prototype = None
     for _ in range(repeat):
         cpu, wall = time.process_time(), time.perf_counter()
         data = chain.run(scene, threads=threads)
         totals.append(time.process_time() - cpu)
         walls.append(time.perf_counter() - wall)
         runs.append({(label, stage): seconds for label, stage, seconds in data.provenance["timings"]})
+        if prototype:
+            theirs.append(prototype.stages())
     peak, per = peak_memory(), reference(3 * repeat)
     n = data.observations[0].n_detectors * data.observations[0].n_samples
     stages = {key: float(np.median([r.get(key, 0.0) for r in runs])) for key in runs[0]}
@@ -168,10 +178,20 @@ def measure(name, threads, repeat):
             row(f"{label} {stage}", seconds)
     row("everything else", rest)
     row("whole chain", total, f"   {min(totals):.3f} to {max(totals):.3f} s")
-    print(f"\n  {'exec and measure together':34s} {'CPU s':>8s} {'ns/sample':>10s} {'x reference':>12s} {'bar':>6s}")
+
+    def together(labels, run):
+        return sum(s for (label, stage), s in run.items() if label in labels and stage in ("exec", "measure")) / n * 1e9
+
+    print(f"\n  {'exec and measure together, ns/sample':38s} {'median':>6s} {'least':>6s} {'bar':>6s}", end="")
+    print(f" {'prototype, least':>18s} {'ratio':>6s}" if prototype else "")
     for what, (labels, best) in BARS.items():
-        seconds = sum(s for (label, stage), s in stages.items() if label in labels and stage in ("exec", "measure"))
-        row(what, seconds, f" {1.5 * best:6.2f}" + ("" if seconds / n * 1e9 <= 1.5 * best else "  above"))
+        times = [together(labels, run) for run in runs]
+        least, bar = min(times), 1.5 * best
+        line = f"  {what:38s} {np.median(times):6.2f} {least:6.2f} {bar:6.2f}"
+        if prototype:
+            bar = 1.5 * min(t[what] for t in theirs)
+            line += f" {bar / 1.5:18.2f} {1.5 * least / bar:6.2f}"
+        print(line + ("" if least <= bar else "  above"))
     print(f"\n  CPU {total:.3f} s of {case.cpu:g} s: {verdict(total, case.cpu)}; wall {np.median(walls):.3f} s")
     print(f"  peak memory {peak:.2f} GB ({before:.2f} GB before) of {case.memory:g} GB: {verdict(peak, case.memory)}")
     print(f"  reference: numpy float32 normals {per * 1e9:.2f} ns/sample; load of the machine {os.getloadavg()[0]:.1f}")
@@ -182,13 +202,15 @@ def main() -> int:
     parser.add_argument("case", nargs="*", choices=[*CASES, []], help="default: all")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--prototypes", type=Path, help="folder of the prototypes' research code")
     options = parser.parse_args()
     if len(options.case) == 1:
-        measure(options.case[0], options.threads, options.repeat)
+        measure(options.case[0], options.threads, options.repeat, options.prototypes)
         return 0
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     for case in options.case or CASES:
         arguments = [case, "--threads", str(options.threads), "--repeat", str(options.repeat)]
+        arguments += ["--prototypes", str(options.prototypes)] if options.prototypes else []
         subprocess.run([sys.executable, __file__, *arguments], check=True, env=environment)
     return 0
 

@@ -256,6 +256,11 @@ def run(
     folder = file.output if output is None else output
     check_output_folder(folder)  # before anything is worked out
     click.get_current_context().with_resource(lock(folder))
+    campaign_there = (folder / "campaign.json").exists()
+    if campaign_there:
+        from .campaign.folder import check_free, make_way
+
+        check_free(folder)
     helper = Helper()
     click.get_current_context().call_on_close(helper.close)
     made = outcome(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
@@ -264,6 +269,8 @@ def run(
     resolved = file.resolved_yaml()
     command = _command(pipelines, settings, keep, drop, no_prune, only)
     provenance = {"resolved_yaml": resolved, "command": command, "plan": made.short}
+    if campaign_there:
+        make_way(folder)
     gc.freeze()
     gc.enable()
     data = file.pipeline().run(file.scene(), output=folder, threads=threads, ceiling=memory, provenance=provenance)

@@ -13,37 +13,53 @@ FLAGS = ("contract", "nsz")
 
 
 @intrinsic
-def four_columns(typing_context: Any, f: Any, p: Any, stride: Any, v0: Any, v1: Any, v2: Any, v3: Any, out: Any, at: Any) -> Any:
-    """out[at + k] = sum_j v_j f[p + j stride + k], k = 0 .. 3, for C arrays ``f`` and ``out`` (n,) of the type of ``v_j``.
+def spline_of_four(typing_context: Any, f: Any, stride: Any, place: Any, weights: Any, size: Any, t: Any, out: Any) -> Any:
+    """out[s] = sum_i sum_j x_i[s] y_j[s] f[place[s] + j stride + i], i, j = 0 .. 3, for the four samples s = t .. t + 3.
 
-    ``p``, ``stride``, ``at`` are uint64; nothing is checked.
+    C arrays: ``place`` int32, ``f``, ``out`` and ``weights`` of one type; ``weights`` are x_0 .. x_3, y_0 .. y_3, one after the
+    other, each of ``size`` samples. ``stride``, ``size``, ``t`` are uint64; nothing is checked.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        f, p, stride, *v, out, at = arguments
-        scalar = context.get_data_type(signature.args[0].dtype)
-        four, size = ir.VectorType(scalar, 4), context.get_abi_sizeof(scalar)
+        f, stride, place, weights, size, t, out = arguments
+        scalar, kinds = context.get_data_type(signature.args[0].dtype), signature.args
+        four, align = ir.VectorType(scalar, 4), context.get_abi_sizeof(scalar)
+        lane = ir.IntType(32)
 
-        def place(array: Any, kind: Any, index: Any) -> Any:
-            first = make_array(kind)(context, builder, array).data
-            return builder.bitcast(builder.gep(first, [index]), four.as_pointer())
+        def data(array: Any, kind: Any) -> Any:
+            return make_array(kind)(context, builder, array).data
 
-        nothing, integer = ir.Constant(four, ir.Undefined), ir.IntType(32)
-        zeros = ir.Constant(ir.VectorType(integer, 4), [0] * 4)
+        def shuffle(a: Any, b: Any, *lanes: int) -> Any:
+            return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(lane, 4), list(lanes)))
 
-        def spread(value: Any) -> Any:
-            return builder.shuffle_vector(builder.insert_element(nothing, value, ir.Constant(integer, 0)), nothing, zeros)
+        def vector(pointer: Any) -> Any:
+            return builder.load(builder.bitcast(pointer, four.as_pointer()), align=align)
 
-        total = None
-        for weight in v:
-            row = builder.load(place(f, signature.args[0], p), align=size)
-            term = builder.fmul(spread(weight), row, flags=FLAGS)
-            total = term if total is None else builder.fadd(total, term, flags=FLAGS)
-            p = builder.add(p, stride)
-        builder.store(total, place(out, signature.args[7], at), align=size)
+        def weighted(terms: Any) -> Any:
+            total = None
+            for a, b in terms:
+                term = builder.fmul(a, b, flags=FLAGS)
+                total = term if total is None else builder.fadd(total, term, flags=FLAGS)
+            return total
+
+        f, weights = data(f, kinds[0]), builder.gep(data(weights, kinds[3]), [t])
+        at = [vector(builder.gep(weights, [builder.mul(size, ir.Constant(size.type, k))])) for k in range(8)]
+        columns = []
+        for s in range(4):
+            first = builder.load(builder.gep(data(place, kinds[2]), [builder.add(t, ir.Constant(t.type, s))]))
+            row, terms = builder.gep(f, [builder.zext(first, t.type)]), []
+            for weight in at[4:]:
+                terms.append((shuffle(weight, weight, s, s, s, s), vector(row)))
+                row = builder.gep(row, [stride])
+            columns.append(weighted(terms))
+        a, b, c, d = columns
+        halves = [[shuffle(p, q, *lanes) for p, q in ((a, b), (c, d))] for lanes in ((0, 4, 1, 5), (2, 6, 3, 7))]
+        turned = [shuffle(*pair, *lanes) for pair in halves for lanes in ((0, 1, 4, 5), (2, 3, 6, 7))]
+        total = weighted([(x, column) for x, column in zip(at[:4], turned, strict=True)])
+        builder.store(total, builder.bitcast(builder.gep(data(out, kinds[6]), [t]), four.as_pointer()), align=align)
         return context.get_dummy_value()
 
-    return types.void(f, types.uint64, types.uint64, v0, v1, v2, v3, out, types.uint64), generate
+    return types.void(f, types.uint64, place, weights, types.uint64, types.uint64, out), generate
 
 
 @intrinsic

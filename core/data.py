@@ -187,7 +187,8 @@ class Observation:
     @property
     def elevation(self) -> Floats:
         """(n_samp,) rad."""
-        return self.derotate("boresight_azel")[1]
+        x, y, z, w = self.boresight_azel.T
+        return np.asarray(np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x)), np.float64)
 
     @property
     def ra(self) -> Floats:

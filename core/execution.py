@@ -119,6 +119,7 @@ class Execution:
         self.operators, self.observation, self.settings, self.timer = list(operators), observation, settings, timer
         self.keep, self.frozen = tuple(keep), frozen
         self.states: dict[str, Any] = {}
+        self._labels = {id(operator): operator.label for operator in operators}  # the property is slow
         self.beforehand: Future[None] | None = None
         self._ahead = Ahead(False)
         self._stop = threading.Event()
@@ -151,9 +152,9 @@ class Execution:
             self._same_use("", "prepared")
             self._keep_to_ceiling()
             self._ahead.start(following)
+            self._leave_out()
             self._execute(before, after)
-            if self.frozen is not None:
-                self.frozen.complete = True
+            self._keep_out()
             for operator in self.operators:
                 start = time.thread_time()
                 operator.collect(data, observation, self.states[operator.label])
@@ -202,6 +203,22 @@ class Execution:
         """Let a run with frozen modes use the samples and detectors that the main run used at this point."""
         if self.frozen is not None:
             self.frozen.at(self.observation, label, stage)
+
+    def _leave_out(self) -> None:
+        """Let a run with frozen modes leave out the single samples that the main run left out."""
+        if self.frozen is not None and self.frozen.complete:
+            for operator in self.operators:
+                if (kept_out := self.frozen.kept_out.get(operator.label)) is not None:
+                    operator.leave_out(self.states[operator.label], kept_out)
+
+    def _keep_out(self) -> None:
+        """Note what the main run left out."""
+        if self.frozen is not None and not self.frozen.complete:
+            for operator in self.operators:
+                kept_out = operator.keep_out(self.observation, self.states[operator.label])
+                if kept_out is not None:
+                    self.frozen.kept_out[operator.label] = kept_out
+            self.frozen.complete = True
 
     # ---- segments
 
@@ -430,10 +447,11 @@ class Execution:
         first, rest = segment.split()
         # whole scans, and what is only taken in pieces, are worked on where they are kept
         in_place = bool(made) and not segment.halo and (not rest or reach == slice(0, n_samples))
-        block = self._block(stage, detectors, reach, samples, made if in_place else {}, again)
         passed_on = set(stage.wanted).union(*(o.requires | o.optional for o in rest))
         if again:
             first, rest = ([o for o in some if o.provides & self._streams] for some in (first, rest))
+        copied = not first or bool(rest)
+        block = self._block(stage, detectors, reach, samples, made if in_place else {}, again, copied)
         if first:
             self._in_pieces(first, block, passed_on)
         self._exec(rest[:1], block)
@@ -446,17 +464,22 @@ class Execution:
         return block
 
     def _exec(self, operators: list[Operator], block: Block) -> None:
+        start = time.thread_time()
         for operator in operators:
             if self._stop.is_set():
                 return
-            start = time.thread_time()
-            operator.exec(block, self.states[operator.label])
-            self.timer.add(operator.label, "exec", time.thread_time() - start)
+            label = self._labels[id(operator)]
+            operator.exec(block, self.states[label])
+            now = time.thread_time()
+            self.timer.add(label, "exec", now - start)
+            start = now
 
-    def _block(self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool) -> Block:
+    def _block(
+        self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool, copied: bool
+    ) -> Block:
         """A block with its sources in it: where they are kept (as ``made`` says), copies, or made again.
 
-        With margins never in place: others read them too.
+        With margins never in place: others read them too. Not ``copied``: operators work on copies of parts of it alone.
         """
         source, observation = stage.source, self.observation
         if again:
@@ -466,7 +489,7 @@ class Execution:
         block = Block(observation, detectors, reach, dtype=self.settings.dtype, buffers=buffers, again=again)
         block.places = {name: stream.array[detectors, reach] for name, stream in made.items()}
         for name, stream in source.streams.items():
-            if made:
+            if made or not copied:
                 block.detdata[name] = block.places.get(name, stream.array[detectors, reach])
             else:
                 block.detdata[name] = block.buffer(name, block.shape)
@@ -491,7 +514,7 @@ class Execution:
 
     def _in_pieces(self, operators: list[Operator], block: Block, passed_on: set[str]) -> None:
         """Let operators that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
-        given, means = dict(block.detdata), block.means
+        given, means, made = block.detdata, block.means, dict[str, Floats]()
         buffers = self._local.__dict__.setdefault("pieces", {})
         for detectors, samples in pieces(block.detectors, block.samples):
             piece = Block(
@@ -503,10 +526,11 @@ class Execution:
                 piece.detdata[name][...] = stream[where]
             self._exec(operators, piece)
             for name in passed_on & piece.detdata.keys():
-                if name not in block.detdata:
-                    block.detdata[name] = block.places[name] if name in block.places else block.buffer(name, block.shape)
-                block.detdata[name][where] = piece.detdata[name]
+                if name not in made:
+                    made[name] = block.places[name] if name in block.places else block.buffer(name, block.shape)
+                made[name][where] = piece.detdata[name]
             block.means = piece.means  # the same fields in every piece
+        block.detdata = {**given, **made}
 
     def _blocks(self, stage: Stage) -> list[tuple[slice, slice]]:
         """The blocks in which a stage works. Raises PipelineError where the least one does not fit."""

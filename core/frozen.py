@@ -2,7 +2,8 @@
 
 A filter that measures the data (singular modes) is not linear in them. With what it measured in the complete data d held fixed
 it is: F_d(a) = a - U_d U_d^T a, and F_d(sky) + F_d(rest) = F_d(d), the main run itself. A companion run with ``modes: full``
-applies F_d; one with ``modes: own`` measures its own data, as the paper's noiseless run does.
+applies F_d; one with ``modes: own`` measures its own data, as the paper's noiseless run does. Samples that the main run left out
+because of their values (not finite) are left out too, so that every map has the same hits.
 """
 
 from __future__ import annotations
@@ -30,11 +31,14 @@ class Frozen:
     ----------
     found
         What `Operator.freeze` returned, by label.
+    kept_out
+        What `Operator.keep_out` returned, by label.
     complete
         True: the main run is done, `at` puts back what it recorded.
     """
 
     found: dict[str, Any] = field(default_factory=dict)
+    kept_out: dict[str, Any] = field(default_factory=dict)
     complete: bool = False
     _used: dict[tuple[str, str], Used] = field(default_factory=dict)
 
@@ -42,6 +46,8 @@ class Frozen:
         """Record which samples, detectors and NETs are in use at this point of the run, or put back what was then."""
         here = (label, stage)
         if self.complete:
+            if here not in self._used:  # a step that the main run does not have uses what is used
+                return
             flags, detector_flags, net = self._used[here]
             observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
             observation.focalplane.net = net.copy()

@@ -74,7 +74,7 @@ def _take(path: Path) -> int:
 
 
 def _living(path: Path) -> dict[str, Any] | None:
-    """The holder of another lock, where there is one and it is not known to be gone."""
+    """The holder of another lock, where there is one and it is not known to be gone. What one that is gone left is removed."""
     try:
         handle = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -82,7 +82,13 @@ def _living(path: Path) -> dict[str, Any] | None:
     try:
         locked = _flock(handle)
         holder = _read(path)
-        return holder or {} if locked is False or (holder is not None and _lives(holder, locked)) else None
+        if locked is False or (holder is not None and _lives(holder, locked)):
+            return holder or {}
+        if locked:  # whoever opened it before looks whether it is still there when he has the lock
+            with contextlib.suppress(OSError):
+                if os.fstat(handle).st_ino == os.stat(path).st_ino:
+                    path.unlink()
+        return None
     finally:
         os.close(handle)
 

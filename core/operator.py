@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import PrivateAttr
@@ -39,7 +39,8 @@ class Operator(Parameters):
 
     A campaign (`core.campaign`) shares the observations out among tasks. What `observe` works out from all of them comes from
     `agree` and `lay_out`; between `collect` and `finalize`, `pack` takes a task's partial products out of ``data.products`` and
-    `merge` adds them together. An operator that puts anything there in `collect` needs both to take part in a campaign.
+    `merge` adds them together. An operator that puts anything there in `collect` needs both to take part in a campaign; with
+    `subtract` its products of a companion run can be derived from those of other runs.
 
     Class attributes
     ----------------
@@ -62,6 +63,11 @@ class Operator(Parameters):
         two observations at once. A class that overrides one of the two must say so itself; one that overrides none need not.
     at_end
         True for operators that only act in `finalize` (plots, reports): they run once, after all companion runs.
+    linear
+        True where what `exec` makes of the components, or of ``signal``, is linear in them, with the same transmission of the air
+        and, for ``couples = "all"``, with what `freeze` kept. A run may then be derived from others (`core.derived`).
+    only_tells
+        True where `collect` puts nothing into ``data.products`` that differs from run to run: it only tells the tally.
     product_only
         True for operators that only make products in memory (map makers, spectra): a plan leaves them out of a run from a file
         where no later step reads what they provide.
@@ -79,6 +85,8 @@ class Operator(Parameters):
     main_run_only: ClassVar[bool] = False
     prepares_ahead: ClassVar[bool] = False
     at_end: ClassVar[bool] = False
+    linear: ClassVar[bool] = False
+    only_tells: ClassVar[bool] = False
     product_only: ClassVar[bool] = False
     knobs: ClassVar[tuple[Knob, ...]] = ()
     lighter: ClassVar[str] = ""
@@ -201,6 +209,24 @@ class Operator(Parameters):
 
     def merge(self, data: Data, part: Mapping[str, Any]) -> None:
         """Add a part that `pack` made to ``data.products``. Parts come in the order of their observations."""
+
+    def subtract(self, whole: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+        """What `pack` would give of a run of all components but those of ``parts``: ``whole`` (the main run) minus these, all as
+        `pack` made them; None where it cannot be told, and must be simulated (`core.derived`)."""
+        return None
+
+    @property
+    def can_subtract(self) -> bool:
+        """Whether its products of a run may be derived from those of others: it has `subtract`, or makes none in `collect`."""
+        mine = type(self)
+        return mine.subtract is not Operator.subtract or mine.collect is Operator.collect or self.only_tells
+
+    def keep_out(self, observation: Observation, state: Any) -> Any:
+        """What the main run left out sample by sample because of their values, for `leave_out`; None: nothing."""
+        return None
+
+    def leave_out(self, state: Any, kept_out: Any) -> None:
+        """Leave out of a run with ``modes: full`` what `keep_out` found in the main run. Called before `exec`."""
 
     def traits(self, observation: Observation) -> Traits:
         """What other operators' bounds need to know of this one (noise, pixels, filters); see `core.plan`.

@@ -16,12 +16,14 @@ from . import ahead as preparation
 from .ahead import Ahead
 from .configuration.parameters import Parameters
 from .data import Data, Tally, html_table
+from .derived import Packed, derivable, derivation, subtract
 from .errors import PipelineError
 from .execution import Execution, Settings, Timer
 from .forecast import room
 from .frozen import Frozen
 from .machine import available_memory, available_threads, resident_memory
 from .operator import Operator
+from .same_air import TRANSMISSION, SameAir
 from .sky_signal import SkySignal, place_of_signal
 
 if TYPE_CHECKING:
@@ -37,7 +39,8 @@ class Companion(Parameters):
     """Components to leave out (e.g. [sky]: the source-free run)."""
     modes: Literal["own", "full"] = "own"
     """Singular modes of filters: those of this run's own data (`own`: the noiseless run), or those of the complete data (`full`:
-    with the main run's modes, flags and weights, filters are linear, and what they do to each part adds up to the main run)."""
+    with the main run's modes, flags, weights and transmission of the air all is linear, and what is left of each part adds up to
+    the main run; of two runs that are its parts one need not be simulated, see `core.derived`)."""
     filters: Literal["all", "none"] = "all"
     """`none`: leave out every step that changes the signal once it is formed."""
 
@@ -173,6 +176,8 @@ class Pipeline:
             raise PipelineError("\n".join(lines), place=self.name)
         self._check_runs()
         self._add_needed_runs()
+        self.derived = derivable(self, tuple(self.runs))
+        """Companion runs that are derived from the main run and these others, if the operators find nothing against it."""
 
     def _name_steps(self) -> None:
         seen: dict[str, int] = {}
@@ -233,7 +238,8 @@ class Pipeline:
         kept = frozenset(o.label for o in makers if run is None or run.keeps(o.provides))
         frozen = run is not None and run.modes == "full" and len(kept) < len(makers)
         labels = frozenset(o.label for o in filters if run is None or run.filters == "all")
-        return kept, labels, frozen and any(o.couples == "all" for o in self.operators)
+        differ = any(o.couples == "all" or (TRANSMISSION in o.provides and o.label not in kept) for o in self.operators)
+        return kept, labels, frozen and differ
 
     def is_frozen(self, run: str) -> bool:
         """Whether a companion run takes singular modes from the main run (empty: the main run itself, which never does)."""
@@ -267,7 +273,20 @@ class Pipeline:
         dropped = {o.label for o in self._generators() if not companion.keeps(o.provides)}
         if companion.filters == "none":
             dropped |= {o.label for o in self._filters()}
-        return [o for o in steps if o.label not in dropped and not o.main_run_only]
+        found: list[Operator] = []
+        for operator in steps:
+            if operator.main_run_only:
+                continue
+            if operator.label not in dropped:
+                found.append(operator)
+            elif companion.modes == "full" and TRANSMISSION in operator.provides - {*(companion.without or ())}:
+                found += [operator, SameAir.behind(operator)]
+        return found
+
+    @property
+    def order(self) -> list[str]:
+        """The runs in the order in which they are made: the main run (empty), what is simulated, what is derived."""
+        return ["", *(r for r in self.runs if r not in self.derived), *self.derived]
 
     def run(
         self,
@@ -338,45 +357,26 @@ class Pipeline:
         if part is None:
             self._meanwhile(data, "pointing")
         self._keep_to(ceiling, memory, data, settings, ahead)
-        pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
-        freeze = any(run.modes == "full" for run in self.runs.values())
-        frozen = [Frozen() if freeze else None for _ in data.observations]
-        for run in ["", *self.runs]:
-            data.run = run
-            steps = self._selected(run)
-            same = not run or self.runs[run].modes == "full"
-
-            def begin(number: int, same: bool = same, run: str = run, steps: list[Operator] = steps) -> Execution:
-                observation, (focalplane, flags, detector_flags) = data.observations[number], pristine[number]
-                before, observation.tally = observation.tally, Tally()
-                if not run:
-                    observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
-                observation.focalplane, observation.smooth = focalplane.copy(), {}
-                observation.output = data.output
-                observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
-                kept = frozen[number] if same else None
-                return Execution(steps, observation, settings, timer, keep if not run else (), kept)
-
-            try:
-                following: Execution | None = begin(0)
-                for number, observation in enumerate(data.observations, 1):
-                    execution = following
-                    assert execution is not None
-                    following = begin(number) if number < len(data.observations) else None
-                    execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, ahead, following)
-                    data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
+        make = _Runs(self, data, keep, hooks, settings, timer, ahead, part is None)
+        kept: dict[str, Packed] = {}
+        try:
+            for run in self.order:
+                data.run = run
+                if not self._derive(run, data, kept):
+                    make(run)
+                if run in self._parts():
+                    kept[run] = self._packed(run, data)
+                for operator in self._selected(run):
                     if part is None:
-                        self._meanwhile(data, "scan")
-            finally:
-                ahead.close()
-            for operator in steps:
+                        self._finalize(operator, data, timer, hooks)
+                    else:
+                        part.take(operator, data)
                 if part is None:
-                    self._finalize(operator, data, timer, hooks)
-                else:
-                    part.take(operator, data)
-            if part is None:
-                self._meanwhile(data, "run")
+                    self._meanwhile(data, "run")
+        finally:
+            ahead.close()
         data.run = ""
+        make.leave_main()
         for operator in self.operators:
             if operator.at_end and part is None:
                 data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
@@ -385,10 +385,38 @@ class Pipeline:
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 
+    def _parts(self) -> set[str]:
+        """Runs from which others are derived."""
+        return {"", *(p for parts in self.derived.values() for p in parts)} if self.derived else set()
+
+    def _packed(self, run: str, data: Data) -> Packed:
+        """A copy of the partial products of the run in progress, of the operators that can subtract them."""
+        found = {}
+        for operator in self._selected(run):
+            if type(operator).subtract is not Operator.subtract and (packed := operator.pack(data, True)) is not None:
+                operator.merge(data, packed)
+                found[operator.label] = packed
+        return found
+
+    def _derive(self, run: str, data: Data, kept: Mapping[str, Packed]) -> bool:
+        """Make the partial products of a run from those of others; False where it must be simulated."""
+        if run not in self.derived:
+            return False
+        parts = self.derived[run]
+        found = subtract(self, run, kept[""], [kept[p] for p in parts])
+        if found is None:
+            data.tally.state(run, "simulated", f"{derivation(parts)} would not do: their samples differ")
+            return False
+        for operator in self._selected(run):
+            if operator.label in found:
+                operator.merge(data, found[operator.label])
+        data.tally.state(run, "derived as", derivation(parts))
+        return True
+
     def pack(self, data: Data, first: bool) -> dict[str, dict[str, Mapping[str, Any]]]:
         """The partial products in ``data``, by run and label."""
         part = Part(first=first)
-        for run in ["", *self.runs]:
+        for run in self.order:
             data.run = run
             for operator in self._selected(run):
                 part.take(operator, data)
@@ -397,7 +425,7 @@ class Pipeline:
 
     def merge(self, data: Data, packed: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
         """Add the partial products of a part to ``data``."""
-        for run in ["", *self.runs]:
+        for run in self.order:
             data.run = run
             for operator in self._selected(run):
                 if (found := packed.get(run, {}).get(operator.label)) is not None:
@@ -410,7 +438,7 @@ class Pipeline:
 
         hooks, timer = manager().hook, Timer()
         hooks.zonda_pipeline_start(pipeline=self, data=data)
-        for run in ["", *self.runs]:
+        for run in self.order:
             data.run = run
             for operator in self._selected(run):
                 self._finalize(operator, data, timer, hooks)
@@ -429,6 +457,11 @@ class Pipeline:
         budget = ceiling or resident_memory() + available_memory() // 2
         left, products = room(self._selected(""), data.observations, settings, budget, self.name)
         settings.memory = min(left, memory or left)
+        if parts := self._parts():  # what runs are derived from is kept until then
+            longest = max(data.observations, key=lambda o: o.n_detectors * o.n_samples)
+            summed = [o for o in self._selected("") if type(o).subtract is not Operator.subtract]
+            kept = min(len(parts) * sum(o.memory(longest) for o in summed), left // 2)
+            settings.memory, products = settings.memory - kept, products + kept
         if ahead.on and len(data.observations) > 1:
             size = preparation.affordable(self._selected(""), data.observations, settings)
             ahead.on = size is not None
@@ -454,7 +487,7 @@ class Pipeline:
             "description": self.description,
             "seed": scene.seed,
             "precision": self.precision,
-            "runs": {k: v.model_dump(exclude_none=True, exclude_defaults=True) for k, v in self.runs.items()},
+            "runs": {k: self.runs[k].model_dump(exclude_none=True, exclude_defaults=True) for k in self.order[1:]},
             "versions": versions(),
             "operators": [
                 (o.label, type(o).__name__, {k: str(v) for k, v in o.model_dump(mode="json", exclude_none=True).items()})
@@ -467,6 +500,68 @@ class Pipeline:
 
     def _repr_html_(self) -> str:
         return html_table(f"Pipeline {self.name}", [(o.label, repr(o)) for o in self.operators])
+
+
+class _Runs:
+    """Simulates runs, one after the other, over all observations: `Pipeline.run`."""
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        data: Data,
+        keep: Sequence[str],
+        hooks: Any,
+        settings: Settings,
+        timer: Timer,
+        ahead: Ahead,
+        whole: bool,
+    ) -> None:
+        self._pipeline, self._data, self._keep, self._hooks = pipeline, data, keep, hooks
+        self._settings, self._timer, self._ahead, self._whole = settings, timer, ahead, whole
+        self._pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
+        freeze = any(run.modes == "full" for run in pipeline.runs.values())
+        self._frozen = [Frozen() if freeze else None for _ in data.observations]
+        self._main = list(self._pristine)
+        self._following: Execution | None = None
+        """What is begun of the next scan, or of the first scan of the next run."""
+
+    def __call__(self, run: str) -> None:
+        """One run; what comes next is prepared meanwhile."""
+        data, hooks = self._data, self._hooks
+        for number, observation in enumerate(data.observations, 1):
+            execution = self._following or self._begin(run, number - 1)
+            self._following = self._begin(run, number) if number < len(data.observations) else self._next_run(run)
+            execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, self._ahead, self._following)
+            data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
+            if not run:
+                self._main[number - 1] = observation.focalplane, observation.flags, observation.detector_flags
+            if self._whole:
+                self._pipeline._meanwhile(data, "scan")
+
+    def leave_main(self) -> None:
+        """Let observations carry what the main run left of detectors and flags."""
+        for observation, found in zip(self._data.observations, self._main, strict=True):
+            observation.focalplane, observation.flags, observation.detector_flags = found
+
+    def _next_run(self, run: str) -> Execution | None:
+        """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived."""
+        order = self._pipeline.order
+        later = order[order.index(run) + 1 :]
+        if len(self._data.observations) < 2 or not later or later[0] in self._pipeline.derived:
+            return None
+        return self._begin(later[0], 0)
+
+    def _begin(self, run: str, number: int) -> Execution:
+        observation, (focalplane, flags, detector_flags) = self._data.observations[number], self._pristine[number]
+        before, observation.tally = observation.tally, Tally()
+        if not run:
+            observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
+        observation.focalplane, observation.smooth = focalplane.copy(), {}
+        observation.output = self._data.output
+        observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
+        kept = self._frozen[number] if not run or self._pipeline.runs[run].modes == "full" else None
+        steps, keep = self._pipeline._selected(run), self._keep if not run else ()
+        return Execution(steps, observation, self._settings, self._timer, keep, kept)
 
 
 def versions() -> dict[str, str]:

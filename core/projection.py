@@ -21,34 +21,63 @@ from .errors import InputError
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
+    from .tangent import TangentWcs
+
 Floats = NDArray[np.float64]
+
+GALACTIC = (
+    (-0.05487565771259163, -0.8734370519556159, -0.48383507361671546),
+    (0.4941094371927268, -0.4448297212232952, 0.7469821839866676),
+    (-0.8676661375596576, -0.19807633727300053, 0.4559838136873016),
+)
+"""The rotation from ICRS to Galactic coordinates as astropy makes it, which takes half a second to import."""
 
 
 def rotation_matrices(quaternions: Floats) -> Floats:
     """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x, y, z, w; they need not be normalized."""
-    q = np.asarray(quaternions, np.float64)
-    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    return np.moveaxis(_rotations(quaternions), 2, 0)
+
+
+def _rotations(quaternions: Floats) -> Floats:
+    """As `rotation_matrices`, (3, 3, n): each element lies in one piece."""
+    x, y, z, w = _normalized(quaternions)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    return np.array(rows)
+
+
+def boresights(quaternions: Floats) -> Floats:
+    """Unit vectors (3, n) that boresight quaternions (n, 4) look at: the last column of `rotation_matrices`."""
+    x, y, z, w = _normalized(quaternions)
+    return np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+
+
+def _normalized(quaternions: Floats) -> Floats:
+    """(4, n)"""
+    q = np.ascontiguousarray(np.asarray(quaternions, np.float64).T)
+    return np.asarray(q / np.sqrt((q * q).sum(axis=0)))
 
 
 def frame_rotation(frame: str) -> Floats:
     """Matrix (3, 3) that turns an ICRS direction into one in ``frame`` (``icrs``, ``fk5``, ``galactic`` or astropy's name)."""
-    from astropy.coordinates.baseframe import frame_transform_graph
-
     if frame == "icrs":
         return np.eye(3)
+    if frame == "galactic":
+        return np.array(GALACTIC)
+    from astropy.coordinates.baseframe import frame_transform_graph
+
     if frame_transform_graph.lookup_name(frame) is None:
         raise InputError(f"unknown celestial frame {frame!r}", place="frame", cure="use icrs or galactic")
     return _rotation_into(frame, frame, "frame")
 
 
-def wcs_frame_rotation(wcs: WCS) -> Floats:
+def wcs_frame_rotation(wcs: WCS | TangentWcs) -> Floats:
     """Matrix (3, 3) from ICRS directions to directions in the frame of ``wcs``."""
+    if (frame := getattr(wcs, "frame", None)) is not None:
+        return frame_rotation(frame)
     from astropy.wcs.utils import wcs_to_celestial_frame
 
     try:
@@ -70,7 +99,7 @@ def _rotation_into(frame: Any, called: str, place: str) -> Floats:
     return matrix
 
 
-def pixel_matrix(wcs: WCS) -> Floats:
+def pixel_matrix(wcs: WCS | TangentWcs) -> Floats:
     """Matrix P (3, 3): an ICRS direction d has the 0-based pixel (x, y) = ((P d)_0, (P d)_1) / (P d)_2.
 
     ``wcs`` is a two-dimensional celestial TAN WCS; CRPIX, CDELT (signs too), PC/CD, LONPOLE, the order of the axes and
@@ -83,6 +112,12 @@ def pixel_matrix(wcs: WCS) -> Floats:
     if not all(k.endswith("-TAN") for k in kinds) or wcs.has_distortion:
         raise InputError(f"projection {kinds} is not a plain TAN", place="WCS", cure="reproject to TAN without distortion")
     wcs.wcs.set()
+    return central(wcs) @ wcs_frame_rotation(wcs)
+
+
+def central(wcs: WCS | TangentWcs) -> Floats:
+    """`pixel_matrix` for directions in the frame of ``wcs`` itself."""
+    lng, lat = wcs.wcs.lng, wcs.wcs.lat
     lon0, lat0 = np.radians([wcs.wcs.crval[lng], wcs.wcs.crval[lat]])
     centre = np.array([np.cos(lat0) * np.cos(lon0), np.cos(lat0) * np.sin(lon0), np.sin(lat0)])
     east = np.array([-np.sin(lon0), np.cos(lon0), 0.0])
@@ -93,17 +128,23 @@ def pixel_matrix(wcs: WCS) -> Floats:
     plane[lat] = np.sin(turn) * east + np.cos(turn) * north
     per_unit = np.linalg.inv(np.asarray(wcs.pixel_scale_matrix, np.float64)) * np.degrees(1.0)
     pixel = per_unit @ plane + np.outer(np.asarray(wcs.wcs.crpix[:2]) - 1.0, centre)
-    return np.vstack([pixel, centre]) @ wcs_frame_rotation(wcs)
+    return np.vstack([pixel, centre])
 
 
-def homographies(quaternions: Floats, wcs: WCS) -> Floats:
+def homographies(quaternions: Floats, wcs: WCS | TangentWcs) -> Floats:
     """Equation (1): coefficients h (n, 9) float64 for boresight quaternions (n, 4) in ICRS and a TAN image.
 
     A detector at focal-plane offsets (xi, eta) looks at R(q) (-eta, -xi, 1) (TOAST's boresight frame). Pixels are
     0-based, with integer coordinates at pixel centres. Error: some 1e-13 of the distance to the image centre in pixels.
+    Each coefficient lies in one piece (Fortran's order).
     """
-    turned = np.matmul(pixel_matrix(wcs), rotation_matrices(quaternions))
-    return np.ascontiguousarray(np.stack([-turned[:, :, 1], -turned[:, :, 0], turned[:, :, 2]], axis=2).reshape(-1, 9))
+    matrix, turn = pixel_matrix(wcs), _rotations(quaternions)
+    h = np.empty((9, turn.shape[2]))
+    for row in range(3):
+        for column, (sign, axis) in enumerate(((-1, 1), (-1, 0), (1, 2))):
+            a, b, c = sign * matrix[row]
+            h[3 * row + column] = a * turn[0, axis] + b * turn[1, axis] + c * turn[2, axis]
+    return h.T
 
 
 def directions(quaternions: Floats, xi: Floats, eta: Floats) -> Floats:

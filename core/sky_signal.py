@@ -18,6 +18,7 @@ class SkySignal(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"sky"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    linear: ClassVar[bool] = True
 
     @property
     def label(self) -> str:

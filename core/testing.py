@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from .configuration.parameters import described
 from .configuration.time import Instant
 from .data import Block, Data, Observation
 from .instrument import Band, Instrument, Telescope
@@ -61,7 +62,7 @@ def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] |
 def check_parameters_are_documented(operator: Operator) -> None:
     """The class and every field have a docstring: messages, schema and documentation are made of them."""
     assert (type(operator).__doc__ or "").strip(), "the class has no docstring"
-    for name, field in type(operator).model_fields.items():
+    for name, field in described(type(operator)).items():
         assert field.description, f"parameter {name} has no docstring"
 
 

@@ -7,6 +7,7 @@ import json
 import typing
 from pathlib import Path
 
+from zonda.core.configuration.parameters import described
 from zonda.core.configuration.units import Unit
 from zonda.core.registry import mapmakers, operators
 
@@ -39,7 +40,7 @@ def page() -> str:
             lines += ["", f"### {cls.__name__}", "", inspect.cleandoc(cls.__doc__ or ""), ""]
             needs, gives = (", ".join(f"`{n}`" for n in sorted(names)) or "nothing" for names in (cls.requires, cls.provides))
             lines += [f"Requires {needs}; provides {gives}.", "", "| parameter | default | |", "|---|---|---|"]
-            for name, field in cls.model_fields.items():
+            for name, field in described(cls).items():
                 if name != "name":
                     text = " ".join((field.description or "").split()).replace("|", "\\|")
                     lines.append(f"| `{name}` | {default(field)} | {text} |")

@@ -215,7 +215,7 @@ def check_whole(folder: Path) -> None:
         elif path.name.endswith(".sqlite") and job:
             joblog.read(path)
         else:
-            assert path.name in (FILE, LOG, f"{LOG}-journal"), path
+            assert path.name in (FILE, LOG) or path.name.endswith(".sqlite-journal"), path
 
 
 def forward(place: Path, name: str) -> list[str]:
@@ -230,10 +230,13 @@ def done(place: Path, name: str) -> int:
     return len(list((place / name / TASKS).glob("[0-9]*.npz")))
 
 
-def killed(place: Path, nursery: Nursery, name: str, moments: random.Random) -> bool:
-    """Begin or resume, and kill at a random moment: after some more tasks and a while; whether that came in time."""
+def killed(place: Path, nursery: Nursery, name: str, moments: random.Random, *arguments: str) -> bool:
+    """Begin or resume, or what ``arguments`` say, and kill at a random moment: after some more tasks and a while.
+
+    Whether that came in time.
+    """
     before, more, pause = done(place, name), moments.randrange(4), moments.uniform(0, 0.05)
-    pid = nursery.begin(*forward(place, name))
+    pid = nursery.begin(*(arguments or forward(place, name)))
     ended = select.poll()
     assert nursery.process.stdout is not None
     ended.register(nursery.process.stdout, select.POLLIN)

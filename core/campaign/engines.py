@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import logging
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -57,6 +59,11 @@ class SerialExecutor(Executor):
         except Exception as err:
             future.set_exception(err)
         return future
+
+
+def engine_failed(err: BaseException) -> bool:
+    """Whether a call did not run to its end for a reason of the engine: a worker that is gone, a scheduler that is not there."""
+    return isinstance(err, BrokenExecutor | CancelledError) or type(err).__module__.partition(".")[0] in ("distributed", "dask")
 
 
 @contextlib.contextmanager
@@ -205,31 +212,33 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
 @contextlib.contextmanager
 def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: int | None) -> Iterator[Pool]:
     try:
+        import dask.config
         import distributed
     except ImportError as err:
         raise _missing("dask.distributed", "dask", err) from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a scheduler that is gone is told without its traceback
     if scheduler is None:
         raise PipelineError(
             "no Dask scheduler is named",
             place="engine dask",
             cure="write campaign.scheduler: tcp://host:8786, or use --scheduler; zonda connects nowhere of itself",
         )
-    options: dict[str, Any] = {"timeout": 20, "set_as_default": False}
-    if "://" in scheduler or not Path(scheduler).is_file():
-        options["address"] = scheduler
-    else:
-        options["scheduler_file"] = scheduler
+    security, cure = None, "is it running there?"
     if tls is not None:
-        options["security"] = distributed.Security(
+        security = distributed.Security(
             tls_ca_file=tls.ca_file, tls_client_cert=tls.cert, tls_client_key=tls.key, require_encryption=True
         )
     try:
-        client = distributed.Client(**options)
-    except (OSError, ValueError, TypeError) as err:
+        file = None if "://" in scheduler or not Path(scheduler).is_file() else Path(scheduler)
+        address = str(json.loads(file.read_text())["address"]) if file else scheduler
+        if address.startswith("tls://"):
+            cure = "is it running there, and are its certificates and yours signed by the same authority (ca_file)?"
+            if security is not None or not dask.config.get("distributed.client.security-loader", None):
+                _check_certificates(security or distributed.Security(), address)
+        client = distributed.Client(address, security=security, timeout=20, set_as_default=False)
+    except (OSError, ValueError, TypeError, KeyError) as err:
         why = str(err).splitlines()[0] if str(err) else type(err).__name__
-        raise PipelineError(
-            f"cannot reach the Dask scheduler: {why}", place=scheduler, cure="is it running, and are the certificates right?"
-        ) from None
+        raise PipelineError(f"cannot reach the Dask scheduler: {why}", place=scheduler, cure=cure) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=600)
@@ -241,6 +250,20 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
         yield Pool(
             client.get_executor(pure=False, retries=0), count, count, threads or 1, memory or min(limits, default=0) // 2 or None
         )
+
+
+def _check_certificates(security: Any, address: str) -> None:
+    """Raise `PipelineError` where this side's certificates are missing or unfit; Dask would say neither which nor where."""
+    cure = "name them in campaign.tls, or in Dask's own configuration: distributed.comm.tls.ca-file, client.cert, client.key"
+    for name, path in [("ca_file", security.tls_ca_file), ("cert", security.tls_client_cert), ("key", security.tls_client_key)]:
+        if not path and name != "key":  # which may be in the same file as cert
+            raise PipelineError(f"no {name} for TLS is named", place=address, cure=cure)
+        if path and "\n" not in path and not Path(path).is_file():  # Dask takes the text of a certificate, too
+            raise PipelineError(f"{name} of TLS: there is no file {path}", place=address, cure=cure)
+    try:
+        security.get_connection_args("client")
+    except (OSError, ValueError) as err:
+        raise PipelineError(f"the certificates for TLS cannot be used: {err}", place=address, cure=cure) from None
 
 
 def _missing(package: str, extra: str, err: ImportError) -> PipelineError:

@@ -182,5 +182,19 @@ def mistakes(
     return found
 
 
+def missing_above(mistake: Diagnostic, document: Document, campaign: Campaign) -> Diagnostic:
+    """A key that the pipeline lacks, told at its place among the axes, where it is one of them; any other mistake as it is."""
+    paths: dict[str, tuple[Any, ...]] = {key: ("campaign", "grid", key) for key in campaign.grid}
+    for k, entry in enumerate(campaign.observations):
+        paths = {key: ("campaign", "observations", k, key) for key in entry} | paths
+    for key, path in paths.items():
+        if mistake.message == f"the pipeline needs '{key}'":
+            here = document.sub(path).value
+            first = setting(key, here[0] if path[1] == "grid" and isinstance(here, list) else here).partition("=")[2]
+            cure = f"write '{key}: {first}' at the top level too: the file is checked with it, and each entry puts its own there"
+            return Diagnostic(f"the axis '{key}' changes what the pipeline does not have", document.mark(path).start, "", cure)
+    return mistake
+
+
 REFUSED = ("version", "name", "description", "requires", "outputs", "campaign", "runs", "operators")
 REFUSED_WHY = "an axis is a key of the scene (seed, site, instrument, time, target, weather), precision, or a step's parameter"

@@ -154,6 +154,8 @@ def read(path: Path) -> list[Row]:
             finally:
                 database.close()
         except sqlite3.OperationalError as err:
+            if "no such table" in str(err):  # its writer has just begun, or was killed then
+                return []
             failure: sqlite3.DatabaseError = err
         except sqlite3.DatabaseError as err:
             failure = err

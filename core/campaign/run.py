@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import time
 from collections import deque
@@ -14,20 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, OutputError, PipelineError, ZondaError
-from ..files import check_output_folder, discard, temporary_sibling, write_text
-from . import log as joblog
+from ..files import check_output_folder, discard
 from . import parts
-from .engines import Pool
+from .engines import Pool, engine_failed
+from .folder import RESOLVED, Say, check_free, clean, make_way, open_log, opened, publish, sources_of, verify, write_sources
 from .job import FILE, LOG, TASKS, Job, Task, digest_of_text
 from .log import Log
 from .prepare import Source, changed, restore_layout
 from .prepare import job as prepare
 from .reduce import Combined, combine
 from .task import Order, Outcome, perform, product_path
-
-RESOLVED = "resolved.yaml"
-
-Say = Callable[[str], None]
 
 
 @dataclass
@@ -72,18 +67,14 @@ def begin(
         For mistakes in the campaign; and at the end where tasks have failed.
     """
     check_output_folder(folder)
-    if (folder / FILE).exists() and not finished(folder):
-        raise OutputError(
-            "holds an unfinished campaign", place=str(folder), cure=f"zonda resume {folder}, remove it, or choose another folder"
-        )
-    for old in (folder / FILE, folder / LOG, *folder.glob("jobs.*.sqlite")):
-        with contextlib.suppress(FileNotFoundError):
-            old.unlink()
-    shutil.rmtree(folder / TASKS, ignore_errors=True)
+    check_free(folder)
+    if (folder / RESOLVED).exists() and not (folder / FILE).exists():
+        say(f"{folder} holds products of an earlier run: those of the same names are replaced, others stay")
+    make_way(folder)
     made = prepare(sources, folder, command, keep, drop, prune_all, _progress())
     _describe(made, folder, say)
-    _write_sources(made, folder)
-    with contextlib.closing(_log(folder / LOG, made)) as log:
+    write_sources(made, folder)
+    with contextlib.closing(open_log(folder / LOG, made)) as log:
         made.write(folder)
         return _work(made, folder, log, pool, say, made.tasks)
 
@@ -98,8 +89,8 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False) -> Resul
     """
     job = Job.read(folder)
     check_unchanged(job, folder, anyway)
-    _clean(folder)
-    log = _opened(folder, job, say)
+    clean(folder)
+    log = opened(folder, job, say)
     with contextlib.closing(log):
         combined = log.combined()
         for number, combination in enumerate(job.combinations):
@@ -108,7 +99,7 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False) -> Resul
                     parts.read(folder / TASKS / combination.layout_file(number), "layout", combination.layout)
                 except InputError:
                     restore_layout(job, folder, number)
-        missing = _verify(job, folder, log, combined, say)
+        missing = verify(job, folder, log, combined, say)
         return _work(job, folder, log, pool, say, missing)
 
 
@@ -124,21 +115,8 @@ def share(
     check_output_folder(folder)
     if not (folder / FILE).exists():
         made = prepare(sources, folder, command, say=_progress(), **options)
-        _write_sources(made, folder)
-        temporary = temporary_sibling(folder / FILE)
-        draft = temporary.with_suffix("")
-        draft.mkdir()
-        try:
-            made.write(draft)
-            try:
-                os.link(draft / FILE, folder / FILE)
-            except FileExistsError:  # another job was first
-                pass
-            except OSError:  # no hard links here
-                if not (folder / FILE).exists():
-                    os.replace(draft / FILE, folder / FILE)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
+        write_sources(made, folder)
+        publish(made, folder)
     job = Job.read(folder)
     if job.source != tuple(s.file.resolved_yaml() for s in sources) or job.version != __version__:
         raise OutputError("holds another campaign", place=str(folder), cure="choose another output folder")
@@ -166,16 +144,6 @@ def share(
     return result
 
 
-def finished(folder: Path) -> bool:
-    """Whether all products of the campaign in a folder are written."""
-    try:
-        job, log = Job.read(folder), Log(folder / LOG)
-    except ZondaError:
-        return False
-    with contextlib.closing(log):
-        return log.combined() == set(range(len(job.combinations)))
-
-
 def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
     """Refuse to go on with another zonda or other files than at the beginning."""
     from zonda import __version__
@@ -183,7 +151,7 @@ def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
     reasons = []
     if job.version != __version__:
         reasons.append(f"it began with zonda {job.version}, this is {__version__}")
-    for path, text in zip(_sources(job, folder), job.source, strict=True):
+    for path, text in zip(sources_of(job, folder), job.source, strict=True):
         if not path.is_file() or digest_of_text(path.read_text(encoding="utf-8", errors="replace")) != digest_of_text(text):
             reasons.append(f"{path} is not what it was")
     reasons += [f"{path} has changed or is gone" for path in changed(job)]
@@ -284,7 +252,7 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
             log.put_off(claimed)
         if pool.stop is not None:
             pool.stop()
-            _clean(folder)
+            clean(folder)
         raise
     finally:
         shown.end()
@@ -362,7 +330,14 @@ def _combine(
             ended = set(done)
         for future in ended:
             number = at_work.pop(future)
-            combined = future.result()
+            try:
+                combined = future.result()
+            except (Exception, CancelledError) as err:
+                if not engine_failed(err):
+                    raise
+                raise PipelineError(
+                    f"the engine failed when it combined the maps: {err}", place=str(folder), cure=f"zonda resume {folder}"
+                ) from None
             if combined.error is not None:
                 raise combined.error
             log.combine(number)
@@ -370,84 +345,6 @@ def _combine(
             if not job.keep_tasks:
                 for task in job.tasks_of(number):
                     discard(product_path(folder, task))
-
-
-# ---- the folder
-
-
-def _verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say) -> list[Task]:
-    """Tasks whose products are not there, or not what they should be; the log then says so."""
-    rows = {row.number: row for row in log.rows()}
-    others = {row.number: row for path in sorted(folder.glob("jobs.*-of-*.sqlite")) for row in _readable(path)}
-    missing, lost = [], []
-    for task in job.tasks:
-        if task.combination in combined:
-            continue
-        row, other = rows[task.number], others.get(task.number)
-        digest = parts.digest_of(product_path(folder, task), task.key)
-        if digest is None or (row.state == "done" and digest != row.digest):
-            missing.append(task)
-            if row.state == "done":
-                lost.append(task)
-        elif row.state != "done":
-            log.done(task.number, other.host if other else row.host, other.seconds if other else row.seconds, digest)
-    gone = {task.number for task in lost}
-    log.put_off(task.number for task in missing if task.number not in gone)
-    log.put_off(gone, "its partial product was missing or damaged when the campaign was resumed")
-    if lost:
-        say(f"{len(lost)} partial products were missing or damaged: their tasks are run again")
-    return missing
-
-
-def _readable(path: Path) -> list[joblog.Row]:
-    try:
-        return joblog.read(path)
-    except InputError:
-        return []
-
-
-def _log(path: Path, job: Job) -> Log:
-    log = Log(path)
-    log.begin((task.number, task.samples) for task in job.tasks)
-    return log
-
-
-def _opened(folder: Path, job: Job, say: Say) -> Log:
-    """The job log; a damaged one is put aside and made anew."""
-    path = folder / LOG
-    try:
-        log = _log(path, job)
-        if {row.number for row in log.rows()} != {task.number for task in job.tasks}:
-            raise InputError("it is of another campaign", place=str(path))
-        log.combined()
-        return log
-    except InputError:
-        aside = next(p for k in range(1, 1000) if not (p := folder / f"jobs.damaged-{k}.sqlite").exists())
-        os.replace(path, aside)
-        for journal in folder.glob(f"{LOG}-*"):
-            discard(journal)
-        say(f"the job log was damaged: it is kept as {aside.name} and made anew from the partial products")
-        return _log(path, job)
-
-
-def _clean(folder: Path) -> None:
-    """Remove what killed workers left half written."""
-    for place in (folder, folder / TASKS, *(folder / "entries").glob("*")):
-        for path in place.glob(".*.part*"):
-            if path.is_file():
-                discard(path)
-
-
-def _sources(job: Job, folder: Path) -> list[Path]:
-    """Where the campaign's own YAML is kept."""
-    if len(job.source) == 1:
-        return [folder / RESOLVED]
-    return [folder / f"resolved-{k}.yaml" for k in range(1, len(job.source) + 1)]
-
-
-def _write_sources(job: Job, folder: Path) -> None:
-    for path, text in zip(_sources(job, folder), job.source, strict=True):
-        write_text(path, text)
 
 
 # ---- what is said

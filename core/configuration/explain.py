@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from .diagnostics import Diagnostic, nearest
+from .parameters import described
 from .units import Unit
 from .yaml_places import Document, Path, Span
 
@@ -119,7 +120,7 @@ def _field(model: type[BaseModel], loc: Iterable[Any]) -> tuple[type[BaseModel] 
     field: FieldInfo | None = None
     for part in loc:
         if owner is not None and part in owner.model_fields:
-            field = owner.model_fields[part]
+            field = described(owner)[part]
             owner = next((t for t in _types(field.annotation) if isinstance(t, type) and issubclass(t, BaseModel)), None)
     return owner, field
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .. import registry
+from ..campaign.entries import missing_above
 from ..campaign.entries import mistakes as campaign_mistakes
 from ..campaign.settings import Campaign
 from ..errors import PipelineError, ZondaError
@@ -225,8 +226,10 @@ class _Check:
         steps = self.steps()
         if header is not None:
             self.runs(header, steps)
-        if not self.mistakes and header is not None and header.campaign is not None:
-            self.mistakes += campaign_mistakes(self.document, header.campaign, KEYS, self.without_campaign)
+        if header is not None and header.campaign is not None:
+            self.mistakes = [missing_above(m, self.document, header.campaign) for m in self.mistakes]
+            if not self.mistakes:
+                self.mistakes += campaign_mistakes(self.document, header.campaign, KEYS, self.without_campaign)
         if self.mistakes:
             raise ConfigurationError(self.mistakes, self.name)
         assert header is not None

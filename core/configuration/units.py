@@ -92,8 +92,9 @@ UNITS = {name: (factor, powers) for names, factor, powers in _NAMED for name in 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
 _FACTOR = re.compile(
     r"(?:sqrt\((?P<root>[^\W\d_]+)\)|(?P<name>[^\W\d_]+|%|°)"
-    r"(?:(?:\^|\*\*)?(?:(?P<power>-?\d+(?:\.\d+)?)|\((?P<top>-?\d+)(?:/(?P<bottom>\d+))?\)))?)(?:\s*[*. ]\s*|$)"
+    r"(?:(?:\^|\*\*)?(?:(?P<power>-?\d(?:\.\d{1,9})?)(?!\d)|\((?P<top>-?\d)(?:/(?P<bottom>[1-9]))?\)))?)(?:\s*[*. ]\s*|$)"
 )
+# powers of one digit: no unit here overflows by them
 
 
 class Measure(NamedTuple):

@@ -144,7 +144,7 @@ class Audit:
         lines += ["  ".join([*(c.ljust(w) for c, w in zip(r, widths, strict=False)), r[6]]).rstrip() for r in table]
         count = sum(r.violated for r in self.rows)
         if not self.rows:
-            return f"{lines[0]}: nothing was dropped or coarsened"
+            return f"{lines[0]}: nothing was coarsened, and no output depends on what was dropped"
         lines.append(f"{len(self.rows)} bounds, {count} violated")
         return "\n".join(lines)
 
@@ -258,7 +258,7 @@ def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: 
         if metric in choice.bound and math.isfinite(actual):
             rows.append(Checked(name, choice.what, metric, choice.bound[metric] + rounding, actual, error))
 
-    scale = ROUNDING * _rms([float((s * s).mean()) for s in full.signal])
+    scale = ROUNDING * _rms([float((s * s).mean()) for s in full.signal if s.size])
     if [a.shape for a in full.signal] == [b.shape for b in other.signal]:
         squares = [
             float((p * p).mean())

@@ -13,6 +13,7 @@ from typing import Any
 from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data
+from ..derived import derivation
 from ..errors import ZondaError
 from ..execution import available_memory, available_threads
 from ..pipeline import Pipeline
@@ -150,7 +151,8 @@ def plan(
     begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
     labels = [o.label for o in pipeline.operators]
-    everything = Structure(tuple(labels), tuple(pipeline.runs), ())
+    derived = {run: derivation(parts) for run, parts in pipeline.derived.items()}
+    everything = Structure(tuple(labels), tuple(pipeline.runs), (), derived=derived)
     operators_dropped = [name for name in drop if name in labels]
     structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
     structure = dataclasses.replace(structure, operators=tuple(k for k in structure.operators if k not in operators_dropped))

@@ -9,8 +9,9 @@ of the components can take its place, and no run needs the main run's singular m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from ..derived import derivable, derivation
 from ..operator import Operator
 from ..pipeline import Companion, Pipeline
 
@@ -42,12 +43,15 @@ class Structure:
         What is left out, and why.
     instead
         The companion run that takes the main run's place, its name no longer needed; empty: none.
+    derived
+        Companion runs that cost nothing, and how they are derived (`core.derived`).
     """
 
     operators: tuple[str, ...]
     runs: tuple[str, ...]
     rows: tuple[Row, ...]
     instead: str = ""
+    derived: Mapping[str, str] = field(default_factory=dict)
 
 
 def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
@@ -89,7 +93,9 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     kept_rows = [r for r in rows if r.run or r.operator in nowhere]
     kept_rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     kept = tuple(o.label for o in pipeline.operators if o.label in acting)
-    return Structure(kept, tuple(r for r in pipeline.runs if r in needed), tuple(kept_rows), instead)
+    runs = tuple(r for r in pipeline.runs if r in needed)
+    derived = {} if instead else {run: derivation(parts) for run, parts in derivable(pipeline, runs).items()}
+    return Structure(kept, runs, tuple(kept_rows), instead, derived)
 
 
 def _wanted(pipeline: Pipeline, run: str) -> set[str]:
@@ -180,7 +186,7 @@ def selected(pipeline: Pipeline, structure: Structure) -> dict[str, int]:
     """Number of runs in which each operator takes part, by label."""
     counts: Mapping[str, int] = {}
     counts = dict.fromkeys(structure.operators, 0)
-    for run in ["", *structure.runs]:
+    for run in ["", *(r for r in structure.runs if r not in structure.derived)]:
         for operator in pipeline._selected(run):
             if operator.label in counts:
                 counts[operator.label] += 1

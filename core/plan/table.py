@@ -60,6 +60,7 @@ def text(plan: Plan, width: int | None = None) -> str:
         named = ", ".join(filter(None, operators))
         left_out = f"left out: {f'run {run}' if run else ''}{': ' if run and named else ''}{named} ({reason})"
         lines += textwrap.wrap(left_out, width, subsequent_indent="    ")
+    lines += [f"run {run} is not simulated: it is {how}" for run, how in plan.structure.derived.items()]
     lines += ["", *_effects(plan, metrics, width), "", line(plan)]
     return "\n".join(lines)
 
@@ -115,6 +116,7 @@ def as_dict(plan: Plan) -> dict[str, Any]:
         "noise": {"sample": sample, "map_pixel": pixel, "samples_per_pixel": hits},
         "budget": {m: {"limit": v, "spent": plan.spent[m]} for m, v in plan.limits.items()},
         "left_out": [{"run": r.run, "operator": r.operator, "reason": r.reason} for r in plan.structure.rows],
+        "derived": dict(plan.structure.derived),
         "effects": rows(plan),
         "prediction": {"cpu_seconds": p.total, "bytes": p.bytes, "by_operator": dict(p.seconds), "unknown": list(p.unknown)},
         "everything_on": {"cpu_seconds": u.total, "bytes": u.bytes},
@@ -127,6 +129,7 @@ def short(plan: Plan) -> list[tuple[str, str, str, str]]:
     for row in plan.structure.rows:
         name = f"run {row.run}" + (f": {row.operator}" if row.operator else "") if row.run else row.operator
         found.append((name, "left out", "", row.reason))
+    found += [(f"run {run}", "not simulated", "", how) for run, how in plan.structure.derived.items()]
     for d in plan.decided:
         bound = describe(d.choice.bound, plan.context.metrics) if d.chosen or d.choice.decision == "not simulated" else ""
         found.append((d.name, f"{d.choice.decision}: {d.choice.what}", bound, d.choice.formula or d.effect.formula))

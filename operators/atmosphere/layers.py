@@ -124,6 +124,7 @@ class AtmosphereLayers(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[Any] = _Provides()
     prepares_ahead: ClassVar[bool] = True
+    only_tells: ClassVar[bool] = True
     knobs: ClassVar[tuple[Knob, ...]] = (
         Knob("tolerance", ("30 %", "10 %", "3 %", "1 %", "0.3 %", "0.1 %"), "layers evaluated at nodes of field and time"),
         Knob("lattice", (0.6, 0.3, 0.15), "turbulence interpolated between the points of its lattice"),

@@ -131,31 +131,34 @@ def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[La
 
 
 def _grid_error(x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float) -> float:
-    wx, wy = lagrange(x, xi), lagrange(y, eta)
-    total = 0.0
-    for layer in layers:
-        e, w = layer.components()
-        one = _separable(x * layer.distance, xi * layer.distance, wx, e)
-        two = _separable(y * layer.distance * stretch, eta * layer.distance * stretch, wy, e)
-        error = 1 - 2 * one[0] * two[0] + one[1] * two[1]
-        total += layer.amplitude**2 * float(error.mean(0) @ w)
+    components = [layer.components() for layer in layers]
+    weight = np.concatenate([layer.amplitude**2 * w for layer, (_, w) in zip(layers, components, strict=True)])
+    nearness = np.concatenate([layer.distance**2 / (4 * e) for layer, (e, _) in zip(layers, components, strict=True)])
+    one, two = _separable(x, xi, nearness), _separable(y, eta, nearness * stretch**2)
+    total = float((1 - 2 * (one[0] * two[0]).mean(0) + (one[1] * two[1]).mean(0)) @ weight)
     return float(np.sqrt(max(total, 0.0)))
 
 
-def _separable(nodes: Floats, points: Floats, weights: Floats, e: Floats) -> tuple[Floats, Floats]:
-    """(W . k, W K W) of one axis: each (n_points, len(e))."""
-    cross = np.exp(-(np.subtract.outer(points, nodes) ** 2)[..., None] / (4 * e))
-    among = np.exp(-(np.subtract.outer(nodes, nodes) ** 2)[..., None] / (4 * e))
-    return np.einsum("dn,dnk->dk", weights, cross), np.einsum("dn,nmk,dm->dk", weights, among, weights, optimize=True)
+def _separable(nodes: Floats, points: Floats, nearness: Floats) -> tuple[Floats, Floats]:
+    """(W . k, W K W) of one axis for covariances exp(-nearness r^2): each (n_points, len(nearness))."""
+    weights = lagrange(nodes, points)
+    cross = np.exp(np.multiply.outer(-(np.subtract.outer(points, nodes) ** 2), nearness))
+    first, second = np.triu_indices(len(nodes), 1)
+    pairs = 2 * weights[:, first] * weights[:, second]
+    among = np.exp(np.multiply.outer(-((nodes[first] - nodes[second]) ** 2), nearness))
+    own = (weights**2).sum(1, keepdims=True)
+    return np.matmul(weights[:, None, :], cross)[:, 0], own + pairs @ among
 
 
 def differential_rms(xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float = 1.0) -> float:
     """Expected rms of the fluctuation minus its focal-plane mean, in units of the fluctuation before the beam."""
-    r = np.hypot(np.subtract.outer(xi, xi), stretch * np.subtract.outer(eta, eta)).ravel()
+    i, j = np.triu_indices(len(xi), 1)
+    square = (xi[i] - xi[j]) ** 2 + (stretch * (eta[i] - eta[j])) ** 2
     total = 0.0
     for layer in layers:
         e, w = layer.gaussian()
-        total += layer.amplitude**2 * float((-np.expm1(-np.multiply.outer((r * layer.distance) ** 2, 1 / (4 * e)))).mean(0) @ w)
+        gone = np.expm1(np.multiply.outer(-(layer.distance**2) / (4 * e), square)).sum(1)
+        total -= layer.amplitude**2 * float(gone @ w) * 2 / len(xi) ** 2
     return float(np.sqrt(total))
 
 
@@ -183,9 +186,10 @@ def choose_nodes(
         return _grid_error(x, y, some_xi, some_eta, layers, stretch)
 
     sizes = [n for n in GRIDS if n >= at_least and n * n < len(xi)]
-    if not sizes or error(sizes[-1]) > tolerance:
+    place = bisect_left(sizes, True, key=lambda size: error(size) <= tolerance)
+    if place == len(sizes):
         return detectors_as_nodes(xi, eta), 0.0
-    n = sizes[bisect_left(sizes, True, key=lambda size: error(size) <= tolerance)]
+    n = sizes[place]
     return grid(xi, eta, n), error(n)
 
 
@@ -195,28 +199,33 @@ def _spline_table() -> tuple[Floats, Floats]:
     q = np.geomspace(1e-2, 1e3, 500)
     u = np.linspace(-6, 6, 1201)  # w / q: the spectrum of exp(-q^2 n^2 / 4) is a Gaussian exp(-(w/q)^2)
     density = np.exp(-u * u) / np.sqrt(np.pi) * (u[1] - u[0])
-    out = np.empty_like(q)
-    for n, ratio in enumerate(q):
-        w = u[600:] * ratio  # even in w
-        b = 3 / (2 + np.cos(w))
-        # Images of frequencies far above Nyquist: fold w to (-pi, pi] and name its own image m.
-        own = np.round(w / (2 * np.pi))
-        half = (w - 2 * np.pi * own) / 2
-        top = np.sin(half) ** 4 * b
-        tiny = np.abs(half) < 1e-12
-        half[tiny], top[tiny] = 1.0, 0.0
-        base = np.where(tiny, 1.0, top / half**4)  # sinc^4 b of the image at the folded frequency itself
-        error = np.zeros_like(w)
-        for m in range(1, 9):
-            for shift in (m * np.pi, -m * np.pi):
-                fourth = ((half + shift) ** 2) ** 2
-                error += 1 / (fourth * fourth)
-        error = error * top**2 + np.where(own == 0, 0.0, base**2)
-        here = np.where(own == 0, base, np.where(tiny, 0.0, top / np.where(w == 0, 1.0, w / 2) ** 4))
-        error -= np.where((own != 0) & (np.abs(own) <= 8), here**2, 0.0)
-        values = error + (1 - here) ** 2
-        out[n] = 2 * density[600:] @ values - density[600] * values[0]
+    even = 2 * density[600:]
+    even[0] = density[600]
+    out = np.concatenate([_lost(np.multiply.outer(part, u[600:])) @ even for part in np.array_split(q, 50)])
     return np.log(q), np.log(out)
+
+
+def _lost(w: Floats) -> Floats:
+    """(1 - A_0 b)^2 + sum (A_m b)^2 of equation (2)."""
+    b = 3 / (2 + np.cos(w))
+    # Images of frequencies far above Nyquist: fold w to (-pi, pi] and name its own image m.
+    own = np.round(w / (2 * np.pi))
+    half = (w - 2 * np.pi * own) / 2
+    top = np.sin(half) ** 4 * b
+    tiny = np.abs(half) < 1e-12
+    half[tiny], top[tiny] = 1.0, 0.0
+    base = np.where(tiny, 1.0, top / half**4)  # sinc^4 b of the image at the folded frequency itself
+    error = np.zeros_like(w)
+    for m in range(1, 9):
+        for shift in (m * np.pi, -m * np.pi):
+            fourth = (half + shift) ** 2
+            fourth *= fourth
+            fourth *= fourth
+            error += 1 / fourth
+    error = error * top**2 + np.where(own == 0, 0.0, base**2)
+    here = np.where(own == 0, base, np.where(tiny, 0.0, top / np.where(w == 0, 1.0, w / 2) ** 4))
+    error -= np.where((own != 0) & (np.abs(own) <= 8), here**2, 0.0)
+    return np.asarray(error + (1 - here) ** 2, np.float64)
 
 
 def spline_error(q: Floats) -> Floats:

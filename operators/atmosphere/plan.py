@@ -41,6 +41,9 @@ MEAN_SHARE = 0.1
 WINDOWS = (16, 1 << 14)
 """Number and length [samples] of the parts of a longer scan at which its path is looked at."""
 
+IN_A_CELL = 16
+"""Samples between two steps at which the path's error is looked at."""
+
 PAYS_FROM = 1 << 18
 """Points (nodes x times) from which coarser steps for single layers are worth their interpolation."""
 
@@ -198,18 +201,21 @@ class _Path:
         return np.asarray((ends[:, 1] - ends[:, 0]) * self._observation.sample_rate, np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
-        """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points."""
+        """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points; from `IN_A_CELL`
+        samples of each cell."""
         squares, total, done = np.zeros(9), 0, 0
+        each = max(1, step // IN_A_CELL)
         for window in self._windows:
             n = window.stop - window.start
             index = window.start + times_with_margin(n, step)
             u = rays(axes_at(self._observation.boresight_azel, index, step), self._xi, self._eta)
-            here = slice(done, done + n)
-            truth = np.concatenate([self.crossing[:, :, here].reshape(-1, n), self.elevation[:, here]])
+            here = slice(done, done + n, each)
+            some, rows = -(-n // each), 3 * len(self._xi)
+            truth = np.concatenate([self.crossing[:, :, here].reshape(-1, some), self.elevation[:, here]])
             values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
-            spline = SmoothField.from_values(np.eye(len(values)), values, step, n).evaluate(slice(0, len(values)), slice(0, n))
-            found = ((spline - truth) ** 2).sum(1)
-            squares[: len(found)] += found
-            total, done = total + n, done + n
+            spline = SmoothField.from_values(np.eye(rows), values, step // each, some)
+            found = ((spline.evaluate(slice(0, rows), slice(0, some)) - truth) ** 2).sum(1)
+            squares[:rows] += found
+            total, done = total + some, done + n
         rms = np.sqrt(squares[: 3 * len(self._xi)] / total).reshape(3, -1).max(1)
         return rms[:2], float(rms[2])

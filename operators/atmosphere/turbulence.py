@@ -293,12 +293,21 @@ def _kernel(outer_scale: float, sigma: float, low: float, high: float, spacing: 
 
 def _separable_kernel(e: Floats, w: Floats, spacing: float, radius: int) -> Field:
     """The kernel whose power is the aliased spectrum sum w exp(-e k^2)."""
-    k = 2 * np.pi * np.fft.fftfreq(_GRID, spacing)
+    k = 2 * np.pi * np.fft.rfftfreq(_GRID, spacing)  # the spectrum is even
     alias = 2 * np.pi / spacing * np.arange(-2, 3)
     gauss = np.exp(-np.multiply.outer(e, np.add.outer(alias, k) ** 2)).sum(1)
     power = np.einsum("ka,kb->ab", gauss * w[:, None], gauss) / spacing**2  # not BLAS: the same bits for any number of threads
-    h = np.fft.irfft2(np.sqrt(power[:, : _GRID // 2 + 1]), (_GRID, _GRID))[: radius + 1, : radius + 1]
+    turns = _cosines(radius)
+    h = np.einsum("ra,ac->rc", turns, np.einsum("ab,cb->ac", np.sqrt(power), turns))
     return _cut(h, float((w / (4 * np.pi * e)).sum()))
+
+
+@lru_cache(maxsize=8)
+def _cosines(radius: int) -> Floats:
+    """The inverse transform (radius + 1, _GRID / 2 + 1) of an even spectrum of which half is given."""
+    index = np.arange(_GRID // 2 + 1)
+    times = np.where((index == 0) | (index == index[-1]), 1.0, 2.0) / _GRID
+    return np.asarray(np.cos(2 * np.pi / _GRID * np.multiply.outer(np.arange(radius + 1), index)) * times, np.float64)
 
 
 def _cut(h: Floats, variance: float) -> Field:

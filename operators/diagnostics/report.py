@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.parameters import described, quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
@@ -306,9 +306,9 @@ def readable(text: str) -> str:
 def _steps(data: Data) -> str:
     made = []
     for label, kind, parameters in data.provenance.get("operators", []):
-        described = _class(kind)
-        doc = (described.__doc__ or "").strip().split("\n\n")[0] if described is not None else ""
-        fields = described.model_fields if described is not None else {}
+        cls = _class(kind)
+        doc = (cls.__doc__ or "").strip().split("\n\n")[0] if cls is not None else ""
+        fields = described(cls) if cls is not None else {}
         rows = []
         for key, text in parameters.items():
             about = (fields[key].description or "") if key in fields else ""

@@ -68,6 +68,7 @@ class CommonModeFilter(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     prepares_ahead: ClassVar[bool] = True
+    linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
     knobs: ClassVar[tuple[Knob, ...]] = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
 

@@ -16,6 +16,7 @@ error of the low part is (K / 2M)^4 at the cut, less below it; the polynomial is
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Seconds
@@ -54,6 +55,7 @@ class HighpassFilter(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     prepares_ahead: ClassVar[bool] = True
+    linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
     knobs: ClassVar[tuple[Knob, ...]] = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
@@ -65,6 +67,8 @@ class HighpassFilter(Operator):
     """Flag this long at either end of each scan."""
     oversampling: float = Field(24.0, ge=8, le=1000)
     """Coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut is about oversampling^-4."""
+
+    _plans: dict[tuple[int, float], HighpassPlan] = PrivateAttr(default_factory=dict)
 
     def prepare(self, observation: Observation) -> HighpassPlan:
         """Tables for this observation's length; flags the trimmed ends."""
@@ -90,7 +94,10 @@ class HighpassFilter(Operator):
         tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()))
         if observation.smooth.get("atmosphere") is not None:
             tally.state(self.label, "smooth mean emission", "removed analytically")
-        plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)
+        key = n, self.frequency / rate
+        if key not in self._plans:
+            self._plans = {key: plan_highpass(*key, self.degree, self.oversampling)}  # that of the scan before will often do
+        plan = copy.copy(self._plans[key])
         plan.bad = np.flatnonzero(bad)
         if plan.cut == 0:
             tally.state(self.label, f"{observation.name} is shorter than 1/frequency", "only the mean and a line are removed")

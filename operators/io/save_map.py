@@ -73,7 +73,7 @@ class SaveMap(Operator):
             for path in [*views, *noise]:
                 if path.exists():
                     raise OutputError(
-                        "is there already", place=str(path), cure="choose another output folder or set overwrite: true"
+                        "is there already", place=str(path), cure="remove it, choose another output folder or set overwrite: true"
                     )
         for path, view in views.items():
             write_map(path, view, data)

@@ -251,6 +251,8 @@ class BinMap(Operator):
             signal.fill(0)
         else:
             signal = block.total("signal") if "signal" in block.means else block.detdata["signal"]
+            signal = state.without_kept_out(signal, block.detectors, block.samples)
+        before = int(dropped[NOT_FINITE])
         begin, end, rows = block.samples.start, block.samples.stop, block.detectors
         xi, eta, use = plane.xi[rows], plane.eta[rows], observation.detector_flags[rows] == 0
         how = (
@@ -259,12 +261,22 @@ class BinMap(Operator):
         )  # fmt: skip
         if isinstance(state.grid, TangentGrid):
             _add_image(signal, state.pointing, begin, xi, eta, *state.grid.shape, *how)
-            return
-        for start in range(begin, end, TILE_SAMPLES):
-            stop = min(start + TILE_SAMPLES, end)
-            index = np.empty((len(xi), stop - start), np.int32)
-            state.grid.pixels(state.pointing, start, stop, xi, eta, index)
-            _add(signal, start - begin, index, *how)
+        else:
+            for start in range(begin, end, TILE_SAMPLES):
+                stop = min(start + TILE_SAMPLES, end)
+                index = np.empty((len(xi), stop - start), np.int32)
+                state.grid.pixels(state.pointing, start, stop, xi, eta, index)
+                _add(signal, start - begin, index, *how)
+        if dropped[NOT_FINITE] > before:
+            state.note_not_finite(signal, rows, begin)
+
+    def keep_out(self, observation: Observation, state: Binning) -> NDArray[np.int64] | None:
+        """Where samples were not finite: rows of (detector, first sample, end)."""
+        return np.concatenate(state.not_finite) if state.not_finite else None
+
+    def leave_out(self, state: Binning, kept_out: NDArray[np.int64]) -> None:
+        """Drop what was not finite in the main run."""
+        state.kept_out = kept_out
 
     def collect(self, data: Data, observation: Observation, state: Binning) -> None:
         """Add this observation to the even or the odd scans' sums."""
@@ -299,6 +311,30 @@ class BinMap(Operator):
             data.products[key] = Halves(self._n_pixels())
         data.products[key].merge(part, self.label)
         self._variance_unknown |= bool(part["variance_unknown"])
+
+    def subtract(self, whole: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+        """The sums of w d, exactly; hits, weights and the noise from the detectors' NET are the main run's. None where the same
+        samples are not in all maps, or the noise is that of the samples' scatter."""
+        if self.noise == "scatter":
+            return None
+        found = dict(whole)
+        for k in range(2):
+            sums = whole[f"sums_{k}"].copy()
+            for part in parts:
+                if not np.array_equal(part[f"pixels_{k}"], whole[f"pixels_{k}"]):
+                    return None
+                if not np.array_equal(part[f"sums_{k}"][:, HITS:], whole[f"sums_{k}"][:, HITS:]):
+                    return None
+                sums[:, DATA] -= part[f"sums_{k}"][:, DATA]
+            found[f"sums_{k}"] = sums
+        largest = np.array([whole["largest"], *(part["largest"] for part in parts)])
+        found["largest"] = np.maximum(largest.sum(axis=0) * (np.arange(largest.shape[1]) == DATA), largest.max(axis=0))
+        return found
+
+    @property
+    def can_subtract(self) -> bool:
+        """Not where the noise is that of the samples' scatter, which is not linear."""
+        return self.noise == "net"
 
     def _n_pixels(self) -> int:
         assert self._grid is not None
@@ -394,6 +430,8 @@ class Binning:
         (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
     alike
         All detectors weigh the same: the sums of weights and noise follow from the hits.
+    not_finite, kept_out
+        (n, 3) detector, first sample, end: what was not finite, in several arrays; what the main run dropped for that reason.
     """
 
     grid: Grid
@@ -404,6 +442,31 @@ class Binning:
     alike: bool
     parts: dict[int, tuple[Sums, Sums, NDArray[np.float64]]] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
+    not_finite: list[NDArray[np.int64]] = field(default_factory=list)
+    kept_out: NDArray[np.int64] | None = None
+
+    def note_not_finite(self, signal: NDArray[np.floating], rows: slice, begin: int) -> None:
+        """Remember which samples of a block of detectors ``rows``, from sample ``begin`` on, are not finite."""
+        n_det, n = signal.shape
+        bad = np.zeros((n_det, n + 2), np.int8)
+        np.logical_not(np.isfinite(signal), out=bad[:, 1:-1])
+        detector, edge = np.nonzero(np.diff(bad, axis=1))
+        found = np.stack([rows.start + detector[::2], begin + edge[::2], begin + edge[1::2]], axis=1)
+        with self.lock:
+            self.not_finite.append(found.astype(np.int64))
+
+    def without_kept_out(self, signal: NDArray[Any], rows: slice, samples: slice) -> NDArray[Any]:
+        """The block's signal with NaN where `kept_out` says so; itself where that is nowhere."""
+        if self.kept_out is None:
+            return signal
+        detector, first, end = self.kept_out.T
+        here = (detector >= rows.start) & (detector < rows.stop) & (first < samples.stop) & (end > samples.start)
+        if not here.any():
+            return signal
+        signal = signal.copy()
+        for d, low, high in self.kept_out[here]:
+            signal[d - rows.start, max(low - samples.start, 0) : high - samples.start] = np.nan
+        return signal
 
     def of_thread(self) -> tuple[Sums, Sums, NDArray[np.float64]]:
         """(sums (n_pixel + 1, 4, or 2 where alike), dropped (4,), largest (4,)); the last row of sums is for what is dropped."""

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.projection import directions, frame_rotation, homographies
+from zonda.core.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
+from zonda.core.tangent import TangentWcs
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -37,8 +38,8 @@ class TangentGrid:
         return self.shape[0] * self.shape[1]
 
     @property
-    def wcs(self) -> Any:
-        """`astropy.wcs.WCS` whose reference point is the middle of the image, for odd and even sizes alike."""
+    def wcs(self) -> TangentWcs:
+        """World coordinates whose reference point is the middle of the image, for odd and even sizes alike."""
         return tangent_wcs(self.centre, self.pixel, self.shape, self.frame)
 
     def pointing(self, observation: Observation) -> Floats:
@@ -80,23 +81,17 @@ class HealpixGrid:
 Grid = TangentGrid | HealpixGrid
 
 
-def tangent_wcs(centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs") -> Any:
-    """`astropy.wcs.WCS` of a TAN image: (ny, nx) pixels of side ``pixel`` [rad] around ``centre`` [rad, in ``frame``]."""
-    from astropy.wcs import WCS
-
-    names = {"icrs": ("RA---TAN", "DEC--TAN"), "galactic": ("GLON-TAN", "GLAT-TAN")}
-    if frame not in names:
+def tangent_wcs(centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs") -> TangentWcs:
+    """World coordinates of a TAN image: (ny, nx) pixels of side ``pixel`` [rad] around ``centre`` [rad, in ``frame``]."""
+    if frame not in ("icrs", "galactic"):
         raise InputError(f"unknown frame {frame!r}", place="map grid", cure="use icrs or galactic")
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = names[frame]
-    wcs.wcs.cunit = ["deg", "deg"]
-    wcs.wcs.crval = [math.degrees(centre[0]) % 360.0, math.degrees(centre[1])]
-    wcs.wcs.cdelt = [-math.degrees(pixel), math.degrees(pixel)]
-    wcs.wcs.crpix = [(shape[1] + 1) / 2, (shape[0] + 1) / 2]
-    if frame == "icrs":
-        wcs.wcs.radesys = "ICRS"
-    wcs.wcs.set()
-    return wcs
+    step = math.degrees(pixel)
+    return TangentWcs(
+        frame=frame,
+        crval=(math.degrees(centre[0]) % 360.0, math.degrees(centre[1])),
+        crpix=((shape[1] + 1) / 2, (shape[0] + 1) / 2),
+        cdelt=(-step, step),
+    )
 
 
 def in_frame(icrs: tuple[float, float], frame: str) -> tuple[float, float]:
@@ -110,27 +105,26 @@ def in_frame(icrs: tuple[float, float], frame: str) -> tuple[float, float]:
 
 def covering_extent(observations: Sequence[Observation], centre: tuple[float, float], frame: str) -> tuple[float, float]:
     """Half-width and half-height [rad, on the tangent plane] of the TAN image around ``centre`` that holds every sample."""
-    wcs = tangent_wcs(centre, 1.0, (1, 1), frame)
+    matrix = pixel_matrix(tangent_wcs(centre, 1.0, (1, 1), frame))
     half = np.zeros(2)
     for observation in observations:
-        h = homographies(observation.boresight_radec, wcs)
-        h8 = h[:, 8] if h.size else np.ones(1)
-        if (h8 < math.cos(math.radians(75.0))).any():
+        x, y, ahead = matrix @ boresights(observation.boresight_radec)
+        if (ahead < math.cos(math.radians(75.0))).any():
             raise InputError(
                 f"{observation.name} reaches more than 75 deg from the map centre, too far for a tangent plane",
                 place="map grid",
                 cure="give width and height, or nside for a HEALPix map",
             )
-        offset = h[:, [2, 5]] / h8[:, None]
+        offset = np.stack([x, y]) / ahead
         reach = observation.focalplane.radius
-        far = np.hypot(*offset.T) * reach
+        far = np.hypot(*offset) * reach
         # a circle of radius r around a point at tangent distance s appears at most r (1 + s^2) / (1 - r s) wide
         if (far > 0.5).any():
             raise InputError(
                 "the field of view is too wide for a tangent plane", place="map grid", cure="give nside for a HEALPix map"
             )
-        grown = reach * (1 + (offset**2).sum(axis=1)) / (1 - far)
-        half = np.maximum(half, (np.abs(offset) + grown[:, None]).max(axis=0))
+        grown = reach * (1 + (offset**2).sum(axis=0)) / (1 - far)
+        half = np.maximum(half, (np.abs(offset) + grown).max(axis=1))
     return float(half[0]), float(half[1])
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core import tangent
 from zonda.core.data import html_table
 from zonda.core.errors import InputError
 
@@ -208,10 +209,15 @@ class MapProduct:
 @lru_cache(maxsize=1)  # the maps of all runs share it
 def _tangent_distance(header: str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
     from astropy.io.fits import Header
-    from astropy.wcs import WCS
 
+    cards = Header.fromstring(header)
+    wcs: Any = tangent.plain(cards)
+    if wcs is None:
+        from astropy.wcs import WCS
+
+        wcs = WCS(cards)
     y, x = np.indices(shape)
-    phi, theta = np.radians(np.array(WCS(Header.fromstring(header)).wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
+    phi, theta = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
     found = _angle(phi, theta, centre)
     found.flags.writeable = False
     return found

@@ -52,6 +52,7 @@ class PinkNoise(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"pink"})
     prepares_ahead: ClassVar[bool] = True
+    only_tells: ClassVar[bool] = True
     knobs: ClassVar[tuple[Knob, ...]] = (
         Knob("poles", (4, 6, 8, 12, 16), "power law by a filter of few poles (their first states are drawn anew)", redraws=True),
     )

@@ -42,6 +42,7 @@ class WhiteNoise(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"white"})
     prepares_ahead: ClassVar[bool] = True
+    only_tells: ClassVar[bool] = True
 
     net: KelvinRootSecond | None = Field(None, ge=0)
     """Noise-equivalent temperature: the rms of one second of integration; None: the instrument's."""

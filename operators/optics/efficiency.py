@@ -51,6 +51,7 @@ class Efficiency(Operator):
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     prepares_ahead: ClassVar[bool] = True
+    linear: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
 
     main_beam: Fraction | None = Field(None, gt=0, le=1)

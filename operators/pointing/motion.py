@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 ACCURACY = 0.01
 """Error (1) aimed at, of the figure or of 0.3 of its limit, whichever is more."""
 
-POINTS, MOST_POINTS = 1 << 16, 1 << 20
+POINTS, MOST_POINTS = 1 << 14, 1 << 20
 """Points of the track that are looked at first, and at most."""
 
 SHORTEST_STEP = 1e-3

@@ -19,7 +19,7 @@ from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 
 from .observed import centre_of, observed, state_times
-from .recording import Clock, Comb, Recording, Scan, comb, read
+from .recording import OUT_OF_ORDER, Clock, Comb, Recording, Scan, comb, read
 from .samples_per_beam import Sampled
 from .transform import CelestialTransform, unit_vectors
 
@@ -94,6 +94,9 @@ class PointingRecorded(Operator):
         if apart > ANOTHER_DAY:
             text = f"the record begins {start}, the weather is that of {data.scene.time}"
             warnings.warn(f"{self.label}: {text}: set the scene's time", stacklevel=2)
+        if number := found.counts[OUT_OF_ORDER]:
+            text = f"{number} rows of {self.file} were dropped: their times jump ahead or back; is its clock right?"
+            warnings.warn(f"{self.label}: {text}", stacklevel=2)
         sampled = Sampled()
         for scan in found.scans:
             observation = self._observation(data, start, scan, recording, len(data.observations))

@@ -6,6 +6,7 @@ drops and flags what was not recorded.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,9 @@ FLAGGED = 1
 
 UNEVEN = 0.25
 """rms of the intervals between rows, over whole numbers of samples, beyond which they are no comb with jitter."""
+
+OUT_OF_ORDER = "rows out of order, dropped"
+"""Count of rows whose time is not between those of the rows around them."""
 
 ALIASES = {
     "time": ("time", "times", "t", "ctime", "timestamp", "mjd"),
@@ -103,6 +107,8 @@ class Comb:
 def comb(recording: Recording, split: float, place: str) -> Comb:
     """Lay a recording out on combs of samples; a gap longer than ``split`` [s] begins another scan.
 
+    As few rows are dropped as leave the times in order (`longest_rising`): one stamp that jumps, ahead or back, goes alone.
+
     Raises
     ------
     InputError
@@ -111,12 +117,13 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
     counts: dict[str, int] = {}
     keep = np.isfinite(recording.seconds)
     counts["rows without a time, dropped"] = int(np.count_nonzero(~keep))
-    seconds = recording.seconds[keep]
-    later = np.ones(len(seconds), bool)
-    if len(seconds) > 1:
-        later[1:] = seconds[1:] > np.maximum.accumulate(seconds)[:-1]
-    counts["rows out of order or repeated, dropped"] = int(np.count_nonzero(~later))
-    rows = np.flatnonzero(keep)[later]
+    rows = np.flatnonzero(keep)
+    rising = longest_rising(recording.seconds[rows])
+    rest = np.setdiff1d(np.arange(len(rows)), rising, assume_unique=True)
+    kept_before = rising[np.maximum(np.searchsorted(rising, rest) - 1, 0)]
+    repeated = int(np.count_nonzero(recording.seconds[rows[rest]] == recording.seconds[rows[kept_before]]))
+    counts[OUT_OF_ORDER], counts["rows repeated, dropped"] = len(rest) - repeated, repeated
+    rows = rows[rising]
     seconds = recording.seconds[rows]
     if len(rows) < 2:
         raise InputError(
@@ -152,6 +159,33 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
     counts["samples whose row is not a number, flagged"] = flagged - missing
     counts["samples flagged in the file"] = sum(int(np.count_nonzero(s.flags & FLAGGED)) for s in scans)
     return Comb(scans, counts)
+
+
+def longest_rising(values: Floats) -> NDArray[np.intp]:
+    """Indices of as many of ``values`` (n,) as there are in strictly rising order: what is left out is out of order, however far.
+
+    Of several such choices, that whose values rise least (Schensted 1961); of equal values the first. O(n log n).
+    """
+    if (np.diff(values) > 0).all():
+        return np.arange(len(values))
+    tails: list[float] = []  # of the lowest chain of each length: its last value ...
+    ends: list[int] = []  # ... and index
+    before = np.full(len(values), -1, np.intp)
+    for i, value in enumerate(values.tolist()):
+        k = len(tails) if not tails or value > tails[-1] else bisect_left(tails, value)
+        if k == len(tails):
+            tails.append(value)
+            ends.append(i)
+        elif value < tails[k]:
+            tails[k], ends[k] = value, i
+        else:
+            continue
+        before[i] = ends[k - 1] if k else -1
+    chain = np.empty(len(tails), np.intp)
+    i = ends[-1]
+    for k in reversed(range(len(chain))):
+        chain[k], i = i, int(before[i])
+    return chain
 
 
 def _scan(

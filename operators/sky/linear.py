@@ -15,7 +15,7 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from .sampling import CHUNK, _covered, _homography, _locate
+from .sampling import CHUNK, chunk, count_covered, locate, misses, span_on_grid
 
 Floats = NDArray[np.floating]
 
@@ -42,48 +42,38 @@ def sample_linear(
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
 def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, constants, out):  # type: ignore[no-untyped-def]
-    n_samp = out.shape[1]
-    cast = constants.dtype.type
-    one, zero = constants[3], constants[6]
-    h = np.empty((9, CHUNK), out.dtype)
-    place = np.empty(CHUNK, np.int32)
-    u, v, found = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
+    h, box = np.empty((9, CHUNK), out.dtype), np.empty((9, 2))
     limits, edge = np.empty(4, out.dtype), np.empty(4, out.dtype)
+    scratch = np.empty((24, CHUNK))
+    place = np.empty(CHUNK, np.int32)
+    u, v = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
     beyond, behind = 0, 0
-    for start in range(0, n_samp, CHUNK):
-        count = min(CHUNK, n_samp - start)
-        g = _homography(quaternions[start + count // 2], matrix)
-        ox, oy = 0.0, 0.0
-        if g[8] > 0.0 and abs(g[2]) < 1e8 * g[8] and abs(g[5]) < 1e8 * g[8]:
-            ox, oy = np.floor(g[2] / g[8]), np.floor(g[5] / g[8])
-        for t in range(count):
-            g0, g1, g2, g3, g4, g5, g6, g7, g8 = _homography(quaternions[start + t], matrix)
-            h[0, t], h[1, t], h[2, t] = g0 - ox * g6, g1 - ox * g7, g2 - ox * g8
-            h[3, t], h[4, t], h[5, t] = g3 - oy * g6, g4 - oy * g7, g5 - oy * g8
-            h[6, t], h[7, t], h[8, t] = g6, g7, g8
-        limits[0], limits[1], limits[2], limits[3] = cast(1 - ox), cast(nx - 3 - ox), cast(1 - oy), cast(ny - 3 - oy)
-        edge[0], edge[1] = cast(bounds[0] - ox), cast(bounds[1] - ox)
-        edge[2], edge[3] = cast(bounds[2] - oy), cast(bounds[3] - oy)
-        x0, y0 = int32(1 - max(min(ox, 1e9), -1e9)), int32(1 - max(min(oy, 1e9), -1e9))
+    for start in range(0, out.shape[1], CHUNK):
+        count = min(CHUNK, out.shape[1] - start)
+        x0, y0 = chunk(quaternions[start : start + count], matrix, ny, nx, bounds, scratch, h, box, limits, edge)
         for d in range(rows.size):
-            inside, front = _locate(h, xi[d], eta[d], count, limits, edge, constants, x0, y0, int32(nx), place, u, v)
+            if misses(box, xi[d], eta[d], limits, edge):
+                beyond += count
+                continue
+            inside, front = locate(h, xi[d], eta[d], count, limits, edge, constants, x0, y0, int32(nx), place, u, v)
             if covered.size > 0:
-                inside = _covered(place, u, v, count, nx, covered)
+                inside = count_covered(place, u, v, count, nx, covered)
             beyond += count - inside
             behind += count - front
-            _bilinear(f, place, u, v, count, uint64(nx), one, zero, found)
+            first, stop = span_on_grid(place, count)
+            stop = min(stop, count)
             row = out[rows[d], start : start + count]
-            for t in range(count):
-                row[t] += found[t]
+            _add_bilinear(f, place, u, v, first, stop, uint64(nx), constants, row)
     return beyond, behind
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _bilinear(f, place, u, v, count, nx, one, zero, found):  # type: ignore[no-untyped-def]
+def _add_bilinear(f, place, u, v, first, stop, nx, constants, row):  # type: ignore[no-untyped-def]
     """The four grid points around each sample, one right and one up of its first spline coefficient; 0 off the grid."""
-    for t in range(uint64(count)):
+    one, zero = constants[3], constants[6]
+    for t in range(uint64(first), uint64(stop)):
         on = one if place[t] >= 0 else zero
         p = uint64(max(place[t], int32(0))) + nx + uint64(1)
         a, b, c, d = f[p], f[p + uint64(1)], f[p + nx], f[p + nx + uint64(1)]
         low, high = a + u[t] * (b - a), c + u[t] * (d - c)
-        found[t] = on * (low + v[t] * (high - low))
+        row[t] += on * (low + v[t] * (high - low))

@@ -31,8 +31,6 @@ def placed(image: WcsMap, centre: tuple[float, float] | None, place: str = "") -
 
     Raises InputError for a ``centre`` with another projection than TAN.
     """
-    from astropy.wcs import WCS
-
     if centre is None:
         return image.wcs if image.wcs is not None and is_plain_tan(image.wcs) else None
     if image.wcs is not None and not is_plain_tan(image.wcs):
@@ -41,6 +39,8 @@ def placed(image: WcsMap, centre: tuple[float, float] | None, place: str = "") -
             place=place,
             cure="remove centre, or give a TAN map",
         )
+    from astropy.wcs import WCS
+
     rows, columns = image.values.shape
     if image.wcs is not None:
         matrix, swapped = np.asarray(image.wcs.pixel_scale_matrix), image.wcs.wcs.lng == 1

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core import tangent
 from zonda.core.errors import InputError
 from zonda.core.files import first_line
 from zonda.core.fits_files import check_size, opened
@@ -243,8 +244,6 @@ def _geometry(
     place: str, header: Any, pixel_size: float | None, centred: bool, notes: dict[str, str]
 ) -> tuple[Any, Floats | None]:
     """(wcs, scale) of `WcsMap`, or the error that says what is missing."""
-    from astropy.wcs import WCS
-
     header = header.copy()
     for key in ("CUNIT1", "CUNIT2"):
         text = str(header.get(key, "") or "").strip()
@@ -285,8 +284,12 @@ def _geometry(
     if absent and not centred:
         raise _no_position(place, ", ".join(absent))
     try:
-        wcs = WCS(header, naxis=2)
-        wcs.wcs.set()
+        wcs = tangent.plain(header)
+        if wcs is None:
+            from astropy.wcs import WCS
+
+            wcs = WCS(header, naxis=2)
+            wcs.wcs.set()
         matrix = np.asarray(wcs.pixel_scale_matrix)
     except Exception as err:  # wcslib has a dozen exception classes of its own
         raise InputError(

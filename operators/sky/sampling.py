@@ -16,7 +16,7 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from zonda.core.columns import four_columns
+from zonda.core.columns import spline_of_four
 
 Floats = NDArray[np.floating]
 
@@ -75,79 +75,150 @@ def sample(
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _homography(quaternion, matrix):  # type: ignore[no-untyped-def]
-    """The nine elements of H at one instant, row by row, for (xi, eta, 1)."""
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    s = 2.0 / (x * x + y * y + z * z + w * w)
-    r00, r01, r02 = 1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
-    r10, r11, r12 = s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)
-    r20, r21, r22 = s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)
-    a, b, c = matrix[0], matrix[1], matrix[2]
-    return (
-        -(a[0] * r01 + a[1] * r11 + a[2] * r21),
-        -(a[0] * r00 + a[1] * r10 + a[2] * r20),
-        a[0] * r02 + a[1] * r12 + a[2] * r22,
-        -(b[0] * r01 + b[1] * r11 + b[2] * r21),
-        -(b[0] * r00 + b[1] * r10 + b[2] * r20),
-        b[0] * r02 + b[1] * r12 + b[2] * r22,
-        -(c[0] * r01 + c[1] * r11 + c[2] * r21),
-        -(c[0] * r00 + c[1] * r10 + c[2] * r20),
-        c[0] * r02 + c[1] * r12 + c[2] * r22,
-    )
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
 def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, constants, out):  # type: ignore[no-untyped-def]
-    n_samp = out.shape[1]
-    cast = constants.dtype.type
-    h = np.empty((9, CHUNK), out.dtype)
-    place = np.empty(CHUNK, np.int32)
-    u, v = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
-    weights = np.empty((8, CHUNK), out.dtype)
-    columns = np.empty((CHUNK, 4), out.dtype)
+    h, box = np.empty((9, CHUNK), out.dtype), np.empty((9, 2))
     limits, edge = np.empty(4, out.dtype), np.empty(4, out.dtype)
+    scratch = np.empty((24, CHUNK))
+    place, at = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
+    u, v, found = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
+    weights = np.zeros((8, CHUNK), out.dtype)
+    flat = weights.reshape(-1)
     beyond, behind = 0, 0
-    for start in range(0, n_samp, CHUNK):
-        count = min(CHUNK, n_samp - start)
-        g = _homography(quaternions[start + count // 2], matrix)
-        ox, oy = 0.0, 0.0
-        if g[8] > 0.0 and abs(g[2]) < 1e8 * g[8] and abs(g[5]) < 1e8 * g[8]:
-            ox, oy = np.floor(g[2] / g[8]), np.floor(g[5] / g[8])
-        for t in range(count):
-            g0, g1, g2, g3, g4, g5, g6, g7, g8 = _homography(quaternions[start + t], matrix)
-            h[0, t], h[1, t], h[2, t] = g0 - ox * g6, g1 - ox * g7, g2 - ox * g8
-            h[3, t], h[4, t], h[5, t] = g3 - oy * g6, g4 - oy * g7, g5 - oy * g8
-            h[6, t], h[7, t], h[8, t] = g6, g7, g8
-        limits[0], limits[1], limits[2], limits[3] = cast(1 - ox), cast(nx - 3 - ox), cast(1 - oy), cast(ny - 3 - oy)
-        edge[0], edge[1], edge[2], edge[3] = (
-            cast(bounds[0] - ox),
-            cast(bounds[1] - ox),
-            cast(bounds[2] - oy),
-            cast(bounds[3] - oy),
-        )
-        # The grid point (1, 1) counted from (ox, oy); far away no sample is on the grid and any number will do.
-        x0, y0 = int32(1 - max(min(ox, 1e9), -1e9)), int32(1 - max(min(oy, 1e9), -1e9))
+    for start in range(0, out.shape[1], CHUNK):
+        count = min(CHUNK, out.shape[1] - start)
+        x0, y0 = chunk(quaternions[start : start + count], matrix, ny, nx, bounds, scratch, h, box, limits, edge)
         for d in range(rows.size):
-            inside, front = _locate(h, xi[d], eta[d], count, limits, edge, constants, x0, y0, int32(nx), place, u, v)
+            if misses(box, xi[d], eta[d], limits, edge):
+                beyond += count
+                continue
+            inside, front = locate(h, xi[d], eta[d], count, limits, edge, constants, x0, y0, int32(nx), place, u, v)
             if covered.size > 0:
-                inside = _covered(place, u, v, count, nx, covered)
+                inside = count_covered(place, u, v, count, nx, covered)
             beyond += count - inside
             behind += count - front
-            _spline(place, u, v, count, constants, weights)
-            _columns(f, place, count, uint64(nx), weights, columns)
+            first, stop = span_on_grid(place, count)
+            if first == stop:
+                continue
+            _spline(place, u, v, first, stop, constants, at, weights)
+            for t in range(uint64(first), uint64(stop), uint64(4)):
+                spline_of_four(f, uint64(nx), at, flat, uint64(CHUNK), t, found)
             row = out[rows[d], start : start + count]
-            for t in range(count):
-                row[t] += (
-                    weights[0, t] * columns[t, 0]
-                    + weights[1, t] * columns[t, 1]
-                    + weights[2, t] * columns[t, 2]
-                    + weights[3, t] * columns[t, 3]
-                )
+            for t in range(uint64(first), uint64(min(stop, count))):
+                row[t] += found[t] if place[t] >= 0 else constants[6]
     return beyond, behind
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _locate(h, a, b, count, limits, edge, constants, x0, y0, width, place, u, v):  # type: ignore[no-untyped-def]
+def chunk(quaternions, matrix, ny, nx, bounds, scratch, h, box, limits, edge):  # type: ignore[no-untyped-def]
+    """Pointing of at most `CHUNK` instants: ``h`` (9, CHUNK), H row by row for (xi, eta, 1) counted from its own origin.
+
+    ``box`` (9, 2) float64: least and largest of each element. ``limits`` (4,): first and last place of the first of a sample's
+    4 x 4 grid points; ``edge`` (4,): the input map's. Returns the grid point (1, 1), counted from the origin.
+    """
+    count, cast = len(quaternions), h.dtype.type
+    g = scratch[15:]
+    _homographies(quaternions, matrix, scratch, g)
+    middle = count // 2
+    ox, oy, w = g[2, middle], g[5, middle], g[8, middle]
+    if w > 0.0 and abs(ox) < 1e8 * w and abs(oy) < 1e8 * w:
+        ox, oy = np.floor(ox / w), np.floor(oy / w)
+    else:
+        ox, oy = 0.0, 0.0
+    for k in range(9):
+        origin, row, base, to = (ox, oy, 0.0)[k // 3], g[k], g[6 + k % 3], h[k]
+        for t in range(count):
+            to[t] = cast(row[t] - origin * base[t])
+        for t in range(count, CHUNK):
+            to[t] = to[count - 1]
+        _extent(to, box[k])
+    limits[0], limits[1], limits[2], limits[3] = cast(1 - ox), cast(nx - 3 - ox), cast(1 - oy), cast(ny - 3 - oy)
+    edge[0], edge[1] = cast(bounds[0] - ox), cast(bounds[1] - ox)
+    edge[2], edge[3] = cast(bounds[2] - oy), cast(bounds[3] - oy)
+    # far away no sample is on the grid and any number will do
+    return int32(1 - max(min(ox, 1e9), -1e9)), int32(1 - max(min(oy, 1e9), -1e9))
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _homographies(quaternions, matrix, scratch, g):  # type: ignore[no-untyped-def]
+    """``g`` (9, n): the elements of H = A R, columns sorted for (xi, eta, 1). One output to a loop, so that it is vectorized."""
+    n = uint64(len(quaternions))
+    x, y, z, w, s, one = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5]
+    for t in range(n):
+        x[t], y[t], z[t], w[t] = quaternions[t, 0], quaternions[t, 1], quaternions[t, 2], quaternions[t, 3]
+    for t in range(n):
+        s[t] = 2.0 / (x[t] * x[t] + y[t] * y[t] + z[t] * z[t] + w[t] * w[t])
+    for column in range(3):
+        a, b, c = scratch[6], scratch[7], scratch[8]
+        if column == 0:  # of xi: the second column of R, reversed
+            for t in range(n):
+                a[t] = s[t] * (z[t] * w[t] - x[t] * y[t])
+            for t in range(n):
+                b[t] = s[t] * (x[t] * x[t] + z[t] * z[t]) - 1.0
+            for t in range(n):
+                c[t] = s[t] * (-x[t] * w[t] - y[t] * z[t])
+        elif column == 1:  # of eta: the first, reversed
+            for t in range(n):
+                a[t] = s[t] * (y[t] * y[t] + z[t] * z[t]) - 1.0
+            for t in range(n):
+                b[t] = s[t] * (-z[t] * w[t] - x[t] * y[t])
+            for t in range(n):
+                c[t] = s[t] * (y[t] * w[t] - x[t] * z[t])
+        else:
+            for t in range(n):
+                a[t] = s[t] * (x[t] * z[t] + y[t] * w[t])
+            for t in range(n):
+                b[t] = s[t] * (y[t] * z[t] - x[t] * w[t])
+            for t in range(n):
+                c[t] = 1.0 - s[t] * (x[t] * x[t] + y[t] * y[t])
+        for row in range(3):
+            p, q, r, to = matrix[row, 0], matrix[row, 1], matrix[row, 2], g[3 * row + column]
+            for t in range(n):
+                to[t] = p * a[t] + q * b[t] + r * c[t]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _extent(values, box):  # type: ignore[no-untyped-def]
+    """The least and the largest of `CHUNK` values, four at a time."""
+    a, b, c, d = values[0], values[1], values[2], values[3]
+    p, q, r, s = a, b, c, d
+    for t in range(uint64(4), uint64(CHUNK), uint64(4)):
+        w, x, y, z = values[t], values[t + uint64(1)], values[t + uint64(2)], values[t + uint64(3)]
+        a, b, c, d = min(a, w), min(b, x), min(c, y), min(d, z)
+        p, q, r, s = max(p, w), max(q, x), max(r, y), max(s, z)
+    box[0], box[1] = min(min(a, b), min(c, d)), max(max(p, q), max(r, s))
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def misses(box, a, b, limits, edge):  # type: ignore[no-untyped-def]
+    """Whether a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at every instant of a chunk.
+
+    By intervals: x = n / w with n and w between bounds, 0 < w, lies between the least and the largest quotient of bounds.
+    False where rounding might come to a pixel.
+    """
+    w_low, w_high = _between(box, 6, a, b)
+    if not w_low > 1e-3:
+        return False
+    for axis in range(2):
+        low, high = _between(box, 3 * axis, a, b)
+        low, high = min(low / w_low, low / w_high), max(high / w_low, high / w_high)
+        if max(-low, high) > 1e6:
+            return False
+        first, last = min(limits[2 * axis], edge[2 * axis]), max(limits[2 * axis + 1] + 1, edge[2 * axis + 1])
+        if low > last + 1.0 or high < first - 1.0:
+            return True
+    return False
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _between(box, k, a, b):  # type: ignore[no-untyped-def]
+    """Bounds of h_k a + h_(k+1) b + h_(k+2)."""
+    p, q = a * box[k, 0], a * box[k, 1]
+    r, s = b * box[k + 1, 0], b * box[k + 1, 1]
+    return min(p, q) + min(r, s) + box[k + 2, 0], max(p, q) + max(r, s) + box[k + 2, 1]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def locate(h, a, b, count, limits, edge, constants, x0, y0, width, place, u, v):  # type: ignore[no-untyped-def]
     """Where a detector at (a, b) = (xi, eta) looks: the index of its first coefficient (-1: none) and the fractions u, v.
 
     Returns the numbers of samples inside the input map's edges and in front of the tangent plane.
@@ -173,7 +244,7 @@ def _locate(h, a, b, count, limits, edge, constants, x0, y0, width, place, u, v)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _covered(place, u, v, count, width, covered):  # type: ignore[no-untyped-def]
+def count_covered(place, u, v, count, width, covered):  # type: ignore[no-untyped-def]
     """The number of samples whose nearest grid point is covered."""
     total = int32(0)
     for t in range(count):
@@ -183,28 +254,34 @@ def _covered(place, u, v, count, width, covered):  # type: ignore[no-untyped-def
     return total
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _spline(place, u, v, count, constants, weights):  # type: ignore[no-untyped-def]
-    """The cubic B-spline weights (8, count): four along x, four along y; those along y are 0 for samples off the grid."""
-    sixth, two_thirds, half, one, two, zero = constants[0], constants[1], constants[2], constants[3], constants[4], constants[6]
-    for t in range(count):
-        p, q = u[t], v[t]
-        pm, qm = one - p, one - q
-        weights[0, t] = pm * pm * pm * sixth
-        weights[1, t] = two_thirds - half * p * p * (two - p)
-        weights[2, t] = two_thirds - half * pm * pm * (two - pm)
-        weights[3, t] = p * p * p * sixth
-        on = one if place[t] >= 0 else zero
-        weights[4, t] = on * (qm * qm * qm * sixth)
-        weights[5, t] = on * (two_thirds - half * q * q * (two - q))
-        weights[6, t] = on * (two_thirds - half * qm * qm * (two - qm))
-        weights[7, t] = on * (q * q * q * sixth)
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def span_on_grid(place, count):  # type: ignore[no-untyped-def]
+    """The multiples of four between which all samples on the grid lie; what is filled up behind ``count`` is off the grid."""
+    first, last = 0, count - 1
+    while first < count and place[first] < 0:
+        first += 1
+    if first == count:
+        return 0, 0
+    while place[last] < 0:
+        last -= 1
+    first, stop = first // 4 * 4, last // 4 * 4 + 4
+    for t in range(count, stop):
+        place[t] = -1
+    return first, stop
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _columns(f, place, count, stride, weights, columns):  # type: ignore[no-untyped-def]
-    """Sums along y of the 4 x 4 coefficients of each sample: four neighbours at once, no gathers."""
-    flat = columns.reshape(-1)
-    for t in range(uint64(count)):
-        p = uint64(max(place[t], int32(0)))
-        four_columns(f, p, stride, weights[4, t], weights[5, t], weights[6, t], weights[7, t], flat, uint64(4) * t)
+def _spline(place, u, v, first, stop, constants, at, weights):  # type: ignore[no-untyped-def]
+    """The cubic B-spline weights (8, CHUNK), four along x, four along y; ``at``: ``place``, somewhere for samples off the grid."""
+    sixth, two_thirds, half, one, two = constants[0], constants[1], constants[2], constants[3], constants[4]
+    for k in range(2):
+        fractions, w0, w1, w2, w3 = (u, v)[k], weights[4 * k], weights[4 * k + 1], weights[4 * k + 2], weights[4 * k + 3]
+        for t in range(uint64(first), uint64(stop)):
+            p = fractions[t]
+            pm = one - p
+            w0[t] = pm * pm * pm * sixth
+            w1[t] = two_thirds - half * p * p * (two - p)
+            w2[t] = two_thirds - half * pm * pm * (two - pm)
+            w3[t] = p * p * p * sixth
+    for t in range(uint64(first), uint64(stop)):
+        at[t] = max(place[t], int32(0))

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from pydantic import PrivateAttr
 
 import zonda
 from zonda.core.data import Observation
@@ -99,11 +100,13 @@ class Late(Operator):
     at_end: ClassVar[bool] = True
     requires: ClassVar[frozenset[str]] = frozenset({"total"})
 
+    _heard: list = PrivateAttr(default_factory=list)
+
     def meanwhile(self, data, done):
-        data.products.setdefault("heard", []).append((data.run, done, len(data.products.get(data.product("total"), []))))
+        self._heard.append((data.run, done, len(data.products.get(data.product("total"), [])), sorted(data.products)))
 
     def finalize(self, data):
-        data.products["seen"] = sorted(name for name in data.products if name.endswith("total"))
+        data.products["seen"], data.products["heard"] = sorted(data.products), self._heard
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +120,11 @@ RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
 def test_companion_runs_use_the_same_random_numbers(scene):
     data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs=RUNS).run(scene, threads=1)
     assert data.products["seen"] == ["noiseless/total", "source_free/total", "total"]
+    assert [(run, there) for run, done, _, there in data.products["heard"] if done == "run"] == [
+        ("", ["total"]),
+        ("noiseless", ["noiseless/total", "total"]),
+        ("source_free", ["noiseless/total", "source_free/total", "total"]),
+    ]
     for k in range(2):
         whole, sky, noise = (data.products[n][k] for n in ("total", "noiseless/total", "source_free/total"))
         assert np.array_equal(whole, sky + noise)
@@ -126,7 +134,27 @@ def test_companion_runs_use_the_same_random_numbers(scene):
 def test_what_acts_at_the_end_hears_of_what_is_done(scene):
     data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs={"again": {"only": ["sky"]}}).run(scene, threads=1)
     scans = [[(run, "scan", k + 1) for k in range(2)] + [(run, "run", 2)] for run in ("", "again")]
-    assert data.products["heard"] == [("", "pointing", 0), *scans[0], *scans[1]]
+    assert [heard[:3] for heard in data.products["heard"]] == [("", "pointing", 0), *scans[0], *scans[1]]
+
+
+class Flag(Operator):
+    """Flags as many samples as the run has an rms in K, and a detector where that is small."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        block.observation.flags[0] = 1
+        block.observation.detector_flags[:] |= np.uint8(not {"white"} & block.detdata.keys())
+
+
+def test_observations_end_with_the_flags_of_the_main_run(scene):
+    """What acts at the end, and whoever has the data, sees those; a companion run may have flagged all detectors."""
+    runs = {"noiseless": {"only": ["sky"]}}
+    data = Pipeline([Point(), Sky(), White(), Sum(), Flag(), Total()], runs=runs).run(scene, threads=1)
+    for observation in data.observations:
+        assert observation.flags[0] == 1
+        assert not observation.detector_flags.any()
 
 
 def test_same_seed_same_bits_two_seeds_incoherent(scene):

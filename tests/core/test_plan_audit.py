@@ -155,3 +155,15 @@ def test_the_sky_is_compared_where_both_maps_hold_the_same_samples():
         (row,) = [r for r in _compare("sky", choice, full, coarse, None) if r.metric == "peak"]
         assert row.actual == largest
         assert row.violated == (n == 20)
+
+
+def test_an_audit_without_a_good_sample_compares_nothing(recwarn):
+    """Not the mean of nothing, which is no number and violates every bound."""
+    choice = Choice("coarse", "test", bound={"tod": 0.5, "peak": 0.5})
+    empty, sky = [np.empty((0, 100))], _Map(np.ones(9), np.ones(9))
+    assert [r.metric for r in _compare("x", choice, _Result(empty, None, sky), _Result(empty, None, sky), None)] == [
+        "tod",
+        "peak",
+    ]
+    assert not any(r.violated for r in _compare("x", choice, _Result(empty, None, sky), _Result(empty, None, sky), None))
+    assert not recwarn.list

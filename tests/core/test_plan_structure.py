@@ -136,9 +136,12 @@ def test_modes_of_the_complete_data_keep_what_determines_them():
 
 
 def test_without_singular_modes_there_is_nothing_to_keep():
-    found, runs, _ = acting(POINT, SKY, AIR, NOISE, SUM, MAP, FULL)
+    found, runs, _ = acting(POINT, SKY, NOISE, SUM, MAP, FULL)
     assert found == {"Point", "Sky", "Sum", "Map", "Full"}
     assert not runs
+    found, runs, _ = acting(POINT, SKY, AIR, NOISE, SUM, MAP, FULL)  # but the transmission of the air
+    assert found == {"Point", "Sky", "Air", "Sum", "Map", "Full"}
+    assert runs == {"_sky_full"}
 
 
 def test_what_is_kept_by_name_keeps_the_main_run():

@@ -82,6 +82,12 @@ class Bench:
         assert command("run", self.file(campaign, *changes), "--output", out, *arguments) == status
         return out
 
+    def run_file(self, file: Path, *arguments: Any) -> Path:
+        """Run a file in series, in full."""
+        out = self.new()
+        assert command("run", file, "--output", out, "--engine", "serial", "--threads", 1, "--no-prune", *arguments) == 0
+        return out
+
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -20,6 +21,101 @@ def test_dask_cluster_of_two_workers(undisturbed, bench):
     with distributed.LocalCluster(**options) as cluster:
         out = bench.run(bench.CAMPAIGN, "--scheduler", cluster.scheduler_address)
     assert bench.planes(out) == bench.planes(undisturbed)
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory):
+    """``ca.pem``, ``node.pem`` which it signed, ``other.pem`` which it did not; each with its ``.key``."""
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        pytest.skip("there is no openssl command to make certificates with")
+    folder = tmp_path_factory.mktemp("certificates")
+
+    def make(*arguments):
+        subprocess.run([openssl, *arguments], cwd=folder, check=True, capture_output=True)
+
+    key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    for name in ("ca", "other"):
+        make("req", "-x509", *key, "-days", "2", "-subj", f"/CN={name}", "-keyout", f"{name}.key", "-out", f"{name}.pem")
+    make("req", *key, "-subj", "/CN=node", "-keyout", "node.key", "-out", "node.csr")
+    make(
+        "x509",
+        "-req",
+        "-in",
+        "node.csr",
+        "-CA",
+        "ca.pem",
+        "-CAkey",
+        "ca.key",
+        "-CAcreateserial",
+        "-days",
+        "2",
+        "-out",
+        "node.pem",
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def encrypted(certificates):
+    """Address of a Dask cluster that talks to nobody without a certificate."""
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install 'zonda[dask]'")
+    pairs = {f"tls_{who}_{what}": str(certificates / file) for who in ("scheduler", "worker", "client")
+             for what, file in (("cert", "node.pem"), ("key", "node.key"))}  # fmt: skip
+    security = distributed.Security(tls_ca_file=str(certificates / "ca.pem"), require_encryption=True, **pairs)
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": True, "dashboard_address": None, "host": "127.0.0.1"}
+    with distributed.LocalCluster(**options, protocol="tls://", security=security) as cluster:
+        assert cluster.scheduler_address.startswith("tls://")
+        yield cluster.scheduler_address
+
+
+def in_a_shell(arguments, **variables):
+    """The command line in a process of its own; its exit status, and what it said."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | variables
+    command = [sys.executable, "-m", "zonda.core.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    return done.returncode, done.stderr
+
+
+def test_dask_with_tls_by_its_own_configuration(undisturbed, bench, certificates, encrypted, tmp_path):
+    """Certificates in variables of the environment, as Dask reads them."""
+    names = {"CA_FILE": "ca.pem", "CLIENT__CERT": "node.pem", "CLIENT__KEY": "node.key"}
+    variables = {f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(certificates / file) for name, file in names.items()}
+    out = bench.new()
+    status, said = in_a_shell(["run", bench.file(bench.CAMPAIGN), "--scheduler", encrypted, "--output", out], **variables)
+    assert status == 0, said
+    assert bench.planes(out) == bench.planes(undisturbed)
+
+
+def test_dask_with_tls_by_the_pipeline_file(bench, certificates, encrypted):
+    tls = f"{{ca_file: {certificates}/ca.pem, cert: {certificates}/node.pem, key: {certificates}/node.key}}"
+    out = bench.run(f"{{engine: dask, scheduler: '{encrypted}', tls: {tls}}}")
+    assert (out / "map.fits").exists()
+
+
+@pytest.mark.parametrize(
+    ("ca", "pair", "why"),
+    [
+        (None, None, "no ca_file for TLS is named"),
+        ("ca", None, "no cert for TLS is named"),
+        ("gone", "node", "ca_file of TLS: there is no file"),
+        ("ca", ("node", "other"), "the certificates for TLS cannot be used"),  # not a pair
+        ("other", "other", "cannot reach the Dask scheduler: "),  # the scheduler's was signed by somebody else
+        ("ca", "other", "cannot reach the Dask scheduler: "),  # the scheduler does not accept it
+    ],
+)
+def test_wrong_certificates_are_one_clean_error(bench, certificates, encrypted, capfd, ca, pair, why):
+    dask = pytest.importorskip("dask")
+    cert, key = pair if isinstance(pair, tuple) else (pair, pair)
+    files = {"ca-file": ca and f"{ca}.pem", "client.cert": cert and f"{cert}.pem", "client.key": key and f"{key}.key"}
+    with dask.config.set({f"distributed.comm.tls.{k}": str(certificates / v) for k, v in files.items() if v}):
+        out = bench.run(bench.CAMPAIGN, "--scheduler", encrypted, status=2)
+    gc.collect()  # a client that was never connected says so when it is thrown away
+    said = [line for line in capfd.readouterr().err.splitlines() if "distributed" not in line.partition(" - ")[2]]
+    assert said[0].startswith(f"error: {encrypted}: {why}"), said
+    assert len(said) == 2, said
+    assert "certificates" in said[1] or "comm.tls" in said[1]
+    assert not out.exists()
 
 
 def test_mpi_with_two_processes(undisturbed, bench):

@@ -123,6 +123,29 @@ def test_mistakes_are_shown_at_their_place(bench, campaign, words, place):
     assert all(word in text for word in words), text
 
 
+@pytest.mark.parametrize(
+    ("gone", "campaign", "words", "place"),
+    [
+        ("site: green_bank\n", "{grid: {site: [mauna_kea, atacama]}}", "write 'site: \"mauna_kea\"' at the top level", "16:19"),
+        (
+            "time: 2024-11-25T07:00\n",
+            "{observations: [{time: 2024-11-26}, {time: 2024-11-27}]}",
+            "write 'time: \"2024-11-26\"' at",
+            "16:28",
+        ),
+    ],
+)
+def test_an_axis_of_what_the_pipeline_lacks(bench, gone, campaign, words, place):
+    """The file is checked as one observation: the error names the axis, not line 1."""
+    with pytest.raises(ConfigurationError) as caught:
+        parse(bench.file(campaign, (gone, "")).read_text(), name="p.yaml")
+    text = caught.value.render()
+    assert "changes what the pipeline does not have" in text
+    assert f"p.yaml:{place}" in text, text
+    assert words in text, text
+    assert "1 mistake" in text
+
+
 def test_check_and_plan_know_a_campaign(bench, capsys):
     path = bench.file("{grid: {seed: [1, 2]}, nights: 4, combine: [night]}")
     assert bench.command("check", path) == 0

@@ -194,6 +194,37 @@ def test_an_exception_leaves_a_campaign_that_resumes(undisturbed, bench, monkeyp
     assert bench.planes(out) == bench.planes(undisturbed)
 
 
+def test_a_plain_run_leaves_an_unfinished_campaign_alone(undisturbed, bench, monkeypatch, capsys):
+    out = half(bench, monkeypatch)
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
+    capsys.readouterr()
+    plain = bench.file("null", name="plain.yaml")
+    assert bench.command("run", plain, "--output", out) == 2
+    said = capsys.readouterr().err
+    assert f"error: {out}: holds an unfinished campaign\n  = zonda resume {out}, remove it, or choose another folder" in said
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()} == before
+    assert bench.command("resume", out, *SERIAL) == 0
+    assert bench.planes(out) == bench.planes(undisturbed)
+    assert bench.command("run", plain, "--output", out) == 0  # a finished one's products are replaced, as another run's are
+    assert bench.planes(out) != bench.planes(undisturbed)
+    assert not (out / "campaign.json").exists()
+    assert not list(out.glob("jobs*"))
+    capsys.readouterr()
+    assert bench.command("status", out) == 2
+    assert "holds no campaign" in capsys.readouterr().err
+
+
+def test_a_campaign_into_the_folder_of_a_plain_run_says_so(undisturbed, bench, capsys):
+    out = bench.new()
+    assert bench.command("run", bench.file("null", name="plain.yaml"), "--output", out) == 0
+    (out / "of-mine.txt").write_text("")
+    capsys.readouterr()
+    assert bench.command("run", bench.file(bench.CAMPAIGN), "--output", out, *SERIAL) == 0
+    assert f"{out} holds products of an earlier run: those of the same names are replaced, others stay" in capsys.readouterr().err
+    assert bench.planes(out) == bench.planes(undisturbed)
+    assert (out / "of-mine.txt").exists()
+
+
 def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypatch):
     submit, killed = campaign._submit, []
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from pydantic_core import PydanticCustomError
 
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import (
@@ -89,6 +90,12 @@ def test_compound_units_agree_with_astropy(text: str) -> None:
 @pytest.mark.parametrize("text", ["m / s / K", "K / s m", "furlong", "1 / s", "K_RJ", "m / (s K)", "s(1/2"])
 def test_other_texts_are_left_to_astropy(text: str) -> None:
     assert read_unit(text) is None
+
+
+@pytest.mark.parametrize("unit", ["km400", "s / mm400", "m(1/0)", "km" + "9" * 5000])
+def test_powers_beyond_all_numbers_are_refused(unit: str) -> None:
+    with pytest.raises(PydanticCustomError, match="unknown unit"):
+        Unit("m").parse(f"1 {unit}")
 
 
 def test_rarer_units_go_through_astropy() -> None:

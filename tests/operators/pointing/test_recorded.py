@@ -1,5 +1,6 @@
 """Simulating on a recorded scan: irregular times, gaps and rows that are not numbers."""
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.projection import rotation_matrices
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.recorded import PointingRecorded
-from zonda.operators.pointing.recording import FLAGGED, NOT_RECORDED, Recording, comb, read
+from zonda.operators.pointing.recording import FLAGGED, NOT_RECORDED, Recording, comb, longest_rising, read
 from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
 
 UNIX = 1732518000.0  # 2024-11-25T07:00:00Z
@@ -81,7 +82,8 @@ def test_nothing_is_repaired_silently() -> None:
     assert len(scan.seconds) == 2000
     assert found.counts == {
         "rows without a time, dropped": 1,
-        "rows out of order or repeated, dropped": 1,
+        "rows out of order, dropped": 1,
+        "rows repeated, dropped": 0,
         "rows closer than half a sample to the one before, dropped": 1,
         "rows alone between gaps, dropped": 0,
         "samples in gaps, flagged": 153,
@@ -107,6 +109,58 @@ def test_what_is_no_comb_is_refused() -> None:
         comb(recording([0.0]), 60, "test")
     with pytest.raises(InputError, match="no two directions next to each other"):
         comb(Recording(None, np.arange(9.0), np.full(9, NAN), np.zeros(9), "azel", np.zeros(9, bool)), 60, "test")
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(-9, 9), max_size=40))
+def test_as_few_rows_as_possible_are_dropped(values: list[int]) -> None:
+    found = longest_rising(np.array(values, float))
+    assert (np.diff(found) > 0).all()
+    assert (np.diff(np.array(values)[found]) > 0).all()
+    longest: list[int] = []  # that ends at each value, by trying all that come before
+    for k, value in enumerate(values):
+        longest.append(1 + max((longest[j] for j in range(k) if values[j] < value), default=0))
+    assert len(found) == max(longest, default=0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(10, 300), st.data())
+def test_stamps_that_jump_are_dropped_alone(n: int, data: st.DataObject) -> None:
+    """However far, ahead or back, as long as there are more good rows than such before and behind them."""
+    jumps = data.draw(
+        st.dictionaries(st.integers(4, n - 5), st.sampled_from([1e9, 3600.0, -3600.0, -1e9]), max_size=min(3, n // 8))
+    )
+    t = np.arange(n) / 100
+    rows = recording(t)
+    for row, jump in jumps.items():
+        rows.seconds[row] += jump
+    found = comb(rows, 60.0, "test")
+    (scan,) = found.scans
+    assert found.counts["rows out of order, dropped"] == len(jumps)
+    assert np.array_equal(np.flatnonzero(scan.flags == NOT_RECORDED), sorted(jumps))
+    assert scan.seconds == pytest.approx(t, abs=1e-9)
+
+
+def test_repeated_rows_are_dropped_without_a_word(observe: Callable[..., Data], tmp_path: Path) -> None:
+    t, angle = UNIX + np.repeat(np.arange(600), 2) / 10, np.repeat(np.arange(600), 2) / 6000
+    file = write_csv(tmp_path / "twice.csv", t, 200 + angle, 40 + angle)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = observe(PointingRecorded(file=file))
+    assert data.observations[0].n_samples == 600
+    assert data.observations[0].tally.get("PointingRecorded", "rows repeated, dropped") == 600
+
+
+def test_a_stamp_ahead_of_its_time_is_dropped_and_said(observe: Callable[..., Data], tmp_path: Path) -> None:
+    """The rest stays: a year ahead, in the third row of 600."""
+    t, angle = UNIX + np.arange(600) / 10, np.arange(600) / 600
+    t[2] += 3e7
+    file = write_csv(tmp_path / "jump.csv", t, 200 + angle, 40 + angle)
+    with pytest.warns(UserWarning, match=r"1 rows of .*jump.csv were dropped: their times jump ahead or back"):
+        data = observe(PointingRecorded(file=file))
+    (observation,) = data.observations
+    assert observation.n_samples == 600
+    assert np.array_equal(np.flatnonzero(observation.flags), [2])
 
 
 # ---- files

@@ -1,0 +1,145 @@
+"""A campaign's output folder: what is kept there besides products, and what others may do with it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from ..errors import InputError, OutputError, ZondaError
+from ..files import discard, temporary_sibling, write_text
+from . import log as joblog
+from . import parts
+from .job import FILE, LOG, TASKS, Job, Task
+from .log import Log
+from .task import product_path
+
+RESOLVED = "resolved.yaml"
+
+Say = Callable[[str], None]
+
+
+def check_free(folder: Path) -> None:
+    """Raise `OutputError` where the folder holds an unfinished campaign."""
+    if (folder / FILE).exists() and not finished(folder):
+        raise OutputError(
+            "holds an unfinished campaign", place=str(folder), cure=f"zonda resume {folder}, remove it, or choose another folder"
+        )
+
+
+def make_way(folder: Path) -> None:
+    """Remove what an earlier campaign left besides its products. The caller holds the folder's lock."""
+    for old in (folder / FILE, folder / LOG, *folder.glob("jobs.*.sqlite")):
+        with contextlib.suppress(FileNotFoundError):
+            old.unlink()
+    shutil.rmtree(folder / TASKS, ignore_errors=True)
+
+
+def finished(folder: Path) -> bool:
+    """Whether all products of the campaign in a folder are written."""
+    if not (folder / LOG).exists():
+        return False
+    try:
+        job, log = Job.read(folder), Log(folder / LOG)
+    except ZondaError:
+        return False
+    with contextlib.closing(log):
+        return log.combined() == set(range(len(job.combinations)))
+
+
+def publish(job: Job, folder: Path) -> None:
+    """Write the campaign's file unless another job of an array was first."""
+    draft = temporary_sibling(folder / FILE).with_suffix("")
+    draft.mkdir()
+    try:
+        job.write(draft)
+        try:
+            os.link(draft / FILE, folder / FILE)
+        except FileExistsError:
+            pass
+        except OSError:  # no hard links here
+            if not (folder / FILE).exists():
+                os.replace(draft / FILE, folder / FILE)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say) -> list[Task]:
+    """Tasks whose products are not there, or not what they should be; the log then says so."""
+    rows = {row.number: row for row in log.rows()}
+    others = {row.number: row for path in sorted(folder.glob("jobs.*-of-*.sqlite")) for row in _readable(path)}
+    missing, lost = [], []
+    for task in job.tasks:
+        if task.combination in combined:
+            continue
+        row, other = rows[task.number], others.get(task.number)
+        digest = parts.digest_of(product_path(folder, task), task.key)
+        if digest is None or (row.state == "done" and digest != row.digest):
+            missing.append(task)
+            if row.state == "done":
+                lost.append(task)
+        elif row.state != "done":
+            log.done(task.number, other.host if other else row.host, other.seconds if other else row.seconds, digest)
+    gone = {task.number for task in lost}
+    log.put_off(task.number for task in missing if task.number not in gone)
+    log.put_off(gone, "its partial product was missing or damaged when the campaign was resumed")
+    if lost:
+        say(f"{len(lost)} partial products were missing or damaged: their tasks are run again")
+    return missing
+
+
+def _readable(path: Path) -> list[joblog.Row]:
+    try:
+        return joblog.read(path)
+    except InputError:
+        return []
+
+
+def open_log(path: Path, job: Job) -> Log:
+    """A job log that knows all tasks."""
+    log = Log(path)
+    log.begin((task.number, task.samples) for task in job.tasks)
+    return log
+
+
+def opened(folder: Path, job: Job, say: Say) -> Log:
+    """The job log; a damaged one is put aside and made anew."""
+    path = folder / LOG
+    try:
+        log = open_log(path, job)
+        if {row.number for row in log.rows()} != {task.number for task in job.tasks}:
+            raise InputError("it is of another campaign", place=str(path))
+        log.combined()
+        return log
+    except InputError:
+        aside = next(p for k in range(1, 1000) if not (p := folder / f"jobs.damaged-{k}.sqlite").exists())
+        os.replace(path, aside)
+        for journal in folder.glob(f"{LOG}-*"):
+            discard(journal)
+        say(f"the job log was damaged: it is kept as {aside.name} and made anew from the partial products")
+        return open_log(path, job)
+
+
+def clean(folder: Path) -> None:
+    """Remove what killed workers left half written."""
+    for place in (folder, folder / TASKS, *(folder / "entries").glob("*")):
+        for path in place.glob(".*.part*"):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                discard(path)
+
+
+def sources_of(job: Job, folder: Path) -> list[Path]:
+    """Where the campaign's own YAML is kept."""
+    if len(job.source) == 1:
+        return [folder / RESOLVED]
+    return [folder / f"resolved-{k}.yaml" for k in range(1, len(job.source) + 1)]
+
+
+def write_sources(job: Job, folder: Path) -> None:
+    """Write the campaign's own YAML."""
+    for path, text in zip(sources_of(job, folder), job.source, strict=True):
+        write_text(path, text)
