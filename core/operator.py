@@ -33,8 +33,9 @@ class Operator(Parameters):
        Its result may depend on absolute detector and sample indices only, never on where the block begins or ends. A block may
        come again (`Block.again`) where the streams between operators do not fit in memory; one that makes no stream is spared.
     4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
-    5. ``finalize(data)`` once at the end of the run: turn sums into products, write files. After it `at_end` operators see
-       ``after_run(data)``.
+    5. ``finalize(data)`` once at the end of the run: turn sums into products, write files.
+
+    `at_end` operators hear of what is done by ``meanwhile(data, done)``.
 
     A campaign (`core.campaign`) shares the observations out among tasks. What `observe` works out from all of them comes from
     `agree` and `lay_out`; between `collect` and `finalize`, `pack` takes a task's partial products out of ``data.products`` and
@@ -177,9 +178,10 @@ class Operator(Parameters):
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """Add this observation's partial products to ``data.products``."""
 
-    def after_run(self, data: Data) -> None:
-        """Called for `at_end` operators after the main run and after each companion run: time to begin with what `finalize` will
-        do, in the background, as far as it depends on products that are there and will not change."""
+    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
+        """Called for `at_end` operators once the telescope is pointed, after every scan, and after every run (``data.run``): time
+        to begin with what `finalize` will do, in the background, as far as it depends on products that are there and will not
+        change."""
 
     def discard(self, observation: Observation, state: Any) -> None:
         """Undo what `prepare` and `exec` began (temporary files): called instead of `collect` when the run fails."""

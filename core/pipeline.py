@@ -354,8 +354,10 @@ class Pipeline:
             raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
         if part is not None and part.scans is not None:
             data.observations = [data.observations[k] for k in part.scans]
+        if part is None:
+            self._meanwhile(data, "pointing")
         self._keep_to(ceiling, memory, data, settings, ahead)
-        make = _Runs(self, data, keep, hooks, settings, timer, ahead)
+        make = _Runs(self, data, keep, hooks, settings, timer, ahead, part is None)
         kept: dict[str, Packed] = {}
         try:
             for run in self.order:
@@ -369,9 +371,8 @@ class Pipeline:
                         self._finalize(operator, data, timer, hooks)
                     else:
                         part.take(operator, data)
-                for operator in self.operators:
-                    if operator.at_end and part is None:
-                        operator.after_run(data)
+                if part is None:
+                    self._meanwhile(data, "run")
         finally:
             ahead.close()
         data.run = ""
@@ -441,9 +442,7 @@ class Pipeline:
             data.run = run
             for operator in self._selected(run):
                 self._finalize(operator, data, timer, hooks)
-            for operator in self.operators:
-                if operator.at_end:
-                    operator.after_run(data)
+            self._meanwhile(data, "run")
         data.run = ""
         for operator in self.operators:
             if operator.at_end:
@@ -468,6 +467,11 @@ class Pipeline:
             ahead.on = size is not None
             settings.memory, products = settings.memory - (size or 0), products + (size or 0)
         settings.ceiling = budget - products
+
+    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
+        for operator in self.operators:
+            if operator.at_end:
+                operator.meanwhile(data, done)
 
     def _finalize(self, operator: Operator, data: Data, timer: Timer, hooks: Any) -> None:
         hooks.zonda_before_operator(operator=operator, observation=None, stage="finalize")
@@ -502,10 +506,18 @@ class _Runs:
     """Simulates runs, one after the other, over all observations: `Pipeline.run`."""
 
     def __init__(
-        self, pipeline: Pipeline, data: Data, keep: Sequence[str], hooks: Any, settings: Settings, timer: Timer, ahead: Ahead
+        self,
+        pipeline: Pipeline,
+        data: Data,
+        keep: Sequence[str],
+        hooks: Any,
+        settings: Settings,
+        timer: Timer,
+        ahead: Ahead,
+        whole: bool,
     ) -> None:
         self._pipeline, self._data, self._keep, self._hooks = pipeline, data, keep, hooks
-        self._settings, self._timer, self._ahead = settings, timer, ahead
+        self._settings, self._timer, self._ahead, self._whole = settings, timer, ahead, whole
         self._pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         freeze = any(run.modes == "full" for run in pipeline.runs.values())
         self._frozen = [Frozen() if freeze else None for _ in data.observations]
@@ -523,6 +535,8 @@ class _Runs:
             data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             if not run:
                 self._main[number - 1] = observation.focalplane, observation.flags, observation.detector_flags
+            if self._whole:
+                self._pipeline._meanwhile(data, "scan")
 
     def leave_main(self) -> None:
         """Let observations carry what the main run left of detectors and flags."""

@@ -49,7 +49,7 @@ from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Companion
-from zonda.operators.diagnostics.power_spectrum import Spectrum
+from zonda.operators.diagnostics.series import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
 from zonda.operators.maps.image import Image

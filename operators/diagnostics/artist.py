@@ -105,11 +105,9 @@ def _prepare() -> None:
     from importlib import import_module
 
     gc.disable()
-    for name in (
-        "zonda.operators.diagnostics.plot_operators",
-        "matplotlib.backends.backend_agg",
-        "astropy.visualization.wcsaxes",
-    ):
+    with suppress(Exception):  # this process shows nobody the lists of properties in matplotlib's docstrings
+        vars(import_module("matplotlib.artist")).update(kwdoc=lambda artist: "")
+    for name in ("zonda.operators.diagnostics.pictures", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         with suppress(Exception):
             import_module(name)
     gc.freeze()

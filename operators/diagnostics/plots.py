@@ -1,24 +1,27 @@
 """Pictures of maps, coverage, spectra, time streams and scans, drawn into ``ax`` or a new figure; each returns its Axes.
 
 matplotlib is imported inside; no window system is needed and no global state is touched. Colours are told apart by
-colour-blind eyes (Okabe & Ito 2008) and brightness scales are perceptually ordered.
+colour-blind eyes (Okabe & Ito 2008) and brightness scales are perceptually ordered. Margins of a new figure are fixed, and
+labels are plain Unicode text: measuring the one and parsing the other take longer than drawing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .sky_axes import SkyAxes, names_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from zonda.core.data import Observation
 
-    from .power_spectrum import Spectrum
-    from .time_streams import TimeStream
+    from .series import Spectrum, TimeStream
     from .transfer_function import Transfer
 
 Floats = NDArray[np.floating]
@@ -38,56 +41,172 @@ COLOURS = {
 SEQUENCE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 
-def _axes(ax: Any, size: tuple[float, float] = (6.4, 5.2), projection: Any = None) -> Any:
-    """``ax``, or the Axes of a new figure that belongs to nobody else (not to pyplot)."""
+DPI = 110
+MAP_SIZE = (6.4, 5.2)
+"""Largest width and height of a picture of one map, in."""
+_TOP, _BOTTOM, _BAR = 0.34, 0.58, 1.12
+"""Margins for a title, for tick labels with an axis label, and for a colour bar with its labels, in."""
+MANY = 2000
+"""Points of a track that are drawn, however near to one another."""
+_CHARACTER, _LINE = 0.078, 0.17
+"""Width of a character and height of a line of 9 pt text, in."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """A scan for `plot_scan`: unit vectors (n, 3) of the boresight, ICRS; the scan's centre (RA, Dec) [rad]."""
+
+    name: str
+    centre: tuple[float, float]
+    directions: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, observation: Observation, most: int = 20000) -> Track:
+        """Of at most ``most`` samples, evenly spaced."""
+        step = -(-observation.n_samples // most)
+        x, y, z, w = np.asarray(observation.boresight_radec[::step], np.float64).T
+        directions = np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=1)
+        return cls(observation.name, observation.centre, directions)
+
+
+def _axes(ax: Any, size: tuple[float, float] = (7.2, 5.0), left: float = 0.85, top: float = _TOP) -> Any:
+    """``ax``, or the Axes of a new figure that belongs to nobody else (not to pyplot). ``left``, ``top``: margins, in."""
     if ax is not None:
         return ax
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=110, layout="constrained")
-    return figure.add_subplot(projection=projection) if projection is not None else figure.add_subplot()
+    width, height = size
+    figure = Figure(figsize=size, dpi=DPI)
+    inside = (left / width, _BOTTOM / height, 1 - (left + 0.12) / width, 1 - (_BOTTOM + top) / height)
+    return figure.add_axes(inside)
+
+
+def _fit(ax: Any) -> None:
+    """Move the left edge of the one axes of a figure to where its tick labels and their name have room."""
+    labels = ax.yaxis.get_major_formatter().format_ticks(ax.yaxis.get_majorticklocs())
+    left = (0.4 + 1.12 * _CHARACTER * max((len(label) for label in labels), default=0)) / ax.figure.get_figwidth()
+    box = ax.get_position()
+    ax.set_position((left, box.y0, box.x1 - left, box.height))
+
+
+def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int = 1) -> list[Any]:
+    """Axes of a new figure for ``count`` images (ny, nx) side by side, each with one for its colour bar as ``bar_axes``.
+
+    They have the image's pixel coordinates, with tick marks where ``axes`` has them, or are astropy's world axes of ``wcs``.
+    """
+    from matplotlib.figure import Figure
+
+    ny, nx = shape
+    width, height = MAP_SIZE[0] - 1.05 - _BAR, MAP_SIZE[1] - _TOP - _BOTTOM
+    scale = min(width / nx, height / ny)
+    marks = None if axes is None else axes.ticks(shape, nx * scale / _CHARACTER, ny * scale / _LINE)
+    left = 0.36 + _CHARACTER * max((len(label) for label in marks["left"].labels), default=0) if marks else 1.05
+    scale = min((MAP_SIZE[0] - left - _BAR) / nx, height / ny)
+    width, height = nx * scale, ny * scale
+    bar = max(0.9 * height, min(1.2, MAP_SIZE[1] - _TOP - _BOTTOM))
+    tall = max(height, bar)
+    size = (left + width + _BAR) * count, tall + _TOP + _BOTTOM
+    figure = Figure(figsize=size, dpi=DPI)
+
+    def placed(x: float, y: float, w: float, h: float, **more: Any) -> Any:
+        return figure.add_axes((x / size[0], y / size[1], w / size[0], h / size[1]), **more)
+
+    made = []
+    for k in range(count):
+        x, y = (left + width + _BAR) * k + left, _BOTTOM + (tall - height) / 2
+        if marks is None:
+            from astropy.wcs import WCS
+
+            ax = placed(x, y, width, height, projection=wcs if hasattr(wcs, "wcs") else WCS(wcs, naxis=2))
+        else:
+            ax = placed(x, y, width, height)
+            ax.set_xticks(marks["bottom"].places, marks["bottom"].labels, fontsize=9)
+            ax.set_yticks(marks["left"].places, marks["left"].labels, fontsize=9)
+            ax.plot(marks["top"].places, np.full(len(marks["top"].places), ny - 0.5), **_tick_style(2))
+            ax.plot(np.full(len(marks["right"].places), nx - 0.5), marks["right"].places, **_tick_style(1))
+        ax.bar_axes = placed(x + width + 0.1, _BOTTOM + (tall - bar) / 2, 0.2, bar)
+        made.append(ax)
+    return made
+
+
+def _tick_style(marker: int) -> dict[str, Any]:
+    """Of tick marks that no axis draws."""
+    return {"linestyle": "none", "marker": marker, "markersize": 3.5, "markeredgewidth": 0.8, "color": "black", "clip_on": False}
 
 
 def _unit(peak: float) -> tuple[float, str]:
     """Factor and name of the unit in which a brightness of ``peak`` kelvin reads well."""
     for factor, name in ((1e6, "µK"), (1e3, "mK")):
         if peak * factor < 3e3:
-            return factor, f"{name}$_\\mathrm{{RJ}}$"
-    return 1.0, "K$_\\mathrm{RJ}$"
+            return factor, name
+    return 1.0, "K"
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _power_of_ten(value: float) -> str:
+    power = int(np.floor(np.log10(value) + 1e-9))
+    mantissa = f"{value / 10.0**power:.3g}"
+    return f"{'' if mantissa == '1' else mantissa + ' · '}10{str(power).translate(_RAISED)}"
+
+
+def _log_labels(axis: Any, low: float, high: float) -> None:
+    """Label the powers of ten between ``low`` and ``high``, and 2 and 5 of each where there are few of them."""
+    few = 0 < low < high < 160 * low
+    text = (lambda value: f"{value:.6g}") if low > 1e-3 and high < 1e5 else _power_of_ten
+    axis.set_major_formatter(lambda value, _: text(value) if value > 0 else "")
+    axis.set_tick_params(which="minor", pad=5)  # their labels are as far away as those of the longer marks
+    axis.set_minor_formatter(lambda value, _: text(value) if few and value > 0 and f"{value:.0e}"[0] in "25" else "")
+
+
+def _title(ax: Any, title: str, pad: float | None = None) -> None:
+    """Above the axes, where it stands: looking for room takes as long as drawing."""
+    ax.set_title(title, y=1.0, pad=pad)
 
 
 def _is_world(ax: Any) -> bool:
-    return hasattr(ax, "coords") and hasattr(ax, "wcs")
+    """Whether positions on ``ax`` are pixels: world axes of astropy's, or those of `map_axes`."""
+    return hasattr(ax, "bar_axes") or (hasattr(ax, "coords") and hasattr(ax, "wcs"))
 
 
-def _axis_names(wcs: Any) -> tuple[str, str, str]:
-    """Names of the two axes of a map and of their frame, as its WCS says: RA, Dec, ICRS; l, b, Galactic."""
-    kind = str(wcs.wcs.ctype[0])
-    if kind.startswith("GLON"):
-        return "l", "b", "Galactic"
-    if kind.startswith("RA"):
-        return "RA", "Dec", str(wcs.wcs.radesys).strip() or "ICRS"
-    return kind.split("-")[0].lower() or "x", str(wcs.wcs.ctype[1]).split("-")[0].lower() or "y", "as in the file"
+def _scales(wcs: Any, axes: SkyAxes | None) -> tuple[float, float]:
+    """Sizes of a pixel, deg."""
+    if axes is not None:
+        return axes.scales
+    from astropy.wcs import WCS
+    from astropy.wcs.utils import proj_plane_pixel_scales
+
+    x, y = proj_plane_pixel_scales(wcs if hasattr(wcs, "wcs") else WCS(wcs, naxis=2))
+    return float(x), float(y)
 
 
-def _show(ax: Any, wcs: Any, values: Floats, label: str, **style: Any) -> Any:
-    """An image with a colour bar, on world axes where ``ax`` has them, else on offsets from the map's centre in arcmin.
+def _show(ax: Any, wcs: Any, axes: SkyAxes | None, values: Floats, label: str, **style: Any) -> Any:
+    """An image with a colour bar, in pixels on world axes, else on offsets from the map's centre in arcmin.
 
     The colour bar has a pointed end where values lie beyond it.
     """
-    from astropy.wcs.utils import proj_plane_pixel_scales
-
     ny, nx = values.shape
-    lon, lat, frame = _axis_names(wcs)
+    if axes is not None:
+        lon, lat, frame = axes.names
+        flip = -1 if axes.matrix[0, 0] < 0 else 1
+    else:
+        header = wcs.to_header(relax=True) if hasattr(wcs, "to_header") else wcs
+        lon, lat, frame = names_of(header)
+        flip = -1 if float(header.get("PC1_1", 1.0)) * float(header.get("CDELT1", 1.0)) < 0 else 1
     if _is_world(ax):
         picture = ax.imshow(values, origin="lower", interpolation="nearest", **style)
-        ax.coords[0].set_axislabel(f"{lon} ({frame})")
-        ax.coords[1].set_axislabel(f"{lat} ({frame})", minpad=0.4)
-        for coordinate in ax.coords:
-            coordinate.set_ticklabel(size=9)
+        names = f"{lon} ({frame})", f"{lat} ({frame})"
+        if hasattr(ax, "coords"):
+            ax.coords[0].set_axislabel(names[0])
+            ax.coords[1].set_axislabel(names[1], minpad=0.4)
+            for coordinate in ax.coords:
+                coordinate.set_ticklabel(size=9)
+        else:
+            ax.set_xlabel(names[0])
+            ax.set_ylabel(names[1])
     else:
-        dx, dy = proj_plane_pixel_scales(wcs) * 60
-        flip = -1 if wcs.wcs.get_pc()[0, 0] * wcs.wcs.get_cdelt()[0] < 0 else 1
+        dx, dy = (60 * scale for scale in _scales(wcs, axes))
         half_x, half_y = nx * dx / 2 * flip, ny * dy / 2
         extent = (-half_x, half_x, -half_y, half_y)
         picture = ax.imshow(values, origin="lower", extent=extent, interpolation="nearest", aspect="equal", **style)
@@ -96,17 +215,20 @@ def _show(ax: Any, wcs: Any, values: Floats, label: str, **style: Any) -> Any:
     low, high = picture.get_clim()
     below, above = bool(np.ma.less(values, low).any()), bool(np.ma.greater(values, high).any())
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
-    bar = ax.figure.colorbar(picture, ax=ax, pad=0.02, shrink=0.9, extend=extend)
+    own = getattr(ax, "bar_axes", None)
+    place = {"ax": ax, "pad": 0.02, "shrink": 0.9} if own is None else {"cax": own}
+    bar = ax.figure.colorbar(picture, extend=extend, **place)
+    if picture.norm.__class__.__name__ == "LogNorm":
+        _log_labels(bar.ax.yaxis, low, high)
     bar.set_label(label)
     return picture
 
 
-def _draw_beam(ax: Any, wcs: Any, shape: tuple[int, ...], fwhm: float) -> None:
-    """The beam's half-power circle in the lower left corner, to scale."""
-    from astropy.wcs.utils import proj_plane_pixel_scales
+def _draw_beam(ax: Any, scales: tuple[float, float], fwhm: float) -> None:
+    """The beam's half-power circle in the lower left corner, to scale. ``scales``: rad per unit of the axes."""
     from matplotlib.patches import Ellipse
 
-    dx, dy = np.radians(proj_plane_pixel_scales(wcs)) if _is_world(ax) else (ARCMIN, ARCMIN)
+    dx, dy = scales
     width, height = fwhm / dx, fwhm / dy
     x0, x1 = ax.get_xlim()
     y0, y1 = ax.get_ylim()
@@ -145,7 +267,8 @@ def plot_map(
     values
         (ny, nx) K_RJ; NaN where nothing was observed (drawn grey).
     wcs
-        Its `astropy.wcs.WCS`; a new figure gets world axes, a plain ``ax`` offsets from the centre in arcmin.
+        Its `astropy.wcs.WCS`, FITS header or `SkyAxes`; a new figure gets tick marks in longitude and latitude, a plain
+        ``ax`` offsets from the centre in arcmin, one of astropy's world axes its own.
     ax
         Axes to draw into.
     title
@@ -160,28 +283,27 @@ def plot_map(
     import matplotlib as mpl
     from matplotlib.patches import Ellipse
 
-    ax = _axes(ax, projection=wcs)
+    axes = wcs if isinstance(wcs, SkyAxes) else SkyAxes.of(wcs)
+    ax = map_axes(values.shape, axes, wcs)[0] if ax is None else ax
     finite = values[np.isfinite(values)]
     if limit is None:
         limit = float(np.percentile(np.abs(finite), SHOWN)) if finite.size else 1.0
     limit = limit or 1.0
     bottom, top, colours = -limit, limit, mpl.colormaps["RdBu_r"]
-    low, high = (float(np.percentile(finite, p)) for p in (100 - SHOWN, SHOWN)) if finite.size else (0.0, 0.0)
+    low, high = (float(p) for p in np.percentile(finite, (100 - SHOWN, SHOWN))) if finite.size else (0.0, 0.0)
     if low * high > 0 and 0 < high - low < 0.5 * max(abs(low), abs(high)):
         bottom, top, colours = low, high, mpl.colormaps["viridis"]
     factor, unit = _unit(max(abs(bottom), abs(top)))
-    shown = np.ma.masked_invalid(np.asarray(values, np.float64) * factor)
+    shown = np.ma.masked_invalid(values * factor)
     bounds = {"vmin": bottom * factor, "vmax": top * factor}
-    _show(ax, wcs, shown, f"brightness [{unit}]", cmap=colours.with_extremes(bad="0.85"), **bounds)
+    _show(ax, wcs, axes, shown, f"Rayleigh–Jeans brightness [{unit}]", cmap=colours.with_extremes(bad="0.85"), **bounds)
+    dx, dy = np.radians(_scales(wcs, axes)) if _is_world(ax) else (ARCMIN, ARCMIN)
     if fwhm:
-        _draw_beam(ax, wcs, values.shape, fwhm)
+        _draw_beam(ax, (dx, dy), fwhm)
     if circle:
-        from astropy.wcs.utils import proj_plane_pixel_scales
-
-        scale = np.radians(proj_plane_pixel_scales(wcs)) if _is_world(ax) else np.array([ARCMIN, ARCMIN])
         centre = ((values.shape[1] - 1) / 2, (values.shape[0] - 1) / 2) if _is_world(ax) else (0.0, 0.0)
-        ax.add_patch(Ellipse(centre, *(circle / scale), fill=False, edgecolor="black", linestyle=":", linewidth=1.2))
-    ax.set_title(title)
+        ax.add_patch(Ellipse(centre, circle / dx, circle / dy, fill=False, edgecolor="black", linestyle=":", linewidth=1.2))
+    _title(ax, title)
     return ax  # type: ignore[no-any-return]
 
 
@@ -190,14 +312,15 @@ def plot_coverage(hits: NDArray[np.integer] | Floats, wcs: Any, *, ax: Any = Non
     import matplotlib as mpl
     from matplotlib.colors import LogNorm, Normalize
 
-    ax = _axes(ax, projection=wcs)
-    hits = np.asarray(hits, np.float64)
+    axes = wcs if isinstance(wcs, SkyAxes) else SkyAxes.of(wcs)
+    ax = map_axes(hits.shape, axes, wcs)[0] if ax is None else ax
+    hits = np.asarray(hits, np.float32)
     colours = mpl.colormaps["cividis"].with_extremes(bad="0.85")
     seen = hits[hits > 0]
     top, middle = (float(seen.max()), float(np.median(seen))) if seen.size else (1.0, 1.0)
     scale = LogNorm(max(1.0, middle / 30), top) if top > 30 * middle else Normalize(0, top)
-    _show(ax, wcs, np.ma.masked_where(hits <= 0, hits), "samples per pixel", cmap=colours, norm=scale)
-    ax.set_title(title)
+    _show(ax, wcs, axes, np.ma.masked_where(hits <= 0, hits), "samples per pixel", cmap=colours, norm=scale)
+    _title(ax, title)
     return ax  # type: ignore[no-any-return]
 
 
@@ -214,7 +337,7 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
 
     The dashed line is the level of white noise, 2 NET^2; the dotted one the knee, where pink noise equals white.
     """
-    ax = _axes(ax, (7.2, 5.0))
+    ax = _axes(ax, left=0.95)
     names = {"signal": "signal (all)", "sky": "astronomical sky", "pink": "pink noise", "white": "white noise"}
     top, bottom = 0.0, np.inf
     for name, psd in spectrum.psd.items():
@@ -267,11 +390,13 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
         floor = level if level > 0 and {"white", "signal"} & set(spectrum.psd) else bottom
         ax.set_ylim(max(bottom * 1e-2, min(floor, top) * 1e-4), top * 5)
     ax.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
+    _log_labels(ax.xaxis, *ax.get_xlim())
+    _log_labels(ax.yaxis, *ax.get_ylim())
     ax.set_xlabel("frequency [Hz]")
-    ax.set_ylabel("power spectral density [K$_\\mathrm{RJ}^2$/Hz]")
+    ax.set_ylabel("power spectral density, Rayleigh–Jeans [K²/Hz]")
     ax.grid(which="major", color="0.9", linewidth=0.7)
     ax.legend(frameon=False, fontsize=9, loc="upper right")
-    ax.set_title(title)
+    _title(ax, title)
     return ax  # type: ignore[no-any-return]
 
 
@@ -281,7 +406,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     S grows without bound where the beam leaves no sky: above 2 it leaves the picture, so that T can be read.
     Horizontal bars are the rings. The dotted line is the beam's FWHM; the upper axis counts wavelengths.
     """
-    ax = _axes(ax, (7.2, 4.6))
+    ax = _axes(ax, (7.2, 4.8), top=0.86)
     r, arcsec = transfer.rings, ARCMIN / 60
     scale, edges = transfer.scale / arcsec, 1 / transfer.edges / arcsec
     width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
@@ -290,6 +415,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     ax.plot(scale, r.amplitude, "--", color=SEQUENCE[1], linewidth=1.2, label="S: ratio of amplitudes")
     ax.set_xscale("log")
     ax.set_xlim(edges[0], edges[-1])
+    _log_labels(ax.xaxis, edges[-1], edges[0])
     top = float(np.nanmax(np.append(np.minimum(r.amplitude, 2.0), r.transfer), initial=1.0))
     ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.05 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
@@ -297,11 +423,12 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
         ax.axvline(transfer.fwhm / arcsec, color="black", linestyle=":", linewidth=1.0)
     upper = ax.secondary_xaxis("top", functions=(_to_kilolambda, _to_kilolambda))
     upper.set_xlabel("baseline [1000 wavelengths]")
+    _log_labels(upper.xaxis, _to_kilolambda(edges[0]), _to_kilolambda(edges[-1]))
     ax.set_xlabel("angular scale [arcsec]")
     ax.set_ylabel("transfer function")
     ax.grid(which="major", color="0.9", linewidth=0.7)
     ax.legend(frameon=False, fontsize=9, loc="best")
-    ax.set_title(title)
+    _title(ax, title, pad=42)
     return ax  # type: ignore[no-any-return]
 
 
@@ -311,57 +438,96 @@ def _to_kilolambda(arcsec: Any) -> Any:
         return 1e-3 / (np.asarray(arcsec, np.float64) * ARCMIN / 60)
 
 
+def _envelope(x: Floats, y: Floats, columns: int = 1600) -> tuple[Floats, Floats]:
+    """Lowest and highest of y, in turn, in ``columns`` equal parts: what a line of many more points looks like."""
+    width = len(y) // columns
+    if width < 4:
+        return x, y
+    whole = width * columns
+    parts, ends = y[:whole].reshape(columns, width), y[whole:]
+    both = np.stack([parts.min(axis=1), parts.max(axis=1)], axis=1).ravel()
+    at = x[:whole].reshape(columns, width)[:, [width // 4, 3 * width // 4]].ravel()
+    return np.append(at, x[whole:]), np.append(both, ends)
+
+
 def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title: str = "") -> Axes:
     """Stream ``name`` of a few detectors against time, K_RJ: samples pale, means over one second dark."""
-    ax = _axes(ax, (7.2, 3.6))
+    own, ax = ax is None, _axes(ax, (7.2, 3.6))
     values = stream.streams[name]
     finite = values[np.isfinite(values)]
     factor, unit = _unit(float(np.abs(finite).max()) if finite.size else 1.0)
+    label = f"{name}, Rayleigh–Jeans [{unit}]"
+    if name == "transmission":
+        factor, label = 1.0, "relative change of the transmission"
     step = float(np.median(np.diff(stream.seconds))) if len(stream.seconds) > 1 else 0.0  # samples need not be a comb
     width = max(1, round(1.0 / step)) if step > 0 else 1
     whole = values.shape[1] // width * width
     centres = stream.seconds[:whole].reshape(-1, width).mean(axis=1)
     for k, detector in enumerate(stream.names):
         colour = SEQUENCE[k % len(SEQUENCE)]
-        ax.plot(stream.seconds, values[k] * factor, linewidth=0.4, alpha=0.2, color=colour, rasterized=True)
+        ax.plot(*_envelope(stream.seconds, values[k] * factor), linewidth=0.4, alpha=0.2, color=colour)
         ax.plot(centres, values[k, :whole].reshape(-1, width).mean(axis=1) * factor, linewidth=0.9, color=colour, label=detector)
     ax.set_xlabel("time since the start of the scan [s]")
-    ax.set_ylabel(f"{name} [{unit}]")
+    ax.set_ylabel(label)
     ax.margins(x=0)
+    if len(stream.seconds) > 1:
+        ax.set_xlim(stream.seconds[0], stream.seconds[-1])
     ax.grid(color="0.92", linewidth=0.7)
     if values.shape[0]:
         legend = ax.legend(frameon=False, fontsize=8, ncols=min(6, len(stream.names)), loc="upper right")
         for line in legend.get_lines():
             line.set_linewidth(2)
-    ax.set_title(title or f"Time streams of {stream.observation}, after step {stream.label}")
+    if own:
+        _fit(ax)
+    _title(ax, title or f"Time streams of {stream.observation}, after step {stream.label}")
     return ax  # type: ignore[no-any-return]
 
 
-def plot_scan(observations: Sequence[Observation], *, ax: Any = None, title: str = "Boresight track") -> Axes:
+def plot_scan(observations: Sequence[Observation | Track], *, ax: Any = None, title: str = "Boresight track") -> Axes:
     """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin, a line per scan.
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
-    ax = _axes(ax, (5.6, 5.2))
-    ra0, dec0 = observations[0].centre
-    for k, observation in enumerate(observations):
-        step = max(1, observation.n_samples // 20000)
-        lon, lat = observation.ra[::step] - ra0, observation.dec[::step]
-        cosine = np.sin(dec0) * np.sin(lat) + np.cos(dec0) * np.cos(lat) * np.cos(lon)
-        near = cosine > 0.1
-        x = np.where(near, np.cos(lat) * np.sin(lon) / np.where(near, cosine, 1), np.nan) / ARCMIN
-        y = (np.cos(dec0) * np.sin(lat) - np.sin(dec0) * np.cos(lat) * np.cos(lon)) / np.where(near, cosine, 1) / ARCMIN
-        width = 0.6 + 1.2 * (1 - (k + 1) / len(observations))
-        ax.plot(x, y, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=observation.name, rasterized=True)
+    ax = _axes(ax, (5.6, 5.2), left=0.65)
+    tracks = [o if isinstance(o, Track) else Track.of(o) for o in observations]
+    offsets = [_offsets(track, tracks[0].centre) for track in tracks]
+    known = np.concatenate(offsets)
+    known = known[np.isfinite(known).all(axis=1)]
+    extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
+    for k, (track, offset) in enumerate(zip(tracks, offsets, strict=True)):
+        width = 0.6 + 1.2 * (1 - (k + 1) / len(tracks))
+        x, y = _apart(offset, extent / 1000).T
+        ax.plot(x, y, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=track.name)
     ax.set_aspect("equal", adjustable="datalim")
     if not ax.xaxis_inverted():
         ax.invert_xaxis()
     ax.set_xlabel("RA offset [arcmin]")
     ax.set_ylabel("Dec offset [arcmin]")
     ax.grid(color="0.92", linewidth=0.7)
-    if len(observations) <= 8:
+    if len(tracks) <= 8:
         legend = ax.legend(frameon=False, fontsize=8, loc="upper right")
         for line in legend.get_lines():
             line.set_linewidth(2)
-    ax.set_title(title)
+    _title(ax, title)
     return ax  # type: ignore[no-any-return]
+
+
+def _offsets(track: Track, centre: tuple[float, float]) -> NDArray[np.float64]:
+    """(n, 2) arcmin east and north of ``centre`` on its tangent plane; NaN far from it."""
+    ra, dec = centre
+    ahead = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    cosine = track.directions @ ahead
+    plane = track.directions @ np.stack([east, np.cross(ahead, east)], axis=1) / np.where(cosine > 0.1, cosine, np.nan)[:, None]
+    return np.asarray(plane / ARCMIN, np.float64)
+
+
+def _apart(points: NDArray[np.float64], least: float) -> NDArray[np.float64]:
+    """The points of a track (n, 2), without those less than ``least`` along it from one that is kept."""
+    steps = np.nan_to_num(np.hypot(*np.diff(points, axis=0).T))
+    if least <= 0 or len(points) < MANY:
+        return points
+    part = np.floor(np.append(0.0, np.cumsum(steps)) / least)
+    keep = np.append(True, part[1:] != part[:-1]) | ~np.isfinite(points).all(axis=1)
+    keep[-1] = True
+    return points[keep]

@@ -18,6 +18,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.operators.io.streams import StreamsAsked
 
+from .series import Spectrum
+
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
@@ -28,91 +30,83 @@ StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pi
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 
 
-@dataclass
-class Spectrum:
-    """Mean one-sided power spectral densities of time streams.
-
-    Attributes
-    ----------
-    frequency
-        (n,) Hz, without zero.
-    psd
-        (n,) per stream, K_RJ^2/Hz on the calibrated sky (`transmission`: relative, 1/Hz).
-    averages
-        Equivalent number of independent periodograms in each value: its relative standard error is averages^-1/2 where
-        detectors are independent.
-    white_level
-        2 <NET^2> of the detectors used, K_RJ^2/Hz: the level of white noise.
-    label
-        Of the step that measured it.
-    detectors, observations
-        How many were averaged.
-    """
-
-    frequency: Floats
-    psd: dict[str, Floats]
-    averages: float
-    white_level: float
-    label: str
-    detectors: int
-    observations: int = 1
-
-    def knee(self) -> float | None:
-        """Highest frequency at which the pink part exceeds the white one [Hz]; None where it never does or one is absent."""
-        if not {"pink", "white"} <= set(self.psd):
-            return None
-        edges = np.geomspace(self.frequency[0], self.frequency[-1], 31)
-        bins = np.clip(np.searchsorted(edges, self.frequency, "right") - 1, 0, 29)
-        sums = [np.bincount(bins, w, 30) for w in (np.log(self.frequency), self.psd["pink"], self.psd["white"])]
-        count = np.bincount(bins, minlength=30)
-        used = count > 0
-        log_f, pink, white = (s[used] / count[used] for s in sums)
-        if not (pink > 0).all() or not (white > 0).all():
-            return None
-        ratio = np.log(pink / white)
-        above = np.flatnonzero(ratio > 0)
-        if not above.size or above[-1] + 1 == ratio.size:
-            return None
-        k = above[-1]
-        return float(np.exp(np.interp(0.0, [-ratio[k], -ratio[k + 1]], [log_f[k], log_f[k + 1]])))
+CHUNK = 8
+"""Segments that are transformed at a time."""
 
 
-def welch(values: Floats, sample_rate: float, length: int) -> tuple[Floats, Floats, float]:
-    """One-sided power spectral density by Welch's method (1967).
+class Welch:
+    """One-sided power spectral densities of series of ``n`` samples by Welch's method (1967).
 
     Segments of ``length`` samples overlap by half, each is freed of its straight line and weighted by a Hann window w once:
 
         P_k = 2 |sum_t w_t x_t e^(-2 pi i k t / L)|^2 / (f_s sum_t w_t^2),    k > 0;  half of it at k = L/2        (1)
 
-    so that white noise of variance s^2 has P = 2 s^2 / f_s. Returns frequency (Hz, without zero), P, and the equivalent
-    number of independent segments.
-    """
-    from scipy.fft import rfft
+    so that white noise of variance s^2 has P = 2 s^2 / f_s.
 
-    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length) if length > 2 else np.ones(length)
-    line = np.arange(length) - (length - 1) / 2
-    starts = range(0, len(values) - length + 1, max(1, length // 2))
-    power = np.zeros(length // 2 + 1)
-    for start in starts:
-        segment = values[start : start + length] - values[start : start + length].mean()
-        segment -= line * ((segment * line).sum() / (line**2).sum())
-        segment *= window
-        found = rfft(segment)
-        power += found.real**2 + found.imag**2
-    power *= 2 / (len(starts) * sample_rate * (window**2).sum())
-    if length % 2 == 0:
-        power[-1] /= 2
-    overlap = ((window[: length - length // 2] * window[length // 2 :]).sum() / (window**2).sum()) ** 2
-    independent = len(starts) / (1 + 2 * overlap * (1 - 1 / len(starts)))
-    return np.arange(1, length // 2 + 1) * sample_rate / length, power[1:], independent
+    Attributes
+    ----------
+    frequency
+        (length // 2,) Hz, without zero.
+    independent
+        Equivalent number of independent segments.
+    """
+
+    def __init__(self, n: int, sample_rate: float, length: int) -> None:
+        w = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length) if length > 2 else np.ones(length)
+        self._length, self._step = length, max(1, length // 2)
+        self._segments = (n - length) // self._step + 1
+        self._line = np.arange(length) - (length - 1) / 2
+        self._slope = self._line / (self._line**2).sum()
+        self._window, self._trend = w, np.array([w, w * self._line])
+        self._scale = np.full(length // 2, 2 / (self._segments * sample_rate * (w**2).sum()))
+        if length % 2 == 0:
+            self._scale[-1] /= 2
+        overlap = ((w[: length - length // 2] * w[length // 2 :]).sum() / (w**2).sum()) ** 2
+        self.independent = self._segments / (1 + 2 * overlap * (1 - 1 / self._segments))
+        self.frequency: Floats = np.arange(1, length // 2 + 1) * sample_rate / length
+
+        self._memory = threading.local()
+
+    def __call__(self, values: Floats) -> Floats:
+        """P (length // 2,) of ``values`` (n,) float64, C-contiguous. May be called from several threads."""
+        power = np.zeros(2 * (self._length // 2 + 1))
+        views = np.lib.stride_tricks.sliding_window_view(values, self._length)[:: self._step]
+        for first in range(0, self._segments, CHUNK):
+            view = views[first : first + CHUNK]
+            segment, trend, found = (part[: len(view)] for part in self._scratch())
+            line = np.stack([view.mean(axis=1), np.einsum("st,t->s", view, self._slope)], axis=1)
+            np.multiply(view, self._window, out=segment)
+            segment -= np.matmul(line, self._trend, out=trend)
+            parts = np.fft.rfft(segment, out=found).view(np.float64)
+            power += np.einsum("sk,sk->k", parts, parts)
+        return np.asarray((power[2::2] + power[3::2]) * self._scale, np.float64)
+
+    def _scratch(self) -> tuple[NDArray[Any], ...]:
+        """This thread's memory for the segments, their straight lines and their transforms."""
+        if not hasattr(self._memory, "arrays"):
+            count = min(CHUNK, self._segments)
+            real, spectrum = (count, self._length), (count, self._length // 2 + 1)
+            self._memory.arrays = np.empty(real), np.empty(real), np.empty(spectrum, np.complex128)
+        return self._memory.arrays  # type: ignore[no-any-return]
+
+
+def _quick(n: int) -> int:
+    """Largest number up to ``n`` without a prime factor above 5: transforms of other lengths take up to ten times as long."""
+    best, five = 1, 1
+    while five <= n:
+        three = five
+        while three <= n:
+            best = max(best, three << (n // three).bit_length() - 1)
+            three *= 3
+        five *= 5
+    return best
 
 
 @dataclass
 class _State:
     detectors: NDArray[np.int64]
-    length: int
-    frequency: Floats | None = None
-    independent: float = 0.0
+    welch: Welch | None
+    """None where the scan is too short."""
     found: dict[int, dict[str, Floats]] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -138,22 +132,23 @@ class PowerSpectrum(Operator):
     detectors: int = Field(16, ge=1)
     """Number of detectors averaged, chosen evenly among those not flagged."""
     segment: Seconds = quantity("128 s", gt=0)
-    """Length of Welch's segments (at most the scan): the inverse of the frequency resolution."""
+    """Length of Welch's segments (at most the scan): the inverse of the frequency resolution. Shortened to a number of samples
+    that has no prime factor above 5."""
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(0.02, 0.0, 1.3e-8 * min(1.0, self.detectors / context.first.n_detectors) * 14))
+        return Estimate((), Cost(0.02, 0.0, 6e-9 * min(1.0, self.detectors / context.first.n_detectors) * 14))
 
     def prepare(self, observation: Observation) -> _State:
         usable = np.flatnonzero(observation.detector_flags == 0)
         count = min(usable.size, self.detectors)
         chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
-        length = min(observation.n_samples, max(2, round(self.segment * observation.sample_rate)))
+        length = _quick(min(observation.n_samples, max(2, round(self.segment * observation.sample_rate))))
         if flagged := int(np.count_nonzero(observation.flags)):
             observation.tally.count(self.label, "flagged samples that the power spectra include", flagged)
-        return _State(usable[chosen], length)
+        return _State(usable[chosen], Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None)
 
     def exec(self, block: Block, state: _State) -> None:
         observation = block.observation
@@ -161,11 +156,11 @@ class PowerSpectrum(Operator):
             raise PipelineError(
                 "got a part of a scan, not a whole one", place=self.label, cure="this is a fault of the executor: report it"
             )
-        if state.length < 4:
+        if state.welch is None:
             return
         for d in state.detectors[(state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)]:
             found: dict[str, Floats] = {}
-            divisor = _divisor(block, int(d))
+            gain = _gain(block, int(d))
             names: Sequence[str] = self.streams or [s for s in ORDER if s in block.detdata and s != "transmission"]
             for name in names:
                 if name not in block.detdata:
@@ -173,17 +168,21 @@ class PowerSpectrum(Operator):
                     raise PipelineError(
                         f"there is no stream {name!r} at this step", place=self.label, cure=f"choose from: {have}"
                     )
-                values = _on_sky(block, int(d), name, divisor)
-                if np.isfinite(values).all():
-                    state.frequency, found[name], state.independent = welch(values, observation.sample_rate, state.length)
+                with np.errstate(invalid="ignore", over="ignore"):  # of samples that are not finite: their spectrum is not
+                    power = state.welch(_on_sky(block, int(d), name, gain))
+                if np.isfinite(power).all():
+                    found[name] = power
                 else:
                     observation.tally.count(self.label, f"detectors left out for non-finite samples of {name}", 1)
             with state.lock:
                 state.found[int(d)] = found
 
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
-        if state.frequency is None:
+        if state.welch is None:
             observation.tally.count(self.label, "scans too short for a power spectrum", 1)
+            return
+        if not any(state.found.values()):
+            observation.tally.count(self.label, "scans without a detector that has a power spectrum", 1)
             return
         names = [s for s in ORDER if any(s in f for f in state.found.values())]
         psd = {}
@@ -192,7 +191,8 @@ class PowerSpectrum(Operator):
             psd[name] = np.mean(rows, axis=0)
         count = len(state.found)
         white = 2 * float(np.mean(observation.focalplane.net[sorted(state.found)] ** 2))
-        self._add(data, Spectrum(state.frequency, psd, state.independent * count, white, self.label, count), observation.tally)
+        mean = Spectrum(state.welch.frequency, psd, state.welch.independent * count, white, self.label, count)
+        self._add(data, mean, observation.tally)
 
     @property
     def _key(self) -> str:
@@ -232,22 +232,26 @@ class PowerSpectrum(Operator):
         self._add(data, Spectrum(**part, label=self.label), data.tally)
 
 
-def _divisor(block: Block, detector: int) -> Floats:
-    """zeta e^-tau of one detector: (n_samp,), or (1,) where no step gave a transmission."""
+def _gain(block: Block, detector: int) -> Floats:
+    """1 / (zeta e^-tau) of one detector: (n_samp,), or (1,) where no step gave a transmission."""
     zeta = block.observation.focalplane.main_beam_efficiency[detector]
     transmission = block.observation.smooth.get("transmission")
     if transmission is None:
-        return np.array([zeta])
-    return np.asarray(zeta * transmission.evaluate(slice(detector, detector + 1), block.samples)[0], np.float64)
+        return np.array([1 / zeta])
+    return np.asarray(1 / (zeta * transmission.evaluate(slice(detector, detector + 1), block.samples)[0]), np.float64)
 
 
-def _on_sky(block: Block, detector: int, name: str, divisor: Floats) -> Floats:
+def _on_sky(block: Block, detector: int, name: str, gain: Floats) -> Floats:
     """One detector's whole stream, mean included, as it enters the calibrated sum, float64 (n_samp,)."""
-    values = block.detdata[name][detector - block.detectors.start].astype(np.float64)
+    row = block.detdata[name][detector - block.detectors.start]
+    if name in ("atmosphere", "white", "pink"):
+        if name == "atmosphere":
+            gain = gain * block.observation.focalplane.illumination_efficiency[detector]
+        if name not in block.means:
+            return np.asarray(row * gain, np.float64)
+    values: Floats = row.astype(np.float64)
     if name in block.means:
         values += block.means[name].evaluate(slice(detector, detector + 1), block.samples)[0]
-    if name == "atmosphere":
-        values *= block.observation.focalplane.illumination_efficiency[detector]
     if name in ("atmosphere", "white", "pink"):
-        values /= divisor
-    return np.asarray(values, np.float64)
+        values *= gain
+    return values

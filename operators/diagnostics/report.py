@@ -63,7 +63,7 @@ class Report(Operator):
         folder = output_folder(data, self.label)
         shown = data.products.get("pictures")
         if shown is None:
-            shown = pictures(data, Plots(central_diameter=f"{self.central_diameter!r} rad"))
+            shown = pictures(data, Plots(central_diameter=f"{self.central_diameter!r} rad").style())
         data.products["report"] = write_text(folder / "report.html", page(data, shown, self.central_diameter))
 
 

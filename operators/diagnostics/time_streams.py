@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -15,34 +14,13 @@ from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.operators.io.streams import StreamsAsked
 
+from .series import TimeStream
+
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
 
 Floats = NDArray[np.float64]
-
-
-@dataclass
-class TimeStream:
-    """Streams of a few detectors of one scan.
-
-    Attributes
-    ----------
-    seconds
-        (n_samp,) s since the scan's start.
-    streams
-        (n_det, n_samp) K_RJ each, mean included.
-    names
-        (n_det) detector names.
-    observation, label
-        Name of the scan; the step at which they were taken.
-    """
-
-    seconds: Floats
-    streams: dict[str, Floats]
-    names: list[str]
-    observation: str
-    label: str
 
 
 class TimeStreams(Operator):

@@ -11,7 +11,7 @@ import numpy as np
 from zonda.operators.atmosphere.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather_summary import HOURS, MONTHS, QUANTILES, WaterByMonth, pwv_steps
 
-from .plots import SEQUENCE, _axes
+from .plots import DPI, SEQUENCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -123,6 +123,15 @@ def weather_figure(
     plot_spectrum(air, elevation, bands, "brightness", axes[1, 0])
     plot_spectrum(air, elevation, bands, "transmission", axes[1, 1])
     return figure
+
+
+def _axes(ax: Any) -> Any:
+    """``ax``, or the Axes of a new figure."""
+    if ax is not None:
+        return ax
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained").add_subplot()
 
 
 def _some_minor(value: float, _: int) -> str:

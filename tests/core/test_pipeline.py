@@ -100,13 +100,13 @@ class Late(Operator):
     at_end: ClassVar[bool] = True
     requires: ClassVar[frozenset[str]] = frozenset({"total"})
 
-    _told: list = PrivateAttr(default_factory=list)
+    _heard: list = PrivateAttr(default_factory=list)
 
-    def after_run(self, data):
-        self._told.append((data.run, sorted(data.products)))
+    def meanwhile(self, data, done):
+        self._heard.append((data.run, done, len(data.products.get(data.product("total"), [])), sorted(data.products)))
 
     def finalize(self, data):
-        data.products["seen"], data.products["told"] = sorted(data.products), self._told
+        data.products["seen"], data.products["heard"] = sorted(data.products), self._heard
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
 def test_companion_runs_use_the_same_random_numbers(scene):
     data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs=RUNS).run(scene, threads=1)
     assert data.products["seen"] == ["noiseless/total", "source_free/total", "total"]
-    assert data.products["told"] == [
+    assert [(run, there) for run, done, _, there in data.products["heard"] if done == "run"] == [
         ("", ["total"]),
         ("noiseless", ["noiseless/total", "total"]),
         ("source_free", ["noiseless/total", "source_free/total", "total"]),
@@ -129,6 +129,12 @@ def test_companion_runs_use_the_same_random_numbers(scene):
         whole, sky, noise = (data.products[n][k] for n in ("total", "noiseless/total", "source_free/total"))
         assert np.array_equal(whole, sky + noise)
         assert 0.9 < sky.std() < 1.1
+
+
+def test_what_acts_at_the_end_hears_of_what_is_done(scene):
+    data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs={"again": {"only": ["sky"]}}).run(scene, threads=1)
+    scans = [[(run, "scan", k + 1) for k in range(2)] + [(run, "run", 2)] for run in ("", "again")]
+    assert [heard[:3] for heard in data.products["heard"]] == [("", "pointing", 0), *scans[0], *scans[1]]
 
 
 class Flag(Operator):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,18 +10,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.wcs import WCS
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from zonda.core.errors import OutputError
-from zonda.operators.diagnostics import plot_operators
+from zonda.operators.diagnostics import pictures
 from zonda.operators.diagnostics.plot_operators import Plots
-from zonda.operators.diagnostics.plots import plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod
+from zonda.operators.diagnostics.plots import plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
 from zonda.operators.maps.image import Image
 from zonda.operators.maps.map_product import MapProduct
 
 ARCSEC = np.pi / 648000
+ARCMIN = 60 * ARCSEC
 
 
 @pytest.fixture
@@ -91,7 +95,11 @@ def drawn(ax):
 def test_a_map_has_world_axes_a_unit_and_its_beam(values, wcs):
     ax = drawn(plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC, circle=60 * ARCSEC))
     assert ax.get_title() == "The map"
-    assert ax.coords[0].get_axislabel() == "RA (ICRS)"
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("RA (ICRS)", "Dec (ICRS)")
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["4ʰ59ᵐ55ˢ", "5ʰ00ᵐ00ˢ", "5ʰ00ᵐ05ˢ"]
+    assert [t.get_text() for t in ax.get_yticklabels()] == [
+        "19°58′30″", "19°59′00″", "19°59′30″", "20°00′00″", "20°00′30″", "20°01′00″", "20°01′30″",
+    ]  # fmt: skip
     assert "FWHM 9″" in texts(ax)
     assert "µK" in ax.images[0].colorbar.ax.get_ylabel()
     low, high = ax.images[0].get_clim()
@@ -134,7 +142,7 @@ def test_axes_are_named_after_the_frame(values, wcs, plain, kinds, frame, names)
     if plain:
         assert (ax.get_xlabel(), ax.get_ylabel()) == tuple(f"{n} offset [arcmin]" for n in names[:2])
     else:
-        assert [c.get_axislabel() for c in ax.coords] == [f"{n} ({names[2]})" for n in names[:2]]
+        assert (ax.get_xlabel(), ax.get_ylabel()) == tuple(f"{n} ({names[2]})" for n in names[:2])
 
 
 def test_the_colour_bar_says_where_values_lie_beyond_it(wcs):
@@ -243,16 +251,23 @@ def test_a_second_process_draws_the_same(data, products, make_observation):
     data.provenance["runs"] = {"noiseless": {}, "source_free": {}}
     operator = Plots()
     operator.observe(data)
-    operator.after_run(data)  # of the main run
+    for name in ("spectrum", "map"):
+        del data.products[name]
+    operator.meanwhile(data, "scan")
+    assert set(operator._begun) == {"input input", "scan", "streams time_streams"}
+    data.products.update({name: products[name] for name in ("spectrum", "map")})
+    operator.meanwhile(data, "scan")  # the spectrum may go on changing until the run has ended
+    assert set(operator._begun) == {"input input", "scan", "streams time_streams"}
+    operator.meanwhile(data, "run")
     begun = set(operator._begun)
     assert begun == {"input input", "map map", "coverage map", "scan", "spectra spectrum", "streams time_streams"}
     data.products.update({"noiseless/map": products["noiseless/map"]})
     data.run = "noiseless"
-    operator.after_run(data)
+    operator.meanwhile(data, "run")
     assert set(operator._begun) == begun | {"map noiseless/map"}
     data.products.update(products)
     data.run = "source_free"
-    operator.after_run(data)
+    operator.meanwhile(data, "run")
     assert set(operator._begun) == begun | {"map noiseless/map", "noise map"}
     answers = {key: future.result() for key, future in operator._begun.items()}
     assert all(answers.values())
@@ -267,20 +282,94 @@ def test_what_the_second_process_fails_at_is_drawn_here(data, products):
     operator = Plots()
     operator.observe(data)
     operator._artist._process.kill()
-    operator.after_run(data)
+    operator.meanwhile(data, "run")
     operator.finalize(data)
     assert {p.name for p in data.products["pictures"]} >= {"input", "map", "noise_map"}
 
 
-def test_the_bytes_are_those_of_savefig(values, wcs):
+def test_the_pixels_are_those_of_savefig(values, wcs):
     import io
+
+    from PIL import Image as Bitmap
 
     def figure():
         return plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC, circle=60 * ARCSEC)
 
     stream = io.BytesIO()
-    figure().figure.savefig(stream, format="png", metadata={"Software": "zonda"})
-    assert plot_operators._png(figure()) == stream.getvalue()
+    figure().figure.savefig(stream, format="png")
+    made = Bitmap.open(io.BytesIO(pictures.png_of(figure())))
+    np.testing.assert_array_equal(np.asarray(made), np.asarray(Bitmap.open(stream).convert("RGB")))
+    assert made.info["Software"] == "zonda"
+    assert made.info["dpi"] == pytest.approx((110, 110), rel=1e-3)  # PNG counts pixels per metre
+
+
+@pytest.mark.parametrize(
+    "picture", ["map", "polar map", "wide map", "spectra", "streams", "transfer function", "scan", "coverage"]
+)
+def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observation):
+    """Margins are fixed: all that is drawn lies within the picture, and no two tick labels of an axis overlap."""
+    from zonda.operators.diagnostics.transfer_function import Rings, Transfer
+
+    hits = np.geomspace(1, 1e5, 3000).reshape(50, 60)
+    if picture == "polar map":
+        wcs.wcs.crval = [75.0, -89.99]
+        wcs.wcs.set()
+    if picture == "wide map":
+        values = np.tile(values, (1, 5)) * 1e6
+    edges = 1 / np.geomspace(400, 12, 13) / ARCSEC
+    ring = np.linspace(0.1, 1, 12)
+    rings = Rings(np.sqrt(edges[1:] * edges[:-1]), ring, ring / 10, ring, ring, ring)
+    ax = {
+        "spectra": lambda: plot_spectra(spectrum),
+        "streams": lambda: plot_tod(replace(stream, streams={"signal": -1e3 + stream.streams["signal"]})),
+        "transfer function": lambda: plot_transfer(Transfer(rings, edges, "sky", 9 * ARCSEC, "T", "map"), title="T"),
+        "scan": lambda: plot_scan([make_observation(500)]),
+        "coverage": lambda: plot_coverage(hits, wcs),
+    }.get(picture, lambda: plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC))()
+    canvas = FigureCanvasAgg(ax.figure)
+    canvas.draw()
+    width, height = canvas.get_width_height()
+    for axes in ax.figure.axes:
+        box = axes.get_tightbbox(canvas.get_renderer(), for_layout_only=True)
+        assert min(box.x0, box.y0, width - box.x1, height - box.y1) >= 0, axes
+        if not hasattr(axes, "coords"):
+            for axis, side in ((axes.xaxis, 0), (axes.yaxis, 1)):
+                labels = [t.get_window_extent() for t in axis.get_ticklabels() if t.get_text()]
+                spans = sorted((b.intervalx if side == 0 else b.intervaly).tolist() for b in labels)
+                assert all(first[1] < second[0] for first, second in itertools.pairwise(spans)), axes
+    assert "$" not in " ".join(t.get_text() for t in ax.figure.findobj(Text))
+
+
+def test_a_polar_map_has_astropys_axes(values, wcs):
+    wcs.wcs.crval = [75.0, 89.99]
+    wcs.wcs.set()
+    ax = drawn(plot_map(values, wcs))
+    assert ax.coords[0].get_axislabel() == "RA (ICRS)"
+
+
+def test_many_scans_take_few_points(make_observation):
+    """A track is drawn with a point per pixel or so, however finely it was sampled; it passes where the samples were."""
+    observation = make_observation(60000)
+    x, y = plot_scan([observation]).lines[0].get_data()
+    ra0, dec0 = observation.centre
+    dx, dy = (observation.ra - ra0) * np.cos(dec0) / ARCMIN, (observation.dec - dec0) / ARCMIN
+    extent = max(np.ptp(dx), np.ptp(dy))
+    assert np.ptp(x) == pytest.approx(np.ptp(dx), abs=0.01 * extent)
+    assert np.ptp(y) == pytest.approx(np.ptp(dy), abs=0.01 * extent)
+    assert len(x) < 20001
+
+
+def test_the_pale_line_keeps_every_extreme():
+    from zonda.operators.diagnostics.plots import _envelope
+
+    seconds, values = np.arange(50000) / 100, np.random.default_rng(1).normal(size=50000)
+    values[[123, 31234, 49999]] = [9.0, -9.0, 12.0]
+    x, y = _envelope(seconds, values)
+    assert len(x) == len(y) < 4000
+    assert (np.diff(x) > 0).all()
+    for k in (123, 31234, 49999):
+        near = np.abs(x - seconds[k]) < 0.4
+        assert values[k] in y[near]
 
 
 def test_only_what_is_there_is_drawn(data):

@@ -9,7 +9,12 @@ import scipy.signal
 from zonda.core.data import Block
 from zonda.core.errors import PipelineError
 from zonda.core.smooth import SmoothField
-from zonda.operators.diagnostics.power_spectrum import PowerSpectrum, Spectrum, welch
+from zonda.operators.diagnostics.power_spectrum import PowerSpectrum, Spectrum, Welch, _quick
+
+
+def welch(values, sample_rate, length):
+    estimator = Welch(len(values), sample_rate, length)
+    return estimator.frequency, estimator(values), estimator.independent
 
 
 def run(operator, observation, data, streams, means=None, sizes=(16,)):
@@ -50,8 +55,9 @@ def test_the_power_of_a_sine_is_recovered(length):
     assert f[p.argmax()] == pytest.approx(3.02, abs=50.0 / length)
 
 
-@pytest.mark.parametrize("length", [256, 1023])
+@pytest.mark.parametrize("length", [256, 1023, 5000])
 def test_equal_to_scipy(length):
+    """Also in several chunks of segments (256) and in one segment (5000)."""
     values = np.random.default_rng(2).normal(size=5000)
     f, p, _ = welch(values, 10.0, length)
     g, q = scipy.signal.welch(values, 10.0, "hann", length, noverlap=length - length // 2, detrend="linear")
@@ -130,6 +136,32 @@ def test_a_scan_of_one_sample(make_observation, data):
     operator.collect(data, observation, state)
     assert data.products == {}
     assert observation.tally.get("PowerSpectrum", "scans too short for a power spectrum") == 1
+
+
+def test_a_scan_whose_detectors_are_all_flagged(make_observation, data, noise):
+    observation = make_observation(20000)
+    observation.detector_flags[:] = 1
+    operator = PowerSpectrum()
+    state = operator.prepare(observation)
+    operator.exec(Block(observation, slice(0, 19), slice(0, 20000), noise), state)
+    operator.collect(data, observation, state)
+    assert data.products == {}
+    assert observation.tally.get("PowerSpectrum", "scans without a detector that has a power spectrum") == 1
+
+
+def test_segments_have_lengths_that_transform_quickly(make_observation):
+    """No prime factor above 5, and at most some per cent shorter; the shipped rates have such lengths already."""
+    for n in (5, 7, 101, 1999, 12800, 99991):
+        length = found = _quick(n)
+        for factor in (2, 3, 5):
+            while found % factor == 0:
+                found //= factor
+        assert found == 1
+        assert 0.8 * n < length <= n
+        if n > 1000:
+            assert length > 0.95 * n
+    assert PowerSpectrum(segment="20 s").prepare(make_observation(20000)).welch.frequency[0] == 0.05
+    assert len(PowerSpectrum().prepare(make_observation(1999)).welch.frequency) == 972  # 1944 = 2^3 3^5
 
 
 def test_a_stream_that_is_not_there(make_observation, noise):

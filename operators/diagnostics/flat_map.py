@@ -1,0 +1,117 @@
+"""A map as its picture needs it: single precision, numpy alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .sky_axes import SkyAxes
+
+Floats = NDArray[np.floating]
+
+FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
+
+
+@dataclass(frozen=True)
+class FlatMap:
+    """Planes (ny, nx) of one map.
+
+    Attributes
+    ----------
+    planes
+        K_RJ each, NaN where nothing is known.
+    hits, weights
+        Samples per pixel, and the sum of their weights.
+    axes, header
+        Where it is on the sky; the header for what `SkyAxes` does not know.
+    centre
+        (longitude, latitude) of its centre, rad.
+    pixel, fwhm, smoothed_by
+        Side of a pixel, the beam's FWHM and that of the Gaussian applied to the map, rad; ``smoothed_by`` 0 for none.
+    rms
+        What is known of a plane's rms beforehand (maps that were not flat).
+    smooth
+        Whether it can be smoothed (maps that were flat).
+    """
+
+    planes: dict[str, Floats]
+    hits: Floats
+    weights: Floats
+    axes: SkyAxes | None
+    header: dict[str, Any]
+    centre: tuple[float, float]
+    pixel: float
+    fwhm: float
+    smoothed_by: float = 0.0
+    rms: dict[str, float] = field(default_factory=dict)
+    smooth: bool = True
+
+    @property
+    def sky(self) -> Any:
+        """What `plots.plot_map` takes for its ``wcs``."""
+        return self.header if self.axes is None else self.axes
+
+    def smoothed(self, fwhm: float) -> FlatMap:
+        """As `MapProduct.smoothed`: every plane convolved with a Gaussian of ``fwhm`` [rad], weighted, empty pixels left out."""
+        convolve = gaussian(fwhm / FWHM_PER_SIGMA / self.pixel)
+        planes = {}
+        for name, values in self.planes.items():
+            use = np.isfinite(values) & (self.hits > 0)
+            weights = np.where(use, self.weights, np.float32(0))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                mean = convolve(weights * np.where(use, values, np.float32(0))) / convolve(weights)
+            planes[name] = np.where(use, mean, np.float32(np.nan))
+        return replace(self, planes=planes, smoothed_by=math.hypot(self.smoothed_by, fwhm))
+
+    def covered(self, least: float) -> NDArray[np.bool_]:
+        """Pixels with at least ``least`` of the 99th percentile of the samples, as smoothed as the map is: the edge is not
+        ragged then."""
+        hits = self.hits
+        if self.smooth and self.smoothed_by:
+            hits = gaussian(self.smoothed_by / self.pixel / FWHM_PER_SIGMA)(hits)
+        seen = hits[self.hits > 0]
+        return np.asarray(hits >= least * np.percentile(seen, 99) if seen.size else self.hits > 0)
+
+    def limit(self, plane: str, hits: Floats, share: float) -> float | None:
+        """Brightness scale that covers ``share`` per cent of what ``hits`` cover well: the noisy rim must not set it."""
+        values = self.planes[plane]
+        if not hits.any():
+            return None
+        good = np.abs(values[(hits > 0.25 * np.percentile(hits[hits > 0], 99)) & np.isfinite(values)])
+        return float(np.percentile(good, share)) if good.size else None
+
+    def central_rms(self, plane: str, radius: float) -> float:
+        """Weighted rms about zero within ``radius`` [rad] of the centre; NaN where it is not known."""
+        if plane in self.rms or self.axes is None:
+            return self.rms.get(plane, math.nan)
+        values = self.planes[plane]
+        use = (self.axes.distance(values.shape, self.centre) <= radius) & np.isfinite(values)
+        w = self.weights[use].astype(np.float64)
+        return math.sqrt((w * values[use].astype(np.float64) ** 2).sum() / w.sum()) if w.sum() > 0 else math.nan
+
+
+def gaussian(sigma: float) -> Callable[[Floats], Floats]:
+    """Convolution of an image (ny, nx) with a Gaussian of ``sigma`` pixels, cut at 5 sigma, of sum 1; nothing lies outside."""
+    reach = np.arange(math.ceil(5 * sigma) + 1)
+    kernel = np.exp(-(reach**2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
+    kernel = (kernel / (2 * kernel.sum() - kernel[0])).astype(np.float32)
+
+    def rows(values: Floats) -> Floats:
+        out: Floats = values * kernel[0]
+        part = np.empty_like(values)
+        for k in range(1, min(len(kernel), len(values))):
+            np.multiply(values, kernel[k], out=part)
+            out[k:] += part[:-k]
+            out[:-k] += part[k:]
+        return out
+
+    def convolve(values: Floats) -> Floats:
+        down = rows(np.asarray(values, np.float32))
+        return np.ascontiguousarray(rows(np.ascontiguousarray(down.T)).T)
+
+    return convolve
