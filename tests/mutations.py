@@ -124,20 +124,20 @@ def nan_pixels_that_stay(patch: Patch) -> None:
 
 
 def nan_samples_that_count_as_zero(patch: Patch) -> None:
-    add = bin_map._add_image
-    patch.setattr(bin_map, "_add_image", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
+    add = bin_map.add_image
+    patch.setattr(bin_map, "add_image", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
 
 
 def sums_rounded_by_block(patch: Patch) -> None:
     """Each block adds float32 sums, as a naive accumulator would."""
-    add = bin_map._add_image
+    add = bin_map.add_image
 
     def rounded(*arguments: Any) -> None:
         add(*arguments)
         sums = arguments[-3]
         sums[:, bin_map.DATA] = sums[:, bin_map.DATA].astype(np.float32).astype(np.int64)
 
-    patch.setattr(bin_map, "_add_image", rounded)
+    patch.setattr(bin_map, "add_image", rounded)
 
 
 def noise_that_starts_again_in_each_block(patch: Patch) -> None:
