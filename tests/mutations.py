@@ -6,7 +6,7 @@ Compiled code that is called from Python is replaced as a whole; nothing is comp
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,13 +76,12 @@ def differences_by_subtraction(patch: Patch) -> None:
 
 
 def highpass_without_detrending(patch: Patch) -> None:
-    finished = highpass.HighpassPlan.__post_init__
+    low = highpass.HighpassPlan._low
 
-    def without(self: Any) -> None:
-        finished(self)
-        self.modes, self.spread_modes = 0 * self.modes, 0 * self.spread_modes
+    def without(self: Any, s: Any) -> Any:
+        return low(replace(self, modes=0 * self.modes, spread_modes=0 * self.spread_modes), s)
 
-    patch.setattr(highpass.HighpassPlan, "__post_init__", without)
+    patch.setattr(highpass.HighpassPlan, "_low", without)
 
 
 def gaps_that_ring(patch: Patch) -> None:
@@ -124,20 +123,20 @@ def nan_pixels_that_stay(patch: Patch) -> None:
 
 
 def nan_samples_that_count_as_zero(patch: Patch) -> None:
-    add = bin_map._add_image
-    patch.setattr(bin_map, "_add_image", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
+    add = bin_map.add_image
+    patch.setattr(bin_map, "add_image", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
 
 
 def sums_rounded_by_block(patch: Patch) -> None:
     """Each block adds float32 sums, as a naive accumulator would."""
-    add = bin_map._add_image
+    add = bin_map.add_image
 
     def rounded(*arguments: Any) -> None:
         add(*arguments)
         sums = arguments[-3]
         sums[:, bin_map.DATA] = sums[:, bin_map.DATA].astype(np.float32).astype(np.int64)
 
-    patch.setattr(bin_map, "_add_image", rounded)
+    patch.setattr(bin_map, "add_image", rounded)
 
 
 def noise_that_starts_again_in_each_block(patch: Patch) -> None:

@@ -23,6 +23,7 @@ freedom in N_samples for each mode, and for terms of order sigma_2 / sigma_1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -41,7 +42,6 @@ from zonda.core.streams import columns, forget_pages
 from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
-from .focal_plane_mean import LANES, add_moments
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -355,8 +355,8 @@ class Gram:
                     _products(*self._tile(tiles[k]), q, rows, times[tiles[k]], moments, parts[k:])
             forget_pages(self.stream.array)
 
-        some = TILES_AT_ONCE
-        list(self.pool.map(work, [range(k, min(k + some, len(tiles))) for k in range(0, len(tiles), some)]))
+        some = max(1, len(tiles) // (4 * self.stream.threads))
+        self._each(work, [range(k, min(k + some, len(tiles))) for k in range(0, len(tiles), some)])
         total, square, image = parts.sum(axis=0)
         return total, square, image, times
 
@@ -376,7 +376,11 @@ class Gram:
                 rest -= np.outer(u[self.use], v[samples])
             return float(np.einsum("dt,dt->", rest, rest))
 
-        return sum(self.pool.map(work, self._tiles()))
+        return sum(self._each(work, self._tiles()))
+
+    def _each(self, work: Callable[[Any], Any], items: list[Any]) -> list[Any]:
+        """Results of ``work``, in order."""
+        return list(map(work, items) if self.stream.threads == 1 else self.pool.map(work, items))
 
 
 @dataclass
@@ -490,70 +494,117 @@ def _directions(step: int, n_detectors: int) -> Floats:
 MOST_COPIED = 64 << 20
 """Bytes of a tile of a spilled stream up to which it is read into an array of its own."""
 
-TILES_AT_ONCE = 4
-"""Tiles in one call of the kernel."""
+LANES = 16
+"""Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples at a time."""
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
-    """`_product` (and `_moments`) of the samples start .. stop - 1 tile by tile: v = A^T q; out (n_tile, 3, n_det) takes each
-    tile's sums, sums of squares and A v."""
+    """v = A^T q of the samples start .. stop - 1, tile by tile: out (n_tile, 3, n_det) takes each tile's sums and squares,
+    where wanted, and A v, of the detectors ``rows``."""
     for k in range(-(-(stop - start) // TILE_SAMPLES)):
         low = start + k * TILE_SAMPLES
         high = min(low + TILE_SAMPLES, stop)
-        _product(array, low, high, q, rows, v[low - start : high - start], out[k, 2])
+        series = v[low - start : high - start]
+        _project(array, low, high, q, rows, series)
         if moments:
-            _moments(array, low, high, rows, out[k])
+            _image_and_moments(array, low, high, rows, series, out[k])
+        else:
+            _image(array, low, high, rows, series, out[k, 2])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _moments(array, start, stop, rows, out):  # type: ignore[no-untyped-def]
-    """Adds the sum and sum of squares of each of ``rows`` over samples start .. stop - 1 to out[:2] (2, n_det)."""
-    lanes = np.empty((2, LANES))
-    for d in rows:
-        add_moments(array[d, start:stop], lanes, out[:, d])
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _product(array, start, stop, q, rows, v, out):  # type: ignore[no-untyped-def]
-    """v = A^T q at samples start .. stop - 1 and out = A v, over the detectors ``rows``, four at a time."""
+def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
+    """v = A^T q at samples start .. stop - 1, eight detectors at a time."""
     n = stop - start
     v[:] = 0.0
-    fours = rows.size // 4 * 4
-    for k in range(0, fours, 4):
+    eights = rows.size // 8 * 8
+    for k in range(0, eights, 8):
         q0, q1, q2, q3 = q[rows[k]], q[rows[k + 1]], q[rows[k + 2]], q[rows[k + 3]]
+        q4, q5, q6, q7 = q[rows[k + 4]], q[rows[k + 5]], q[rows[k + 6]], q[rows[k + 7]]
         a, b = array[rows[k], start:stop], array[rows[k + 1], start:stop]
         c, d = array[rows[k + 2], start:stop], array[rows[k + 3], start:stop]
+        e, f = array[rows[k + 4], start:stop], array[rows[k + 5], start:stop]
+        g, h = array[rows[k + 6], start:stop], array[rows[k + 7], start:stop]
         for t in range(n):
-            v[t] += (q0 * np.float64(a[t]) + q1 * np.float64(b[t])) + (q2 * np.float64(c[t]) + q3 * np.float64(d[t]))
-    for k in range(fours, rows.size):
+            x = (q0 * np.float64(a[t]) + q1 * np.float64(b[t])) + (q2 * np.float64(c[t]) + q3 * np.float64(d[t]))
+            y = (q4 * np.float64(e[t]) + q5 * np.float64(f[t])) + (q6 * np.float64(g[t]) + q7 * np.float64(h[t]))
+            v[t] += x + y
+    for k in range(eights, rows.size):
         q0, a = q[rows[k]], array[rows[k], start:stop]
         for t in range(n):
             v[t] += q0 * np.float64(a[t])
-    whole = n // LANES * LANES
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _image(array, start, stop, rows, v, out):  # type: ignore[no-untyped-def]
+    """out = A v over samples start .. stop - 1, four detectors at a time."""
+    n, half = np.uintp(stop - start), np.uintp(LANES)
+    whole, last = n // (half + half) * (half + half), rows.size - 1
     lanes = np.empty((4, LANES))
-    l0, l1, l2, l3 = lanes[0], lanes[1], lanes[2], lanes[3]
     for k in range(0, rows.size, 4):
-        last = rows.size - 1
-        r0, r1, r2, r3 = rows[k], rows[min(k + 1, last)], rows[min(k + 2, last)], rows[min(k + 3, last)]
+        a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
+        c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
         lanes[:] = 0.0
-        for base in range(0, whole, LANES):
-            w, at = v[base : base + LANES], start + base
-            a, b = array[r0, at : at + LANES], array[r1, at : at + LANES]
-            c, d = array[r2, at : at + LANES], array[r3, at : at + LANES]
-            for i in range(LANES):
-                l0[i] += np.float64(a[i]) * w[i]
-                l1[i] += np.float64(b[i]) * w[i]
-                l2[i] += np.float64(c[i]) * w[i]
-                l3[i] += np.float64(d[i]) * w[i]
+        for t in range(np.uintp(0), whole, half + half):
+            for i in range(half):
+                x, y = v[t + i], v[t + half + i]
+                lanes[0, i] += np.float64(a[t + i]) * x + np.float64(a[t + half + i]) * y
+                lanes[1, i] += np.float64(b[t + i]) * x + np.float64(b[t + half + i]) * y
+                lanes[2, i] += np.float64(c[t + i]) * x + np.float64(c[t + half + i]) * y
+                lanes[3, i] += np.float64(d[t + i]) * x + np.float64(d[t + half + i]) * y
         for j in range(min(4, rows.size - k)):
-            r = rows[k + j]
-            total = 0.0
+            row, total = array[rows[k + j], start:stop], 0.0
             for i in range(LANES):
                 total += lanes[j, i]
             for t in range(whole, n):
-                total += np.float64(array[r, start + t]) * v[t]
-            out[r] = total
+                total += np.float64(row[t]) * v[t]
+            out[rows[k + j]] = total
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _image_and_moments(array, start, stop, rows, v, out):  # type: ignore[no-untyped-def]
+    """out = A 1, squares, A v (3, n_det): `_image` with the moments in the same reading."""
+    n, half = np.uintp(stop - start), np.uintp(LANES)
+    whole, last = n // (half + half) * (half + half), rows.size - 1
+    lanes = np.empty((4, 3, LANES))
+    for k in range(0, rows.size, 4):
+        a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
+        c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
+        lanes[:] = 0.0
+        for t in range(np.uintp(0), whole, half + half):
+            for i in range(half):
+                x, y = v[t + i], v[t + half + i]
+                p, r = np.float64(a[t + i]), np.float64(a[t + half + i])
+                lanes[0, 0, i] += p + r
+                lanes[0, 1, i] += p * p + r * r
+                lanes[0, 2, i] += p * x + r * y
+                p, r = np.float64(b[t + i]), np.float64(b[t + half + i])
+                lanes[1, 0, i] += p + r
+                lanes[1, 1, i] += p * p + r * r
+                lanes[1, 2, i] += p * x + r * y
+                p, r = np.float64(c[t + i]), np.float64(c[t + half + i])
+                lanes[2, 0, i] += p + r
+                lanes[2, 1, i] += p * p + r * r
+                lanes[2, 2, i] += p * x + r * y
+                p, r = np.float64(d[t + i]), np.float64(d[t + half + i])
+                lanes[3, 0, i] += p + r
+                lanes[3, 1, i] += p * p + r * r
+                lanes[3, 2, i] += p * x + r * y
+        for j in range(min(4, rows.size - k)):
+            row, first, second, third = array[rows[k + j], start:stop], 0.0, 0.0, 0.0
+            for i in range(LANES):
+                first += lanes[j, 0, i]
+                second += lanes[j, 1, i]
+                third += lanes[j, 2, i]
+            for t in range(whole, n):
+                p = np.float64(row[t])
+                first += p
+                second += p * p
+                third += p * v[t]
+            out[0, rows[k + j]] = first
+            out[1, rows[k + j]] = second
+            out[2, rows[k + j]] = third
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})

@@ -16,15 +16,15 @@ error of the low part is (K / 2M)^4 at the cut, less below it; the polynomial is
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Seconds
@@ -32,6 +32,7 @@ from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.tiles import TILE_DETECTORS
 from zonda.core.transforms import cosine_transform, fast_length
 
 if TYPE_CHECKING:
@@ -69,10 +70,8 @@ class HighpassFilter(Operator):
     oversampling: float = Field(24.0, ge=8, le=1000)
     """Coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut is about oversampling^-4."""
 
-    _plans: dict[tuple[int, float], HighpassPlan] = PrivateAttr(default_factory=dict)
-
-    def prepare(self, observation: Observation) -> HighpassPlan:
-        """Tables for this observation's length; flags the trimmed ends."""
+    def prepare(self, observation: Observation) -> tuple[HighpassPlan, NDArray[np.intp]]:
+        """Tables for this observation's length, flagged samples; flags the trimmed ends."""
         n, rate, tally = observation.n_samples, observation.sample_rate, observation.tally
         if self.frequency >= rate / 2:
             raise PipelineError(
@@ -95,18 +94,14 @@ class HighpassFilter(Operator):
         tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()))
         if observation.smooth.get("atmosphere") is not None:
             tally.state(self.label, "smooth mean emission", "removed analytically")
-        key = n, self.frequency / rate
-        if key not in self._plans:
-            self._plans = {key: plan_highpass(*key, self.degree, self.oversampling)}  # that of the scan before will often do
-        plan = copy.copy(self._plans[key])
-        plan.bad = np.flatnonzero(bad)
+        plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)
         if plan.cut == 0:
             tally.state(self.label, f"{observation.name} is shorter than 1/frequency", "only the mean and a line are removed")
-        return plan
+        return plan, np.flatnonzero(bad)
 
     def memory(self, observation: Observation) -> int:
         """Spline weights in both precisions, and what they are made from."""
-        return 100 * observation.n_samples
+        return 200 * observation.n_samples
 
     def traits(self, observation: Observation) -> Traits:
         """What passes."""
@@ -120,11 +115,21 @@ class HighpassFilter(Operator):
 
         return highpass_estimate(self, context)
 
-    def exec(self, block: Block, state: HighpassPlan) -> None:
+    def exec(self, block: Block, state: tuple[HighpassPlan, NDArray[np.intp]]) -> None:
         """Filter the block's rows in place."""
         block.means.pop("signal", None)
-        spoilt = state.apply(block.detdata["signal"])
+        plan, bad = state
+        spoilt = plan.apply(block.detdata["signal"], bad)
         block.observation.tally.count(self.label, "samples not finite", spoilt)
+
+
+GROUP = 16
+"""Samples that are taken together: their low part comes from the same five knots, or six where knots lie closer."""
+
+ABREAST = TILE_DETECTORS
+"""Rows whose sums are formed side by side."""
+
+NONE = np.zeros(0, np.intp)
 
 
 @dataclass
@@ -137,48 +142,46 @@ class HighpassPlan:
         Samples N, and the number K of cosines removed (0: the scan is shorter than one cycle; polynomial only).
     knots
         M; 0: use the full DCT.
-    edges
-        (M + 1,): first sample of each interval between knots.
+    first
+        (n_group,): column of s and c, m + 1, of the first knot that the `GROUP` samples from GROUP g on reach.
     weights
-        (4, N): B at the four knots around each sample, float64.
+        (n_group, 5 or 6, GROUP): B at that knot and those after it; 0 past the end.
     modes
         (degree + 1, M + 3): coarse coefficients of orthonormal polynomials; `spread_modes`, the same shape, their s.
     polynomials
         (degree + 1, N): the polynomials themselves where the full DCT is used.
     response
         (K,): factor from the DCT-I of s to that of c.
-    bad
-        Flagged samples, bridged before filtering.
     """
 
     n: int
     cut: int
     knots: int
-    edges: NDArray[np.int64]
+    first: NDArray[np.int64]
     weights: Floats
     modes: Floats
     spread_modes: Floats
     polynomials: Floats
     response: Floats
-    bad: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    _weights: dict[np.dtype[Any], Floats] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self._weights = {np.dtype(t): np.ascontiguousarray(self.weights, t) for t in (np.float32, np.float64)}
+    def apply(self, rows: Floats, bad: NDArray[np.intp] = NONE) -> int:
+        """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite; they stay as they were.
 
-    def apply(self, rows: Floats) -> int:
-        """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite; they stay as they were."""
+        ``bad``: flagged samples, bridged before filtering.
+        """
         done = np.zeros(len(rows), bool)
-        if self.knots and not self.bad.size:
+        if self.knots and not bad.size:
             coarse = self._spread(rows)
             done[:] = np.isfinite(coarse).all(axis=1)
             coarse[~done] = 0
             self._subtract(rows, coarse)
-        return sum(self._bridged(rows[d]) for d in np.flatnonzero(~done))
+        return sum(self._bridged(rows[d], bad) for d in np.flatnonzero(~done))
 
-    def _bridged(self, row: Floats) -> int:
+    def _bridged(self, row: Floats, bad: NDArray[np.intp]) -> int:
         """`apply` to one row (N,) that has gaps or no coarse series."""
         lost = np.flatnonzero(~np.isfinite(row))
-        gaps = np.union1d(self.bad, lost)
+        gaps = np.union1d(bad, lost)
         if gaps.size == self.n:
             return int(lost.size)
         kept = row[lost]
@@ -191,12 +194,28 @@ class HighpassPlan:
         return int(lost.size)
 
     def _spread(self, rows: Floats) -> Floats:
-        s = np.zeros((len(rows), self.knots + 3))
-        _spread(rows, self.edges, self._weights[rows.dtype], s)
+        s = np.empty((len(rows), self.knots + 3))
+        for start in range(0, len(rows), ABREAST):
+            some = rows[start : start + ABREAST]
+            sums = np.zeros((self._columns, ABREAST))
+            _spread(some, self.first, self._weights_as(rows.dtype), sums)
+            s[start : start + ABREAST] = sums[: s.shape[1], : len(some)].T
         return s
 
     def _subtract(self, rows: Floats, coarse: Floats) -> None:
-        _subtract(rows, self.edges, self._weights[rows.dtype], self._low(coarse).astype(rows.dtype))
+        c = np.zeros((len(rows), self._columns), rows.dtype)
+        c[:, : coarse.shape[1]] = self._low(coarse)
+        _subtract(rows, self.first, self._weights_as(rows.dtype), c)
+
+    @property
+    def _columns(self) -> int:
+        """Of s and c, with those that weigh nothing."""
+        return self.knots - 1 + self.weights.shape[1]
+
+    def _weights_as(self, kind: np.dtype[Any]) -> Floats:
+        if kind not in self._weights:
+            self._weights[kind] = self.weights.astype(kind)
+        return self._weights[kind]
 
     def _low(self, s: Floats) -> Floats:
         """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s, (n_det, M + 3) each."""
@@ -230,8 +249,12 @@ class HighpassPlan:
         return np.asarray(fit + idct(spectrum, type=2))
 
 
+@lru_cache(maxsize=2)
 def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) -> HighpassPlan:
-    """The plan for scans of ``n`` samples and a cut at ``frequency`` cycles per sample; the rest as in `HighpassFilter`."""
+    """The plan for scans of ``n`` samples and a cut at ``frequency`` cycles per sample; the rest as in `HighpassFilter`.
+
+    Kept for the next scan of that length: not to be changed.
+    """
     cycles = n * frequency
     cut = max(1, math.ceil(2 * cycles - 1e-9)) if cycles >= 1 else 0
     degree = min(degree if cut else min(degree, 1), n - 1)
@@ -245,11 +268,10 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     u = position - cell
     v = 1.0 - u
     weights = np.array([v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6])
-    edges = np.searchsorted(cell, np.arange(knots + 1)).astype(np.int64)
     if not knots:
         powers = np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree)
         basis, none = np.linalg.qr(powers)[0].T.copy(), np.zeros((0, 0))
-        return HighpassPlan(n, cut, 0, edges, weights[:, :0], none, none, basis, np.zeros(0))
+        return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), np.zeros((0, 5, GROUP)), none, none, basis, np.zeros(0))
     # polynomials through their B-spline coefficients: B * (t^2) = t^2 + 1/3, B * (t^3) = t^3 + t
     t = (np.arange(knots + 3) - 1) * (2 / knots) - 1
     third = (2 / knots) ** 2 / 3
@@ -261,7 +283,19 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     norm = np.linalg.inv(np.linalg.cholesky(raw @ spread.T))
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
-    return HighpassPlan(n, cut, knots, edges, weights, norm @ raw, norm @ spread, np.zeros((0, n)), response)
+    first, grouped = _grouped(cell, weights)
+    return HighpassPlan(n, cut, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
+
+
+def _grouped(cell: NDArray[np.int64], weights: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """`HighpassPlan.first` and ``weights`` from each sample's interval (N,) and B at the four knots around it (4, N)."""
+    first = cell[::GROUP].copy()
+    group, place = np.divmod(np.arange(cell.size), GROUP)
+    later = cell - first[group]
+    grouped = np.zeros((first.size, 4 + int(later.max()), GROUP))
+    for j in range(4):
+        grouped[group, later + j, place] = weights[j]
+    return first, grouped if grouped.shape[1] > 4 else np.pad(grouped, ((0, 0), (0, 1), (0, 0)))
 
 
 def bridge(row: Floats, gaps: NDArray[np.intp]) -> None:
@@ -272,55 +306,55 @@ def bridge(row: Floats, gaps: NDArray[np.intp]) -> None:
     row[gaps] = np.interp(gaps, known, row[known])
 
 
-LANES = 16
-"""Partial sums per interval: fixed, so that bits do not depend on the machine's vectors."""
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _spread(rows, first, weights, s):  # type: ignore[no-untyped-def]
+    """s[first + j, d] += sum_n weights[j, n] rows[d, n] of up to `ABREAST` rows (n_det, N): s (n_knot, ABREAST).
 
-AT_ONCE = 16
-"""Intervals between knots that all rows pass through together, while their weights are in the cache."""
+    Groups are turned round, so that rows are neighbours: no vector is ever summed up.
+    """
+    n_det, n, w = np.uintp(rows.shape[0]), np.uintp(rows.shape[1]), weights
+    x = np.zeros((GROUP, ABREAST), rows.dtype)
+    for g in range(np.uintp(first.size)):
+        start = g * np.uintp(GROUP)
+        length = min(np.uintp(GROUP), n - start)
+        if length < np.uintp(GROUP):
+            x[:] = 0
+        for d in range(n_det):
+            for t in range(length):
+                x[t, d] = rows[d, start + t]
+        m = np.uintp(first[g])
+        for j in range(np.uintp(w.shape[1])):
+            for d in range(np.uintp(ABREAST)):
+                a = (x[0, d] * w[g, j, 0] + x[1, d] * w[g, j, 1]) + (x[2, d] * w[g, j, 2] + x[3, d] * w[g, j, 3])
+                b = (x[4, d] * w[g, j, 4] + x[5, d] * w[g, j, 5]) + (x[6, d] * w[g, j, 6] + x[7, d] * w[g, j, 7])
+                e = (x[8, d] * w[g, j, 8] + x[9, d] * w[g, j, 9]) + (x[10, d] * w[g, j, 10] + x[11, d] * w[g, j, 11])
+                f = (x[12, d] * w[g, j, 12] + x[13, d] * w[g, j, 13]) + (x[14, d] * w[g, j, 14] + x[15, d] * w[g, j, 15])
+                s[m + j, d] += np.float64((a + b) + (e + f))
+
+
+AT_ONCE = 64
+"""Groups that all rows pass through together, while their weights are in the cache."""
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _spread(rows, edges, weights, s):  # type: ignore[no-untyped-def]
-    """s[d, m] += sum_n weights[j, n] rows[d, n], m = cell + j, in `LANES` fixed partial sums per interval."""
-    lanes = np.empty((4, LANES), rows.dtype)
-    l0, l1, l2, l3 = lanes[0], lanes[1], lanes[2], lanes[3]
-    for begin in range(0, edges.size - 1, AT_ONCE):
-        for d in range(rows.shape[0]):
-            for m in range(begin, min(begin + AT_ONCE, edges.size - 1)):
-                x = rows[d, edges[m] : edges[m + 1]]
-                w0, w1 = weights[0, edges[m] : edges[m + 1]], weights[1, edges[m] : edges[m + 1]]
-                w2, w3 = weights[2, edges[m] : edges[m + 1]], weights[3, edges[m] : edges[m + 1]]
-                whole = x.size // LANES * LANES
-                lanes[:] = 0
-                for base in range(0, whole, LANES):
-                    for i in range(LANES):
-                        l0[i] += x[base + i] * w0[base + i]
-                        l1[i] += x[base + i] * w1[base + i]
-                        l2[i] += x[base + i] * w2[base + i]
-                        l3[i] += x[base + i] * w3[base + i]
-                for n in range(whole, x.size):
-                    l0[n - whole] += x[n] * w0[n]
-                    l1[n - whole] += x[n] * w1[n]
-                    l2[n - whole] += x[n] * w2[n]
-                    l3[n - whole] += x[n] * w3[n]
-                t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
-                for i in range(LANES):
-                    t0, t1, t2, t3 = t0 + l0[i], t1 + l1[i], t2 + l2[i], t3 + l3[i]
-                s[d, m] += t0
-                s[d, m + 1] += t1
-                s[d, m + 2] += t2
-                s[d, m + 3] += t3
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _subtract(rows, edges, weights, c):  # type: ignore[no-untyped-def]
-    """rows[d, n] -= sum_j weights[j, n] c[d, cell + j]."""
-    for begin in range(0, edges.size - 1, AT_ONCE):
-        for d in range(rows.shape[0]):
-            for m in range(begin, min(begin + AT_ONCE, edges.size - 1)):
-                c0, c1, c2, c3 = c[d, m], c[d, m + 1], c[d, m + 2], c[d, m + 3]
-                x = rows[d, edges[m] : edges[m + 1]]
-                w0, w1 = weights[0, edges[m] : edges[m + 1]], weights[1, edges[m] : edges[m + 1]]
-                w2, w3 = weights[2, edges[m] : edges[m + 1]], weights[3, edges[m] : edges[m + 1]]
-                for n in range(x.size):
-                    x[n] -= c0 * w0[n] + c1 * w1[n] + c2 * w2[n] + c3 * w3[n]
+def _subtract(rows, first, weights, c):  # type: ignore[no-untyped-def]
+    """rows[d, n] -= sum_j weights[j, n] c[d, first + j]."""
+    n_det, n, w = np.uintp(rows.shape[0]), np.uintp(rows.shape[1]), weights
+    one, two, three, four, five = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4), np.uintp(5)
+    whole = n // np.uintp(GROUP)
+    for begin in range(np.uintp(0), whole, np.uintp(AT_ONCE)):
+        for d in range(n_det):
+            for g in range(begin, min(begin + np.uintp(AT_ONCE), whole)):
+                m, start = np.uintp(first[g]), g * np.uintp(GROUP)
+                c0, c1, c2, c3, c4 = c[d, m], c[d, m + one], c[d, m + two], c[d, m + three], c[d, m + four]
+                for i in range(np.uintp(GROUP)):
+                    low = c0 * w[g, 0, i] + c1 * w[g, 1, i] + c2 * w[g, 2, i] + c3 * w[g, 3, i] + c4 * w[g, 4, i]
+                    rows[d, start + i] -= low
+                if w.shape[1] > 5:
+                    c5 = c[d, m + five]
+                    for i in range(np.uintp(GROUP)):
+                        rows[d, start + i] -= c5 * w[g, 5, i]
+    for d in range(n_det):
+        for t in range(whole * np.uintp(GROUP), n):
+            for j in range(np.uintp(w.shape[1])):
+                rows[d, t] -= c[d, np.uintp(first[whole]) + j] * w[whole, j, t - whole * np.uintp(GROUP)]

@@ -2,19 +2,15 @@
 
     m_p = sum_i w_i d_i / sum_i w_i over the samples i in pixel p                                        (1)
 
-The sums are kept in fixed point (int64), so that they are exact and their bits depend neither on the order of blocks nor on
-the number of threads; each sample is rounded to `VALUE` = 2^-36 K (1.5e-11 K).
+The sums are kept in fixed point (`sums`), so that they are exact; each sample is rounded to 2^-36 K (1.5e-11 K).
 """
 
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
@@ -27,33 +23,29 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
 from zonda.core.tiles import TILE_SAMPLES
 
-from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame, tangent_pixels
+from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
 from .map_product import MapProduct
+from .sums import (
+    DATA,
+    FLAGGED,
+    HITS,
+    NOISE,
+    NOT_FINITE,
+    OUTSIDE,
+    TOO_LARGE,
+    VALUE,
+    WEIGHT,
+    WEIGHTS,
+    Binning,
+    Halves,
+    Sums,
+    add_image,
+    add_list,
+)
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
-
-Sums = NDArray[np.int64]
-
-VALUE = 2.0**36
-"""Fixed-point units per K in the sum of w d."""
-WEIGHT = 2.0**30
-"""Fixed-point units per reference weight in the sums of w and of the noise terms."""
-LARGEST = 2.0**50
-"""Largest w d that is accepted, in fixed-point units: 2^14 K at the reference weight."""
-MAGIC = 1.5 * 2.0**52
-"""A float64 q + MAGIC has the integer q in its low bits."""
-MAGIC_BITS = 0x4338000000000000
-
-TOGETHER = 4
-"""Detectors that are scattered side by side: successive samples of one often fall in the same pixel and would wait for it."""
-
-AT_ONCE = 256
-"""Samples of 16 detectors whose pixels, values and pointing are in the first cache together."""
-
-DATA, HITS, WEIGHTS, NOISE = range(4)
-OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
 
 
 class _Requires:
@@ -221,9 +213,8 @@ class BinMap(Operator):
             )
         noise = weight**2 * variance
         alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
-        return Binning(
-            self._grid, self._grid.pointing(observation), (observation.flags == 0).astype(np.uint8), weight, noise, alike
-        )
+        good = (observation.flags == 0).astype(np.uint8)
+        return Binning(self._grid, self._grid.pointing(observation), good, weight, noise, alike)
 
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, their total, two halves, the product; and the pointing, twice while it is laid out."""
@@ -256,17 +247,17 @@ class BinMap(Operator):
         begin, end, rows = block.samples.start, block.samples.stop, block.detectors
         xi, eta, use = plane.xi[rows], plane.eta[rows], observation.detector_flags[rows] == 0
         how = (
-            use, state.good[begin:end], state.weight[rows], state.noise[rows], self.noise == "scatter", state.alike,
-            1 / self._variance, sums, dropped, largest,
+            use, state.good[begin:end], state.weight[rows], state.noise[rows], self.noise == "scatter", 1 / self._variance,
+            sums, dropped, largest,
         )  # fmt: skip
         if isinstance(state.grid, TangentGrid):
-            _add_image(signal, state.pointing, begin, xi, eta, *state.grid.shape, *how)
+            add_image(signal, state.pointing, begin, xi, eta, *state.grid.shape, *how)
         else:
             for start in range(begin, end, TILE_SAMPLES):
                 stop = min(start + TILE_SAMPLES, end)
                 index = np.empty((len(xi), stop - start), np.int32)
                 state.grid.pixels(state.pointing, start, stop, xi, eta, index)
-                _add(signal, start - begin, index, *how)
+                add_list(signal, start - begin, index, *how)
         if dropped[NOT_FINITE] > before:
             state.note_not_finite(signal, rows, begin)
 
@@ -280,9 +271,12 @@ class BinMap(Operator):
 
     def collect(self, data: Data, observation: Observation, state: Binning) -> None:
         """Add this observation to the even or the odd scans' sums."""
-        sums, dropped, largest = state.merged()
+        key = data.product(f"{self.label} sums")
+        if key not in data.products:
+            data.products[key] = Halves(self._n_pixels())
+        binned, dropped = data.products[key].add(observation, state, self.label)
         tally = observation.tally
-        tally.count(self.label, "samples binned", int(sums[:, HITS].sum()))
+        tally.count(self.label, "samples binned", binned)
         tally.count(self.label, "samples dropped: outside the map", int(dropped[OUTSIDE]))
         tally.count(self.label, "samples dropped: flagged", int(dropped[FLAGGED]))
         tally.count(self.label, "samples dropped: not finite", int(dropped[NOT_FINITE]))
@@ -292,10 +286,6 @@ class BinMap(Operator):
                 place=f"{self.label}, {observation.name}",
                 cure="look for the operator that makes them; a signal is below 1e4 K",
             )
-        key = data.product(f"{self.label} sums")
-        if key not in data.products:
-            data.products[key] = Halves(self._n_pixels())
-        data.products[key].add(observation, sums, largest, self.label)
 
     def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
         """The sums, of pixels with hits only."""
@@ -370,7 +360,7 @@ class BinMap(Operator):
     def _product_of(self, halves: Halves) -> MapProduct:
         grid = self._grid
         assert grid is not None
-        total = halves.sums[0] + halves.sums[1]
+        total = halves.total()
         signal, weight = _mean(total)
         hits = total[:, HITS]
         noise = self._noise_of(total, signal, weight)
@@ -416,245 +406,3 @@ def _mean(sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     weight = sums[:, WEIGHTS] / WEIGHT
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(sums[:, HITS] > 0, sums[:, DATA] / VALUE / weight, np.nan), weight
-
-
-@dataclass
-class Binning:
-    """One observation's pointing and weights, and the sums of each thread.
-
-    Attributes
-    ----------
-    good
-        (n_samp,) uint8: 1 where not flagged.
-    weight, noise
-        (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
-    alike
-        All detectors weigh the same: the sums of weights and noise follow from the hits.
-    not_finite, kept_out
-        (n, 3) detector, first sample, end: what was not finite, in several arrays; what the main run dropped for that reason.
-    """
-
-    grid: Grid
-    pointing: NDArray[np.float64]
-    good: NDArray[np.uint8]
-    weight: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    alike: bool
-    parts: dict[int, tuple[Sums, Sums, NDArray[np.float64]]] = field(default_factory=dict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    not_finite: list[NDArray[np.int64]] = field(default_factory=list)
-    kept_out: NDArray[np.int64] | None = None
-
-    def note_not_finite(self, signal: NDArray[np.floating], rows: slice, begin: int) -> None:
-        """Remember which samples of a block of detectors ``rows``, from sample ``begin`` on, are not finite."""
-        n_det, n = signal.shape
-        bad = np.zeros((n_det, n + 2), np.int8)
-        np.logical_not(np.isfinite(signal), out=bad[:, 1:-1])
-        detector, edge = np.nonzero(np.diff(bad, axis=1))
-        found = np.stack([rows.start + detector[::2], begin + edge[::2], begin + edge[1::2]], axis=1)
-        with self.lock:
-            self.not_finite.append(found.astype(np.int64))
-
-    def without_kept_out(self, signal: NDArray[Any], rows: slice, samples: slice) -> NDArray[Any]:
-        """The block's signal with NaN where `kept_out` says so; itself where that is nowhere."""
-        if self.kept_out is None:
-            return signal
-        detector, first, end = self.kept_out.T
-        here = (detector >= rows.start) & (detector < rows.stop) & (first < samples.stop) & (end > samples.start)
-        if not here.any():
-            return signal
-        signal = signal.copy()
-        for d, low, high in self.kept_out[here]:
-            signal[d - rows.start, max(low - samples.start, 0) : high - samples.start] = np.nan
-        return signal
-
-    def of_thread(self) -> tuple[Sums, Sums, NDArray[np.float64]]:
-        """(sums (n_pixel + 1, 4, or 2 where alike), dropped (4,), largest (4,)); the last row of sums is for what is dropped."""
-        mine = threading.get_ident()
-        with self.lock:
-            if mine not in self.parts:
-                self.parts[mine] = (
-                    np.zeros((self.grid.n_pixels + 1, 2 if self.alike else 4), np.int64),
-                    np.zeros(4, np.int64),
-                    np.zeros(4),
-                )
-            return self.parts[mine]
-
-    def merged(self) -> tuple[Sums, Sums, NDArray[np.float64]]:
-        """All threads' sums together."""
-        sums, dropped, largest = np.zeros((self.grid.n_pixels, 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
-        for part_sums, part_dropped, part_largest in self.parts.values():
-            sums[:, : part_sums.shape[1]] += part_sums[:-1]
-            dropped += part_dropped
-            largest = np.maximum(largest, part_largest)
-        self.parts.clear()
-        if self.alike:
-            sums[:, WEIGHTS] = sums[:, HITS] * np.int64(np.rint(self.weight[0] * WEIGHT))
-            sums[:, NOISE] = sums[:, HITS] * np.int64(np.rint(self.noise[0] * WEIGHT))
-        return sums, dropped, largest
-
-
-class Halves:
-    """Sums of the even and of the odd observations, in their order."""
-
-    def __init__(self, n_pixels: int) -> None:
-        self.sums = np.zeros((2, n_pixels, 4), np.int64)
-        self.scans: list[str] = []
-        self._largest = np.zeros(4)
-
-    def add(self, observation: Observation, sums: Sums, largest: NDArray[np.float64], label: str) -> None:
-        """Add one observation. Raises PipelineError where a sum may have overflowed."""
-        self.sums[len(self.scans) % 2] += sums
-        self.scans.append(observation.name)
-        self._largest = np.maximum(self._largest, largest)
-        self._check(f"{label}, {observation.name}")
-
-    def packed(self) -> dict[str, Any]:
-        """As plain values and arrays: numbers of the pixels with hits, and their sums."""
-        used = [np.flatnonzero(half[:, HITS]) for half in self.sums]
-        found: dict[str, Any] = {"scans": list(self.scans), "largest": self._largest}
-        for k, pixels in enumerate(used):
-            found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k][pixels]}
-        return found
-
-    def merge(self, part: Mapping[str, Any], label: str) -> None:
-        """Add what `packed` gave, whose scans follow those that are here. Raises PipelineError as `add`."""
-        shift = len(self.scans) % 2
-        for k in range(2):
-            self.sums[(k + shift) % 2][part[f"pixels_{k}"]] += part[f"sums_{k}"]
-        self.scans += part["scans"]
-        self._largest = np.maximum(self._largest, part["largest"])
-        self._check(label)
-
-    def _check(self, place: str) -> None:
-        """No sum can have overflowed."""
-        deepest = float(self.sums[:, :, HITS].sum(axis=0).max(initial=0))
-        if deepest * self._largest.max() >= 2.0**62:
-            highest = self._largest[DATA] / VALUE
-            raise PipelineError(
-                f"{deepest:.0f} samples in one pixel, each up to {highest:.3g} K, overflow the map's fixed-point sums",
-                place=place,
-                cure="make smaller pixels, or put a HighpassFilter before",
-            )
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add_image(signal, h, start, xi, eta, ny, nx, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
-    """`_add` of a block that begins at sample ``start`` to the pixels of an image, found as they are needed."""
-    n = signal.shape[1]
-    space = np.empty(xi.size * AT_ONCE, np.int32)
-    for low in range(0, n, AT_ONCE):
-        high = min(low + AT_ONCE, n)
-        index = space[: xi.size * (high - low)].reshape(xi.size, high - low)
-        tangent_pixels(h, start + low, start + high, xi, eta, ny, nx, index)
-        _add(signal, low, index, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest)
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add(signal, first, index, use, good, weight, noise, scatter, alike, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
-    """Add samples to the fixed-point sums of their pixels; count what is dropped; note the largest terms.
-
-    The last row of ``sums`` takes what is dropped. ``index`` (n_det, n): pixels of the samples first .. first + n - 1 of the
-    block, like ``good``. ``alike``: all detectors weigh the same; the sums of weights and noise follow from the hits.
-    """
-    n = index.shape[1]
-    flat, columns = sums.reshape(-1), np.uintp(sums.shape[1])
-    trash = np.int32(sums.shape[0] - 1)
-    lost = sums[trash, HITS]
-    fine = good[first : first + n]
-    rows = np.flatnonzero(use)
-    dropped[FLAGGED] += n * (use.size - rows.size)
-    shifted, cells = np.empty((TOGETHER, n)), np.empty((TOGETHER, n), np.int32)
-    units = shifted.view(np.int64)
-    for begin in range(0, rows.size, TOGETHER):
-        group = rows[begin : begin + TOGETHER]
-        for k in range(group.size):
-            d = group[k]
-            limit, factor, square = _scales(weight[d], per_variance, scatter)
-            high = _units(signal[d, first : first + n], index[d], fine, limit, factor, trash, shifted[k], units[k], cells[k])
-            w, term = np.int64(np.rint(weight[d] * WEIGHT)), np.int64(np.rint(noise[d] * WEIGHT))
-            if not alike:
-                for t in range(n):
-                    if scatter:
-                        y = np.float64(units[k, t]) / factor
-                        term = np.int64(np.rint(square * y * y))
-                    cell = np.uintp(cells[k, t]) * columns
-                    flat[cell + np.uintp(WEIGHTS)] += w
-                    flat[cell + np.uintp(NOISE)] += term
-            largest[DATA] = max(largest[DATA], float(high))
-            largest[WEIGHTS] = max(largest[WEIGHTS], float(w))
-            largest[NOISE] = max(largest[NOISE], square * (high / factor) ** 2 if scatter else float(term))
-        _scatter(flat, columns, cells[: group.size], units)
-    if sums[trash, HITS] != lost:
-        for d in rows:
-            limit, _, _ = _scales(weight[d], per_variance, scatter)
-            _count_dropped(signal[d, first : first + n], index[d], fine, limit, dropped)
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _scales(weight, per_variance, scatter):  # type: ignore[no-untyped-def]
-    """Of one detector: the largest |d| [K] that is accepted, units of w d per K, and units of the scatter per K^2."""
-    limit, square = LARGEST / VALUE / max(weight, 1.0), weight * per_variance * WEIGHT
-    if scatter:
-        limit = min(limit, math.sqrt(2.0**60 / square))
-    return limit, weight * VALUE, square
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _units(row, place, good, limit, factor, trash, shifted, units, cells):  # type: ignore[no-untyped-def]
-    """Where each sample goes (``trash``: what is not wanted) and its w d in fixed point; returns the largest. ``units``
-    are the bits of ``shifted``: adding `MAGIC` rounds to an integer in the low bits."""
-    for t in range(row.size):
-        x = np.float64(row[t])
-        wanted = (abs(x) < limit) & (place[t] >= 0) & (good[t] != 0)
-        shifted[t] = (x if wanted else 0.0) * factor + MAGIC
-        cells[t] = place[t] if wanted else trash
-    high = np.int64(0)
-    for t in range(row.size):
-        q = units[t] - MAGIC_BITS
-        units[t] = q
-        high = max(high, abs(q))
-    return high
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _scatter(flat, columns, cells, units):  # type: ignore[no-untyped-def]
-    """Add fixed-point values and hits of all rows of ``cells`` (n_row, n) to their pixels."""
-    hit = np.uintp(HITS)
-    if cells.shape[0] == TOGETHER:
-        a, b, c, d = cells
-        p, q, r, s = units
-        for t in range(np.uintp(cells.shape[1])):
-            at = np.uintp(a[t]) * columns
-            flat[at] += p[t]
-            flat[at + hit] += 1
-            at = np.uintp(b[t]) * columns
-            flat[at] += q[t]
-            flat[at + hit] += 1
-            at = np.uintp(c[t]) * columns
-            flat[at] += r[t]
-            flat[at + hit] += 1
-            at = np.uintp(d[t]) * columns
-            flat[at] += s[t]
-            flat[at + hit] += 1
-        return
-    for k in range(cells.shape[0]):
-        for t in range(np.uintp(cells.shape[1])):
-            at = np.uintp(cells[k, t]) * columns
-            flat[at] += units[k, t]
-            flat[at + hit] += 1
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _count_dropped(row, place, good, limit, dropped):  # type: ignore[no-untyped-def]
-    """Why samples of one detector are not in the map."""
-    for t in range(row.size):
-        size = abs(np.float64(row[t]))
-        if not good[t]:
-            dropped[FLAGGED] += 1
-        elif not size < np.inf:
-            dropped[NOT_FINITE] += 1
-        elif place[t] < 0:
-            dropped[OUTSIDE] += 1
-        elif not size < limit:
-            dropped[TOO_LARGE] += 1
