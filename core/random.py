@@ -112,7 +112,7 @@ def _target(start: int, stop: int, stream: int, out: NDArray[Any] | None, dtype:
 # ---------------------------------------------------------------------------------------------- kernels (callable from numba)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def fill_normals(key, stream, start, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n,) float32 or float64 with normal deviates ``start`` .. of ``stream`` under ``key`` (2,) uint32."""
     words, bits, tile = normal_scratch()
@@ -127,13 +127,13 @@ def fill_normals(key, stream, start, out):  # type: ignore[no-untyped-def]
             target[k] = source[k]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def normal_scratch():  # type: ignore[no-untyped-def]
     """(words, bits, tile) for `normal_tile`."""
     return np.empty((4, _BLOCKS), np.uint32), np.empty(_BLOCKS, np.int32), np.empty(TILE, np.float32)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def normal_tile(key, stream, number, words, bits, tile):  # type: ignore[no-untyped-def]
     """Fill ``tile`` (`TILE`,) float32 with normal deviates `TILE` number .. of ``stream`` under ``key``."""
     counter = uint64(number) << uint64(8)
@@ -190,7 +190,8 @@ def fill_lattice_normals(key, i0, j0, out):  # type: ignore[no-untyped-def]
 def philox(key, c0, c1, c2, c3, words):  # type: ignore[no-untyped-def]
     """Philox4x32-10 of the counters (c0 + b, c1, c2, c3), b = 0 .. n - 1 (no carry): words (4, n) uint32.
 
-    Each 32-bit word is held in the low half of a uint64, which the compiler turns into vector multiplications.
+    Each 32-bit word is held in the low half of a uint64, which the compiler turns into vector multiplications; the high half is
+    masked where they are made, so that the masks become part of them.
     """
     low, half = uint64(0xFFFFFFFF), uint64(32)
     m0, m1 = uint64(0xD2511F53), uint64(0xCD9E8D57)
@@ -200,11 +201,11 @@ def philox(key, c0, c1, c2, c3, words):  # type: ignore[no-untyped-def]
     for b in range(uint64(out0.size)):
         x0, x1, x2, x3 = uint64(c0) + uint64(b), uint64(c1), uint64(c2), uint64(c3)
         for r in range(10):
-            p, q = m0 * x0, m1 * x2
-            x0 = (q >> half) ^ x1 ^ ((k0 + uint64(r) * w0) & low)
-            x1 = q & low
-            x2 = (p >> half) ^ x3 ^ ((k1 + uint64(r) * w1) & low)
-            x3 = p & low
+            p, q = m0 * (x0 & low), m1 * (x2 & low)
+            x0 = (q >> half) ^ x1 ^ (k0 + uint64(r) * w0)
+            x1 = q
+            x2 = (p >> half) ^ x3 ^ (k1 + uint64(r) * w1)
+            x3 = p
         out0[b], out1[b], out2[b], out3[b] = uint32(x0), uint32(x1), uint32(x2), uint32(x3)
 
 

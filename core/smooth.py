@@ -192,32 +192,22 @@ def _prefilter(values, taps, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _evaluate_rows(coefficients, basis, start, out):  # type: ignore[no-untyped-def]
-    n_det, n = out.shape
-    step = basis.shape[1]
-    stop = start + n
-    first, last = start // step, (stop + step - 1) // step
-    b0, b1, b2, b3 = basis[0], basis[1], basis[2], basis[3]
-    for d in range(n_det):
-        row, line = out[d], coefficients[d]
-        for m in range(first, last):
-            low, high = max(m * step, start), min((m + 1) * step, stop)
-            r = low - m * step
-            c0, c1, c2, c3 = line[m], line[m + 1], line[m + 2], line[m + 3]
-            into = row[low - start : high - start]
-            w0, w1, w2, w3 = b0[r : r + into.size], b1[r : r + into.size], b2[r : r + into.size], b3[r : r + into.size]
-            for t in range(into.size):
-                into[t] = c0 * w0[t] + c1 * w1[t] + c2 * w2[t] + c3 * w3[t]
+    for d in range(out.shape[0]):
+        series_into(coefficients[d], 0, basis, start, out[d])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _lines(weights, coefficients, first, lines):  # type: ignore[no-untyped-def]
     """lines[d, k] = sum_n weights[d, n] coefficients[n, first + k], summed in float64."""
+    total = np.empty(lines.shape[1])
     for d in range(lines.shape[0]):
-        for k in range(lines.shape[1]):
-            total = 0.0
-            for node in range(weights.shape[1]):
-                total += weights[d, node] * coefficients[node, first + k]
-            lines[d, k] = total
+        total[:] = 0.0
+        for node in range(weights.shape[1]):
+            weight, values = weights[d, node], coefficients[node, first : first + total.size]
+            for k in range(nb.uint64(total.size)):  # unsigned: vectorized
+                total[k] += weight * values[k]
+        for k in range(nb.uint64(total.size)):
+            lines[d, k] = total[k]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
@@ -226,17 +216,16 @@ def _evaluate(lines, first, basis, start, out):  # type: ignore[no-untyped-def]
         series_into(lines[d], first, basis, start, out[d])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def series_into(line, first, basis, start, into):  # type: ignore[no-untyped-def]
     """One detector of a `Series` at the samples start .. start + into.size - 1 (absolute). For use in kernels."""
-    step = basis.shape[1]
-    stop = start + into.size
+    step, size = nb.uint64(basis.shape[1]), nb.uint64(into.size)
     b0, b1, b2, b3 = basis[0], basis[1], basis[2], basis[3]
-    for m in range(start // step, (stop + step - 1) // step):
-        low, high = max(m * step, start), min((m + 1) * step, stop)
-        k, r = m - first, low - m * step
-        c0, c1, c2, c3 = line[k], line[k + 1], line[k + 2], line[k + 3]
-        part = into[low - start : high - start]
-        w0, w1, w2, w3 = b0[r : r + part.size], b1[r : r + part.size], b2[r : r + part.size], b3[r : r + part.size]
-        for t in range(part.size):
-            part[t] = c0 * w0[t] + c1 * w1[t] + c2 * w2[t] + c3 * w3[t]
+    m, done = nb.uint64(start) // step, nb.uint64(0)
+    k, r = m - nb.uint64(first), nb.uint64(start) - m * step
+    while done < size:
+        n = min(step - r, size - done)
+        c0, c1, c2, c3 = line[k], line[k + nb.uint64(1)], line[k + nb.uint64(2)], line[k + nb.uint64(3)]
+        for t in range(n):
+            into[done + t] = c0 * b0[r + t] + c1 * b1[r + t] + c2 * b2[r + t] + c3 * b3[r + t]
+        done, k, r = done + n, k + nb.uint64(1), nb.uint64(0)

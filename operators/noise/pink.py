@@ -136,10 +136,11 @@ class PinkNoise(Operator):
         if state is None:
             block.new("pink")
             return
-        out = block.new("pink")
+        add = "pink" in block.detdata
+        out = block.new("pink", zero=False)
         level = state.amplitude(block.observation).series(block.detectors, block.samples, out.dtype)
         shared = state.common[0, block.samples]
-        state.streams.add(block.detectors.start, block.samples.start, out, level, shared, state.shared)
+        state.streams.add(block.detectors.start, block.samples.start, out, level, shared, state.shared, over=not add)
 
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """State the rms."""
@@ -208,11 +209,12 @@ class Streams:
         level: Series | None = None,
         common: NDArray[np.float32] = NOTHING,
         shared: float = 0.0,
+        over: bool = False,
     ) -> None:
         """Add level * noise to ``out`` (n_det, n_samp), whose first element is (detector, sample). Thread-safe.
 
         ``level``: of the same detectors and samples; absent: 1. ``common`` (n_samp,): a stream that makes up the share
-        ``shared`` of the variance.
+        ``shared`` of the variance. ``over``: put it into ``out``, whatever is there.
         """
         end = detector + out.shape[0]
         if level is None:
@@ -225,10 +227,18 @@ class Streams:
             low, high = max(detector, origin), min(end, origin + TILE_DETECTORS)
             rows = slice(low - detector, high - detector)
             part = Series(level.lines[rows], level.first, level.basis)
-            self._add_tile(number, low - origin, sample, part, common, shares, out[rows])
+            self._add_tile(number, low - origin, sample, part, common, shares, over, out[rows])
 
     def _add_tile(
-        self, number: int, lane: int, sample: int, level: Series, common: NDArray[np.float32], shares: Floats, out: Floats
+        self,
+        number: int,
+        lane: int,
+        sample: int,
+        level: Series,
+        common: NDArray[np.float32],
+        shares: Floats,
+        over: bool,
+        out: Floats,
     ) -> None:
         with self._lock:
             tile = self._tiles.get(number)
@@ -239,11 +249,12 @@ class Streams:
             state = tile.kept[nearest].copy()
             law = self._rate, self._tap
             for start, stop in _pieces(nearest, sample):
-                _filter(self.key, number, start, stop - start, state, *law, 0, *level, common[:0], shares, out[:0])
+                _filter(self.key, number, start, stop - start, state, *law, 0, *level, common[:0], shares, over, out[:0])
                 self._keep(tile, stop, state)
             for start, stop in _pieces(sample, sample + out.shape[1]):
                 part = slice(start - sample, stop - sample)
-                _filter(self.key, number, start, stop - start, state, *law, lane, *level, common[part], shares, out[:, part])
+                these = common[part], shares, over, out[:, part]
+                _filter(self.key, number, start, stop - start, state, *law, lane, *level, *these)
                 self._keep(tile, stop, state)
 
     def _keep(self, tile: _Tile, sample: int, state: NDArray[np.float32]) -> None:
@@ -266,8 +277,9 @@ def _pieces(start: int, stop: int) -> list[tuple[int, int]]:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, basis, common, shares, out):  # type: ignore[no-untyped-def]
-    """Equation (2) of `one_over_f` for 16 detectors x n samples; adds level * y of those from ``lane`` on to ``out``.
+def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, basis, common, shares, over, out):  # type: ignore[no-untyped-def]
+    """Equation (2) of `one_over_f` for 16 detectors x n samples; adds level * y of those from ``lane`` on to ``out`` (``over``:
+    puts it there).
 
     ``state`` (K, 16), K a multiple of 4, is moved on by n samples. Deviate 16 t + lane of stream ``tile`` drives sample t.
     ``lines, cell, basis``: the `Series` of the level. Where there is a ``common`` stream, shares[0] y + shares[1] common
@@ -289,6 +301,8 @@ def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, basis, com
         for d in range(uint64(out.shape[0])):
             row, size = out[d, done : done + m], level[:m]
             series_into(lines[d], cell, basis, start + done, size)
+            if over:
+                row[:] = 0
             if common.size:
                 shared = common[done : done + m]
                 for t in range(uint64(m)):

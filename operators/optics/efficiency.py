@@ -25,7 +25,7 @@ from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
 from zonda.core.operator import Operator
 from zonda.core.random import normals
-from zonda.core.smooth import SmoothField
+from zonda.core.smooth import Series, SmoothField, series_into
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -123,17 +123,18 @@ class Efficiency(Operator):
         have = block.detdata
         signal = block.buffer("signal", shape)
         absent = np.empty((0, 0), block.dtype)
-        divisor = absent
+        nothing = Series(absent, 0, absent)
+        divisor = mean = nothing
         noisy = any(name in have for name in ("atmosphere", "white", "pink"))
         if state.transmission is not None and noisy:
-            divisor = state.transmission.evaluate(rows, block.samples, block.buffer("Efficiency t", shape))
+            divisor = state.transmission.series(rows, block.samples, signal.dtype)
         instantaneous = self.calibration == "instantaneous" and "transmission" in have
-        mean = absent
         if instantaneous and state.mean is not None:
-            mean = state.mean.evaluate(rows, block.samples, block.buffer("Efficiency M", shape))
+            mean = state.mean.series(rows, block.samples, signal.dtype)
         streams = [have.get(name, absent) for name in ("sky", "transmission", "atmosphere", "white", "pink")]
-        per_detector = [a[rows].astype(block.dtype) for a in (state.gain, state.epsilon, state.zeta)]
-        clipped = _calibrate(*streams, divisor, mean, *per_detector, instantaneous, block.dtype(OPAQUE), signal)
+        smooth = divisor.lines, divisor.basis, mean.lines, mean.basis
+        factors = np.array([a[rows] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
+        clipped = _calibrate(*streams, block.samples.start, *smooth, factors, instantaneous, signal)
         if instantaneous:
             block.observation.tally.count(self.label, f"samples whose fluctuating e^-tau was raised to {OPAQUE:g}", clipped)
         have["signal"] = signal
@@ -154,14 +155,16 @@ class Calibration:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, instantaneous, opaque, out):  # type: ignore[no-untyped-def]
-    """Equation (2); absent streams have no rows. ``wet`` is x, ``divisor`` t, ``mean`` M (instantaneous only).
+def _calibrate(sky, wet, air, white, pink, start, divisor, basis, mean, mean_basis, factors, instantaneous, out):  # type: ignore[no-untyped-def]
+    """Equation (2); absent streams have no rows. ``wet`` is x; ``divisor``, t, and ``mean``, M (instantaneous only), are lines of
+    `Series` of the samples from ``start`` on, with their bases; ``factors`` (3, n_det): gain, epsilon, zeta.
 
-    Returns how many samples of 1 + x were raised to ``opaque``.
+    Returns how many samples of 1 + x were raised to `OPAQUE`.
     """
+    gain, epsilon, zeta = factors[0], factors[1], factors[2]
     n_det, n = out.shape
     clipped = 0
-    one = out.dtype.type(1)
+    one, opaque = out.dtype.type(1), out.dtype.type(OPAQUE)
     piece = 2048
     noise, scale = np.empty(piece, out.dtype), np.empty(piece, out.dtype)
     for d in range(n_det):
@@ -196,11 +199,12 @@ def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, i
                     noise[t] += a[t]
             if air.shape[0] or white.shape[0] or pink.shape[0]:
                 factor = gain[d] / zeta[d]
-                scale[:] = factor
                 if divisor.shape[0]:
-                    a = divisor[d, begin : begin + m]
+                    series_into(divisor[d], start // basis.shape[1], basis, start + begin, scale[:m])
                     for t in range(m):
-                        scale[t] = factor / max(a[t], opaque)
+                        scale[t] = factor / max(scale[t], opaque)
+                else:
+                    scale[:] = factor
                 if instantaneous:
                     x = wet[d, begin : begin + m]
                     for t in range(m):
@@ -208,9 +212,10 @@ def _calibrate(sky, wet, air, white, pink, divisor, mean, gain, epsilon, zeta, i
                 for t in range(m):
                     row[t] += noise[t] * scale[t]
             if instantaneous and mean.shape[0]:
-                x, a = wet[d, begin : begin + m], mean[d, begin : begin + m]
+                x = wet[d, begin : begin + m]
+                series_into(mean[d], start // mean_basis.shape[1], mean_basis, start + begin, scale[:m])
                 for t in range(m):
-                    row[t] -= a[t] * x[t] / max(one + x[t], opaque)
+                    row[t] -= scale[t] * x[t] / max(one + x[t], opaque)
     return clipped
 
 

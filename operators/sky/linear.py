@@ -30,18 +30,19 @@ def sample_linear(
     bounds: NDArray[np.float64],
     covered: NDArray[np.uint8],
     out: Floats,
+    over: bool = False,
 ) -> tuple[int, int]:
     """As `sampling.sample`, from the grid's ``values`` (ny, nx). Samples within two points of its border are left as they are."""
     kind = out.dtype.type
     constants = np.array([1 / 6, 2 / 3, 0.5, 1.0, 2.0, 1e6, 0.0], kind)
     a, b = xi.astype(kind), eta.astype(kind)
     flat, (ny, nx) = values.reshape(-1), values.shape
-    beyond, behind = _sample(quaternions, pixel_matrix, a, b, rows, flat, ny, nx, bounds, covered, constants, out)
+    beyond, behind = _sample(quaternions, pixel_matrix, a, b, rows, flat, ny, nx, bounds, covered, constants, over, out)
     return int(beyond), int(behind)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, constants, out):  # type: ignore[no-untyped-def]
+def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, constants, over, out):  # type: ignore[no-untyped-def]
     h, box = np.empty((9, CHUNK), out.dtype), np.empty((9, 2))
     limits, edge = np.empty(4, out.dtype), np.empty(4, out.dtype)
     scratch = np.empty((24, CHUNK))
@@ -52,6 +53,9 @@ def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, cons
         count = min(CHUNK, out.shape[1] - start)
         x0, y0 = chunk(quaternions[start : start + count], matrix, ny, nx, bounds, scratch, h, box, limits, edge)
         for d in range(rows.size):
+            row = out[rows[d], start : start + count]
+            if over:
+                row[:] = 0
             if misses(box, xi[d], eta[d], limits, edge):
                 beyond += count
                 continue
@@ -62,7 +66,6 @@ def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, cons
             behind += count - front
             first, stop = span_on_grid(place, count)
             stop = min(stop, count)
-            row = out[rows[d], start : start + count]
             _add_bilinear(f, place, u, v, first, stop, uint64(nx), constants, row)
     return beyond, behind
 

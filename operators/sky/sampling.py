@@ -34,6 +34,7 @@ def sample(
     bounds: NDArray[np.float64],
     covered: NDArray[np.uint8],
     out: Floats,
+    over: bool = False,
 ) -> tuple[int, int]:
     """Add the map to ``out`` (n_det, n_samp) at its ``rows``; the numbers of samples (outside the input map, behind it).
 
@@ -51,6 +52,8 @@ def sample(
         (4,) x_low, x_high, y_low, y_high of the input map on the working grid.
     covered
         (ny, nx) 1 where the input map has data, or (0, 0): everywhere within ``bounds``.
+    over
+        Put the map into ``out``, whatever is there, and zeros where there is no map.
 
     A sample whose 4 x 4 coefficients are not all on the grid is left as it is. Samples behind the tangent plane are counted
     in both numbers.
@@ -69,13 +72,14 @@ def sample(
         bounds,
         covered,
         constants,
+        over,
         out,
     )
     return int(beyond), int(behind)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, constants, out):  # type: ignore[no-untyped-def]
+def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, constants, over, out):  # type: ignore[no-untyped-def]
     h, box = np.empty((9, CHUNK), out.dtype), np.empty((9, 2))
     limits, edge = np.empty(4, out.dtype), np.empty(4, out.dtype)
     scratch = np.empty((24, CHUNK))
@@ -88,6 +92,9 @@ def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, cons
         count = min(CHUNK, out.shape[1] - start)
         x0, y0 = chunk(quaternions[start : start + count], matrix, ny, nx, bounds, scratch, h, box, limits, edge)
         for d in range(rows.size):
+            row = out[rows[d], start : start + count]
+            if over:
+                row[:] = 0
             if misses(box, xi[d], eta[d], limits, edge):
                 beyond += count
                 continue
@@ -102,7 +109,6 @@ def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, cons
             _spline(place, u, v, first, stop, constants, at, weights)
             for t in range(uint64(first), uint64(stop), uint64(4)):
                 spline_of_four(f, uint64(nx), at, flat, uint64(CHUNK), t, found)
-            row = out[rows[d], start : start + count]
             for t in range(uint64(first), uint64(min(stop, count))):
                 row[t] += found[t] if place[t] >= 0 else constants[6]
     return beyond, behind
@@ -142,7 +148,7 @@ def chunk(quaternions, matrix, ny, nx, bounds, scratch, h, box, limits, edge):  
 def _homographies(quaternions, matrix, scratch, g):  # type: ignore[no-untyped-def]
     """``g`` (9, n): the elements of H = A R, columns sorted for (xi, eta, 1). One output to a loop, so that it is vectorized."""
     n = uint64(len(quaternions))
-    x, y, z, w, s, one = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5]
+    x, y, z, w, s = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     for t in range(n):
         x[t], y[t], z[t], w[t] = quaternions[t, 0], quaternions[t, 1], quaternions[t, 2], quaternions[t, 3]
     for t in range(n):
@@ -176,7 +182,7 @@ def _homographies(quaternions, matrix, scratch, g):  # type: ignore[no-untyped-d
                 to[t] = p * a[t] + q * b[t] + r * c[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def _extent(values, box):  # type: ignore[no-untyped-def]
     """The least and the largest of `CHUNK` values, four at a time."""
     a, b, c, d = values[0], values[1], values[2], values[3]
@@ -188,7 +194,7 @@ def _extent(values, box):  # type: ignore[no-untyped-def]
     box[0], box[1] = min(min(a, b), min(c, d)), max(max(p, q), max(r, s))
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def misses(box, a, b, limits, edge):  # type: ignore[no-untyped-def]
     """Whether a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at every instant of a chunk.
 
@@ -243,7 +249,7 @@ def locate(h, a, b, count, limits, edge, constants, x0, y0, width, place, u, v):
     return inside, front
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def count_covered(place, u, v, count, width, covered):  # type: ignore[no-untyped-def]
     """The number of samples whose nearest grid point is covered."""
     total = int32(0)
@@ -254,7 +260,7 @@ def count_covered(place, u, v, count, width, covered):  # type: ignore[no-untype
     return total
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def span_on_grid(place, count):  # type: ignore[no-untyped-def]
     """The multiples of four between which all samples on the grid lie; what is filled up behind ``count`` is off the grid."""
     first, last = 0, count - 1
@@ -272,7 +278,7 @@ def span_on_grid(place, count):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
 def _spline(place, u, v, first, stop, constants, at, weights):  # type: ignore[no-untyped-def]
-    """The cubic B-spline weights (8, CHUNK), four along x, four along y; ``at``: ``place``, somewhere for samples off the grid."""
+    """The cubic B-spline weights (8, CHUNK), four along x, four along y; ``at``: ``place``, 0 for samples off the grid."""
     sixth, two_thirds, half, one, two = constants[0], constants[1], constants[2], constants[3], constants[4]
     for k in range(2):
         fractions, w0, w1, w2, w3 = (u, v)[k], weights[4 * k], weights[4 * k + 1], weights[4 * k + 2], weights[4 * k + 3]

@@ -120,7 +120,8 @@ class SkyMap(Operator):
 
     def exec(self, block: Block, state: State) -> None:
         observation, plane = block.observation, block.observation.focalplane
-        stream = block.new("sky")
+        over = bool(state.beams) and "sky" not in block.detdata
+        stream = block.new("sky", zero=not over)
         index = state.index[block.detectors]
         xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
         quaternions = np.ascontiguousarray(observation.boresight_radec[block.samples], np.float64)
@@ -131,9 +132,9 @@ class SkyMap(Operator):
             rows = np.flatnonzero(index == number)
             if rows.size:
                 coefficients = beam.convolved.coefficients[stream.dtype.name]
-                found = (sample_linear if self.interpolation == "linear" else sample)(
-                    quaternions, beam.matrix, xi[rows], eta[rows], rows, coefficients, beam.convolved.bounds, beam.covered, stream
-                )
+                of_beam = coefficients, beam.convolved.bounds, beam.covered
+                interpolate = sample_linear if self.interpolation == "linear" else sample
+                found = interpolate(quaternions, beam.matrix, xi[rows], eta[rows], rows, *of_beam, stream, over)
                 beyond, behind = beyond + found[0], behind + found[1]
         if self.outside:
             stream += stream.dtype.type(self.outside)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
+import pkgutil
 import subprocess
 import sys
 import warnings
@@ -15,6 +16,7 @@ import pytest
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
+import zonda
 from zonda.core import kernel_cache
 from zonda.core.kernel_cache import SUFFIX, KernelCache, KernelFiles, meaning
 from zonda.core.registry import mapmakers, operators
@@ -289,3 +291,21 @@ def test_every_kernel_is_kept_this_way():
     ours = [k for k in found.values() if k.py_func.__module__.startswith("zonda.") and "toy_" not in k.py_func.__module__]
     assert len(ours) > 30
     assert [k for k in ours if not isinstance(k._cache, KernelCache)] == []
+
+
+def test_kernels_that_others_call_say_how_they_round():
+    """A kernel that does not state ``fastmath`` inherits it from whoever has it compiled first; numba keeps the result for all:
+    bits would depend on the order of compilation."""
+    kernels: dict[Any, Dispatcher] = {}
+    for module in pkgutil.walk_packages(zonda.__path__, "zonda."):
+        if module.name.startswith(("zonda.core", "zonda.operators")):
+            for kernel in vars(import_module(module.name)).values():
+                if isinstance(kernel, Dispatcher):
+                    kernels[kernel.py_func] = kernel
+    assert len(kernels) > 40
+    silent = set()
+    for function, kernel in kernels.items():
+        if kernel.targetoptions.get("fastmath"):
+            called = (function.__globals__.get(name) for name in function.__code__.co_names)
+            silent |= {k.py_func.__qualname__ for k in called if isinstance(k, Dispatcher) and "fastmath" not in k.targetoptions}
+    assert not silent
