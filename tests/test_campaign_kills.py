@@ -29,36 +29,22 @@ from zonda.core.campaign import parts
 from zonda.core.campaign.job import FILE, LOG, TASKS, Job
 from zonda.core.configuration.pipeline_file import load
 
+from .scenes import camera, write_sky
+
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked and killed as POSIX does")
 
-CAMPAIGN = """\
-site: green_bank
-instrument:
-  name: cam
-  telescope: {name: dish, diameter: 100 m}
-  band: {name: b, low: 80 GHz, high: 100 GHz}
-  detectors: 7
-  field_of_view: 2 arcmin
-  fwhm: 9 arcsec
-  main_beam_efficiency: 0.3
-  illumination_efficiency: 0.8
-  net: 1 mK s(1/2)
-  knee: 1 Hz
-  sample_rate: 50 Hz
-time: 2024-11-25T07:00
-target: 05h00m00s +20d00m00s
-seed: 1
-budget: 0 %
-campaign: {nights: 4, realizations: 2}
+CAMPAIGN = f"""\
+{camera(7)}budget: 0 %
+campaign: {{nights: 4, realizations: 2}}
 operators:
-  - PointingDaisy: {radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 20 s}
-  - SkyMap: {file: sky.fits}
+  - PointingDaisy: {{radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 20 s}}
+  - SkyMap: {{file: sky.fits}}
   - WhiteNoise
   - PinkNoise
   - Efficiency
-  - SaveTOD: {format: fits}
+  - SaveTOD: {{format: fits}}
   - HighpassFilter
-  - BinMap: {pixel: 4 arcsec}
+  - BinMap: {{pixel: 4 arcsec}}
   - SaveMap
 """
 TASKS_IN_ALL = 8
@@ -137,13 +123,8 @@ class Nursery:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from astropy.io import fits
-
     folder = tmp_path_factory.mktemp("campaign")
-    image = fits.PrimaryHDU(np.random.default_rng(0).standard_normal((21, 21)) * 1e-3)
-    image.header.update({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 11, "CRPIX2": 11, "CRVAL1": 75.0, "CRVAL2": 20.0})
-    image.header.update({"CDELT1": -0.004, "CDELT2": 0.004, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K_RJ"})
-    image.writeto(folder / "sky.fits")
+    write_sky(folder / "sky.fits", 21, 0.004, 1e-3)
     (folder / "c.yaml").write_text(CAMPAIGN)
     return folder
 

@@ -216,7 +216,8 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
         import distributed
     except ImportError as err:
         raise _missing("dask.distributed", "dask", err) from None
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a scheduler that is gone is told without its traceback
+    for logger in ("distributed", "distributed.client", "distributed.core", "tornado", "tornado.application"):
+        logging.getLogger(logger).setLevel(logging.CRITICAL)  # a scheduler that is gone is told without Dask's traceback
     if scheduler is None:
         raise PipelineError(
             "no Dask scheduler is named",

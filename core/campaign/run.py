@@ -267,9 +267,9 @@ def _submit(pool: Pool, order: Order) -> Future[Outcome]:
     assert pool.executor is not None
     try:
         return pool.executor.submit(perform, order)
-    except BrokenExecutor as err:  # a worker was killed since the last result
+    except Exception as err:
         future: Future[Outcome] = Future()
-        future.set_exception(err)
+        future.set_exception(err if isinstance(err, BrokenExecutor) else CancelledError())  # a worker was killed; all is gone
         return future
 
 

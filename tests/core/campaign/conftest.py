@@ -10,32 +10,18 @@ import pytest
 
 from zonda.core import cli
 
-YAML = """\
-site: green_bank
-instrument:
-  name: cam
-  telescope: {name: dish, diameter: 100 m}
-  band: {name: b, low: 80 GHz, high: 100 GHz}
-  detectors: 19
-  field_of_view: 2 arcmin
-  fwhm: 9 arcsec
-  main_beam_efficiency: 0.3
-  illumination_efficiency: 0.8
-  net: 1 mK s(1/2)
-  knee: 1 Hz
-  sample_rate: 50 Hz
-time: 2024-11-25T07:00
-target: 05h00m00s +20d00m00s
-seed: 1
-campaign: CAMPAIGN
+from ...scenes import camera
+
+YAML = f"""\
+{camera(19)}campaign: CAMPAIGN
 operators:
-  - PointingDaisy: {radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 6 s, scans: 2, gap: 1 s}
+  - PointingDaisy: {{radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 6 s, scans: 2, gap: 1 s}}
   - WhiteNoise
   - PinkNoise
   - Efficiency
-  - PowerSpectrum: {segment: 2 s}
+  - PowerSpectrum: {{segment: 2 s}}
   - HighpassFilter
-  - BinMap: {pixel: 4 arcsec}
+  - BinMap: {{pixel: 4 arcsec}}
   - SaveMap
 """
 

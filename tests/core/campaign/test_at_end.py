@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import h5py
-import numpy as np
 import pytest
 
 from zonda.core.campaign.job import Job
 from zonda.core.campaign.log import read
 from zonda.core.campaign.reduce import combined
 from zonda.core.configuration.pipeline_file import load
+
+from ...scenes import write_sky
 
 SERIAL = ("--engine", "serial", "--threads", 1, "--no-prune")
 
@@ -40,12 +41,7 @@ runs:
 @pytest.fixture
 def files(bench):
     """The same scene as an ordinary run and as a campaign of its scans, its output folders beside it."""
-    from astropy.io import fits
-
-    image = fits.PrimaryHDU(np.random.default_rng(0).standard_normal((41, 41)))
-    image.header.update({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 21, "CRPIX2": 21, "CRVAL1": 75.0, "CRVAL2": 20.0})
-    image.header.update({"CDELT1": -0.001, "CDELT2": 0.001, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K_RJ"})
-    image.writeto(bench.folder / "sky.fits")
+    write_sky(bench.folder / "sky.fits", 41, 0.001, 1.0)
 
     def write(campaign: str, name: str, *more: tuple[str, str]) -> Path:
         path = bench.file(campaign, name=name)
