@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import linecache
+import re
 import sys
 import textwrap
 from itertools import pairwise, takewhile
@@ -90,8 +91,14 @@ def _of_class(lines: list[str], name: str) -> dict[str, str]:
 
 
 def _by_indentation(lines: list[str]) -> list[str]:
-    """The class statement and what is indented more; it may end too early, within brackets or texts."""
+    """The class statement and what is indented more, but for the methods behind the last annotation.
+
+    It may end too early, within brackets or texts.
+    """
     indent = len(lines[0]) - len(lines[0].lstrip())
     head = len(list(takewhile(lambda line: not line.lstrip().startswith("class "), lines))) + 1
-    body = takewhile(lambda line: not line.strip() or len(line) - len(line.lstrip()) > indent, lines[head:])
-    return [*lines[:head], *body]
+    body = list(takewhile(lambda line: not line.strip() or len(line) - len(line.lstrip()) > indent, lines[head:]))
+    inner = next((line[: len(line) - len(line.lstrip())] for line in body if line.strip()), "")
+    last = max((k for k, line in enumerate(body) if re.match(rf"{inner}[A-Za-z_]\w* *:", line)), default=0)
+    methods = next((k for k in range(last, len(body)) if re.match(rf"{inner}(@|def |async |class )", body[k])), len(body))
+    return [*lines[:head], *body[:methods]]

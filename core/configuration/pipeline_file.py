@@ -266,14 +266,16 @@ class _Check:
         self.wrong(message, span, getattr(err, "label", ""), err.cure)
 
     def requirements(self) -> None:
+        wanted = self.tree.get("requires")
+        if not isinstance(wanted, list):
+            return
         from importlib.metadata import PackageNotFoundError, version
 
         from packaging.requirements import InvalidRequirement, Requirement
 
         from zonda import __version__
 
-        wanted = self.tree.get("requires")
-        for i, text in enumerate(wanted if isinstance(wanted, list) else []):
+        for i, text in enumerate(wanted):
             at = self.document.mark(("requires", i)).value
             if not isinstance(text, str):
                 continue  # the header's own check has said so

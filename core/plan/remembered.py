@@ -67,18 +67,26 @@ def outcome(
 ) -> Outcome:
     """What `plan` finds, from memory where it is there. Arguments and errors as of `plan`."""
     options = {"keep": list(keep), "drop": list(drop), "prune_all": prune_all, "threads": threads or available_threads()}
-    options["memory"] = memory or f"about 2^{math.log2(available_memory()):.0f}"  # it says where streams fit, no more
     key = _key(file, options)
-    found = _read(user_cache.recall(KIND, key)) if key else None
-    if found is not None:
-        return found
+    ceilings = [memory] if memory else _about(available_memory())
+    for ceiling in ceilings if key else ():
+        found = _read(user_cache.recall(KIND, {**(key or {}), "memory": ceiling}))
+        if found is not None:
+            return found
     made = plan(file, keep=keep, drop=drop, prune_all=prune_all, threads=threads, memory=memory)
     fresh = Outcome(made.operators, made.structure.runs, made.settings(), table.short(made), made.prediction, made.unpruned)
     if key:
-        user_cache.remember(KIND, key, {**asdict(fresh), **{k: list(getattr(fresh, k)) for k in ("operators", "runs")},
-                                        "short": [list(row) for row in fresh.short],
-                                        "prediction": _plain(fresh.prediction), "unpruned": _plain(fresh.unpruned)})  # fmt: skip
+        value = {**asdict(fresh), **{k: list(getattr(fresh, k)) for k in ("operators", "runs")}}
+        value |= {"short": [list(row) for row in fresh.short]}
+        value |= {"prediction": _plain(fresh.prediction), "unpruned": _plain(fresh.unpruned)}
+        user_cache.remember(KIND, {**key, "memory": ceilings[0]}, value)
     return fresh
+
+
+def _about(memory: int) -> list[str]:
+    """Free memory to a power of two, and the other that is as near: it says where streams fit, no more, and it fluctuates."""
+    power = math.log2(memory)
+    return [f"about 2^{k}" for k in sorted({round(power - 0.4), round(power + 0.4)}, key=lambda k: abs(k - power))]
 
 
 def _plain(prediction: Prediction) -> dict[str, Any]:

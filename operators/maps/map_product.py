@@ -145,15 +145,13 @@ class MapProduct:
         """f(values, power): values convolved with the power-th power of the Gaussian kernel, whose sum is 1."""
         sigma = fwhm / FWHM_PER_SIGMA / self.pixel
         if self.header is not None:
-            from scipy.ndimage import convolve1d
-
             reach = np.arange(-math.ceil(5 * sigma), math.ceil(5 * sigma) + 1)
             kernel = np.exp(-(reach**2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
             kernel /= kernel.sum()
 
             def flat(values: Floats, power: float) -> Floats:
-                once = convolve1d(values, kernel**power, axis=0, mode="constant")
-                return np.asarray(convolve1d(once, kernel**power, axis=1, mode="constant"))
+                taps = kernel[kernel.size // 2 :] ** power
+                return _symmetric(np.ascontiguousarray(_symmetric(values, taps).T), taps).T
 
             return flat
 
@@ -204,6 +202,15 @@ class MapProduct:
         if self.half_difference is not None:
             rows.append(("half-difference rms there", f"{self.rms(of='half_difference'):.3g} {self.unit}"))
         return html_table("Map", rows)
+
+
+def _symmetric(values: Floats, taps: Floats) -> Floats:
+    """sum_k taps[|k|] values[j + k] along the first axis; zeros beyond the ends."""
+    out = taps[0] * values
+    for k in range(1, min(taps.size, len(values))):
+        out[k:] += taps[k] * values[:-k]
+        out[:-k] += taps[k] * values[k:]
+    return np.asarray(out)
 
 
 @lru_cache(maxsize=1)  # the maps of all runs share it

@@ -103,3 +103,17 @@ def test_others_operators_are_not_remembered(file, monkeypatch):
 
     monkeypatch.setattr(remembered, "discover", lambda group: [Found("Mine", "mine:Mine", "zonda-mine", "1")])
     assert remembered._key(file, {}) is None
+
+
+def test_free_memory_may_fluctuate_about_a_limit(file, no_planning, monkeypatch):
+    """Only between powers of two whose middle it is near; a quarter of it is another case."""
+    monkeypatch.setattr(remembered, "available_memory", lambda: int(2**33.45))
+    first = outcome(file)
+    no_planning()
+    for power in (33.0, 33.45, 33.55):
+        monkeypatch.setattr(remembered, "available_memory", lambda power=power: int(2**power))
+        assert outcome(file) == first
+    for power in (31.5, 34.0):
+        monkeypatch.setattr(remembered, "available_memory", lambda power=power: int(2**power))
+        with pytest.raises(RuntimeError, match="planned again"):
+            outcome(file)

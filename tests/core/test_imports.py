@@ -1,0 +1,38 @@
+"""What a run of the shipped MUSTANG-2 pipeline imports before its first block: each of these takes 0.1 s or more."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+HEAVY = {
+    "astropy.coordinates", "astropy.table", "astropy.time", "astropy.visualization", "astropy.wcs",
+    "h5py", "healpy", "matplotlib", "numba.np.linalg", "numba.np.arrayobj", "numpy.testing",
+    "scipy.fft", "scipy.interpolate", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.spatial",
+    "scipy.special", "scipy.stats",
+}  # fmt: skip
+
+RUN = """
+import os, sys
+from zonda.core import cli
+from zonda.core.execution import Execution
+
+def first_block(*arguments, **named):
+    print(*sorted(sys.modules))
+    sys.stdout.flush()
+    os._exit(0)
+
+Execution._make = first_block
+cli.main(["run", "mustang2_cluster", "--output", sys.argv[1], "--threads", "1",
+          "--set", "PointingDaisy.scan_duration=20 s", "--set", "PointingDaisy.scans=2"])
+"""
+
+
+def test_a_run_imports_nothing_heavy_before_its_first_block(tmp_path: Path) -> None:
+    for _ in range(2):  # the first compiles, makes the plan and measures the processor, where nothing is remembered
+        done = subprocess.run([sys.executable, "-c", RUN, str(tmp_path / "out")], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    found = set(done.stdout.split())
+    assert "zonda.operators.maps.bin_map" in found
+    assert not found & HEAVY
