@@ -95,6 +95,7 @@ def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int 
     They have the image's pixel coordinates, with tick marks where ``axes`` has them, or are astropy's world axes of ``wcs``.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FixedFormatter, FixedLocator
 
     ny, nx = shape
     width, height = MAP_SIZE[0] - 1.05 - _BAR, MAP_SIZE[1] - _TOP - _BOTTOM
@@ -120,8 +121,10 @@ def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int 
             ax = placed(x, y, width, height, projection=wcs if hasattr(wcs, "wcs") else WCS(wcs, naxis=2))
         else:
             ax = placed(x, y, width, height)
-            ax.set_xticks(marks["bottom"].places, marks["bottom"].labels, fontsize=9)
-            ax.set_yticks(marks["left"].places, marks["left"].labels, fontsize=9)
+            for axis, edge in ((ax.xaxis, "bottom"), (ax.yaxis, "left")):
+                axis.set_major_locator(FixedLocator(marks[edge].places))
+                axis.set_major_formatter(FixedFormatter(marks[edge].labels))
+                axis.set_tick_params(labelsize=9)
             ax.plot(marks["top"].places, np.full(len(marks["top"].places), ny - 0.5), **_tick_style(2))
             ax.plot(np.full(len(marks["right"].places), nx - 0.5), marks["right"].places, **_tick_style(1))
         ax.bar_axes = placed(x + width + 0.1, _BOTTOM + (tall - bar) / 2, 0.2, bar)
