@@ -376,7 +376,7 @@ class Gram:
                 rest -= np.outer(u[self.use], v[samples])
             return float(np.einsum("dt,dt->", rest, rest))
 
-        return sum(self._each(work, self._tiles()))
+        return float(sum(self._each(work, self._tiles())))
 
     def _each(self, work: Callable[[Any], Any], items: list[Any]) -> list[Any]:
         """Results of ``work``, in order."""

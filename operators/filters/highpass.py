@@ -210,7 +210,7 @@ class HighpassPlan:
     @property
     def _columns(self) -> int:
         """Of s and c, with those that weigh nothing."""
-        return self.knots - 1 + self.weights.shape[1]
+        return self.knots - 1 + int(self.weights.shape[1])
 
     def _weights_as(self, kind: np.dtype[Any]) -> Floats:
         if kind not in self._weights:

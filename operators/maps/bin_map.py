@@ -98,6 +98,7 @@ class BinMap(Operator):
     _fwhm: float = PrivateAttr(0.0)
     _variance_unknown: bool = PrivateAttr(False)
     _middle: tuple[float, float] = PrivateAttr((0.0, 0.0))
+    _spare: list[Sums] = PrivateAttr(default_factory=list)
 
     @field_validator("nside")
     @classmethod
@@ -214,7 +215,7 @@ class BinMap(Operator):
         noise = weight**2 * variance
         alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
         good = (observation.flags == 0).astype(np.uint8)
-        return Binning(self._grid, self._grid.pointing(observation), good, weight, noise, alike)
+        return Binning(self._grid, self._grid.pointing(observation), good, weight, noise, alike, self._spare)
 
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, their total, two halves, the product; and the pointing, twice while it is laid out."""
@@ -332,6 +333,7 @@ class BinMap(Operator):
 
     def finalize(self, data: Data) -> None:
         """Turn the sums into ``data.products[data.product(product)]``, a `MapProduct`."""
+        self._spare.clear()
         halves = data.products.pop(data.product(f"{self.label} sums"), None)
         if halves is None:
             return
@@ -373,7 +375,7 @@ class BinMap(Operator):
                 half = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
         unit = self._variance if self.weights == "inverse_variance" else 1.0
         shape = grid.shape if isinstance(grid, TangentGrid) else (grid.n_pixels,)
-        arrays = [signal, hits, weight / unit, noise] + ([half] if half is not None else [])
+        arrays: list[NDArray[Any]] = [signal, hits, weight / unit, noise] + ([half] if half is not None else [])
         keep = slice(None) if isinstance(grid, TangentGrid) else hits > 0
         arrays = [a[keep].reshape(shape if isinstance(grid, TangentGrid) else -1) for a in arrays]
         common: dict[str, Any] = {

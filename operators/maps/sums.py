@@ -67,6 +67,8 @@ class Binning:
         All detectors weigh the same: the sums of weights and noise follow from the hits.
     not_finite, kept_out
         (n, 3) detector, first sample, end: what was not finite, in several arrays; what the main run dropped for that reason.
+    spare
+        Arrays of zeros that served the scans before: touching fresh memory costs more than the sums.
     """
 
     grid: Grid
@@ -75,6 +77,7 @@ class Binning:
     weight: Floats
     noise: Floats
     alike: bool
+    spare: list[Sums] = field(default_factory=list)
     parts: dict[int, tuple[Sums, Sums, Floats]] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
     not_finite: list[NDArray[np.int64]] = field(default_factory=list)
@@ -108,11 +111,20 @@ class Binning:
         mine = threading.get_ident()
         with self.lock:
             if mine not in self.parts:
-                n = self.grid.n_pixels + 1
-                if isinstance(self.grid, TangentGrid):
-                    n = (self.grid.shape[0] + 2) * (self.grid.shape[1] + 2)
-                self.parts[mine] = np.zeros((n, 2 if self.alike else 4), np.int64), np.zeros(4, np.int64), np.zeros(4)
+                self.parts[mine] = self._zeros(), np.zeros(4, np.int64), np.zeros(4)
             return self.parts[mine]
+
+    def _zeros(self) -> Sums:
+        n = self.grid.n_pixels + 1
+        if isinstance(self.grid, TangentGrid):
+            n = (self.grid.shape[0] + 2) * (self.grid.shape[1] + 2)
+        shape = n, 2 if self.alike else 4
+        try:
+            while (sums := self.spare.pop()).shape != shape:
+                pass
+        except IndexError:
+            return np.zeros(shape, np.int64)
+        return sums
 
     def fold(self, half: Sums) -> tuple[int, int, Sums, Floats]:
         """Add all threads' sums to ``half`` (n_pixels, 4): (samples binned, most in a pixel, dropped (4,), largest (4,))."""
@@ -125,6 +137,7 @@ class Binning:
             dropped += part_dropped
             dropped[OUTSIDE] += outside
             largest = np.maximum(largest, part_largest)
+            self.spare.append(sums)
         self.parts.clear()
         return inside, deepest, dropped, largest
 
@@ -149,7 +162,7 @@ class Halves:
 
     def total(self) -> Sums:
         """Both halves together, (n_pixels, 4)."""
-        return self.sums[0] + self.sums[1] if len(self.scans) > 1 else self.sums[0]
+        return np.asarray(self.sums[: len(self.scans)].sum(axis=0) if len(self.scans) > 1 else self.sums[0], np.int64)
 
     def packed(self) -> dict[str, Any]:
         """As plain values and arrays: numbers of the pixels with hits, and their sums."""
@@ -360,7 +373,7 @@ def _scatter(flat, columns, cells, rows, units):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _fold(sums, ny, nx, weight, noise, out):  # type: ignore[no-untyped-def]
-    """Add a thread's sums to ``out`` (n_pixels, 4): hits inside, on the border, and the most in a pixel. ``ny``: 0 for a list.
+    """Move a thread's sums to ``out`` (n_pixels, 4): hits inside, on the border, and the most in a pixel. ``ny``: 0 for a list.
 
     ``weight``, ``noise``: of every sample, where ``sums`` has two columns.
     """
@@ -376,6 +389,7 @@ def _fold(sums, ny, nx, weight, noise, out):  # type: ignore[no-untyped-def]
                 to = (y - 1) * nx + x - 1
             if border:
                 outside += hits
+                sums[at] = 0
                 continue
             inside += hits
             out[to, DATA] += sums[at, DATA]
@@ -383,4 +397,5 @@ def _fold(sums, ny, nx, weight, noise, out):  # type: ignore[no-untyped-def]
             most = max(most, out[to, HITS])
             out[to, WEIGHTS] += sums[at, WEIGHTS] if sums.shape[1] == 4 else hits * weight
             out[to, NOISE] += sums[at, NOISE] if sums.shape[1] == 4 else hits * noise
+            sums[at] = 0
     return inside, outside, most

@@ -44,6 +44,22 @@ def test_equals_the_full_brick_wall(n):
     assert np.std(filtered(x.astype(np.float32)) - expected) < 1e-6 * x.std() + 6e-8 * np.abs(x).max()
 
 
+@pytest.mark.parametrize(("n", "frequency", "taps"), [(20011, 0.08 / 100, 5), (20011, 0.5 / 225, 5), (6007, 0.5 / 110, 6)])
+def test_rows_side_by_side_and_close_knots(n, frequency, taps):
+    """35 rows: two tiles and a rest; knots 104, 18.7 and 9.1 samples apart; alone or beside others a row has the same bits."""
+    x = np.cumsum(np.random.default_rng(3).normal(0, 1.0, (35, n)), axis=1)
+    plan = plan_highpass(n, frequency, 3, 24.0)
+    assert plan.weights.shape[1] == taps
+    expected = brick_wall(x, plan.cut, 3)
+    for kind, rounding in ((np.float64, 0.0), (np.float32, 6e-8 * np.abs(x).max())):
+        together = x.astype(kind)
+        plan.apply(together)
+        assert np.std(together - expected) < 2e-6 * x.std() + rounding
+        alone = x[20:21].astype(kind)
+        plan.apply(alone)
+        np.testing.assert_array_equal(alone[0], together[20])
+
+
 def test_oversampling_buys_accuracy():
     rng = np.random.default_rng(1)
     x = rng.standard_normal(30000)

@@ -99,6 +99,47 @@ def test_outside_flagged_and_nan_are_dropped_and_counted(bench):
     assert whole.tally["BinMap", "samples dropped: outside the map"] == "0"
 
 
+@pytest.mark.parametrize("how", [{"width": "1 arcmin"}, {"nside": 4096}])
+@pytest.mark.parametrize("weights", ["uniform", "inverse_variance"])
+def test_what_is_dropped_is_counted_once_whatever_else_is_wrong_with_it(bench, how, weights):
+    """Outside and not finite or too large, flagged and too large; 9 detectors (a rest beside groups of four), unequal NETs."""
+    a, observation, whole = np.full((9, N), 0.5), bench.observation(9, N), bench.observation(9, N)
+    for o in (observation, whole):
+        o.focalplane.net[:] = np.linspace(1e-3, 3e-3, 9)
+    clean = bench.run([BinMap(weights=weights, **how)], whole, {"signal": a})
+    a[:, 500:520] = np.nan
+    a[5, 1000:1010] = -np.inf
+    observation.flags[1005:1020] = 1
+    a[:, 1005:1020] = 1e20
+    result = bench.run([BinMap(weights=weights, **how)], observation, {"signal": a})
+    count = {what: int(v) for (who, what), v in result.tally.items() if who == "BinMap" and what.startswith("samples")}
+    assert count["samples dropped: flagged"] == 9 * 15
+    assert count["samples dropped: not finite"] == 9 * 20 + 5
+    assert sum(count.values()) == 9 * N
+    assert result.map.hits.sum() == count["samples binned"]
+    lost = clean.map.hits.sum() - result.map.hits.sum()
+    assert 0 <= lost <= 9 * 35 + 5
+    if "nside" in how:
+        assert lost == 9 * 35 + 5
+    np.testing.assert_allclose(result.map.signal[result.map.hits > 0], 0.5, rtol=1e-9)  # rounded weights, 2^-31 of the smallest
+
+
+def test_behind_the_image_is_outside(bench):
+    """The image's antipode: its homographies have positive numerators there too."""
+    there = BinMap(width="1 deg", height="1 deg", pixel="1 arcmin", centre="255 deg -20 deg")
+    result = bench.run([there], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))})
+    assert result.map.hits.sum() == 0
+    assert result.tally["BinMap", "samples dropped: outside the map"] == str(N_DET * N)
+
+
+def test_scans_of_the_next_thread_and_pass_begin_with_empty_sums(bench):
+    """The arrays of one scan's sums serve the next."""
+    step = BinMap(width="1 arcmin")
+    once = bench.run([step], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))}).map
+    again = bench.run([step], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))}).map
+    np.testing.assert_array_equal(once.hits, again.hits)
+
+
 def test_nothing_is_piled_into_the_edge(bench):
     """A small map equals the middle of a large one (centre off the scan's, so that no sample lies on a pixel's corner)."""
     maps = [
