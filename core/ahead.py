@@ -1,4 +1,4 @@
-"""Prepares the next observation on a thread of its own while one is executed.
+"""Prepares the next observation, or the first one of the next run, on a thread of its own while one is executed.
 
 `Operator.prepare` is mostly Python on one thread; the blocks of the observation before it keep the others busy meanwhile. Nothing
 depends on it: an observation's preparation reads and writes what belongs to that observation. Only operators that say so

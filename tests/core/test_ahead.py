@@ -184,6 +184,53 @@ def test_who_listens_hears_one_observation_after_the_other(scene, log):
     assert {log.threads["prepare", k] for k in range(3)} == {"MainThread"}
 
 
+class Draws(Operator):
+    """Where told to, the last scan of the first run waits until the first scan of the second is prepared."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"white"})
+    prepares_ahead: ClassVar[bool] = True
+    prepared: ClassVar[list[tuple[int, str]]] = []
+    fourth: ClassVar[threading.Event | None] = None
+
+    def prepare(self, observation):
+        self.prepared.append((observation.index, threading.current_thread().name))
+        if len(self.prepared) == 4 and self.fourth:
+            self.fourth.set()
+        observation.tally.count(self.label, "prepared", 1)
+        return observation.index + 1
+
+    def exec(self, block, state):
+        if self.fourth and len(self.prepared) >= 3 and block.observation.index == 2:
+            assert self.fourth.wait(WAIT)
+        block.new("white")[...] = state
+
+
+class Signal(Operator):
+    """Passes it on."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"white"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        block.new("signal")[...] = block.detdata["white"]
+
+
+def test_the_first_scan_of_the_next_run_is_prepared_beside_the_last_of_this_one(scene, monkeypatch):
+    pipeline = Pipeline([Point(), Draws(), Signal(), Total()], runs={"again": {"only": ["white"]}})
+    tallies = []
+    for threads in (1, 2):
+        monkeypatch.setattr(Draws, "prepared", [])
+        monkeypatch.setattr(Draws, "fourth", threading.Event() if threads > 1 else None)
+        data = pipeline.run(scene, threads=threads)
+        assert [k for k, _ in Draws.prepared] == [0, 1, 2] * 2
+        assert all(name.startswith("ahead") == (threads > 1) for _, name in Draws.prepared[1:])
+        for run in ("", "again/"):
+            assert [float(t.mean()) for t in data.products[f"{run}total"]] == [1, 2, 3]
+            assert data.tally.get(f"{run}Draws", "prepared") == 3
+        tallies.append([row for row in data.tally if row[1] != "thread"])
+    assert tallies[0] == tallies[1]
+
+
 class Overrides(Maker):
     """Has another `prepare` than the class that said it was safe."""
 
