@@ -24,9 +24,10 @@ KERNELS = (
     "zonda.core.smooth _evaluate f4:2C i8 f4:2C i8 f4:2C",
     "zonda.operators.noise.white _add_normals u4:1C i8 i8 f4:2C i8 f4:2C b1 f4:2C",
     "zonda.operators.optics.efficiency _calibrate f4:2C f4:2C f4:2C f4:2C f4:2C i8 f4:2C f4:2C f4:2C f4:2C f4:2C b1 f4:2C",
-    "zonda.operators.filters.highpass _spread f4:2C i8:1C f4:2C f8:2C",
-    "zonda.operators.filters.highpass _subtract f4:2C i8:1C f4:2C f4:2C",
+    "zonda.operators.filters.highpass _spread f4:2C i8:1C f4:3C f8:2C",
+    "zonda.operators.filters.highpass _subtract f4:2C i8:1C f4:3C f4:2C",
     "zonda.operators.filters.common_mode _products f4:2C i8 i8 f8:1C i8:1C f8:1C b1 f8:3C",
     "zonda.operators.filters.common_mode _remove f4:2C f8:1C f8:1C",
-    "zonda.operators.maps.bin_map _add_image f4:2C f8:2C i8 f8:1C f8:1C i8 i8 b1:1C u1:1C f8:1C f8:1C b1 b1 f8 i8:2C i8:1C f8:1C",
+    "zonda.operators.maps.sums add_image f4:2C f8:2C i8 f8:1C f8:1C i8 i8 b1:1C u1:1C f8:1C f8:1C b1 f8 i8:2C i8:1C f8:1C",
+    "zonda.operators.maps.sums _fold i8:2C i8 i8 i8 i8 i8:2C",
 )

@@ -122,7 +122,7 @@ def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int 
         else:
             ax = placed(x, y, width, height)
             for axis, edge in ((ax.xaxis, "bottom"), (ax.yaxis, "left")):
-                axis.set_major_locator(FixedLocator(marks[edge].places))
+                axis.set_major_locator(FixedLocator(marks[edge].places.tolist()))
                 axis.set_major_formatter(FixedFormatter(marks[edge].labels))
                 axis.set_tick_params(labelsize=9)
             ax.plot(marks["top"].places, np.full(len(marks["top"].places), ny - 0.5), **_tick_style(2))
