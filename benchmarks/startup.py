@@ -80,7 +80,7 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
 
 
 def listen(compiled: list[Any]) -> None:
-    """Note every kernel of zonda that is compiled or loaded: module, name, types, own CPU seconds, whether within another."""
+    """Note every kernel of zonda that is compiled: module, name, types, CPU seconds (own, all), whether within another."""
     import numba.core.event as events
 
     from zonda.core.compile_ahead import text_of
@@ -100,7 +100,7 @@ def listen(compiled: list[Any]) -> None:
             function = event.data["dispatcher"].py_func
             if function.__module__.startswith("zonda."):
                 types = [text_of(t) for t in event.data["args"]]
-                compiled.append([function.__module__, function.__name__, types, took - inside, bool(self.open)])
+                compiled.append([function.__module__, function.__name__, types, took - inside, took, bool(self.open)])
 
     events.register("numba:compile", Listener())
 
@@ -121,7 +121,7 @@ def child(folder: Path, caches: Path, pipeline: str, kernels: bool = False) -> d
 
 
 def write(rows: list[list[str]]) -> None:
-    """core/kernels.py: its docstring, and ``rows`` (module, name, types)."""
+    """core/kernels.py: its docstring, and ``rows`` (seconds, module, name, types)."""
     path = Path(__file__).parents[1] / "core" / "kernels.py"
     head = path.read_text().partition("KERNELS")[0]
     lines = dict.fromkeys(f'    "{" ".join(row)}",' for row in rows)
@@ -157,9 +157,9 @@ def main() -> None:
         if options.kernels:
             os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # one processor: nothing is compiled elsewhere
             made = child(folder, Path(place, "caches"), options.pipeline, kernels=True)["compiled"]
-            rows = [[m, n, *t] for m, n, t, _, inside in made if not inside and None not in t]
+            rows = [[f"{all_in:.1f}", m, n, *t] for m, n, t, _, all_in, inside in made if not inside and None not in t]
             write(rows)
-            for module, name, types, seconds, _ in sorted(made, key=lambda row: -row[3]):
+            for module, name, types, seconds, *_ in sorted(made, key=lambda row: -row[3]):
                 print(f"{seconds:6.2f} s  {module}.{name} {', '.join(map(str, types))}")
             print(f"{sum(row[3] for row in made):6.2f} s of CPU time in all")
             return

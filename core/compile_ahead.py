@@ -1,8 +1,9 @@
 """The first run on a machine: a second process compiles the kernels that come last, while this one compiles as it needs them.
 
-`kernels` lists those of the shipped pipelines with the types of their arguments, in the order of their first use. The child works
-through it from the end; both find in the cache what the other has made (`kernel_cache`), so they meet in the middle. Whatever
-goes wrong there only means that this process compiles it. Later runs load the kernels in a thread while they point the telescope.
+`kernels` lists those of the shipped pipelines with the types of their arguments, in the order of their first use, and what each
+takes. The child begins with the second half, the dearest first; each finds in the cache what the other has made, and waits for
+what the other is making (`kernel_cache.share`). Whatever goes wrong there only means that this process compiles it. Later runs
+load the kernels in a thread while they point the telescope.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import os
 import re
 import subprocess
 import sys
+from bisect import bisect_right
 from contextlib import suppress
 from importlib import import_module
+from itertools import accumulate
 from threading import Event, Thread
 from typing import Any
 
-from . import user_cache
+from . import kernel_cache, user_cache
 from .compiled import cache_folder
 from .execution import available_threads
 from .pipeline import versions
@@ -52,6 +55,7 @@ class Helper:
             self._thread = Thread(target=compile_listed, args=(modules, False, self._enough), daemon=True)
             self._thread.start()
         else:
+            kernel_cache.share()
             with suppress(OSError):
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", _CHILD.format(path=sys.path)],
@@ -90,22 +94,31 @@ def serve() -> None:
         os._exit(0)
 
     Thread(target=leave_with_parent, daemon=True).start()
+    kernel_cache.share(polite=True)
     compile_listed(modules)
 
 
-def compile_listed(modules: list[str], last_first: bool = True, enough: Event | None = None) -> int:
+def compile_listed(modules: list[str], as_child: bool = True, enough: Event | None = None) -> int:
     """Compile or load the listed kernels of these modules until ``enough``; returns how many there were."""
     from .kernels import KERNELS
 
-    rows = [row for line in KERNELS if (row := line.split())[0] in modules]
+    rows = [row for line in KERNELS if (row := line.split())[1] in modules]
     done = 0
-    for module, name, *types in reversed(rows) if last_first else rows:
+    for _, module, name, *types in for_child(rows) if as_child else rows:
         if enough is not None and enough.is_set():
             break
         with suppress(Exception):  # a list of another version: what it lacks is compiled when it is used
             getattr(import_module(module), name).compile(tuple(map(type_of, types)))
             done += 1
     return done
+
+
+def for_child(rows: list[list[str]]) -> list[list[str]]:
+    """Rows that begin with seconds in the child's order: what ends in the second half of the time, the dearest first; then the
+    others from the end."""
+    ends = list(accumulate(float(row[0]) for row in rows))
+    first = bisect_right(ends, ends[-1] / 2) if ends else 0
+    return sorted(rows[first:], key=lambda row: -float(row[0])) + rows[:first][::-1]
 
 
 def text_of(kind: Any) -> str | None:

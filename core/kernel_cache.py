@@ -4,7 +4,8 @@ numba's own cache keeps an index beside numbered files. Two first runs at once m
 next run loads the wrong machine code; a truncated file ends the run with a traceback; and a kernel stays as it was compiled
 when a function of another module that it calls has changed. Here a file's name is a hash of all that its content depends on,
 its content is checked by a hash, and it is written under another name first. So files are written by any number of runs at
-once, damaged ones are compiled again, and nothing stale is ever loaded.
+once, damaged ones are compiled again, and nothing stale is ever loaded. Processes that share the work (`share`) compile no
+kernel twice: each locks the name of what it compiles, and who wants the same waits for it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import os
 import pickle
 import secrets
 import sys
+import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -31,6 +33,70 @@ from numba.core.serialize import dumps
 FORMAT = 1
 _DIGEST = 16
 SUFFIX = ".zkc"
+
+
+WAIT = 120.0
+"""Seconds [s] for which another process's kernel is waited for; then it is compiled here."""
+
+
+class Taken(Exception):
+    """Another process compiles this kernel now."""
+
+
+class _Claims:
+    """What this process compiles, if it shares the work: open, locked files by the path of the kernel."""
+
+    def __init__(self) -> None:
+        self.shared = self.polite = False
+        self.held: dict[Path, int] = {}
+
+    def take(self, path: Path) -> None:
+        """Claim a kernel, when the process that has it has done with it. Raises `Taken`.
+
+        No two wait for each other: a process holds a kernel and those that call it, and waits for one that these call.
+        """
+        try:
+            import fcntl
+
+            handle = os.open(_claim(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except (ImportError, OSError):
+            return
+        end = time.monotonic() + WAIT
+        while time.monotonic() < end:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self.held[path] = handle
+                return
+            except BlockingIOError:
+                if self.polite and not self.held:
+                    os.close(handle)
+                    raise Taken(path.name) from None
+                time.sleep(0.01)
+            except OSError:  # a file system without locks
+                break
+        os.close(handle)
+
+    def release(self, path: Path | None) -> None:
+        """Give up a claim, if there is one."""
+        if path in self.held:
+            with suppress(OSError):
+                _claim(path).unlink(missing_ok=True)
+            os.close(self.held.pop(path))
+
+
+def _claim(path: Path) -> Path:
+    return path.with_suffix(".claim")
+
+
+_CLAIMS = _Claims()
+
+
+def share(polite: bool = False) -> None:
+    """From now on compile nothing that another process that shares compiles at the same time: wait for it.
+
+    ``polite``: raise `Taken` instead where no other kernel needs it.
+    """
+    _CLAIMS.shared, _CLAIMS.polite = True, polite
 
 
 def install() -> None:
@@ -61,6 +127,16 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
         that only the addresses of the functions that count references: those of numba's other helpers are known from the
         beginning, but for ``hash`` and ``parallel=True``, which no kernel here uses.
         """
+        found = self._load(sig, target_context)
+        path = self._cache_file.asked
+        if found is None and _CLAIMS.shared and path is not None and path not in _CLAIMS.held:
+            _CLAIMS.take(path)
+            found = self._load(sig, target_context)  # made in the meantime?
+            if found is not None:
+                _CLAIMS.release(path)
+        return found
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
         try:
             rtsys.initialize(target_context)
             with self._guard_against_spurious_io_errors():
@@ -76,6 +152,9 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
             super().save_overload(sig, data)
         except OSError as error:
             warnings.warn(f"compiled code cannot be kept for the next run: {error.strerror or error}", stacklevel=2)
+        finally:
+            if _CLAIMS.held:
+                _CLAIMS.release(self._cache_file.path(self._index_key(sig, data.codegen)))
 
 
 class KernelFiles:
@@ -94,7 +173,8 @@ class KernelFiles:
     def __init__(self, folder: str, base: str, function: Any) -> None:
         self.folder, self.base, self.function = Path(folder), base, function
         self._meaning = b""
-        self._last: Path | None = None
+        self.asked: Path | None = None
+        """The file that was looked for last."""
 
     def path(self, key: Any) -> Path:
         """Of the file for ``key``: (signature, processor, hashes of the function)."""
@@ -105,7 +185,7 @@ class KernelFiles:
 
     def load(self, key: Any) -> Any:
         """What was kept under ``key``, or None."""
-        path = self._last = self.path(key)
+        path = self.asked = self.path(key)
         try:
             content = path.read_bytes()
         except OSError:
@@ -131,9 +211,9 @@ class KernelFiles:
     def give_up(self) -> None:
         """Remove the file that was asked for last, and say so."""
         warnings.warn("compiled code in the cache was damaged; it is compiled again", stacklevel=2)
-        if self._last is not None:
+        if self.asked is not None:
             with suppress(OSError):
-                self._last.unlink(missing_ok=True)
+                self.asked.unlink(missing_ok=True)
 
     def flush(self) -> None:
         """Remove all."""

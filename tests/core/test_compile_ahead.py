@@ -8,9 +8,9 @@ from numba import types
 from numba.core.dispatcher import Dispatcher
 
 from zonda.core import compile_ahead, kernels
-from zonda.core.compile_ahead import Helper, compile_listed, text_of, type_of
+from zonda.core.compile_ahead import Helper, compile_listed, for_child, text_of, type_of
 
-CHEAP = ("zonda.operators.maps.bin_map", "_scales", "f8", "f8", "b1")
+CHEAP = ("0.1", "zonda.operators.maps.sums", "_scales", "f8", "f8", "b1")
 
 
 @pytest.mark.parametrize(
@@ -44,27 +44,34 @@ def test_other_texts_are_no_types(text):
 
 def test_the_list_names_kernels():
     assert len(kernels.KERNELS) >= 20
-    for module, name, *listed in map(str.split, kernels.KERNELS):
+    for _, module, name, *listed in map(str.split, kernels.KERNELS):
         assert isinstance(getattr(import_module(module), name), Dispatcher), f"{module}.{name}"
         assert len(list(map(type_of, listed))) == getattr(import_module(module), name).py_func.__code__.co_argcount
 
 
+def test_the_second_process_begins_with_the_dearest_of_the_second_half():
+    rows = [[seconds, name] for seconds, name in zip("25143212", "abcdefgh", strict=True)]
+    assert "".join(name for _, name in for_child(rows)) == "defhgcba"
+    assert for_child([]) == []
+
+
 def test_listed_kernels_are_compiled_and_what_is_wrong_is_passed_over(monkeypatch):
-    wrong = [("zonda.no_module", "_scales"), (CHEAP[0], "no_kernel"), (CHEAP[0], CHEAP[1], "f8"), (CHEAP[0], CHEAP[1], "x8")]
+    wrong = [("0.3", "zonda.no_module", "_scales"), ("0.1", CHEAP[1], "no_kernel"), (*CHEAP[:3], "f8"), (*CHEAP[:3], "x8")]
     monkeypatch.setattr(kernels, "KERNELS", [" ".join(row) for row in (CHEAP, *wrong)])
     assert compile_listed(["zonda.elsewhere"]) == 0
     enough = Event()
-    assert compile_listed([CHEAP[0], "zonda.no_module"], False, enough) == 1
+    assert compile_listed([CHEAP[1], "zonda.no_module"], False, enough) == 1
     enough.set()
-    assert compile_listed([CHEAP[0], "zonda.no_module"], False, enough) == 0
-    assert compile_listed([CHEAP[0], "zonda.no_module"]) == 1
-    kernel = getattr(import_module(CHEAP[0]), CHEAP[1])
-    assert tuple(map(type_of, CHEAP[2:])) in kernel.overloads
+    assert compile_listed([CHEAP[1], "zonda.no_module"], False, enough) == 0
+    assert compile_listed([CHEAP[1], "zonda.no_module"]) == 1
+    kernel = getattr(import_module(CHEAP[1]), CHEAP[2])
+    assert tuple(map(type_of, CHEAP[3:])) in kernel.overloads
 
 
 def test_there_is_one_first_run(monkeypatch, tmp_path):
     monkeypatch.setenv("ZONDA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(compile_ahead, "available_threads", lambda: 2)
+    monkeypatch.setattr(compile_ahead.kernel_cache, "_CLAIMS", compile_ahead.kernel_cache._Claims())
     started = []
     monkeypatch.setattr(compile_ahead.subprocess, "Popen", lambda command, **options: started.append(command) or Process())
     for expected in (1, 2):  # the first failed
@@ -79,9 +86,9 @@ def test_there_is_one_first_run(monkeypatch, tmp_path):
     later = Helper()
     later.close()
     assert len(started) == 3
-    ((modules, last_first, enough),) = loaded
+    ((modules, as_child, enough),) = loaded
     assert "zonda.core.compile_ahead" in modules
-    assert not last_first
+    assert not as_child
     assert enough.is_set()
 
 

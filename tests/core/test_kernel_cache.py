@@ -137,6 +137,49 @@ def test_a_damaged_file_is_compiled_again(folder, monkeypatch, damage):
         assert (mended(2.0), hits(mended)) == (7.0, 1)
 
 
+def test_who_shares_waits_for_what_another_compiles(folder, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    monkeypatch.setattr(kernel_cache, "_CLAIMS", kernel_cache._Claims())
+    assert fresh(folder, monkeypatch)(2.0) == 7.0
+    made = {path: path.read_bytes() for path in kept(folder)}
+    for path in made:
+        path.unlink()
+    (outer,) = (path for path in made if "outer" in path.name)
+    handle = os.open(outer.with_suffix(".claim"), os.O_RDWR | os.O_CREAT)  # as another process does
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    kernel_cache.share(polite=True)
+    with pytest.raises(kernel_cache.Taken):
+        fresh(folder, monkeypatch)(2.0)
+    kernel_cache.share()
+
+    def done(seconds: float) -> None:
+        outer.write_bytes(made[outer])
+        os.close(handle)
+
+    monkeypatch.setattr(kernel_cache.time, "sleep", done)
+    kernel = fresh(folder, monkeypatch)
+    assert kernel(2.0) == 7.0
+    assert hits(kernel) == 1
+    assert kept(folder) == [outer]  # what it calls was not needed
+    assert fresh(folder, monkeypatch)(2) == 7
+    assert not kernel_cache._CLAIMS.held
+    assert not list(folder.rglob("*.claim"))
+
+
+def test_nobody_is_waited_for_without_end(folder, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    monkeypatch.setattr(kernel_cache, "_CLAIMS", kernel_cache._Claims())
+    monkeypatch.setattr(kernel_cache, "WAIT", 0.02)
+    assert fresh(folder, monkeypatch)(2.0) == 7.0
+    (outer,) = (path for path in kept(folder) if "outer" in path.name)
+    outer.unlink()
+    with open(outer.with_suffix(".claim"), "w") as claim:
+        fcntl.flock(claim, fcntl.LOCK_EX)
+        kernel_cache.share()
+        assert fresh(folder, monkeypatch)(2.0) == 7.0
+    assert outer in kept(folder)
+
+
 def test_a_change_in_a_called_kernel_counts(folder, monkeypatch):
     """numba looks at the file of the kernel alone, and would give 7 again."""
     assert fresh(folder, monkeypatch)(2.0) == 7.0
