@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from pydantic import Field, model_validator
 from . import ahead as preparation
 from .ahead import Ahead
 from .configuration.parameters import Parameters
-from .data import Data, Tally, html_table
+from .data import Data, Observation, Tally, html_table
 from .derived import Packed, derivable, derivation, subtract
 from .errors import PipelineError
 from .execution import Execution, Settings, Timer
@@ -529,8 +530,10 @@ class _Runs:
         """One run; what comes next is prepared meanwhile."""
         data, hooks = self._data, self._hooks
         for number, observation in enumerate(data.observations, 1):
-            execution = self._following or self._begin(run, number - 1)
-            self._following = self._begin(run, number) if number < len(data.observations) else self._next_run(run)
+            execution = self._following or self._begin(run, number - 1, observation)
+            observation = data.observations[number - 1] = execution.observation
+            last = number == len(data.observations)
+            self._following = self._next_run(run) if last else self._begin(run, number, data.observations[number])
             execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, self._ahead, self._following)
             data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             if not run:
@@ -544,15 +547,18 @@ class _Runs:
             observation.focalplane, observation.flags, observation.detector_flags = found
 
     def _next_run(self, run: str) -> Execution | None:
-        """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived."""
+        """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived.
+
+        A copy of it: until this run is finished, operators find there what this run left.
+        """
         order = self._pipeline.order
         later = order[order.index(run) + 1 :]
         if len(self._data.observations) < 2 or not later or later[0] in self._pipeline.derived:
             return None
-        return self._begin(later[0], 0)
+        return self._begin(later[0], 0, copy.copy(self._data.observations[0]))
 
-    def _begin(self, run: str, number: int) -> Execution:
-        observation, (focalplane, flags, detector_flags) = self._data.observations[number], self._pristine[number]
+    def _begin(self, run: str, number: int, observation: Observation) -> Execution:
+        focalplane, flags, detector_flags = self._pristine[number]
         before, observation.tally = observation.tally, Tally()
         if not run:
             observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
