@@ -363,7 +363,7 @@ class Pipeline:
         try:
             for run in self.order:
                 data.run = run
-                if not self._derive(run, data, kept):
+                if not self._derive(run, data, kept, make.kept_out):
                     make(run)
                 if run in self._parts():
                     kept[run] = self._packed(run, data)
@@ -399,12 +399,17 @@ class Pipeline:
                 found[operator.label] = packed
         return found
 
-    def _derive(self, run: str, data: Data, kept: Mapping[str, Packed]) -> bool:
-        """Make the partial products of a run from those of others; False where it must be simulated."""
+    def _derive(self, run: str, data: Data, kept: Mapping[str, Packed], kept_out: frozenset[str]) -> bool:
+        """Make the partial products of a run from those of others; False where it must be simulated.
+
+        ``kept_out``: labels of the steps that left out single samples of the main run. One that cannot tell what others did with
+        them (no `Operator.subtract`) is not linear.
+        """
         if run not in self.derived:
             return False
         parts = self.derived[run]
-        found = subtract(self, run, kept[""], [kept[p] for p in parts])
+        unlike = [o for o in self._selected(run) if o.label in kept_out and type(o).subtract is Operator.subtract]
+        found = None if unlike else subtract(self, run, kept[""], [kept[p] for p in parts])
         if found is None:
             data.tally.state(run, "simulated", f"{derivation(parts)} would not do: their samples differ")
             return False
@@ -540,6 +545,11 @@ class _Runs:
                 self._main[number - 1] = observation.focalplane, observation.flags, observation.detector_flags
             if self._whole:
                 self._pipeline._meanwhile(data, "scan")
+
+    @property
+    def kept_out(self) -> frozenset[str]:
+        """Labels of the steps that left out single samples of the main run."""
+        return frozenset().union(*(found.kept_out for found in self._frozen if found))
 
     def leave_main(self) -> None:
         """Let observations carry what the main run left of detectors and flags."""

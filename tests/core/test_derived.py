@@ -109,6 +109,29 @@ def test_what_is_not_finite_in_the_main_run_is_left_out_of_all():
             assert np.array_equal(data.products[name].signal, again.products[name].signal, equal_nan=True)
 
 
+def test_where_a_filter_bridged_the_main_run_the_run_is_simulated():
+    """The high-pass bridges what is not finite, in the main run and in that of the noise; the sky has nothing to bridge."""
+
+    class Gaps(Operator):
+        """Holes of 20 samples in every 500 of the noise."""
+
+        optional: ClassVar[frozenset[str]] = frozenset({"white"})
+        provides: ClassVar[frozenset[str]] = frozenset({"white"})
+
+        def exec(self, block: Block, state: object) -> None:
+            where = np.arange(block.samples.start, block.samples.stop) % 500 < 20
+            (block.detdata["white"] if "white" in block.detdata else block.new("white"))[:, where] = np.nan
+
+    operators = steps(*FILTERS["high-pass"])
+    operators.insert(2, Gaps())
+    pipeline, data = observed(operators, BOTH)
+    assert pipeline.derived == {"rest": ("sky",)}
+    assert any(who == "rest" and what == "simulated" for who, what, _ in data.tally)
+    _, alone = observed(operators, {"rest": REST})
+    assert np.array_equal(data.products["rest/map"].signal, alone.products["rest/map"].signal, equal_nan=True)
+    assert np.array_equal(data.products["rest/map"].hits, data.products["map"].hits)
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_operators_find_what_their_run_left_of_every_scan(threads):
     """Also of the first, which is prepared for the next run while the last one is still executed."""
