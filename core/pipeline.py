@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from pydantic import Field, model_validator
 from . import ahead as preparation
 from .ahead import Ahead
 from .configuration.parameters import Parameters
-from .data import Data, Tally, html_table
+from .data import Data, Observation, Tally, html_table
 from .derived import Packed, derivable, derivation, subtract
 from .errors import PipelineError
 from .execution import Execution, Settings, Timer
@@ -362,7 +363,7 @@ class Pipeline:
         try:
             for run in self.order:
                 data.run = run
-                if not self._derive(run, data, kept):
+                if not self._derive(run, data, kept, make.kept_out):
                     make(run)
                 if run in self._parts():
                     kept[run] = self._packed(run, data)
@@ -398,12 +399,17 @@ class Pipeline:
                 found[operator.label] = packed
         return found
 
-    def _derive(self, run: str, data: Data, kept: Mapping[str, Packed]) -> bool:
-        """Make the partial products of a run from those of others; False where it must be simulated."""
+    def _derive(self, run: str, data: Data, kept: Mapping[str, Packed], kept_out: frozenset[str]) -> bool:
+        """Make the partial products of a run from those of others; False where it must be simulated.
+
+        ``kept_out``: labels of the steps that left out single samples of the main run. One that cannot tell what others did with
+        them (no `Operator.subtract`) is not linear.
+        """
         if run not in self.derived:
             return False
         parts = self.derived[run]
-        found = subtract(self, run, kept[""], [kept[p] for p in parts])
+        unlike = [o for o in self._selected(run) if o.label in kept_out and type(o).subtract is Operator.subtract]
+        found = None if unlike else subtract(self, run, kept[""], [kept[p] for p in parts])
         if found is None:
             data.tally.state(run, "simulated", f"{derivation(parts)} would not do: their samples differ")
             return False
@@ -529,8 +535,10 @@ class _Runs:
         """One run; what comes next is prepared meanwhile."""
         data, hooks = self._data, self._hooks
         for number, observation in enumerate(data.observations, 1):
-            execution = self._following or self._begin(run, number - 1)
-            self._following = self._begin(run, number) if number < len(data.observations) else self._next_run(run)
+            execution = self._following or self._begin(run, number - 1, observation)
+            observation = data.observations[number - 1] = execution.observation
+            last = number == len(data.observations)
+            self._following = self._next_run(run) if last else self._begin(run, number, data.observations[number])
             execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, self._ahead, self._following)
             data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             if not run:
@@ -538,21 +546,29 @@ class _Runs:
             if self._whole:
                 self._pipeline._meanwhile(data, "scan")
 
+    @property
+    def kept_out(self) -> frozenset[str]:
+        """Labels of the steps that left out single samples of the main run."""
+        return frozenset().union(*(found.kept_out for found in self._frozen if found))
+
     def leave_main(self) -> None:
         """Let observations carry what the main run left of detectors and flags."""
         for observation, found in zip(self._data.observations, self._main, strict=True):
             observation.focalplane, observation.flags, observation.detector_flags = found
 
     def _next_run(self, run: str) -> Execution | None:
-        """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived."""
+        """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived.
+
+        A copy of it: until this run is finished, operators find there what this run left.
+        """
         order = self._pipeline.order
         later = order[order.index(run) + 1 :]
         if len(self._data.observations) < 2 or not later or later[0] in self._pipeline.derived:
             return None
-        return self._begin(later[0], 0)
+        return self._begin(later[0], 0, copy.copy(self._data.observations[0]))
 
-    def _begin(self, run: str, number: int) -> Execution:
-        observation, (focalplane, flags, detector_flags) = self._data.observations[number], self._pristine[number]
+    def _begin(self, run: str, number: int, observation: Observation) -> Execution:
+        focalplane, flags, detector_flags = self._pristine[number]
         before, observation.tally = observation.tally, Tally()
         if not run:
             observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files

@@ -8,6 +8,7 @@ import linecache
 import re
 import sys
 import textwrap
+import tokenize
 from itertools import pairwise, takewhile
 from typing import Any
 
@@ -78,7 +79,7 @@ def _of_class(lines: list[str], name: str) -> dict[str, str]:
     for block in (_by_indentation, inspect.getblock):  # the second reads tokens: slow, and never wrong
         try:
             statement = ast.parse(textwrap.dedent("".join(block(lines)))).body[0]
-        except (SyntaxError, IndexError):
+        except (SyntaxError, IndexError, ValueError, tokenize.TokenError):  # the file has changed meanwhile
             continue
         if isinstance(statement, ast.ClassDef) and statement.name == name:
             found = {}

@@ -92,7 +92,8 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Pic
 
 def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int) -> list[Picture]:
     """Samples per pixel; ``samples`` in ``pixels`` in all."""
-    ax = plot_coverage(product.hits, product.sky)
+    (ax,) = map_axes(product.hits.shape, product.axes, product.header)
+    plot_coverage(product.hits, product.sky, ax=ax)
     return [Picture(file, "Coverage", f"{samples:,} samples in {pixels:,} pixels.", png_of(ax))]
 
 

@@ -44,6 +44,9 @@ Floats = NDArray[np.floating]
 FLAG_TRIM = 2
 """Bit set in ``flags`` at the trimmed ends."""
 
+SPOILT = "samples not finite"
+"""Count of samples that are left as they are."""
+
 SHORTEST_STEP = 8
 """Samples per coarse knot below which the full DCT is cheaper and is used instead."""
 
@@ -120,7 +123,11 @@ class HighpassFilter(Operator):
         block.means.pop("signal", None)
         plan, bad = state
         spoilt = plan.apply(block.detdata["signal"], bad)
-        block.observation.tally.count(self.label, "samples not finite", spoilt)
+        block.observation.tally.count(self.label, SPOILT, spoilt)
+
+    def keep_out(self, observation: Observation, state: tuple[HighpassPlan, NDArray[np.intp]]) -> bool | None:
+        """True where samples were not finite: they were bridged, which a run that has them would not do."""
+        return True if observation.tally.get(self.label, SPOILT) else None
 
 
 GROUP = 16

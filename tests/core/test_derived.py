@@ -109,6 +109,49 @@ def test_what_is_not_finite_in_the_main_run_is_left_out_of_all():
             assert np.array_equal(data.products[name].signal, again.products[name].signal, equal_nan=True)
 
 
+def test_where_a_filter_bridged_the_main_run_the_run_is_simulated():
+    """The high-pass bridges what is not finite, in the main run and in that of the noise; the sky has nothing to bridge."""
+
+    class Gaps(Operator):
+        """Holes of 20 samples in every 500 of the noise."""
+
+        optional: ClassVar[frozenset[str]] = frozenset({"white"})
+        provides: ClassVar[frozenset[str]] = frozenset({"white"})
+
+        def exec(self, block: Block, state: object) -> None:
+            where = np.arange(block.samples.start, block.samples.stop) % 500 < 20
+            (block.detdata["white"] if "white" in block.detdata else block.new("white"))[:, where] = np.nan
+
+    operators = steps(*FILTERS["high-pass"])
+    operators.insert(2, Gaps())
+    pipeline, data = observed(operators, BOTH)
+    assert pipeline.derived == {"rest": ("sky",)}
+    assert any(who == "rest" and what == "simulated" for who, what, _ in data.tally)
+    _, alone = observed(operators, {"rest": REST})
+    assert np.array_equal(data.products["rest/map"].signal, alone.products["rest/map"].signal, equal_nan=True)
+    assert np.array_equal(data.products["rest/map"].hits, data.products["map"].hits)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_operators_find_what_their_run_left_of_every_scan(threads):
+    """Also of the first, which is prepared for the next run while the last one is still executed."""
+    seen: dict[str, list[Any]] = {}
+
+    class Look(Operator):
+        requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+        only_tells: ClassVar[bool] = True
+
+        def finalize(self, data: Data) -> None:
+            seen[data.run] = [(int(np.count_nonzero(o.flags)), "atmosphere" in o.smooth) for o in data.observations]
+
+    _, data = observed(steps(FILTERS["modes"][0], Look()), BOTH, threads=threads)
+    trimmed = 2 * round(data.observations[0].sample_rate)
+    assert seen[""][0] == seen[""][1] == (trimmed, True)
+    assert seen["sky"] == seen["rest"] == [(trimmed, False)] * 2
+    assert [o.index for o in data.observations] == [0, 1]
+    assert [int(np.count_nonzero(o.flags)) for o in data.observations] == [trimmed] * 2
+
+
 def test_where_samples_differ_the_run_is_simulated(monkeypatch):
     """Without the main run's holes in it the run of the sky has more samples."""
     monkeypatch.setattr(zonda.BinMap, "leave_out", Operator.leave_out)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic._internal._docs_extraction import extract_docstrings_from_cls
 
 from zonda.core import registry
-from zonda.core.configuration.parameters import Parameters, described
+from zonda.core.configuration.parameters import Parameters, _of_class, described
 
 
 class Plain(Parameters):
@@ -83,6 +83,20 @@ def test_a_class_of_a_notebook_cell_is_read_and_one_without_source_has_none() ->
         module: dict[str, type[Parameters]] = {}
         exec(compile(text, name, "exec"), {"__name__": "cell"}, module)
         assert texts(module["Cell"]) == {"a": wanted}
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["class A(Parameters):\n", "    x: int = (\n"],
+        ["class A(Parameters):\n", '    """\n'],
+        ["x = 1\n"],
+        ["class A: '\0'\n"],
+        [],
+    ],
+)
+def test_a_file_that_was_changed_after_it_was_read_has_none(lines: list[str]) -> None:
+    assert _of_class(lines, "A") == {}
 
 
 @pytest.mark.parametrize("kind", [registry.operators, registry.mapmakers, registry.weather_sources])

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from zonda.operators.diagnostics.pictures import Style
+from zonda.operators.diagnostics.pictures import Style, draw_coverage
 from zonda.operators.diagnostics.plot_operators import _flat
 from zonda.operators.maps.grid import tangent_wcs
 from zonda.operators.maps.map_product import MapProduct
@@ -43,6 +43,14 @@ def test_the_stated_noise_is_that_of_the_map(product):
     flat = _flat("map", product, "half_difference").smoothed(9 * ARCSEC)
     there = product.smoothed(9 * ARCSEC).rms(30 * ARCSEC, of="half_difference")
     assert flat.central_rms("half_difference", 30 * ARCSEC) == pytest.approx(there, rel=1e-5)
+
+
+def test_the_coverage_of_a_map_with_a_pole_in_it_is_drawn(product):
+    from dataclasses import replace
+
+    header = tangent_wcs((1.3, np.pi / 2), 2 * ARCSEC, product.hits.shape).to_header()
+    flat = _flat("map", replace(product, header=header, centre=(1.3, np.pi / 2)), "signal")
+    assert draw_coverage("coverage", flat, 1, 1)[0].png.startswith(b"\x89PNG")
 
 
 def test_a_healpix_map_keeps_its_own_noise():
