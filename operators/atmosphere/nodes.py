@@ -21,6 +21,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,16 @@ from .covariance import mixture
 
 Floats = NDArray[np.float64]
 
+SPLINE_TABLE = Path(__file__).parent / "data" / "spline_error.npz"
+
 LARGEST_STEP = 2048
 """Samples; see `core.tiles`."""
 
 GRIDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 32, 40, 48, 64)
 _TRIED = 64
+
+_SERIES, _SERIES_TO = 7, 0.03
+"""Terms of the series of 1 - exp(-x), and up to which x: the next term is 1e-17 of the first."""
 
 
 @dataclass(frozen=True)
@@ -162,9 +168,22 @@ def differential_rms(xi: Floats, eta: Floats, layers: Sequence[LayerModel], stre
     total = 0.0
     for layer in layers:
         e, w = layer.gaussian()
-        gone = np.expm1(np.multiply.outer(-(layer.distance**2) / (4 * e), square)).sum(1)
-        total -= layer.amplitude**2 * float(gone @ w) * 2 / len(xi) ** 2
+        total += layer.amplitude**2 * float(_gone(layer.distance**2 / (4 * e), square) @ w) * 2 / len(xi) ** 2
     return float(np.sqrt(total))
+
+
+def _gone(nearness: Floats, square: Floats) -> Floats:
+    """Sums over the squared separations of 1 - exp(-nearness square), for each nearness; by its series where that is short."""
+    largest = float(square.max(initial=0.0))
+    near = nearness * largest > _SERIES_TO
+    out = np.zeros(len(nearness))
+    x, powers = nearness[~near] * largest, square / max(largest, 1e-300)
+    term, power = -np.ones(len(x)), np.ones(len(square))
+    for k in range(1, _SERIES + 1):
+        term, power = term * -x / k, power * powers
+        out[~near] += term * power.sum()
+    out[near] = -np.expm1(np.multiply.outer(-nearness[near], square)).sum(1)
+    return out
 
 
 def some(xi: Floats, eta: Floats, number: int = _TRIED) -> tuple[Floats, Floats]:
@@ -191,7 +210,10 @@ def choose_nodes(
         return _grid_error(x, y, some_xi, some_eta, layers, stretch)
 
     sizes = [n for n in GRIDS if n >= at_least and n * n < len(xi)]
-    place = bisect_left(sizes, True, key=lambda size: error(size) <= tolerance)
+    reach = 1
+    while reach < len(sizes) and error(sizes[reach - 1]) > tolerance:  # small grids cost little, and serve most often
+        reach *= 2
+    place = bisect_left(sizes, True, reach // 2, min(reach, len(sizes)), key=lambda size: error(size) <= tolerance)
     if place == len(sizes):
         return detectors_as_nodes(xi, eta), 0.0
     n = sizes[place]
@@ -200,6 +222,12 @@ def choose_nodes(
 
 @lru_cache(maxsize=1)
 def _spline_table() -> tuple[Floats, Floats]:
+    """(ln q, ln G(q)) of `spline_table`, as kept in the package."""
+    with np.load(SPLINE_TABLE) as kept:
+        return kept["log_q"], kept["log_g"]
+
+
+def spline_table() -> tuple[Floats, Floats]:
     """(ln q, ln G(q)) of equation (2) on 500 points of q, 0.01 to 1000."""
     q = np.geomspace(1e-2, 1e3, 500)
     u = np.linspace(-6, 6, 1201)  # w / q: the spectrum of exp(-q^2 n^2 / 4) is a Gaussian exp(-(w/q)^2)
@@ -252,6 +280,18 @@ def time_error(layers: Sequence[LayerModel], speeds: Sequence[Floats], deltas: S
     """
     parts = (layer_time_error(*one, dt) for one in zip(layers, speeds, deltas, strict=True))
     return math.sqrt(sum(parts))
+
+
+def time_error_within(
+    layers: Sequence[LayerModel], speeds: Sequence[Floats], deltas: Sequence[float], dt: float, allowed: float
+) -> bool:
+    """Whether `time_error` is at most ``allowed``; only as many layers are looked at as it takes to exceed it."""
+    total = 0.0
+    for one in zip(layers, speeds, deltas, strict=True):
+        total += layer_time_error(*one, dt)
+        if math.sqrt(total) > allowed:
+            return False
+    return True
 
 
 def layer_time_error(layer: LayerModel, speeds: Floats, delta: float, dt: float) -> float:

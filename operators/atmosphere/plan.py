@@ -26,6 +26,7 @@ from .nodes import (
     layer_time_error,
     some,
     time_error,
+    time_error_within,
     times_with_margin,
 )
 from .radiative_transfer import ELEVATION_MAX
@@ -126,9 +127,12 @@ def make_plan(
 
     late_allowed = tolerance * rms * (1.0 if nodes.shape else math.sqrt(2.0))
     mean_step = next(s for s in candidates if s == 1 or slope * path_errors(s)[1] <= allowed)
-    step, late = 1, 0.0
+    step, late, still = 1, 0.0, [0.0] * len(models)
     for candidate in candidates[:-1]:
-        late = time_error(models, speeds, path_errors(candidate)[0], candidate / observation.sample_rate)
+        dt = candidate / observation.sample_rate
+        if not time_error_within(models, speeds, still, dt, late_allowed):
+            continue  # even along an exact path
+        late = time_error(models, speeds, path_errors(candidate)[0], dt)
         if late <= late_allowed:
             step = candidate
             break

@@ -56,6 +56,11 @@ PREFILTER = 10
 
 _GRID = 96
 
+_NEGLIGIBLE = 40.0
+"""exp(-40) is 4e-18."""
+
+_stream_key = lru_cache(maxsize=1024)(stream_key)
+
 
 @dataclass(frozen=True)
 class Fidelity:
@@ -145,7 +150,7 @@ class Turbulence:
         else:
             self.levels = _levels(outer_scale, sigma, lattice, fidelity)
         self.spacing = self.levels[0].spacing
-        self._keys = [stream_key(seed, *names, "level", level.exponent) for level in self.levels]
+        self._keys = [_stream_key(seed, *names, "level", level.exponent) for level in self.levels]
         self._weights = _kriging(self.fidelity.taps, self.fidelity.resolution)
 
     @property
@@ -295,7 +300,10 @@ def _separable_kernel(e: Floats, w: Floats, spacing: float, radius: int) -> Fiel
     """The kernel whose power is the aliased spectrum sum w exp(-e k^2)."""
     k = 2 * np.pi * np.fft.rfftfreq(_GRID, spacing)  # the spectrum is even
     alias = 2 * np.pi / spacing * np.arange(-2, 3)
-    gauss = np.exp(-np.multiply.outer(e, np.add.outer(alias, k) ** 2)).sum(1)
+    square = np.add.outer(alias, k) ** 2
+    own, others = square[2].max(), square.min(1)
+    heard = others <= own + _NEGLIGIBLE / e.min()  # of the images, those that are not lost beside the wave itself
+    gauss = np.exp(-np.multiply.outer(e, square[heard])).sum(1)
     power = np.einsum("ka,kb->ab", gauss * w[:, None], gauss) / spacing**2  # not BLAS: the same bits for any number of threads
     turns = _cosines(radius)
     h = np.einsum("ra,ac->rc", turns, np.einsum("ab,cb->ac", np.sqrt(power), turns))

@@ -20,7 +20,9 @@ from zonda.operators.atmosphere.nodes import (
     lagrange,
     some,
     spline_error,
+    spline_table,
     time_error,
+    time_error_within,
 )
 
 RNG = np.random.default_rng(1)
@@ -72,6 +74,12 @@ def test_spline_error_falls_as_the_eighth_power() -> None:
     assert spline_error(np.array([0.0]))[0] < 1e-40
 
 
+def test_the_table_of_the_spline_error_is_what_its_equation_gives() -> None:
+    log_q, log_g = spline_table()
+    # Where q is small the integrand is a difference of numbers near 1: G >= 1e-23 there, of rounding 1e-32.
+    assert np.allclose(spline_error(np.exp(log_q)), np.exp(log_g), rtol=1e-6, atol=0.0)
+
+
 @pytest.mark.parametrize(("lattice", "error"), [(0.8, 1.2e-4), (0.6, 5e-5), (0.5, 2e-5)])
 def test_the_lattice_itself_is_fine_enough(lattice: float, error: float) -> None:
     # numerics.md section 3: rms 7e-6 to 3e-5 of the field at 0.5 to 0.7 sigma, per axis; here for both axes together.
@@ -88,6 +96,25 @@ def test_time_error_adds_path_and_speed() -> None:
     assert 0.01 < fast < 1.5
     # Across many sigma per step the samples are independent: error > the field itself.
     assert time_error(LAYERS, [np.full(1, 1e6)] * 2, [0.0, 0.0], 1.0) > 1
+
+
+def test_an_error_is_within_what_it_is_itself() -> None:
+    way = [np.full(3, 2.0)] * 2, [0.01, 0.02], 0.5
+    error = time_error(LAYERS, *way)
+    assert time_error_within(LAYERS, *way, error)
+    assert not time_error_within(LAYERS, *way, np.nextafter(error, 0.0))
+
+
+@pytest.mark.parametrize(("radius", "stretch"), [(1e-6, 1.0), (1e-3, 1.5), (0.02, 1.0), (0.3, 1.0)])
+def test_differences_of_near_detectors_are_those_of_far_ones(radius: float, stretch: float) -> None:
+    # By the definition, all exponentials taken; expm1 cancels nothing, so only rounding differs.
+    xi, eta = XI / 0.01 * radius, ETA / 0.01 * radius
+    square = np.subtract.outer(xi, xi) ** 2 + (stretch * np.subtract.outer(eta, eta)) ** 2
+    total = 0.0
+    for layer in LAYERS:
+        for e, w in zip(*layer.gaussian(), strict=True):
+            total -= layer.amplitude**2 * w * np.expm1(-(layer.distance**2) * square / (4 * e)).mean()
+    assert differential_rms(xi, eta, LAYERS, stretch) == pytest.approx(np.sqrt(total), rel=1e-12)
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
