@@ -191,6 +191,8 @@ def _plain(header: Any) -> dict[str, Any]:
 def _input(name: str, image: Image) -> tuple[Any, ...]:
     step = -(-max(image.values.shape) // LARGEST)
     values, axes, header = image.values[::step, ::step], SkyAxes.of(image.header), _plain(image.header)
+    if axes is not None and not axes.upright(image.values.shape):
+        axes = None  # drawn on astropy's, from the header
     if step > 1 and axes is not None:
         axes = axes.thinned(step)
     elif step > 1:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from zonda.operators.diagnostics.pictures import Style, draw_coverage
-from zonda.operators.diagnostics.plot_operators import _flat
+from zonda.operators.diagnostics.pictures import Style, draw_coverage, draw_input
+from zonda.operators.diagnostics.plot_operators import _flat, _input
 from zonda.operators.maps.grid import tangent_wcs
 from zonda.operators.maps.map_product import MapProduct
 
@@ -51,6 +53,12 @@ def test_the_coverage_of_a_map_with_a_pole_in_it_is_drawn(product):
     header = tangent_wcs((1.3, np.pi / 2), 2 * ARCSEC, product.hits.shape).to_header()
     flat = _flat("map", replace(product, header=header, centre=(1.3, np.pi / 2)), "signal")
     assert draw_coverage("coverage", flat, 1, 1)[0].png.startswith(b"\x89PNG")
+
+
+def test_an_input_with_a_pole_in_it_is_drawn():
+    wcs = tangent_wcs((1.3, np.pi / 2), 2 * ARCSEC, (30, 40))
+    image: Any = SimpleNamespace(values=np.ones((30, 40)), header=wcs.to_header(), wcs=wcs.astropy())
+    assert draw_input(*_input("input", image))[0].png.startswith(b"\x89PNG")
 
 
 def test_a_healpix_map_keeps_its_own_noise():
