@@ -11,8 +11,8 @@ from .configuration.parameters import Parameters
 from .knobs import Knob
 
 if TYPE_CHECKING:
+    from .companion import Companion
     from .data import Block, Data, Observation, Stream
-    from .pipeline import Companion
     from .plan.context import Context
     from .plan.estimate import Estimate, Traits
 

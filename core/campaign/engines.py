@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..errors import PipelineError
-from ..execution import available_memory, available_threads
+from ..machine import available_memory, available_threads
 from .settings import Engine, Tls
 
 SCHEDULER_FILE_WAIT = 20.0

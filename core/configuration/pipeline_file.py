@@ -14,9 +14,11 @@ from .. import registry
 from ..campaign.entries import missing_above
 from ..campaign.entries import mistakes as campaign_mistakes
 from ..campaign.settings import Campaign
+from ..companion import Companion
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
-from ..pipeline import Companion, Pipeline, check_order
+from ..order import check_order
+from ..pipeline import Pipeline
 from ..plan.budget import Limits
 from ..scene import Scene
 from ..weather import WeatherSource, resolve

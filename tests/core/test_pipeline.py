@@ -10,7 +10,8 @@ import zonda
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.pipeline import Pipeline, check_order
+from zonda.core.order import check_order
+from zonda.core.pipeline import Pipeline
 from zonda.core.random import normals
 
 
