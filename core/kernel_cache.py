@@ -19,18 +19,20 @@ import sys
 import time
 import warnings
 from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
 from types import CodeType, FunctionType
-from typing import Any
+from typing import Any, ClassVar
 
 import llvmlite
+import llvmlite.binding as ll
 import numba
 import numpy as np
-from numba.core import caching, dispatcher, environment
+from numba.core import caching, codegen, dispatcher, environment
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
-FORMAT = 1
+FORMAT = 2
 _DIGEST = 16
 SUFFIX = ".zkc"
 
@@ -113,8 +115,31 @@ def _cache_of(function: Any) -> Any:
     return caching.FunctionCache(function)
 
 
+class _TriedOnce:
+    """Finds the folder of a kernel as numba does, but tries only once whether a file can be made there."""
+
+    tried: ClassVar[set[str]] = set()
+
+    def ensure_cache_path(self) -> None:
+        path = self.get_cache_path()  # type: ignore[attr-defined]
+        if path not in self.tried:
+            super().ensure_cache_path()  # type: ignore[misc]
+            self.tried.add(path)
+
+    def get_source_stamp(self) -> None:
+        """Not needed here: numba's is a hash of the module's file."""
+
+
+class _Reduced(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes: ClassVar[list[Any]] = [
+        type(found.__name__, (_TriedOnce, found), {}) for found in caching.CompileResultCacheImpl._locator_classes
+    ]
+
+
 class KernelCache(caching.FunctionCache):  # type: ignore[misc]
     """Kept code of one kernel."""
+
+    _impl_class = _Reduced
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
@@ -146,6 +171,21 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
             self._cache_file.give_up()
             return None
 
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = self._cache_file.load(self._index_key(sig, target_context.codegen())) if self._enabled else None
+        if found is None:
+            return None
+        reduced, bitcode = found
+        made = self._impl.rebuild(target_context, reduced)
+        if bitcode is not None:
+            made.library._shared_module = None
+            made.library._get_module_for_linking = cache(partial(ll.parse_bitcode, bitcode))
+        return made
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        """Types and processor; numba's own also has the function's code, which `meaning` knows, and what it closes over."""
+        return super()._index_key(sig, codegen) if self._py_func.__closure__ else (sig, _processor(codegen))
+
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled kernel; where the disk is full or read-only it is compiled again next time."""
         try:
@@ -155,6 +195,30 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
         finally:
             if _CLAIMS.held:
                 _CLAIMS.release(self._cache_file.path(self._index_key(sig, data.codegen)))
+
+
+@cache
+def _processor(codegen: Any) -> Any:
+    return codegen.magic_tuple()
+
+
+def _without_bitcode(reduced: Any) -> Any:
+    """(``reduced``, bitcode) of a compiled kernel that numba has reduced to ``reduced``.
+
+    Its library is machine code, and LLVM's bitcode of the kernel and all that it calls, with which other kernels that call it are
+    compiled. numba reads both when it loads a kernel, to know the names in it: more than half of the time. In its place comes
+    bitcode of the names alone, of functions that do nothing, and the true one beside it. A numba whose inside has changed: as it
+    is, and None.
+    """
+    known = hasattr(codegen.CPUCodeLibrary, "_get_module_for_linking") and hasattr(codegen.CPUCodeLibrary, "_unserialize")
+    with suppress(AttributeError, TypeError, ValueError, RuntimeError):
+        (name, kind, (machine, bitcode)), description, *others = reduced
+        if known and kind == "object":
+            names = [getattr(description, f"llvm_{what}_name") for what in ("func", "cpython_wrapper", "cfunc_wrapper")]
+            defined = {f.name for f in ll.parse_bitcode(bitcode).functions if not f.is_declaration}
+            text = "".join(f'define void @"{function}"() {{ ret void }}\n' for function in names if function in defined)
+            return ((name, kind, (machine, ll.parse_assembly(text).as_bitcode())), description, *others), bitcode
+    return reduced, None
 
 
 class KernelFiles:
@@ -198,9 +262,10 @@ class KernelFiles:
 
     def save(self, key: Any, data: Any) -> None:
         """Keep ``data`` under ``key``: whole, or not at all. Raises OSError."""
-        path, body = self.path(key), dumps(data)
+        path, body = self.path(key), dumps(_without_bitcode(data))
         temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             temporary.write_bytes(hashlib.blake2b(body, digest_size=_DIGEST).digest() + body)
             os.replace(temporary, path)
         except BaseException:

@@ -85,6 +85,7 @@ def write(folder: Path, factor: float = 3.0) -> None:
 
 def fresh(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """`outer`, as a new process would have it."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python takes sources of the same second and size for the same
     for name in ("toy_inner", "toy_outer"):
         spec = importlib.util.spec_from_file_location(f"zonda.{name}", folder / f"{name}.py")
         assert spec is not None
@@ -109,6 +110,24 @@ def test_compiled_once(folder, monkeypatch):
     second = fresh(folder, monkeypatch)
     assert (second(2.0), hits(second)) == (7.0, 1)
     assert len(kept(folder, "outer")) == 1
+
+
+def test_a_kernel_is_compiled_with_a_kept_one(folder, monkeypatch):
+    """What is loaded at first is machine code alone; the bitcode of what a kernel calls is there when it is compiled."""
+    assert fresh(folder, monkeypatch)(2.0) == 7.0
+    for path in kept(folder, "outer"):
+        path.unlink()
+    outer = fresh(folder, monkeypatch)
+    inner = sys.modules["zonda.toy_inner"].inner
+    assert (inner(2.0), hits(inner)) == (6.0, 1)
+    (loaded,) = inner.overloads.values()
+    assert loaded.library._shared_module is None  # nothing was parsed to load it
+    assert (outer(2.0), hits(outer)) == (7.0, 0)
+    (made,) = outer.overloads.values()
+    declared = {f.name for f in made.library._final_module.functions if f.is_declaration}
+    assert loaded.fndesc.llvm_func_name not in declared  # linked, or inlined
+    again = fresh(folder, monkeypatch)
+    assert (again(2.0), hits(again)) == (7.0, 1)
 
 
 @pytest.mark.parametrize("damage", [b"", b"short", "half", "flipped", "pickle"])
