@@ -378,6 +378,8 @@ class Pipeline:
             ahead.close()
         data.run = ""
         make.leave_main()
+        if part is None:
+            self._meanwhile(data, "runs")
         for operator in self.operators:
             if operator.at_end and part is None:
                 data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
@@ -450,6 +452,7 @@ class Pipeline:
                 self._finalize(operator, data, timer, hooks)
             self._meanwhile(data, "run")
         data.run = ""
+        self._meanwhile(data, "runs")
         for operator in self.operators:
             if operator.at_end:
                 self._finalize(operator, data, timer, hooks)
@@ -474,7 +477,7 @@ class Pipeline:
             settings.memory, products = settings.memory - (size or 0), products + (size or 0)
         settings.ceiling = budget - products
 
-    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
+    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         for operator in self.operators:
             if operator.at_end:
                 operator.meanwhile(data, done)
