@@ -16,6 +16,7 @@ from pydantic import Field, PrivateAttr
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
+from zonda.core.early import take
 from zonda.core.files import atomic_path, product_path
 from zonda.core.operator import Operator
 from zonda.operators.io.map_view import MapView, maps_of, noise_sources
@@ -82,7 +83,7 @@ class Plots(Operator):
         self._begun = {}
         if self._artist is None and data.threads > 1:
             with suppress(OSError):
-                self._artist = Artist()
+                self._artist = take(Artist)
 
     def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         """Begin with the pictures of what will not change any more."""
