@@ -1,8 +1,9 @@
 """Processes that steps want, started before anything of the pipeline file but its text is looked at.
 
-A step names a function in the entry-point group ``zonda.processes`` under its own name; what the function returns has ``close()``.
-It is called where a pipeline file seems to have that step and there is a second processor, and imports next to nothing: the process
-makes itself ready while this one imports, reads and plans. The step asks for it with `take`; what nobody took is closed.
+A step names a function in the entry-point group ``zonda.processes`` under its own name; what the function returns has
+``close()``. It is called where a pipeline file seems to have that step and there is a second processor, and imports next to
+nothing: the process makes itself ready while this one imports, reads and plans. The step asks for it with `take`; what nobody
+took is closed.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class Process(Protocol):
 
 P = TypeVar("P", bound=Process)
 
-_waiting: dict[Callable[[], Any], Process] = {}
+_waiting: dict[Callable[[], Any], Any] = {}
 
 
 def begin(path_or_name: str) -> None:
@@ -45,7 +46,7 @@ def begin(path_or_name: str) -> None:
 
 def take(start: Callable[[], P]) -> P:
     """What ``start`` returned when it was called by `begin`, or returns now; the caller closes it."""
-    return _waiting.pop(start, None) or start()  # type: ignore[return-value]
+    return _waiting.pop(start) if start in _waiting else start()
 
 
 def end() -> None:
