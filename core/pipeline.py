@@ -199,6 +199,8 @@ class Pipeline:
             ahead.close()
         data.run = ""
         simulation.leave_main()
+        if part is None:
+            self._meanwhile(data, "runs")
         for operator in self.operators:
             if operator.at_end and part is None:
                 data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
@@ -238,13 +240,14 @@ class Pipeline:
                 self._finalize(operator, data, timer, hooks)
             self._meanwhile(data, "run")
         data.run = ""
+        self._meanwhile(data, "runs")
         for operator in self.operators:
             if operator.at_end:
                 self._finalize(operator, data, timer, hooks)
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 
-    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
+    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         for operator in self.operators:
             if operator.at_end:
                 operator.meanwhile(data, done)
