@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,6 +15,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
 from zonda.core.files import atomic_path, check_output_folder, product_path
+from zonda.core.fits_image import Cards, image_bytes
 from zonda.core.operator import Operator
 
 from .map_view import MapView, NoiseFigure, maps_of, noise_figures, noise_sources
@@ -126,34 +128,42 @@ def write_map(
 
     ``tables``: `provenance_tables`, where several maps have the same.
     """
-    from astropy.io import fits
-
-    hdus = _healpix_hdus(view) if view.is_healpix else _image_hdus(view)
-    main = hdus[1 if view.is_healpix else 0].header
-    for header in {id(h): h for h in (hdus[0].header, main)}.values():
-        add_provenance(header, view, data)
-    for keyword, (value, comment) in (cards or {}).items():
-        main[keyword] = (value, comment)
+    write = _write_healpix if view.is_healpix else _write_images
     with atomic_path(path) as temporary:
-        fits.HDUList(hdus).writeto(temporary, output_verify="exception")
+        write(temporary, view, data, cards or {})
         with open(temporary, "ab") as file:
             file.write(provenance_tables(data) if tables is None else tables)
     return path
 
 
-def _image_hdus(view: MapView) -> list[Any]:
+def _write_images(path: Path, view: MapView, data: Data, cards: dict[str, tuple[float | None, str]]) -> None:
+    world = (tangent.plain(view.header) or view.wcs).to_header(relax=True)
+    with open(path, "wb") as file:
+        for k, (name, plane) in enumerate(view.planes.items()):
+            header = Cards((key, world[key], world.comments[key]) for key in world if key not in ("", "COMMENT", "HISTORY"))
+            header["EXTNAME"] = (name.upper(), "extension name")
+            _describe(header, name, view.units.get(name, ""))
+            if name not in ("hits", "weights"):
+                _add(header, _beam(view))
+            if k == 0:
+                add_provenance(header, view, data)
+                _add(header, cards)
+            file.write(image_bytes(header, _stored(name, plane), extension=k > 0))
+
+
+def _write_healpix(path: Path, view: MapView, data: Data, cards: dict[str, tuple[float | None, str]]) -> None:
     from astropy.io import fits
 
-    world = (tangent.plain(view.header) or view.wcs).to_header(relax=True)
-    hdus: list[Any] = []
-    for name, plane in view.planes.items():
-        make = fits.ImageHDU if hdus else fits.PrimaryHDU
-        hdu = make(_stored(name, plane), header=world)
-        hdu.name = name.upper()
-        _describe(hdu.header, name, view.units.get(name, ""))
-        hdu.header.update({k: v for k, v in _beam(view).items() if name not in ("hits", "weights")})
-        hdus.append(hdu)
-    return hdus
+    hdus = _healpix_hdus(view)
+    for hdu in hdus:
+        add_provenance(hdu.header, view, data)
+    _add(hdus[1].header, cards)
+    fits.HDUList(hdus).writeto(path, output_verify="exception")
+
+
+def _add(header: Any, cards: Mapping[str, tuple[Any, str]]) -> None:
+    for keyword, card in cards.items():
+        header[keyword] = card
 
 
 def _stored(name: str, plane: Any) -> Any:
@@ -196,7 +206,7 @@ def _healpix_hdus(view: MapView) -> list[Any]:
     header["INDXSCHM"] = ("EXPLICIT", "pixel numbers are in the column PIXEL")
     header["OBJECT"] = ("PARTIAL", "not all of the sky")
     header["TEMPSCAL"] = ("K_RJ", "temperature scale: Rayleigh-Jeans brightness")
-    header.update(_beam(view))
+    _add(header, _beam(view))
     return [fits.PrimaryHDU(), table]
 
 
@@ -243,13 +253,11 @@ def provenance_tables(data: Data) -> bytes:
 
 
 def _text_table(name: str, columns: dict[str, list[str]]) -> bytes:
-    """FITS 4.0, section 7.3. astropy's tables take 0.1 s to import, and as long to write."""
-    from astropy.io.fits import Header
-
+    """FITS 4.0, section 7.3; see `core.fits_image` for why not astropy."""
     plain = {title: [ascii_text(t) for t in texts] for title, texts in columns.items()}
     widths = {title: max([1, *map(len, texts)]) for title, texts in plain.items()}
     rows = list(zip(*([t.ljust(widths[title], "\0") for t in texts] for title, texts in plain.items()), strict=True))
-    header = Header([("XTENSION", "BINTABLE", "binary table extension"), ("BITPIX", 8), ("NAXIS", 2)])
+    header = Cards([("XTENSION", "BINTABLE", "binary table extension"), ("BITPIX", 8), ("NAXIS", 2)])
     sizes = {"NAXIS1": sum(widths.values()), "NAXIS2": len(rows), "PCOUNT": 0, "GCOUNT": 1, "TFIELDS": len(plain)}
     for key, size in sizes.items():
         header[key] = size

@@ -11,6 +11,8 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import OutputError, PipelineError
+from zonda.core.fits_image import image_bytes
+from zonda.operators.io import save_map
 from zonda.operators.io.save_map import SaveMap
 from zonda.operators.maps.map_product import MapProduct
 
@@ -207,12 +209,15 @@ def test_a_failure_in_the_middle_leaves_the_old_file(run, data, monkeypatch, err
     run(map=wcs_map(20, 20))
     before = (data.output / "map.fits").read_bytes()
 
-    def half(self, name, **_):
-        with open(name, "wb") as file:
-            file.write(b"SIMPLE")
-        raise error
+    written = []
 
-    monkeypatch.setattr(fits.HDUList, "writeto", half)
+    def half(*arguments, **named):
+        if written:
+            raise error
+        written.append(image_bytes(*arguments, **named))
+        return written[0]
+
+    monkeypatch.setattr(save_map, "image_bytes", half)
     expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else OutputError
     with pytest.raises(expected):
         SaveMap().finalize(data)
