@@ -144,7 +144,8 @@ def test_what_is_read_at_all(file: Path) -> None:
     [
         ["BSCALE  = 1.0"], ["BZERO   = 0"], ["BLANK   = -1"], ["GROUPS  = T"], ["PCOUNT  = 0"], ["KEY     = 1", "KEY     = 1"],
         ["KEY     = 'a&'", "CONTINUE  'b'"], ["HIERARCH A B = 1"], ["key     = 1"], ["KEY     = 1D3"], ["NAXIS3  = 1"],
-        ["OBJECT  = 'AXIS.1: 2'"], ["KEY     ="], ["KEY     = 'it''s'"], ["KEY     = '' / '"], ["COMMENT \xe9"], ["XTENSION= 'IMAGE   '"],
+        ["OBJECT  = 'AXIS.1: 2'"], ["KEY     ="], ["KEY     = 'it''s'"], ["KEY     = '' / '"], ["COMMENT \xe9"],
+        ["XTENSION= 'IMAGE   '"],
     ],
 )  # fmt: skip
 def test_what_is_left_to_astropy(file: Path, cards: list[str]) -> None:
