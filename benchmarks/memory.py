@@ -83,8 +83,8 @@ def scene(instrument):
 def one(name, budget, threads):
     """Predicted and actual memory of one case, as JSON."""
     from zonda.core.errors import PipelineError
-    from zonda.core.execution import Settings
     from zonda.core.forecast import forecast, room
+    from zonda.core.settings import Settings
 
     case = SCENES[name]
     pipeline, where = chain(case["scan_duration"], case.get("method", "mean")), scene(case["instrument"])

@@ -15,10 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from .data import Observation
+from .forecast import forecast
 from .operator import Operator
+from .settings import Settings
 
 if TYPE_CHECKING:
-    from .execution import Execution, Settings
+    from .execution import Execution
 
 
 def ready(operator: Operator) -> bool:
@@ -47,8 +49,6 @@ def memory(operators: Sequence[Operator], observations: Sequence[Observation]) -
 
 def affordable(operators: Sequence[Operator], observations: Sequence[Observation], settings: Settings) -> int | None:
     """`memory`, where streams and blocks do the same without it; None where it would take room that they need."""
-    from .forecast import forecast
-
     size = memory(operators, observations)
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
     less = dataclasses.replace(settings, memory=settings.memory - size)

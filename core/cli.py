@@ -216,13 +216,18 @@ def run(
     What its outputs do not depend on is left out, and effects are dropped or coarsened while the errors stay within the budget
     (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
     """
+    from . import early
     from .compiled import ensure_cache, one_blas_thread
+    from .machine import available_threads
 
     one_blas_thread()
     ensure_cache()
     click.get_current_context().call_on_close(gc.enable)
     gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
     pipeline = pipelines[0]
+    if available_threads() > 1 and threads != 1 and not (len(pipelines) > 1 or engine or workers or scheduler or share):
+        click.get_current_context().call_on_close(early.end)
+        early.begin(pipeline)
     file = _load(pipeline, settings)
     if len(pipelines) > 1 or file.header.campaign is not None or engine or workers or scheduler or share:
         if verify or only:

@@ -22,9 +22,9 @@ from typing import Any
 
 from . import kernel_cache, user_cache
 from .compiled import cache_folder
-from .execution import available_threads
-from .pipeline import versions
+from .machine import available_threads
 from .program import fingerprint
+from .versions import versions
 
 KIND = "compiled"
 _CHILD = "import sys; sys.path[:] = {path!r}; from zonda.core.compile_ahead import serve; serve()"

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from .data import Data
+from .operator import Operator
 from .same_air import TRANSMISSION
-
-if TYPE_CHECKING:
-    from .pipeline import Pipeline
+from .selection import Selection
 
 MOST_PARTS = 4
 """Runs that may be taken from the main run: each adds its rounding."""
@@ -29,16 +29,16 @@ Packed = Mapping[str, Mapping[str, Any]]
 """By label: what `Operator.pack` gave."""
 
 
-def derivable(pipeline: Pipeline, runs: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def derivable(selection: Selection, runs: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Of these companion runs the ones that can be derived, and which ones the main run loses for them."""
-    if not all(o.linear for o in pipeline._selected("") if "signal" in o.provides):
+    if not all(o.linear for o in selection.steps("") if "signal" in o.provides):
         return {}
-    every = pipeline.components("")
-    made = {name: pipeline.components(name) for name in runs if _fits(pipeline, name)}
+    every = selection.components("")
+    made = {name: selection.components(name) for name in runs if _fits(selection, name)}
     found: dict[str, tuple[str, ...]] = {}
     taken: set[str] = set()
     for name in sorted(made, key=lambda n: -len(made[n])):
-        if name in taken or not all(o.can_subtract for o in pipeline._selected(name)):
+        if name in taken or not all(o.can_subtract for o in selection.steps(name)):
             continue
         rest = every - made[name]
         others = [other for other in made if other != name and other not in found and made[other] <= rest]
@@ -50,11 +50,11 @@ def derivable(pipeline: Pipeline, runs: Sequence[str]) -> dict[str, tuple[str, .
     return found
 
 
-def _fits(pipeline: Pipeline, name: str) -> bool:
+def _fits(selection: Selection, name: str) -> bool:
     """Whether a run is a term of equation (1)."""
-    run, kept = pipeline.runs[name], pipeline.components(name)
+    run, kept = selection.runs[name], selection.components(name)
     names_air = TRANSMISSION in [*(run.only or ()), *(run.without or ())]
-    return run.modes == "full" and run.filters == "all" and not names_air and bool(kept) and kept != pipeline.components("")
+    return run.modes == "full" and run.filters == "all" and not names_air and bool(kept) and kept != selection.components("")
 
 
 def derivation(parts: Sequence[str]) -> str:
@@ -62,10 +62,15 @@ def derivation(parts: Sequence[str]) -> str:
     return f"the main run minus {' and '.join(parts)}"
 
 
-def subtract(pipeline: Pipeline, run: str, whole: Packed, parts: Sequence[Packed]) -> dict[str, Mapping[str, Any]] | None:
+def parts_of(derived: Mapping[str, tuple[str, ...]]) -> set[str]:
+    """Runs from which others are derived."""
+    return {"", *(p for parts in derived.values() for p in parts)} if derived else set()
+
+
+def subtract(selection: Selection, run: str, whole: Packed, parts: Sequence[Packed]) -> dict[str, Mapping[str, Any]] | None:
     """The partial products of a run by equation (1), by label; None where an operator finds that it does not hold."""
     found: dict[str, Mapping[str, Any]] = {}
-    for operator in pipeline._selected(run):
+    for operator in selection.steps(run):
         label = operator.label
         if label not in whole:
             continue
@@ -74,3 +79,49 @@ def subtract(pipeline: Pipeline, run: str, whole: Packed, parts: Sequence[Packed
             return None
         found[label] = made
     return found
+
+
+class Derivation:
+    """Derives runs once those are made of which they follow.
+
+    Parameters
+    ----------
+    derived
+        By run: the runs that are taken from the main run (`derivable`).
+    """
+
+    def __init__(self, selection: Selection, derived: Mapping[str, tuple[str, ...]]) -> None:
+        self._selection, self._derived = selection, derived
+        self._parts = parts_of(derived)
+        self._kept: dict[str, Packed] = {}
+
+    def keep(self, run: str, data: Data) -> None:
+        """Copy the partial products of the run in progress, of the operators that can subtract them, if others follow from it."""
+        if run not in self._parts:
+            return
+        found = {}
+        for operator in self._selection.steps(run):
+            if type(operator).subtract is not Operator.subtract and (packed := operator.pack(data, True)) is not None:
+                operator.merge(data, packed)
+                found[operator.label] = packed
+        self._kept[run] = found
+
+    def derive(self, run: str, data: Data, kept_out: frozenset[str]) -> bool:
+        """Make the partial products of a run from those of others; False where it must be simulated.
+
+        ``kept_out``: labels of the steps that left out single samples of the main run. One that cannot tell what others did with
+        them (no `Operator.subtract`) is not linear.
+        """
+        if run not in self._derived:
+            return False
+        parts, steps = self._derived[run], self._selection.steps(run)
+        unlike = [o for o in steps if o.label in kept_out and type(o).subtract is Operator.subtract]
+        found = None if unlike else subtract(self._selection, run, self._kept[""], [self._kept[p] for p in parts])
+        if found is None:
+            data.tally.state(run, "simulated", f"{derivation(parts)} would not do: their samples differ")
+            return False
+        for operator in steps:
+            if operator.label in found:
+                operator.merge(data, found[operator.label])
+        data.tally.state(run, "derived as", derivation(parts))
+        return True

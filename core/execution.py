@@ -15,89 +15,22 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from .ahead import Ahead, reach
-from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, pieces, trimmed, whole_span, within
-from .data import Block, Data, Floats, Observation, Stream, Tally, in_order
+from .block_maker import BlockMaker
+from .blocks import Segment, cut, least_block
+from .data import Block, Data, Floats, Observation, Stream, in_order
 from .errors import PipelineError
 from .frozen import Frozen
-from .machine import available_memory, available_threads, resident_memory
+from .layout import Layout, read
+from .machine import resident_memory
 from .operator import Operator
+from .settings import Settings, Timer
 from .smooth import SmoothField
-from .streams import (
-    DISK_RATE,
-    SAMPLE_COST,
-    WORTH_MEASURING,
-    Held,
-    Ledger,
-    Source,
-    Stage,
-    Store,
-    StreamMadeAgain,
-    choose,
-    disk_rate,
-    forget_pages,
-)
-from .tiles import TILE_DETECTORS, TILE_SAMPLES
-
-__all__ = ["PIECE", "Execution", "Segment", "Settings", "Timer", "available_memory", "available_threads", "cut"]
-
-
-SCRATCH_STREAMS = 2
-"""Block-sized arrays assumed for operators' own scratch when the budget is divided."""
-
-
-@dataclass
-class Settings:
-    """How to execute.
-
-    Attributes
-    ----------
-    threads
-        Threads that work on blocks.
-    memory
-        Bytes for streams and blocks.
-    ceiling
-        Bytes that the whole process may hold; None: only ``memory`` counts.
-    dtype
-        Type of the streams.
-    prefer
-        What is done with streams that do not fit in memory where there is a choice; None: what is quicker.
-    progress
-        Whom to tell.
-    spare
-        Memory to use again.
-    """
-
-    threads: int = 1
-    memory: int = 2 << 30
-    dtype: type[np.floating[Any]] = np.float32
-    progress: Callable[[int, int, str], None] = lambda done, total, what: None
-    spare: list[Floats] = field(default_factory=list)
-    ceiling: int | None = None
-    prefer: Held | None = None
-
-
-@dataclass
-class Timer:
-    """CPU seconds by (operator label, stage), added up over threads."""
-
-    seconds: dict[tuple[str, str], float] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def add(self, label: str, stage: str, seconds: float) -> None:
-        """Add to a stage."""
-        with self._lock:
-            self.seconds[label, stage] = self.seconds.get((label, stage), 0.0) + seconds
-
-    def rows(self) -> list[tuple[str, str, float]]:
-        """(label, stage, seconds) in the order in which they first took time."""
-        with self._lock:
-            return [(*key, seconds) for key, seconds in self.seconds.items()]
+from .streams import Ledger, Source, Stage, Store, StreamMadeAgain, forget_pages
 
 
 def _nobody(**what: Any) -> None:
@@ -119,15 +52,14 @@ class Execution:
         self.operators, self.observation, self.settings, self.timer = list(operators), observation, settings, timer
         self.keep, self.frozen = tuple(keep), frozen
         self.states: dict[str, Any] = {}
-        self._labels = {id(operator): operator.label for operator in operators}  # the property is slow
         self.beforehand: Future[None] | None = None
         self._ahead = Ahead(False)
         self._stop = threading.Event()
-        self._local = threading.local()
         self.ledger = Ledger()
         self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
-        streams = set(keep).union(*(o.requires | o.optional for o in operators if type(o).exec is not Operator.exec))
-        self._streams = frozenset(streams - {"boresight"})
+        streams = read(operators) | set(keep)
+        self.layout = Layout(observation, settings, streams)
+        self._blocks = BlockMaker(operators, observation, settings, self.states, streams, timer, self.ledger, self._stop.is_set)
 
     def run(
         self,
@@ -235,7 +167,7 @@ class Execution:
             for operator in segment.operators:
                 before(operator=operator, observation=self.observation, stage="exec")
             begun += segment.operators
-            source = self._advance(Stage(segment, source, self.passed_on(segment, source, wanted)), later)
+            source = self._advance(Stage(segment, source, self.layout.passed_on(segment, source, wanted)), later)
             if source.stage is None:  # else they are not through yet
                 for operator in begun:
                     used = self.timer.seconds.get((operator.label, "exec"), 0.0)
@@ -263,11 +195,7 @@ class Execution:
             self.settings = settings = copy.copy(settings)
             settings.memory = room
             self._store = Store(room, settings.dtype, settings.spare, self.ledger)
-
-    def passed_on(self, segment: Segment, source: Source, wanted: set[str]) -> frozenset[str]:
-        """Streams that later segments may read."""
-        made = source.names.union(*(o.provides for o in segment.operators))
-        return frozenset(made & wanted & self._streams)
+            self.layout = Layout(self.observation, settings, self.layout.streams)
 
     def _measure(self, operator: Operator, source: Source, before: Callable[..., None], after: Callable[..., None]) -> None:
         names = sorted(operator.requires & source.names)
@@ -310,15 +238,15 @@ class Execution:
         """`Stream.sweep` of a stream that ``stage`` makes."""
 
         def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
-            block = self._make(stage, detectors, samples, {}, again=False)
+            block = self._blocks.make(stage, detectors, samples, {}, again=False)
             return detectors, samples, work(detectors, samples, block.detdata[name])
 
-        todo = self._blocks(stage)
+        todo = self.layout.blocks(stage, self._store.held)
         for done, result in enumerate(in_order(one, todo, self.settings.threads), 1):
             self.settings.progress(done, len(todo), f"{self.observation.name}: {what}")
             yield result
         stage.has_been_swept()
-        self._let_go()
+        self._blocks.let_go()
 
     # ---- streams between segments
 
@@ -326,9 +254,9 @@ class Execution:
         """Let the segment of ``stage`` work, or put that off until its streams are read."""
         in_place = frozenset() if stage.segment.halo else stage.wanted & stage.source.streams.keys()
         new = sorted(stage.wanted - in_place)
-        size = len(new) * self.stream_size
-        if later and new and not self.keeps(stage, size, self._store.held, later):
-            how, why = self.where(stage, new, size, later)
+        size, held = len(new) * self.layout.stream_size, self._store.held
+        if later and new and not self.layout.keeps(stage, size, held, later):
+            how, why = self.layout.where(stage, new, size, held, later, self._cost)
             if how == "again":
                 self._store.clear_spare()
                 found = self._probe(stage)
@@ -339,46 +267,6 @@ class Execution:
             return self._pass(stage, in_memory=False)
         return self._pass(stage)
 
-    def keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
-        """Whether ``size`` bytes of streams beside those held stay in memory: in half of it, and leave room for blocks."""
-        following = Stage(later[0], Source(names=stage.wanted), frozenset())
-        blocks = max(self.least_blocks(stage), self.least_blocks(following))
-        return held + size <= min(self.settings.memory // 2, self.settings.memory - blocks)
-
-    def where(self, stage: Stage, new: list[str], size: int, later: list[Segment], measure: bool = True) -> tuple[Held, str]:
-        """What becomes of streams that do not fit in memory, and why. ``measure``: try what disk and operators take."""
-        following = later[0]
-        head, span = following.operators[0], stage.span
-        hindrance = ""
-        if head.couples == "all" and not head.sweeps(self.observation):
-            hindrance = f"{head.label} reads it as a whole"
-        elif {span, following.span} == {"time", "detectors"}:
-            hindrance = f"{head.label} needs the other direction whole"
-        # what is made in order of time at little cost would cost much in any other
-        slow = stage.in_time_order and whole_span(following.span, span) == "time"
-        rate, cost = DISK_RATE, SAMPLE_COST
-        if measure and size >= WORTH_MEASURING and not hindrance:
-            rate, cost = disk_rate(), self._cost(stage)
-        return choose(
-            f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
-            size,
-            self.observation.n_detectors * self.observation.n_samples,
-            readings=self.readings(later),
-            hindrance=hindrance,
-            threads=self.settings.threads,
-            prefer="spilled" if slow else self.settings.prefer,
-            rate=rate,
-            cost=cost,
-            place=self.observation.name,
-            ceiling=self._ceiling_for(2 * (self._store.held + size)),
-        )
-
-    def readings(self, later: Sequence[Segment]) -> int:
-        """How often, beyond once, the segments to come read what is passed on to the first of them."""
-        heads = [s.operators[0] for s in later]
-        swept = sum(o.sweeps(self.observation) for o in heads if o.couples == "all")
-        return swept + round(2 * later[0].halo / PIECE + 0.4)
-
     def _cost(self, stage: Stage) -> float:
         """CPU seconds for a sample, from a small block made twice: the first may compile."""
         self._probe(stage)
@@ -388,13 +276,8 @@ class Execution:
 
     def _probe(self, stage: Stage) -> Block:
         """The smallest block, made before its time."""
-        rows, columns = least_block(stage.span, (self.observation.n_detectors, self.observation.n_samples))
-        return self._make(stage, slice(0, rows), slice(0, columns), {}, again=True)
-
-    @property
-    def stream_size(self) -> int:
-        """Bytes of a whole stream."""
-        return self.observation.n_detectors * self.observation.n_samples * np.dtype(self.settings.dtype).itemsize
+        rows, columns = least_block(stage.span, self.layout.shape)
+        return self._blocks.make(stage, slice(0, rows), slice(0, columns), {}, again=True)
 
     def _pass(self, stage: Stage, in_memory: bool = True) -> Source:
         """Run a segment's operators over all blocks; what it passes on is held, ``in_memory`` where there is room."""
@@ -404,7 +287,7 @@ class Execution:
             if name in source.streams and not stage.segment.halo:
                 made[name] = source.streams[name]  # changed in place
                 continue
-            array = self._store.allocate(name, self._shape, in_memory)
+            array = self._store.allocate(name, self.layout.shape, in_memory)
             made[name] = Stream(name, observation, array, {}, settings.threads)
             if isinstance(array, np.memmap):
                 observation.tally.state("Execution", f"stream {name} spilled to disk", f"{array.nbytes / 1e9:.2f} GB")
@@ -412,7 +295,7 @@ class Execution:
         means: dict[str, SmoothField] = {}
 
         def work(detectors: slice, samples: slice) -> None:
-            block = self._make(stage, detectors, samples, made, again=False)
+            block = self._blocks.make(stage, detectors, samples, made, again=False)
             for name, stream in made.items():
                 if name in block.detdata:
                     seen.add(name)
@@ -423,176 +306,13 @@ class Execution:
                 forget_pages(stream.array)
 
         what = ", ".join(o.label for o in stage.segment.operators)
-        self._map(work, self._blocks(stage), what)
+        self._map(work, self.layout.blocks(stage, self._store.held), what)
         stage.has_been_swept()
-        self._let_go()
+        self._blocks.let_go()
         kept = {name: Stream(name, observation, s.array, means, settings.threads) for name, s in made.items() if name in seen}
         held = {id(s.array) for s in kept.values()}
         self._store.release([s.array for s in [*source.streams.values(), *made.values()] if id(s.array) not in held])
         return Source.of(kept, means)
-
-    def _let_go(self) -> None:
-        """Blocks are done with: their threads have ended."""
-        self._local = threading.local()
-        self.ledger.drop("blocks")
-
-    # ---- blocks
-
-    def _make(self, stage: Stage, detectors: slice, samples: slice, made: dict[str, Stream], *, again: bool) -> Block:
-        """A block with the segment's operators, and those of the stages before it, carried out."""
-        segment, again = stage.segment, again or stage.swept
-        n_samples = self.observation.n_samples
-        margin = -(-segment.halo // TILE_SAMPLES) * TILE_SAMPLES
-        reach = slice(max(0, samples.start - margin), min(n_samples, samples.stop + margin))
-        first, rest = segment.split()
-        # whole scans, and what is only taken in pieces, are worked on where they are kept
-        in_place = bool(made) and not segment.halo and (not rest or reach == slice(0, n_samples))
-        passed_on = set(stage.wanted).union(*(o.requires | o.optional for o in rest))
-        if again:
-            first, rest = ([o for o in some if o.provides & self._streams] for some in (first, rest))
-        copied = not first or bool(rest)
-        block = self._block(stage, detectors, reach, samples, made if in_place else {}, again, copied)
-        if first:
-            self._in_pieces(first, block, passed_on)
-        self._exec(rest[:1], block)
-        if reach != samples:
-            block = trimmed(block, samples)
-        self._exec(rest[1:], block)
-        buffers = [*self._local.__dict__.get("blocks", {}).values(), self._local.__dict__.get("pieces", {})]
-        size = sum(array.nbytes for held in buffers for array in held.values())
-        self.ledger.note(("blocks", threading.get_ident()), size)
-        return block
-
-    def _exec(self, operators: list[Operator], block: Block) -> None:
-        start = time.thread_time()
-        for operator in operators:
-            if self._stop.is_set():
-                return
-            label = self._labels[id(operator)]
-            operator.exec(block, self.states[label])
-            now = time.thread_time()
-            self.timer.add(label, "exec", now - start)
-            start = now
-
-    def _block(
-        self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool, copied: bool
-    ) -> Block:
-        """A block with its sources in it: where they are kept (as ``made`` says), copies, or made again.
-
-        With margins never in place: others read them too. Not ``copied``: operators work on copies of parts of it alone.
-        """
-        source, observation = stage.source, self.observation
-        if again:
-            observation = copy.copy(observation)
-            observation.tally = Tally()
-        buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(stage.depth, {})
-        block = Block(observation, detectors, reach, dtype=self.settings.dtype, buffers=buffers, again=again)
-        block.places = {name: stream.array[detectors, reach] for name, stream in made.items()}
-        for name, stream in source.streams.items():
-            if made or not copied:
-                block.detdata[name] = block.places.get(name, stream.array[detectors, reach])
-            else:
-                block.detdata[name] = block.buffer(name, block.shape)
-                block.detdata[name][...] = stream.array[detectors, reach]
-            block.means.update(stream.means)
-        if source.stage is None:
-            return block
-        margins = slice(reach.start, samples.start), slice(samples.stop, reach.stop)
-        for part, known in ((margins[0], True), (samples, again), (margins[1], True)):
-            if part.start == part.stop:
-                continue
-            before = self._make(source.stage, detectors, part, {}, again=known)
-            for name in source.names:
-                if reach == samples:
-                    block.detdata[name] = before.detdata[name]
-                    continue
-                if name not in block.detdata:
-                    block.detdata[name] = block.buffer(name, block.shape)
-                block.detdata[name][:, within(reach, part)] = before.detdata[name]
-            block.means.update(before.means)
-        return block
-
-    def _in_pieces(self, operators: list[Operator], block: Block, passed_on: set[str]) -> None:
-        """Let operators that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
-        given, means, made = block.detdata, block.means, dict[str, Floats]()
-        buffers = self._local.__dict__.setdefault("pieces", {})
-        for detectors, samples in pieces(block.detectors, block.samples):
-            piece = Block(
-                block.observation, detectors, samples, means=dict(means), dtype=block.dtype, buffers=buffers, again=block.again
-            )
-            where = within(block.detectors, detectors), within(block.samples, samples)
-            for name, stream in given.items():
-                piece.detdata[name] = piece.buffer(name, piece.shape)
-                piece.detdata[name][...] = stream[where]
-            self._exec(operators, piece)
-            for name in passed_on & piece.detdata.keys():
-                if name not in made:
-                    made[name] = block.places[name] if name in block.places else block.buffer(name, block.shape)
-                made[name][where] = piece.detdata[name]
-            block.means = piece.means  # the same fields in every piece
-        block.detdata = {**given, **made}
-
-    def _blocks(self, stage: Stage) -> list[tuple[slice, slice]]:
-        """The blocks in which a stage works. Raises PipelineError where the least one does not fit."""
-        rows, columns = least_block(stage.span, self._shape)
-        share = self._share(stage, self._store.held)
-        if rows * columns > share:
-            settings, need = self.settings, self.least_blocks(stage)
-            raise PipelineError(
-                f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on each of {settings.threads} "
-                f"threads, the memory budget has {(settings.memory - self._store.held) / 1e6:.1f} MB for all of them",
-                place=self.observation.name,
-                cure=f"raise --memory to {self._ceiling_for(need + self._store.held)}, use fewer --threads, or make the scan "
-                "shorter",
-            )
-        return list(blocks(stage.span, stage.in_time_order, self._shape, share))
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.observation.n_detectors, self.observation.n_samples
-
-    def _share(self, stage: Stage, held: int) -> int:
-        """Samples that a block may hold beside ``held`` bytes of streams: within half of the budget, or all that is left."""
-        settings, (whole, part) = self.settings, self._streams_in_block(stage)
-        rows, columns = least_block(stage.span, self._shape)
-        each = settings.threads * np.dtype(settings.dtype).itemsize
-        share = block_share(settings.memory // 2 // each, whole, part)
-        return share if share >= rows * columns else block_share((settings.memory - held) // each, whole, part)
-
-    def least_blocks(self, stage: Stage) -> int:
-        """Bytes of the smallest blocks, on all threads."""
-        rows, columns = least_block(stage.span, self._shape)
-        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
-
-    def largest_blocks(self, stage: Stage, held: int) -> int:
-        """Bytes of the blocks that would be cut beside ``held`` bytes of streams, on all threads."""
-        share = max(self._share(stage, held), 1)
-        first = next(iter(blocks(stage.span, stage.in_time_order, self._shape, share)))
-        rows, columns = (s.stop - s.start for s in first)
-        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
-
-    def _bytes(self, stage: Stage, block: int, piece: int) -> int:
-        whole, part = self._streams_in_block(stage)
-        return self.settings.threads * np.dtype(self.settings.dtype).itemsize * (whole * block + part * piece)
-
-    def _streams_in_block(self, stage: Stage | None) -> tuple[int, int]:
-        """Numbers of block-sized and of piece-sized arrays that a stage and those before it hold."""
-        if stage is None:
-            return 0, 0
-        first, rest = stage.segment.split()
-        names = set(stage.source.names | stage.wanted).union(*(o.requires | o.optional | o.provides for o in rest))
-        every = names.union(*(o.requires | o.optional | o.provides for o in first)) if first else set()
-        before = self._streams_in_block(stage.source.stage)
-        whole, part = len(names & self._streams), len(every & self._streams)
-        scratch = SCRATCH_STREAMS if rest else 0
-        margins = 2 if stage.segment.halo else 1  # a block with margins is trimmed to a copy
-        return before[0] + margins * whole + scratch, max(before[1], part + (SCRATCH_STREAMS if first else 0))
-
-    def _ceiling_for(self, need: int) -> str:
-        """``--memory`` with which streams and blocks may take ``need`` bytes."""
-        settings = self.settings
-        fixed = max(settings.ceiling - settings.memory, 0) if settings.ceiling else 0
-        return f"{-(-(need + fixed) // 1_000_000)}MB"
 
     def _map(self, work: Callable[[slice, slice], None], blocks: list[tuple[slice, slice]], what: str) -> None:
         """Call ``work`` on every block, on ``threads`` threads; the first error stops all."""

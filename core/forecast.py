@@ -1,6 +1,6 @@
 """Memory before it is taken: what streams and blocks of an observation will need, and whether the budget allows it.
 
-The same rules as in `execution`, without running anything: where streams are kept, which blocks are cut.
+By the rules of `layout`, without running anything: where streams are kept, which blocks are cut.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import numpy as np
 from .blocks import Segment, cut
 from .data import Observation, Stream
 from .errors import PipelineError
-from .execution import Execution, Settings, Timer
+from .layout import Layout, read
 from .machine import available_memory, resident_memory
 from .operator import Operator
+from .settings import Settings
 from .streams import Source, Stage
 
 BASE = 230_000_000
@@ -42,26 +43,26 @@ def forecast(operators: Sequence[Operator], observation: Observation, settings: 
     PipelineError
         Where a stream fits neither in memory nor on the disk and cannot be made again.
     """
-    execution = Execution(operators, observation, settings, Timer(), ())
+    layout = Layout(observation, settings, read(operators))
     segments: list[Segment] = cut(operators, observation)
     source, held, most, least, elsewhere, again = Source(), 0, 0, 0, list[str](), dict[str, int]()
     for number, segment in enumerate(segments):
         later = segments[number + 1 :]
         wanted = set().union(*(o.requires | o.optional for s in later for o in s.operators))
-        stage = Stage(segment, source, execution.passed_on(segment, source, wanted))
+        stage = Stage(segment, source, layout.passed_on(segment, source, wanted))
         new = stage.wanted if segment.halo else stage.wanted - source.streams.keys()
-        size = len(new) * execution.stream_size
-        if later and new and not execution.keeps(stage, size, held, later):
-            how, _ = execution.where(stage, sorted(new), size, later, measure=False)
+        size = len(new) * layout.stream_size
+        if later and new and not layout.keeps(stage, size, held, later):
+            how, _ = layout.where(stage, sorted(new), size, held, later, None)
             elsewhere += [f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}" for name in sorted(new)]
             if how == "again":
-                readings = execution.readings(later)
+                readings = layout.readings(later)
                 again.update({o.label: max(readings, again.get(o.label, 0)) for o in segment.operators if not o.product_only})
                 source = Source({}, stage, stage.wanted)
                 continue
             size = 0
-        smallest = execution.least_blocks(stage)
-        largest = max(execution.largest_blocks(stage, held + size), smallest)
+        smallest = layout.least_blocks(stage)
+        largest = max(layout.largest_blocks(stage, held + size), smallest)
         most, least = max(most, held + size + largest), max(least, smallest)
         held += size if later else 0
         nothing = np.empty((0, 0), settings.dtype)

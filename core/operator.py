@@ -11,8 +11,8 @@ from .configuration.parameters import Parameters
 from .knobs import Knob
 
 if TYPE_CHECKING:
+    from .companion import Companion
     from .data import Block, Data, Observation, Stream
-    from .pipeline import Companion
     from .plan.context import Context
     from .plan.estimate import Estimate, Traits
 
@@ -178,10 +178,10 @@ class Operator(Parameters):
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """Add this observation's partial products to ``data.products``."""
 
-    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
-        """Called for `at_end` operators once the telescope is pointed, after every scan, and after every run (``data.run``): time
-        to begin with what `finalize` will do, in the background, as far as it depends on products that are there and will not
-        change."""
+    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+        """Called for `at_end` operators once the telescope is pointed, after every scan, after every run (``data.run``), and when
+        all runs have ended: time to begin with what `finalize` will do, as far as it depends on products that are there and will
+        not change; in the background, until the runs have ended."""
 
     def discard(self, observation: Observation, state: Any) -> None:
         """Undo what `prepare` and `exec` began (temporary files): called instead of `collect` when the run fails."""

@@ -2,60 +2,30 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
 
-from . import ahead as preparation
 from .ahead import Ahead
-from .configuration.parameters import Parameters
-from .data import Data, Observation, Tally, html_table
-from .derived import Packed, derivable, derivation, subtract
+from .companion import Companion
+from .data import Data, html_table
+from .derived import Derivation, derivable, parts_of
 from .errors import PipelineError
-from .execution import Execution, Settings, Timer
-from .forecast import room
-from .frozen import Frozen
-from .machine import available_memory, available_threads, resident_memory
+from .machine import available_memory, available_threads
+from .memory_budget import divide
 from .operator import Operator
-from .same_air import TRANSMISSION, SameAir
-from .sky_signal import SkySignal, place_of_signal
+from .order import check_order
+from .selection import Selection
+from .settings import Settings, Timer
+from .simulation import Simulation
+from .versions import versions
 
 if TYPE_CHECKING:
     from .scene import Scene
-
-
-class Companion(Parameters):
-    """A companion run: the same pipeline and random numbers with some signal components absent."""
-
-    only: list[str] | None = Field(None, min_length=1)
-    """Components to keep (e.g. [sky]: the noiseless run); all others are left out."""
-    without: list[str] | None = Field(None, min_length=1)
-    """Components to leave out (e.g. [sky]: the source-free run)."""
-    modes: Literal["own", "full"] = "own"
-    """Singular modes of filters: those of this run's own data (`own`: the noiseless run), or those of the complete data (`full`:
-    with the main run's modes, flags, weights and transmission of the air all is linear, and what is left of each part adds up to
-    the main run; of two runs that are its parts one need not be simulated, see `core.derived`)."""
-    filters: Literal["all", "none"] = "all"
-    """`none`: leave out every step that changes the signal once it is formed."""
-
-    @model_validator(mode="after")
-    def _one_of_two(self) -> Companion:
-        if (self.only is None) == (self.without is None):
-            raise ValueError("give either only or without")
-        return self
-
-    def keeps(self, provides: frozenset[str]) -> bool:
-        """Whether an operator that provides these components takes part."""
-        if self.only is not None:
-            return bool(provides & set(self.only))
-        return not provides & set(self.without or ())
 
 
 @dataclass
@@ -84,58 +54,6 @@ class Part:
         found = operator.pack(data, self.first)
         if found is not None:
             self.packed.setdefault(data.run, {})[operator.label] = found
-
-
-@dataclass(frozen=True)
-class OrderProblem:
-    """A step that does not fit where it stands."""
-
-    index: int
-    message: str
-    label: str
-    cure: str = ""
-
-
-def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
-    """Every step whose inputs are not there yet, or whose output comes too late to be used."""
-    problems = []
-    have: set[str] = set()
-    sky_is_signal = place_of_signal(operators)
-    for index, operator in enumerate(operators):
-        if index == sky_is_signal:
-            have.add("signal")
-        name = type(operator).__name__
-        later = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides}
-        for what in sorted(operator.requires - have):
-            if what in later:
-                problems.append(
-                    OrderProblem(
-                        index, f"{name} needs {what}, which {later[what]} provides only later", f"move it below {later[what]}"
-                    )
-                )
-            else:
-                problems.append(
-                    OrderProblem(index, f"{name} needs {what}, which no step provides", f"add a step that provides {what} above")
-                )
-        for what in sorted((operator.optional - operator.requires) & set(later)):
-            if not operator.at_end:
-                problems.append(
-                    OrderProblem(
-                        index, f"{later[what]} provides {what} only after {name} has used it", f"move {name} below {later[what]}"
-                    )
-                )
-        if operator.couples == "all" and len(operator.requires - {"boresight"}) != 1:
-            problems.append(
-                OrderProblem(
-                    index,
-                    f"{name} couples all samples but requires {len(operator.requires)} streams",
-                    "it must require exactly one",
-                )
-            )
-        have |= operator.provides
-    if operators and not any("boresight" in o.provides | o.requires for o in operators):
-        problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step, e.g. PointingDaisy"))
-    return problems
 
 
 class Pipeline:
@@ -175,9 +93,8 @@ class Pipeline:
         if problems := check_order(self.operators):
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             raise PipelineError("\n".join(lines), place=self.name)
-        self._check_runs()
-        self._add_needed_runs()
-        self.derived = derivable(self, tuple(self.runs))
+        self.selection = Selection(self.operators, self.runs, self.name)
+        self.derived = derivable(self.selection, tuple(self.runs))
         """Companion runs that are derived from the main run and these others, if the operators find nothing against it."""
 
     def _name_steps(self) -> None:
@@ -186,103 +103,6 @@ class Pipeline:
             base = operator.name or type(operator).__name__
             seen[base] = seen.get(base, 0) + 1
             operator._label = base if seen[base] == 1 else f"{base}.{seen[base]}"
-
-    def _check_runs(self) -> None:
-        for name, companion in self.runs.items():
-            if not name.isidentifier() or name.startswith("_"):
-                cure = "use letters, digits and underscores, the first a letter"
-                raise PipelineError(f"{name!r} cannot name a run", place=self.name, cure=cure)
-            self._check_components(companion, f"run {name} names")
-            self._check_frozen(name)
-
-    def _check_components(self, companion: Companion, who: str) -> None:
-        components = sorted(set().union(*(o.provides for o in self._generators())))
-        for what in [*(companion.only or ()), *(companion.without or ())]:
-            if what not in components:
-                cure = f"choose from: {', '.join(components)}"
-                raise PipelineError(f"{who} {what!r}, which no step provides", place=self.name, cure=cure)
-
-    def _check_frozen(self, name: str) -> None:
-        if self.runs[name].modes == "own":
-            return
-        for operator in self._selected(name):
-            if operator.couples == "all" and not operator.can_freeze:
-                raise PipelineError(
-                    f"run {name} has modes: full, but {operator.label} cannot freeze what it measures",
-                    place=self.name,
-                    cure=f"leave modes: full out, or give {type(operator).__name__} freeze and measure_frozen (docs/plugins.md)",
-                )
-
-    def _add_needed_runs(self) -> None:
-        """Find for each step the runs that it reads, see `Operator.needs`; add those that are not there."""
-        for operator in self.operators:
-            names = []
-            for wanted in operator.needs():
-                self._check_components(wanted, f"{operator.label} needs")
-                kind = self._kind(wanted)
-                same = [name for name, run in self.runs.items() if self._kind(run) == kind]
-                if kind == self._kind(None):
-                    names.append("")
-                elif same:
-                    names.append(same[0])
-                else:
-                    parts = [*(wanted.only or ["without", *(wanted.without or ())])]
-                    parts += ["unfiltered"] * (wanted.filters == "none") + ["full"] * (wanted.modes == "full")
-                    names.append("_" + "_".join(parts))
-                    self.runs[names[-1]] = wanted
-                    self._check_frozen(names[-1])
-            operator._runs = tuple(names)
-
-    def _kind(self, run: Companion | None) -> tuple[frozenset[str], frozenset[str], bool]:
-        """What tells runs apart: steps of components, filters, whether modes are the complete data's. None: the main run."""
-        makers, filters = self._generators(), self._filters()
-        kept = frozenset(o.label for o in makers if run is None or run.keeps(o.provides))
-        frozen = run is not None and run.modes == "full" and len(kept) < len(makers)
-        labels = frozenset(o.label for o in filters if run is None or run.filters == "all")
-        differ = any(o.couples == "all" or (TRANSMISSION in o.provides and o.label not in kept) for o in self.operators)
-        return kept, labels, frozen and differ
-
-    def is_frozen(self, run: str) -> bool:
-        """Whether a companion run takes singular modes from the main run (empty: the main run itself, which never does)."""
-        return bool(run) and self._kind(self.runs[run])[2]
-
-    def components(self, run: str) -> frozenset[str]:
-        """Labels of the steps whose components a run keeps."""
-        return self._kind(self.runs[run] if run else None)[0]
-
-    def _filters(self) -> list[Operator]:
-        """The operators that change the signal."""
-        return [o for o in self.operators if "signal" in o.requires & o.provides]
-
-    def _generators(self) -> list[Operator]:
-        """The operators that make signal components: those before `signal` is formed, pointing aside."""
-        found = []
-        for operator in self.operators:
-            if "signal" in operator.provides | operator.requires:
-                break
-            if operator.provides and "boresight" not in operator.provides:
-                found.append(operator)
-        return found
-
-    def _selected(self, run: str) -> list[Operator]:
-        steps = [o for o in self.operators if not o.at_end and "boresight" not in o.provides]
-        if place_of_signal(self.operators) is not None:
-            steps.insert(place_of_signal(steps) or 0, SkySignal())
-        if not run:
-            return steps
-        companion = self.runs[run]
-        dropped = {o.label for o in self._generators() if not companion.keeps(o.provides)}
-        if companion.filters == "none":
-            dropped |= {o.label for o in self._filters()}
-        found: list[Operator] = []
-        for operator in steps:
-            if operator.main_run_only:
-                continue
-            if operator.label not in dropped:
-                found.append(operator)
-            elif companion.modes == "full" and TRANSMISSION in operator.provides - {*(companion.without or ())}:
-                found += [operator, SameAir.behind(operator)]
-        return found
 
     @property
     def order(self) -> list[str]:
@@ -357,17 +177,18 @@ class Pipeline:
             data.observations = [data.observations[k] for k in part.scans]
         if part is None:
             self._meanwhile(data, "pointing")
-        self._keep_to(ceiling, memory, data, settings, ahead)
-        make = _Runs(self, data, keep, hooks, settings, timer, ahead, part is None)
-        kept: dict[str, Packed] = {}
+        if ceiling is not None or memory is None:
+            steps, parts = self.selection.steps(""), len(parts_of(self.derived))
+            divide(steps, data.observations, settings, ahead, ceiling, memory, parts, self.name)
+        simulation = Simulation(self.selection, self.order, self.derived, data, keep, hooks, settings, timer, ahead)
+        derivation = Derivation(self.selection, self.derived)
         try:
             for run in self.order:
                 data.run = run
-                if not self._derive(run, data, kept, make.kept_out):
-                    make(run)
-                if run in self._parts():
-                    kept[run] = self._packed(run, data)
-                for operator in self._selected(run):
+                if not derivation.derive(run, data, simulation.kept_out):
+                    simulation.make(run, lambda: self._meanwhile(data, "scan") if part is None else None)
+                derivation.keep(run, data)
+                for operator in self.selection.steps(run):
                     if part is None:
                         self._finalize(operator, data, timer, hooks)
                     else:
@@ -377,7 +198,9 @@ class Pipeline:
         finally:
             ahead.close()
         data.run = ""
-        make.leave_main()
+        simulation.leave_main()
+        if part is None:
+            self._meanwhile(data, "runs")
         for operator in self.operators:
             if operator.at_end and part is None:
                 data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
@@ -386,45 +209,12 @@ class Pipeline:
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 
-    def _parts(self) -> set[str]:
-        """Runs from which others are derived."""
-        return {"", *(p for parts in self.derived.values() for p in parts)} if self.derived else set()
-
-    def _packed(self, run: str, data: Data) -> Packed:
-        """A copy of the partial products of the run in progress, of the operators that can subtract them."""
-        found = {}
-        for operator in self._selected(run):
-            if type(operator).subtract is not Operator.subtract and (packed := operator.pack(data, True)) is not None:
-                operator.merge(data, packed)
-                found[operator.label] = packed
-        return found
-
-    def _derive(self, run: str, data: Data, kept: Mapping[str, Packed], kept_out: frozenset[str]) -> bool:
-        """Make the partial products of a run from those of others; False where it must be simulated.
-
-        ``kept_out``: labels of the steps that left out single samples of the main run. One that cannot tell what others did with
-        them (no `Operator.subtract`) is not linear.
-        """
-        if run not in self.derived:
-            return False
-        parts = self.derived[run]
-        unlike = [o for o in self._selected(run) if o.label in kept_out and type(o).subtract is Operator.subtract]
-        found = None if unlike else subtract(self, run, kept[""], [kept[p] for p in parts])
-        if found is None:
-            data.tally.state(run, "simulated", f"{derivation(parts)} would not do: their samples differ")
-            return False
-        for operator in self._selected(run):
-            if operator.label in found:
-                operator.merge(data, found[operator.label])
-        data.tally.state(run, "derived as", derivation(parts))
-        return True
-
     def pack(self, data: Data, first: bool) -> dict[str, dict[str, Mapping[str, Any]]]:
         """The partial products in ``data``, by run and label."""
         part = Part(first=first)
         for run in self.order:
             data.run = run
-            for operator in self._selected(run):
+            for operator in self.selection.steps(run):
                 part.take(operator, data)
         data.run = ""
         return part.packed
@@ -433,7 +223,7 @@ class Pipeline:
         """Add the partial products of a part to ``data``."""
         for run in self.order:
             data.run = run
-            for operator in self._selected(run):
+            for operator in self.selection.steps(run):
                 if (found := packed.get(run, {}).get(operator.label)) is not None:
                     operator.merge(data, found)
         data.run = ""
@@ -446,35 +236,18 @@ class Pipeline:
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for run in self.order:
             data.run = run
-            for operator in self._selected(run):
+            for operator in self.selection.steps(run):
                 self._finalize(operator, data, timer, hooks)
             self._meanwhile(data, "run")
         data.run = ""
+        self._meanwhile(data, "runs")
         for operator in self.operators:
             if operator.at_end:
                 self._finalize(operator, data, timer, hooks)
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 
-    def _keep_to(self, ceiling: int | None, memory: int | None, data: Data, settings: Settings, ahead: Ahead) -> None:
-        """Divide what the process may hold; refuse what does not fit."""
-        if ceiling is None and memory is not None:
-            return
-        budget = ceiling or resident_memory() + available_memory() // 2
-        left, products = room(self._selected(""), data.observations, settings, budget, self.name)
-        settings.memory = min(left, memory or left)
-        if parts := self._parts():  # what runs are derived from is kept until then
-            longest = max(data.observations, key=lambda o: o.n_detectors * o.n_samples)
-            summed = [o for o in self._selected("") if type(o).subtract is not Operator.subtract]
-            kept = min(len(parts) * sum(o.memory(longest) for o in summed), left // 2)
-            settings.memory, products = settings.memory - kept, products + kept
-        if ahead.on and len(data.observations) > 1:
-            size = preparation.affordable(self._selected(""), data.observations, settings)
-            ahead.on = size is not None
-            settings.memory, products = settings.memory - (size or 0), products + (size or 0)
-        settings.ceiling = budget - products
-
-    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
+    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         for operator in self.operators:
             if operator.at_end:
                 operator.meanwhile(data, done)
@@ -506,97 +279,3 @@ class Pipeline:
 
     def _repr_html_(self) -> str:
         return html_table(f"Pipeline {self.name}", [(o.label, repr(o)) for o in self.operators])
-
-
-class _Runs:
-    """Simulates runs, one after the other, over all observations: `Pipeline.run`."""
-
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        data: Data,
-        keep: Sequence[str],
-        hooks: Any,
-        settings: Settings,
-        timer: Timer,
-        ahead: Ahead,
-        whole: bool,
-    ) -> None:
-        self._pipeline, self._data, self._keep, self._hooks = pipeline, data, keep, hooks
-        self._settings, self._timer, self._ahead, self._whole = settings, timer, ahead, whole
-        self._pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
-        freeze = any(run.modes == "full" for run in pipeline.runs.values())
-        self._frozen = [Frozen() if freeze else None for _ in data.observations]
-        self._main = list(self._pristine)
-        self._following: Execution | None = None
-        """What is begun of the next scan, or of the first scan of the next run."""
-
-    def __call__(self, run: str) -> None:
-        """One run; what comes next is prepared meanwhile."""
-        data, hooks = self._data, self._hooks
-        for number, observation in enumerate(data.observations, 1):
-            execution = self._following or self._begin(run, number - 1, observation)
-            observation = data.observations[number - 1] = execution.observation
-            last = number == len(data.observations)
-            self._following = self._next_run(run) if last else self._begin(run, number, data.observations[number])
-            execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, self._ahead, self._following)
-            data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
-            if not run:
-                self._main[number - 1] = observation.focalplane, observation.flags, observation.detector_flags
-            if self._whole:
-                self._pipeline._meanwhile(data, "scan")
-
-    @property
-    def kept_out(self) -> frozenset[str]:
-        """Labels of the steps that left out single samples of the main run."""
-        return frozenset().union(*(found.kept_out for found in self._frozen if found))
-
-    def leave_main(self) -> None:
-        """Let observations carry what the main run left of detectors and flags."""
-        for observation, found in zip(self._data.observations, self._main, strict=True):
-            observation.focalplane, observation.flags, observation.detector_flags = found
-
-    def _next_run(self, run: str) -> Execution | None:
-        """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived.
-
-        A copy of it: until this run is finished, operators find there what this run left.
-        """
-        order = self._pipeline.order
-        later = order[order.index(run) + 1 :]
-        if len(self._data.observations) < 2 or not later or later[0] in self._pipeline.derived:
-            return None
-        return self._begin(later[0], 0, copy.copy(self._data.observations[0]))
-
-    def _begin(self, run: str, number: int, observation: Observation) -> Execution:
-        focalplane, flags, detector_flags = self._pristine[number]
-        before, observation.tally = observation.tally, Tally()
-        if not run:
-            observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
-        observation.focalplane, observation.smooth = focalplane.copy(), {}
-        observation.output = self._data.output
-        observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
-        kept = self._frozen[number] if not run or self._pipeline.runs[run].modes == "full" else None
-        steps, keep = self._pipeline._selected(run), self._keep if not run else ()
-        return Execution(steps, observation, self._settings, self._timer, keep, kept)
-
-
-def versions() -> dict[str, str]:
-    """Versions of everything that can change a number."""
-    import platform
-
-    found = {"python": platform.python_version(), "machine": platform.machine()}
-    for package in ("zonda", "numpy", "scipy", "astropy", "astropy-iers-data", "numba", "healpy", "h5py"):
-        installed = _version(package)
-        if installed is not None:
-            found[package] = installed
-    return found
-
-
-@cache
-def _version(package: str) -> str | None:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

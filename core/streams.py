@@ -30,7 +30,7 @@ from .errors import OutputError, PipelineError
 from .smooth import SmoothField
 
 if TYPE_CHECKING:
-    from .execution import Segment
+    from .blocks import Segment
 
 Held = Literal["kept", "spilled", "again"]
 

@@ -55,15 +55,15 @@ def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_wa
 def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     """By the forecast, without running: 372 GB of streams are kept nowhere."""
     from zonda.core.data import Data
-    from zonda.core.execution import Settings
     from zonda.core.forecast import forecast
+    from zonda.core.settings import Settings
 
     file = load("atlast_full", ())
     pipeline, scene = file.pipeline(), file.scene()
     data = Data(scene, output=tmp_path)
     for operator in pipeline.operators:
         operator.observe(data)
-    steps, settings = pipeline._selected(""), Settings(threads=2)
+    steps, settings = pipeline.selection.steps(""), Settings(threads=2)
     left, _ = room(steps, data.observations, settings, 8 * 10**9, "test")
     found = forecast(steps, data.observations[0], Settings(threads=2, memory=left))
     assert found.bytes < left

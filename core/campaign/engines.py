@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
@@ -15,8 +16,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..errors import PipelineError
-from ..execution import available_memory, available_threads
+from ..machine import available_memory, available_threads
 from .settings import Engine, Tls
+
+SCHEDULER_FILE_WAIT = 20.0
+"""Seconds [s] for which a scheduler file that is not there, or not whole, is waited for."""
 
 
 @dataclass
@@ -230,8 +234,7 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
             tls_ca_file=tls.ca_file, tls_client_cert=tls.cert, tls_client_key=tls.key, require_encryption=True
         )
     try:
-        file = None if "://" in scheduler or not Path(scheduler).is_file() else Path(scheduler)
-        address = str(json.loads(file.read_text())["address"]) if file else scheduler
+        address = _address(scheduler)
         if address.startswith("tls://"):
             cure = "is it running there, and are its certificates and yours signed by the same authority (ca_file)?"
             if security is not None or not dask.config.get("distributed.client.security-loader", None):
@@ -251,6 +254,21 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
         yield Pool(
             client.get_executor(pure=False, retries=0), count, count, threads or 1, memory or min(limits, default=0) // 2 or None
         )
+
+
+def _address(scheduler: str) -> str:
+    """What is named, or the address in the scheduler file of that name: one that is starting may not have written it yet."""
+    if "://" in scheduler or not (scheduler.endswith(".json") or Path(scheduler).is_file()):
+        return scheduler
+    end = time.monotonic() + SCHEDULER_FILE_WAIT
+    while True:
+        try:
+            return str(json.loads(Path(scheduler).read_text())["address"])
+        except (OSError, ValueError, TypeError, KeyError) as err:
+            if time.monotonic() > end:
+                why = err.strerror if isinstance(err, OSError) else f"{type(err).__name__}: {err}"
+                raise ValueError(f"its file cannot be read: {why}") from None
+            time.sleep(0.1)
 
 
 def _check_certificates(security: Any, address: str) -> None:

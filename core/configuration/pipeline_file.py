@@ -11,9 +11,11 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .. import registry
+from ..companion import Companion
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
-from ..pipeline import Companion, Pipeline, check_order
+from ..order import check_order
+from ..pipeline import Pipeline
 from ..plan.budget import Limits
 from ..scene import Scene
 from ..weather import WeatherSource, resolve
@@ -66,7 +68,7 @@ class Header(Parameters):
     budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
     """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
     campaign: Any = None
-    """None; in a file with a campaign the header is a `core.campaign.settings.CampaignHeader`, which a plain run need not import."""
+    """None; the header of a file with a campaign is a `core.campaign.settings.CampaignHeader`."""
     outputs: Path | None = None
     """Folder for products, relative to the working directory; where absent, out/<name>."""
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from .. import user_cache
-from ..execution import Settings
 from ..forecast import BASE, forecast
+from ..settings import Settings
 from .context import Context
 from .estimate import Cost
 
@@ -35,7 +35,7 @@ LASTS = 30 * 86400.0
 @cache
 def calibrate() -> Mapping[str, float]:
     """Time of each kernel relative to the reference machine: measured once, then remembered for `LASTS` seconds."""
-    from ..pipeline import versions
+    from ..versions import versions
 
     key = {"processor": user_cache.processor(), "versions": versions()}
     found = user_cache.recall("speed", key)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+from ..companion import Companion
 from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..errors import ZondaError
-from ..pipeline import Companion
 from .planner import same_labels
 
 
@@ -23,7 +23,7 @@ def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:
         Where no step provides a component, or a step asks for singular modes of the complete data.
     """
     pipeline = file.pipeline()
-    makers = pipeline._generators()
+    makers = pipeline.selection.generators()
     provided = sorted(set().union(*(o.provides for o in makers)))
     for name in components:
         if name not in provided:

@@ -15,7 +15,7 @@ from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data
 from ..derived import derivation
 from ..errors import ZondaError
-from ..execution import available_memory, available_threads
+from ..machine import available_memory, available_threads
 from ..pipeline import Pipeline
 from .budget import limits
 from .context import Context, look

@@ -18,9 +18,9 @@ from pydantic import BaseModel
 from .. import user_cache
 from ..configuration.pipeline_file import PipelineFile
 from ..discovery import HOST, discover, normalized
-from ..execution import available_memory, available_threads
-from ..pipeline import versions
+from ..machine import available_memory, available_threads
 from ..program import fingerprint
+from ..versions import versions
 from . import table
 from .cost import Prediction
 from .planner import apply, plan

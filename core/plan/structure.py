@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from ..companion import Companion
 from ..derived import derivable, derivation
 from ..operator import Operator
-from ..pipeline import Companion, Pipeline
+from ..pipeline import Pipeline
 
 STREAMS = frozenset({"sky", "atmosphere", "transmission", "white", "pink", "signal"})
 """Names whose only use is to be read by a later operator of the same run."""
@@ -60,11 +61,11 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     in_memory = all(o.product_only or "boresight" in o.provides or o.provides <= STREAMS for o in pipeline.operators)
     needed: dict[str, dict[str, str]] = {}  # by run: label -> reason
     for run in [*pipeline.runs, ""]:  # the main run last: the others may need it
-        steps, wanted = pipeline._selected(run), _wanted(pipeline, run)
+        steps, wanted = pipeline.selection.steps(run), _wanted(pipeline, run)
         pinned = dict.fromkeys(keep, "asked for with --keep")
         if in_memory:
             wanted = set().union(*(o.provides for o in pipeline.operators))  # nothing is written: the products are the output
-        for frozen in [r for r in needed if not run and pipeline.is_frozen(r)]:
+        for frozen in [r for r in needed if not run and pipeline.selection.is_frozen(r)]:
             pinned |= {o.label: f"run {frozen} takes its modes" for o in steps if o.couples == "all"}
         found, left_out = _walk(steps, wanted, pinned)
         needed[run] = found
@@ -83,7 +84,7 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
         rows = [r for r in rows if r.run not in ("", instead)]
         words = "the sky alone" if pipeline.runs[instead].only == ["sky"] else f"run {instead.strip('_')}"
         reason = f"no step reads what a run of everything makes: {words} takes its place"
-        rows += [Row("", o.label, False, reason) for o in pipeline._selected("") if o.label not in needed[instead]]
+        rows += [Row("", o.label, False, reason) for o in pipeline.selection.steps("") if o.label not in needed[instead]]
         needed[""] = needed.pop(instead)
     acting = set().union(*(set(found) for found in needed.values()))
     outside = [o for o in pipeline.operators if o.at_end or "boresight" in o.provides]
@@ -94,7 +95,7 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     kept_rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     kept = tuple(o.label for o in pipeline.operators if o.label in acting)
     runs = tuple(r for r in pipeline.runs if r in needed)
-    derived = {} if instead else {run: derivation(parts) for run, parts in derivable(pipeline, runs).items()}
+    derived = {} if instead else {run: derivation(parts) for run, parts in derivable(pipeline.selection, runs).items()}
     return Structure(kept, runs, tuple(kept_rows), instead, derived)
 
 
@@ -109,13 +110,14 @@ def _wanted(pipeline: Pipeline, run: str) -> set[str]:
 
 def _in_place_of_main(pipeline: Pipeline, needed: Mapping[str, Mapping[str, str]], wanted: set[str], keep: set[str]) -> str:
     """A run whose components hold those of all other needed runs, where nothing reads what the main run makes; else empty."""
-    main = [o for o in pipeline._selected("") if o.label in needed[""]]
-    if any(_makes_something(o, wanted) or o.label in keep for o in main) or any(pipeline.is_frozen(run) for run in needed):
+    selection = pipeline.selection
+    main = [o for o in selection.steps("") if o.label in needed[""]]
+    if any(_makes_something(o, wanted) or o.label in keep for o in main) or any(selection.is_frozen(run) for run in needed):
         return ""
     others = [run for run in needed if run and pipeline.runs[run].only is not None]
     for run in others:
-        components, filters = pipeline.components(run), pipeline.runs[run].filters
-        if filters == "all" and len(others) == len(needed) - 1 and all(pipeline.components(r) <= components for r in others):
+        components, filters = selection.components(run), pipeline.runs[run].filters
+        if filters == "all" and len(others) == len(needed) - 1 and all(selection.components(r) <= components for r in others):
             return run
     return ""
 
@@ -167,7 +169,7 @@ def _not_in_run(pipeline: Pipeline, run: str, steps: Sequence[Operator]) -> list
         return []
     taking = {o.label for o in steps}
     rows = []
-    for o in pipeline._selected(""):
+    for o in pipeline.selection.steps(""):
         if o.label not in taking:
             why = "belongs to the main run only" if o.main_run_only else f"the run has {_words(pipeline.runs[run])}"
             if not o.main_run_only and pipeline.runs[run].keeps(o.provides) | ("signal" in o.provides):
@@ -187,7 +189,7 @@ def selected(pipeline: Pipeline, structure: Structure) -> dict[str, int]:
     counts: Mapping[str, int] = {}
     counts = dict.fromkeys(structure.operators, 0)
     for run in ["", *(r for r in structure.runs if r not in structure.derived)]:
-        for operator in pipeline._selected(run):
+        for operator in pipeline.selection.steps(run):
             if operator.label in counts:
                 counts[operator.label] += 1
     return dict(counts)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -15,10 +16,11 @@ from pydantic import Field, PrivateAttr
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
+from zonda.core.early import take
 from zonda.core.files import atomic_path, product_path
 from zonda.core.operator import Operator
 from zonda.operators.io.map_view import MapView, maps_of, noise_sources
-from zonda.operators.io.save_map import output_folder
+from zonda.operators.io.save_map import MOST_AT_ONCE, output_folder
 from zonda.operators.maps.image import Image
 from zonda.operators.maps.map_product import MapProduct
 
@@ -81,13 +83,14 @@ class Plots(Operator):
         self._begun = {}
         if self._artist is None and data.threads > 1:
             with suppress(OSError):
-                self._artist = Artist()
+                self._artist = take(Artist)
 
-    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run"]) -> None:
+    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         """Begin with the pictures of what will not change any more."""
         if self._artist is not None:
             for drawing in _drawings(data, self.style()):
-                if drawing.key not in self._begun and (drawing.settled == "at once" or (done == "run" and drawing.settled)):
+                settled = drawing.settled == "at once" or (done == "run" and drawing.settled != "") or done == "runs"
+                if settled and drawing.key not in self._begun:
                     self._begun[drawing.key] = self._artist.submit(drawing.function, *drawing.arguments())
 
     def estimate(self, context: Context) -> Estimate:
@@ -98,16 +101,21 @@ class Plots(Operator):
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
+        written = []
         try:
-            made = pictures(data, self.style(), self._begun, self._artist)
+            with ThreadPoolExecutor(MOST_AT_ONCE, self.label) as pool:  # while the disk writes one, the next is drawn
+
+                def write(picture: Picture) -> None:
+                    written.append(pool.submit(_write, product_path(folder, picture.name, ".png"), picture.png))
+
+                made = pictures(data, self.style(), self._begun, self._artist, write)
         finally:
             self._begun = {}
             if self._artist is not None:
                 self._artist.close()
                 self._artist = None
-        for picture in made:
-            with atomic_path(product_path(folder, picture.name, ".png")) as temporary:
-                temporary.write_bytes(picture.png)
+        for file in written:
+            file.result()
         data.products["pictures"] = made
 
     def style(self) -> Style:
@@ -127,18 +135,37 @@ class Drawing:
     settled: Literal["at once", "run", ""] = "run"
 
 
+def _write(path: Path, png: bytes) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(png)
+
+
 def pictures(
-    data: Data, style: Style, begun: dict[str, Future[Any]] | None = None, artist: Artist | None = None
+    data: Data,
+    style: Style,
+    begun: Mapping[str, Future[Any]] | None = None,
+    artist: Artist | None = None,
+    there: Callable[[Picture], Any] = lambda picture: None,
 ) -> list[Picture]:
-    """Every picture that the products allow, in reading order. ``begun``: by `Drawing.key`, what ``artist`` is drawing."""
+    """Every picture that the products allow, in reading order.
+
+    ``begun``: by `Drawing.key`, what ``artist`` is drawing. ``there`` is told of every picture as soon as it is there.
+    """
     drawings, coming = list(_drawings(data, style)), dict(begun or {})
     for drawing in drawings:
         if artist is not None and drawing.key not in coming:
             coming[drawing.key] = artist.submit(drawing.function, *drawing.arguments())
+    for future in as_completed(coming.values()):
+        for picture in future.result() or ():
+            there(picture)
     made: list[Picture] = []
     for drawing in drawings:
         found = coming[drawing.key].result() if drawing.key in coming else None
-        made += drawing.function(*drawing.arguments()) if found is None else found
+        if found is None:
+            found = drawing.function(*drawing.arguments())
+            for picture in found:
+                there(picture)
+        made += found
     return made
 
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import base64
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from html import escape
 from importlib import resources
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import PrivateAttr
 
 from zonda.core.configuration.parameters import described, quantity
 from zonda.core.configuration.units import Angle
-from zonda.core.data import Data
+from zonda.core.data import Data, Observation
 from zonda.core.errors import ZondaError
 from zonda.core.files import write_text
 from zonda.core.operator import Operator
@@ -49,6 +50,8 @@ class Report(Operator):
     central_diameter: Angle = quantity("1 arcmin", gt=0)
     """Diameter of the circle about the map's centre in which the noise is stated."""
 
+    _known: dict[str, str] | None = PrivateAttr(None)
+
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
@@ -59,25 +62,37 @@ class Report(Operator):
 
         return Estimate((), Cost(once=0.35, bytes=10e6, kernel="python"))
 
+    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+        """Write what no later step changes while the last pictures are drawn."""
+        if done == "runs":
+            self._known = _known(data, self.central_diameter)
+
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         shown = data.products.get("pictures")
         if shown is None:
             shown = pictures(data, Plots(central_diameter=f"{self.central_diameter!r} rad").style())
-        data.products["report"] = write_text(folder / "report.html", page(data, shown, self.central_diameter))
+        known, self._known = self._known, None
+        data.products["report"] = write_text(folder / "report.html", page(data, shown, self.central_diameter, known))
 
 
-def page(data: Data, shown: Sequence[Picture], central_diameter: float) -> str:
-    """The whole page. Everything that is not markup of this module is escaped."""
+def _known(data: Data, central_diameter: float) -> dict[str, str]:
+    """The sections that are settled once all runs have ended."""
+    return {"results": _results(data, central_diameter), "scene": _scene(data), "scans": _scans(data), "steps": _steps(data)}
+
+
+def page(data: Data, shown: Sequence[Picture], central_diameter: float, known: Mapping[str, str] | None = None) -> str:
+    """The whole page. Everything that is not markup of this module is escaped. ``known``: `_known`, where it was made before."""
+    known = _known(data, central_diameter) if known is None else known
     style = resources.files(__package__).joinpath("data/report.css").read_text(encoding="utf-8")
     provenance = data.provenance
     name = str(provenance.get("name") or "zonda run")
     parts = [
-        ("results", "Results", _results(data, central_diameter)),
+        ("results", "Results", known["results"]),
         ("pictures", "Pictures", _pictures(shown)),
-        ("scene", "Scene", _scene(data)),
-        ("scans", "Scans", _scans(data)),
-        ("steps", "Steps", _steps(data)),
+        ("scene", "Scene", known["scene"]),
+        ("scans", "Scans", known["scans"]),
+        ("steps", "Steps", known["steps"]),
         ("tally", "Counted and approximated", _tally(data)),
         ("plan", "Plan", _plan(data)),
         ("time", "Computing time", _timings(data)),
@@ -247,8 +262,7 @@ def _spread(values: Any, unit: str = "") -> str:
 def _scans(data: Data) -> str:
     rows = []
     for o in data.observations:
-        elevation = np.degrees(o.elevation)
-        azimuth = np.degrees(np.unwrap(o.azimuth))
+        azimuth, elevation = _ranges(o)
         flagged = f"{np.count_nonzero(o.flags)} / {np.count_nonzero(o.detector_flags)}"
         centre = f"{np.degrees(o.centre[0]):.5f}°, {np.degrees(o.centre[1]):+.5f}°"
         rows.append(
@@ -258,8 +272,8 @@ def _scans(data: Data) -> str:
                 f"{o.duration:.1f} s",
                 f"{o.n_detectors} × {o.n_samples}",
                 centre,
-                f"{elevation.min():.2f}° – {elevation.max():.2f}°",
-                f"{azimuth.min():.2f}° – {azimuth.max():.2f}°",
+                f"{elevation[0]:.2f}° – {elevation[1]:.2f}°",
+                f"{azimuth[0]:.2f}° – {azimuth[1]:.2f}°",
                 flagged,
             )
         )
@@ -274,6 +288,19 @@ def _scans(data: Data) -> str:
         "flagged samples / detectors",
     )
     return f'<div class="compact">{_table(rows, head)}</div>'
+
+
+def _ranges(observation: Observation) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lowest and highest azimuth, which begins between 0 and 360 and goes on beyond, and elevation of a scan [deg].
+
+    As `Observation.azimuth` and `Observation.elevation`, which take every angle of every sample.
+    """
+    x, y, z, w = observation.boresight_azel.T
+    azimuth = np.degrees(np.unwrap(np.arctan2(2 * (w * x - y * z), 2 * (x * z + w * y))))
+    azimuth += azimuth[0] % 360 - azimuth[0]
+    sine = 1 - 2 * (x * x + y * y)
+    low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
+    return (float(azimuth.min()), float(azimuth.max())), (float(low), float(high))
 
 
 _NUMBER = re.compile(r"([-+]?\d+\.?\d*(?:e[-+]?\d+)?) ([A-Za-z][A-Za-z0-9 /()]*)", re.IGNORECASE)

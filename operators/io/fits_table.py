@@ -13,7 +13,7 @@ import numpy as np
 from zonda.core.files import writing
 from zonda.core.fits_files import check_size, opened
 
-from .save_map import ascii_text
+from .map_file import ascii_text
 from .time_ordered_data import UNITS, Floats, TimeOrderedData
 from .toast_hdf5 import azimuth_elevation
 

@@ -145,7 +145,7 @@ def noise_figures(maps: Mapping[str, MapProduct], diameter: float) -> list[Noise
         for of, (product, plane) in noise_sources(maps, name).items():
             rms = product.rms(diameter / 2, of=plane)
             again = product.header is not None and product.fwhm > 0 and not product.smoothed_by
-            smoothed = product.smoothed(product.fwhm).rms(diameter / 2, of=plane) if again else math.nan
+            smoothed = product.smoothed_rms(product.fwhm, diameter / 2, of=plane) if again else math.nan
             found.append(NoiseFigure(name, of, rms, smoothed))
     return found
 

@@ -104,9 +104,21 @@ class MapProduct:
         values = getattr(self, of)
         if values is None:
             raise InputError("the map has no half-difference", place="map", cure="set BinMap.half_difference and make two scans")
-        use = (self.distance() <= radius) & np.isfinite(values)
-        w = self.weights[use]
-        return float(np.sqrt((w * values[use] ** 2).sum() / w.sum())) if use.any() and w.sum() > 0 else math.nan
+        return _rms(values, self.weights, self.distance() <= radius)
+
+    def smoothed_rms(
+        self, fwhm: float, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal"
+    ) -> float:
+        """``smoothed(fwhm).rms(radius, of)``; of a TAN map, only what the circle sees is smoothed."""
+        if self.header is None or getattr(self, of) is None:
+            return self.smoothed(fwhm).rms(radius, of)
+        near = self.distance() <= radius
+        reach = math.ceil(5 * fwhm / FWHM_PER_SIGMA / self.pixel)
+        window = tuple(_around(np.flatnonzero(near.any(axis=axis)), reach) for axis in (1, 0))
+        names = ("signal", "hits", "weights", "noise", "half_difference")
+        planes: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[window] for n in names}
+        cut = replace(self, **planes)
+        return _rms(getattr(cut.smoothed(fwhm), of), cut.weights, near[window])
 
     def smoothed(self, fwhm: float) -> MapProduct:
         """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w over pixels with hits.
@@ -202,6 +214,17 @@ class MapProduct:
         if self.half_difference is not None:
             rows.append(("half-difference rms there", f"{self.rms(of='half_difference'):.3g} {self.unit}"))
         return html_table("Map", rows)
+
+
+def _rms(values: Floats, weights: Floats, where: NDArray[np.bool_]) -> float:
+    use = where & np.isfinite(values)
+    w = weights[use]
+    return float(np.sqrt((w * values[use] ** 2).sum() / w.sum())) if use.any() and w.sum() > 0 else math.nan
+
+
+def _around(places: NDArray[np.int64], reach: int) -> slice:
+    """From ``reach`` before the first to ``reach`` behind the last."""
+    return slice(max(0, int(places[0]) - reach), int(places[-1]) + reach + 1) if places.size else slice(0)
 
 
 def _symmetric(values: Floats, taps: Floats) -> Floats:

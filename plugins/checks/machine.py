@@ -38,8 +38,8 @@ FUNCTIONS = (
 
 def description() -> dict[str, str]:
     """What this machine is: interpreter, libraries, CPU, memory, threads."""
-    from zonda.core.execution import available_memory, available_threads
-    from zonda.core.pipeline import versions
+    from zonda.core.machine import available_memory, available_threads
+    from zonda.core.versions import versions
 
     found = versions()
     cpu, features = _cpu()
@@ -130,7 +130,7 @@ def _cache_folder() -> Path:
 @checks.add(MACHINE, reference="1 GB, enough for the shipped pipelines", limit=0, unit="GB short")
 def memory() -> Measured:
     """free memory"""
-    from zonda.core.execution import available_memory
+    from zonda.core.machine import available_memory
 
     free = available_memory() / 1e9
     return max(0.0, 1.0 - free), f"{free:.1f} GB free"

@@ -11,10 +11,10 @@ import zonda
 from zonda.core import ahead
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
-from zonda.core.execution import Settings
 from zonda.core.hooks import hookimpl, manager
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
+from zonda.core.settings import Settings
 
 WAIT = 60.0
 """Seconds after which a thread that never came is given up."""

@@ -197,7 +197,7 @@ def test_several_runs_make_up_the_rest():
     pipeline = Pipeline(pipeline.operators, runs=runs)
     assert pipeline.derived == {"rest": ("sky",)}
     assert pipeline.order == ["", "noise", "sky", "rest"]
-    assert derivable(pipeline, ["rest", "noise"]) == {}
+    assert derivable(pipeline.selection, ["rest", "noise"]) == {}
 
 
 @pytest.mark.parametrize("binning", [{"pixel": "8 arcsec"}, {"nside": 8192}], ids=["image", "HEALPix"])

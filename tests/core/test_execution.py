@@ -5,11 +5,13 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from zonda.core.blocks import PIECE, cut
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.execution import PIECE, Execution, Settings, Timer, cut
+from zonda.core.execution import Execution
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.operator import Operator
+from zonda.core.settings import Settings, Timer
 from zonda.core.smooth import SmoothField
 from zonda.core.tiles import TILE_SAMPLES
 
@@ -150,7 +152,7 @@ def execute(operators, obs, room=None, **settings):
     nothing = lambda **k: None  # noqa: E731
     execution = Execution(operators, obs, Settings(**settings), Timer(), ["signal"])
     if room is not None:
-        execution._store._room, execution.keeps = room, lambda stage, size, held, later: held + size <= room
+        execution._store._room, execution.layout.keeps = room, lambda stage, size, held, later: held + size <= room
     execution.run(data, nothing, nothing)
     return execution, obs.detdata["signal"], data
 

@@ -8,9 +8,9 @@ import pytest
 
 from tests.core.test_execution import CHAIN, Demean, Level, Scale, Sink, Source, execute, observation
 from zonda.core.errors import PipelineError
-from zonda.core.execution import Settings
 from zonda.core.forecast import BASE, forecast, room
 from zonda.core.operator import Operator
+from zonda.core.settings import Settings
 
 
 def labelled(chain):

@@ -16,14 +16,14 @@ HEAVY = {
 RUN = """
 import os, sys
 from zonda.core import cli
-from zonda.core.execution import Execution
+from zonda.core.block_maker import BlockMaker
 
 def first_block(*arguments, **named):
     print(*sorted(sys.modules))
     sys.stdout.flush()
     os._exit(0)
 
-Execution._make = first_block
+BlockMaker.make = first_block
 cli.main(["run", "mustang2_cluster", "--output", sys.argv[1], "--threads", "1",
           "--set", "PointingDaisy.scan_duration=20 s", "--set", "PointingDaisy.scans=2"])
 """

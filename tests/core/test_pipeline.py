@@ -10,7 +10,8 @@ import zonda
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.pipeline import Pipeline, check_order
+from zonda.core.order import check_order
+from zonda.core.pipeline import Pipeline
 from zonda.core.random import normals
 
 
@@ -134,7 +135,7 @@ def test_companion_runs_use_the_same_random_numbers(scene):
 def test_what_acts_at_the_end_hears_of_what_is_done(scene):
     data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs={"again": {"only": ["sky"]}}).run(scene, threads=1)
     scans = [[(run, "scan", k + 1) for k in range(2)] + [(run, "run", 2)] for run in ("", "again")]
-    assert [heard[:3] for heard in data.products["heard"]] == [("", "pointing", 0), *scans[0], *scans[1]]
+    assert [heard[:3] for heard in data.products["heard"]] == [("", "pointing", 0), *scans[0], *scans[1], ("", "runs", 2)]
 
 
 class Flag(Operator):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from zonda.core.companion import Companion
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.operator import Operator
-from zonda.core.pipeline import Companion, Pipeline
+from zonda.core.pipeline import Pipeline
 from zonda.core.plan.planner import plan
 from zonda.core.plan.structure import prune, selected
 

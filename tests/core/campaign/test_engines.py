@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from zonda.core.campaign import engines
 from zonda.core.campaign.engines import engine
 from zonda.core.errors import PipelineError
 
@@ -149,6 +150,34 @@ def test_dask_connects_only_where_it_is_told(bench, capsys):
     assert "no Dask scheduler is named" in capsys.readouterr().err
     assert bench.command("run", bench.file(bench.CAMPAIGN), "--scheduler", "no address", "--output", bench.new()) == 2
     assert "cannot reach the Dask scheduler" in capsys.readouterr().err
+
+
+def test_a_scheduler_file_that_is_still_being_written_is_waited_for(monkeypatch, tmp_path):
+    """Dask writes it in place, and a job script starts scheduler and campaign together."""
+    file, tries = tmp_path / "scheduler.json", []
+
+    def write_more(seconds):
+        tries.append(seconds)
+        file.write_text({1: "", 2: '{"type": "Sched', 3: "{}"}.get(len(tries), '{"address": "tcp://127.0.0.1:8786"}'))
+
+    monkeypatch.setattr(engines.time, "sleep", write_more)
+    assert engines._address(str(file)) == "tcp://127.0.0.1:8786"
+    assert len(tries) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [(None, "No such file"), ("", "JSONDecodeError"), ("[]", "TypeError"), ("{}", "KeyError: 'addr"), ("\xff", "UnicodeDecode")],
+)
+def test_a_scheduler_file_that_never_comes(monkeypatch, tmp_path, text, why):
+    pytest.importorskip("distributed", reason="distributed is not installed")
+    monkeypatch.setattr(engines, "SCHEDULER_FILE_WAIT", 0.0)
+    file = tmp_path / "scheduler.json"
+    if text is not None:
+        file.write_bytes(text.encode("latin-1"))
+    with pytest.raises(PipelineError, match=f"its file cannot be read: .*{why}") as caught, engine("dask", scheduler=str(file)):
+        pass
+    assert caught.value.place == str(file)
 
 
 def test_one_mpi_process_is_not_enough(capsys):

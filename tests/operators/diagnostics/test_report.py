@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
-from zonda.operators.diagnostics.report import Report, readable
+from zonda.operators.diagnostics.report import Report, _ranges, readable
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
 EVIL = "<script>alert('x')</script>&\"quoted\""
@@ -157,3 +158,11 @@ def test_no_output_folder(data):
 )
 def test_quantities_are_readable(text, shown):
     assert readable(text) == shown
+
+
+def test_the_ranges_of_a_scan_are_those_of_its_samples(make_observation):
+    scan = make_observation(300)
+    azimuth, elevation = _ranges(scan)
+    around = np.degrees(np.unwrap(scan.azimuth))
+    assert azimuth == pytest.approx((around.min(), around.max()), abs=1e-9)
+    assert elevation == pytest.approx(np.degrees([scan.elevation.min(), scan.elevation.max()]), abs=1e-9)

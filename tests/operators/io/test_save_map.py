@@ -11,6 +11,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import OutputError, PipelineError
+from zonda.operators.io import map_file
 from zonda.operators.io.save_map import SaveMap
 from zonda.operators.maps.map_product import MapProduct
 
@@ -207,12 +208,11 @@ def test_a_failure_in_the_middle_leaves_the_old_file(run, data, monkeypatch, err
     run(map=wcs_map(20, 20))
     before = (data.output / "map.fits").read_bytes()
 
-    def half(self, name, **_):
-        with open(name, "wb") as file:
-            file.write(b"SIMPLE")
+    def half(*_):
+        yield b"SIMPLE"
         raise error
 
-    monkeypatch.setattr(fits.HDUList, "writeto", half)
+    monkeypatch.setattr(map_file, "_images", half)
     expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else OutputError
     with pytest.raises(expected):
         SaveMap().finalize(data)
