@@ -249,7 +249,8 @@ def run(
 
     if only and verify:
         raise click.UsageError("--verify measures the whole pipeline: leave --only out")
-    file = _load(pipeline, settings, only)
+    if only:
+        file = _load(pipeline, settings, only)
     target = file.header.accuracy
     if target is not None:
         from .accuracy.store import settings_for

@@ -15,12 +15,17 @@ from .discovery import HOST
 def fingerprint() -> str:
     """Hash of the names, times and sizes of zonda's own files."""
     digest = hashlib.blake2b(digest_size=16)
+    for folder in folders():
+        for path, stat in sorted(_files(folder)):
+            digest.update(f"{path} {stat.st_mtime_ns} {stat.st_size}\n".encode())
+    return digest.hexdigest()
+
+
+def folders() -> Iterator[str]:
+    """Where zonda's own modules are."""
     for package in ("core", "operators", "plugins"):
         spec = find_spec(f"{HOST}.{package}")
-        for folder in spec.submodule_search_locations or () if spec else ():
-            for path, stat in sorted(_files(folder)):
-                digest.update(f"{path} {stat.st_mtime_ns} {stat.st_size}\n".encode())
-    return digest.hexdigest()
+        yield from spec.submodule_search_locations or () if spec else ()
 
 
 def _files(folder: str) -> Iterator[tuple[str, os.stat_result]]:

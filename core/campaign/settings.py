@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from ..configuration.parameters import Parameters
+from ..configuration.pipeline_file import Header
 from ..configuration.time import Instant
 
 Engine = Literal["serial", "processes", "mpi", "dask"]
@@ -107,3 +108,11 @@ class Campaign(Parameters):
     def combines(self, axis: str) -> bool:
         """Whether maps are co-added over an axis."""
         return self.combine == "all" or axis in self.combine
+
+
+class CampaignHeader(Header):
+    """Top level of a pipeline file that has a campaign."""
+
+    campaign: Campaign | None = None
+    """Many observations of this pipeline as tasks: a grid or a list of sites, times, seeds or steps' parameters, nights,
+    realizations; and the engine that works on them."""

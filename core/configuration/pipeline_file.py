@@ -11,9 +11,6 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .. import registry
-from ..campaign.entries import missing_above
-from ..campaign.entries import mistakes as campaign_mistakes
-from ..campaign.settings import Campaign
 from ..companion import Companion
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
@@ -70,9 +67,8 @@ class Header(Parameters):
     the cheapest setting of the knobs that a stored front of `zonda accuracy` shows to meet it, else the tightest."""
     budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
     """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
-    campaign: Campaign | None = None
-    """Many observations of this pipeline as tasks: a grid or a list of sites, times, seeds or steps' parameters, nights,
-    realizations; and the engine that works on them."""
+    campaign: Any = None
+    """None; the header of a file with a campaign is a `core.campaign.settings.CampaignHeader`."""
     outputs: Path | None = None
     """Folder for products, relative to the working directory; where absent, out/<name>."""
 
@@ -222,16 +218,18 @@ class _Check:
 
     def run(self) -> PipelineFile:
         head = {k: v for k, v in self.tree.items() if k not in (*SCENE_KEYS, "operators") and not str(k).startswith("x-")}
-        header = self.validate(Header, head, (), "the pipeline", KEYS)
+        header = self.validate(self.kind_of_header(), head, (), "the pipeline", KEYS)
         self.requirements()
         scene = self.scene()
         steps = self.steps()
         if header is not None:
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
-            self.mistakes = [missing_above(m, self.document, header.campaign) for m in self.mistakes]
+            from ..campaign import entries
+
+            self.mistakes = [entries.missing_above(m, self.document, header.campaign) for m in self.mistakes]
             if not self.mistakes:
-                self.mistakes += campaign_mistakes(self.document, header.campaign, KEYS, self.without_campaign)
+                self.mistakes += entries.mistakes(self.document, header.campaign, KEYS, self.without_campaign)
         if self.mistakes:
             raise ConfigurationError(self.mistakes, self.name)
         assert header is not None
@@ -241,6 +239,14 @@ class _Check:
         header = header.model_copy(update={"name": name, "outputs": header.outputs or Path("out") / name})
         parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree}
         return PipelineFile(header, parameters, tuple(s for s in steps if s is not None), self.name, scene)
+
+    def kind_of_header(self) -> type[Header]:
+        """The class that the header is checked against."""
+        if self.tree.get("campaign") is None:
+            return Header
+        from ..campaign.settings import CampaignHeader
+
+        return CampaignHeader
 
     def without_campaign(self, document: Document) -> list[Diagnostic]:
         """What is wrong with a document but for its campaign."""

@@ -10,10 +10,11 @@ from pydantic.errors import PydanticInvalidForJsonSchema
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from .. import registry
+from ..campaign.settings import CampaignHeader
 from ..errors import ZondaError
 from ..operator import Operator
 from ..scene import Scene
-from .pipeline_file import KEYS, Header
+from .pipeline_file import KEYS
 
 _MODE: JsonSchemaMode = "validation"
 
@@ -30,11 +31,11 @@ def json_schema() -> dict[str, Any]:
             continue
         classes[found.qualified if twice else found.name] = operator
     weather = _weather()
-    wanted: list[type[BaseModel]] = [Header, Scene, *dict.fromkeys([*classes.values(), *weather.values()])]
+    wanted: list[type[BaseModel]] = [CampaignHeader, Scene, *dict.fromkeys([*classes.values(), *weather.values()])]
     models = [(model, _MODE) for model in wanted]
     references, definitions = models_json_schema(models, ref_template="#/$defs/{model}")
     defs = definitions.get("$defs", {})
-    header, scene = (defs.pop(references[model, _MODE]["$ref"].rpartition("/")[2]) for model in (Header, Scene))
+    header, scene = (defs.pop(references[model, _MODE]["$ref"].rpartition("/")[2]) for model in (CampaignHeader, Scene))
     properties = header["properties"] | scene["properties"]
     for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
         properties[kind] = _name_or(properties[kind], names)
