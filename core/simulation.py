@@ -10,6 +10,7 @@ from .ahead import Ahead
 from .data import Data, Observation, Tally
 from .execution import Execution
 from .frozen import Frozen
+from .repeated import Repeated, affordable, alike
 from .selection import Selection
 from .settings import Settings, Timer
 
@@ -48,6 +49,7 @@ class Simulation:
         freeze = any(run.modes == "full" for run in selection.runs.values())
         self._frozen = [Frozen() if freeze else None for _ in data.observations]
         self._main = list(self._pristine)
+        self._repeated, self._last_repeat = self._keep_for_later_runs()
         self._following: Execution | None = None
         """What is begun of the next scan, or of the first scan of the next run."""
 
@@ -63,6 +65,9 @@ class Simulation:
             data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             if not run:
                 self._main[number - 1] = observation.focalplane, observation.flags, observation.detector_flags
+            if (repeated := self._repeated[number - 1]) is not None and run == self._last_repeat:
+                repeated.forget(self._settings)
+                self._repeated[number - 1] = None
             after_scan()
 
     @property
@@ -74,6 +79,21 @@ class Simulation:
         """Let observations carry what the main run left of detectors and flags."""
         for observation, found in zip(self._data.observations, self._main, strict=True):
             observation.focalplane, observation.flags, observation.detector_flags = found
+
+    def _keep_for_later_runs(self) -> tuple[list[Repeated | None], str]:
+        """What the main run keeps of each scan, for which less is left of ``settings.memory``; the last run to copy it."""
+        steps, observations, settings = self._selection.steps(""), self._data.observations, self._settings
+        names, users = alike(steps), list[str]()
+        for run in (r for r in self._order if r and r not in self._derived):
+            if any(o.label in names for o in self._selection.steps(run)):
+                users.append(run)
+        later = {o.label for run in users for o in self._selection.steps(run)}
+        names = {label: streams for label, streams in names.items() if label in later}
+        sizes = affordable(steps, names, observations, settings)
+        settings.memory -= sum(sizes)
+        if settings.ceiling is not None:
+            settings.ceiling -= sum(sizes)
+        return [Repeated(names) if size else None for size in sizes], users[-1] if users else ""
 
     def _next_run(self, run: str) -> Execution | None:
         """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived.
@@ -95,4 +115,4 @@ class Simulation:
         observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
         kept = self._frozen[number] if not run or self._selection.runs[run].modes == "full" else None
         steps, keep = self._selection.steps(run), self._keep if not run else ()
-        return Execution(steps, observation, self._settings, self._timer, keep, kept)
+        return Execution(steps, observation, self._settings, self._timer, keep, kept, self._repeated[number])
