@@ -48,7 +48,7 @@ class Simulation:
         self._pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         freeze = any(run.modes == "full" for run in selection.runs.values())
         self._frozen = [Frozen() if freeze else None for _ in data.observations]
-        self._main = list(self._pristine)
+        self._main = [_left(o) for o in data.observations]
         self._repeated, self._last_repeat = self._keep_for_later_runs()
         self._following: Execution | None = None
         """What is begun of the next scan, or of the first scan of the next run."""
@@ -64,7 +64,7 @@ class Simulation:
             execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, self._ahead, self._following)
             data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             if not run:
-                self._main[number - 1] = observation.focalplane, observation.flags, observation.detector_flags
+                self._main[number - 1] = _left(observation)
             if (repeated := self._repeated[number - 1]) is not None and run == self._last_repeat:
                 repeated.forget(self._settings)
                 self._repeated[number - 1] = None
@@ -76,9 +76,10 @@ class Simulation:
         return frozenset().union(*(found.kept_out for found in self._frozen if found))
 
     def leave_main(self) -> None:
-        """Let observations carry what the main run left of detectors and flags."""
+        """Let observations carry what the main run left of detectors, flags, smooth fields and tallies."""
         for observation, found in zip(self._data.observations, self._main, strict=True):
-            observation.focalplane, observation.flags, observation.detector_flags = found
+            for name, value in found.items():
+                setattr(observation, name, value)
 
     def _keep_for_later_runs(self) -> tuple[list[Repeated | None], str]:
         """What the main run keeps of each scan, for which less is left of ``settings.memory``; the last run to copy it."""
@@ -116,3 +117,8 @@ class Simulation:
         kept = self._frozen[number] if not run or self._selection.runs[run].modes == "full" else None
         steps, keep = self._selection.steps(run), self._keep if not run else ()
         return Execution(steps, observation, self._settings, self._timer, keep, kept, self._repeated[number])
+
+
+def _left(observation: Observation) -> dict[str, Any]:
+    """What a run leaves behind in an observation."""
+    return {name: getattr(observation, name) for name in ("focalplane", "flags", "detector_flags", "smooth", "tally")}
