@@ -132,8 +132,10 @@ class Efficiency(Operator):
         if instantaneous and state.mean is not None:
             mean = state.mean.series(rows, block.samples, signal.dtype)
         streams = [have.get(name, absent) for name in ("sky", "transmission", "atmosphere", "white", "pink")]
+        first = np.array([block.samples.start, divisor.first, mean.first], np.int64)
+        smooth = divisor.lines, divisor.inside, mean.lines, mean.inside
         factors = np.array([a[rows] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
-        clipped = _calibrate(*streams, block.samples.start, *divisor, *mean, factors, instantaneous, signal)
+        clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
         if instantaneous:
             block.observation.tally.count(self.label, f"samples whose fluctuating e^-tau was raised to {OPAQUE:g}", clipped)
         have["signal"] = signal
@@ -154,13 +156,15 @@ class Calibration:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _calibrate(sky, wet, air, white, pink, start, divisor, cell, inside, mean, m_cell, m_inside, factors, at_once, out):  # type: ignore[no-untyped-def]
-    """Equation (2); absent streams have no rows. ``wet`` is x; ``divisor``, t, and ``mean``, M, are lines of `Series` of the samples
-    from ``start`` on; ``factors`` (3, n_det): gain, epsilon, zeta. ``at_once``: with the instantaneous transmission.
+def _calibrate(sky, wet, air, white, pink, first, divisor, inside, mean, mean_inside, factors, at_once, out):  # type: ignore[no-untyped-def]
+    """Equation (2); absent streams have no rows. ``wet`` is x; ``divisor``, t, and ``mean``, M, are lines of `Series`;
+    ``first`` (3,): the first sample, and the first cells of t and M; ``factors`` (3, n_det): gain, epsilon, zeta.
+    ``at_once``: by the instantaneous transmission.
 
     Returns how many samples of 1 + x were raised to `OPAQUE`.
     """
     gain, epsilon, zeta = factors[0], factors[1], factors[2]
+    start, cell, mean_cell = first[0], first[1], first[2]
     n_det, n = out.shape
     clipped = 0
     one, opaque = out.dtype.type(1), out.dtype.type(OPAQUE)
@@ -186,7 +190,7 @@ def _calibrate(sky, wet, air, white, pink, start, divisor, cell, inside, mean, m
                     row[t] = gain[d] * s[t] * (one + x[t]) + noise * (factor / max(scale[t], opaque))
             else:
                 if mean.shape[0]:
-                    series_into(mean[d], m_cell, m_inside, start + begin, level[:m])
+                    series_into(mean[d], mean_cell, mean_inside, start + begin, level[:m])
                 for t in range(m):
                     passed = max(one + x[t], opaque)
                     clipped += not one + x[t] >= opaque
