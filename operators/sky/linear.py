@@ -15,26 +15,23 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from .sampling import CHUNK, CONSTANTS, count_covered, locate, misses, pointing, span_on_grid
+from .sampling import CHUNK, CONSTANTS, Chunks, count_covered, locate, misses, span_on_grid
 
 Floats = NDArray[np.floating]
 
 
 def sample_linear(
-    quaternions: NDArray[np.float64],
-    pixel_matrix: NDArray[np.float64],
+    chunks: Chunks,
     xi: NDArray[np.float64],
     eta: NDArray[np.float64],
     rows: NDArray[np.int64],
     values: Floats,
-    bounds: NDArray[np.float64],
     covered: NDArray[np.uint8],
     out: Floats,
     over: bool = False,
 ) -> tuple[int, int]:
     """As `sampling.sample`, from the grid's ``values`` (ny, nx). Samples within two points of its border are left as they are."""
     kind = out.dtype.type
-    chunks = pointing(quaternions, pixel_matrix, values.shape, bounds, kind)
     of_map = rows, values.reshape(-1), values.shape[1], covered, CONSTANTS.astype(kind)
     beyond, behind = _sample(*chunks, xi.astype(kind), eta.astype(kind), *of_map, over, out)
     return int(beyond), int(behind)

@@ -26,14 +26,16 @@ CHUNK = 256
 """Samples that share a coordinate origin; divides `TILE_SAMPLES`, so chunks are absolute."""
 
 
+Chunks = tuple[Floats, NDArray[np.float64], Floats, NDArray[np.int32]]
+"""What `pointing` returns."""
+
+
 def sample(
-    quaternions: NDArray[np.float64],
-    pixel_matrix: NDArray[np.float64],
+    chunks: Chunks,
     xi: NDArray[np.float64],
     eta: NDArray[np.float64],
     rows: NDArray[np.int64],
     coefficients: Floats,
-    bounds: NDArray[np.float64],
     covered: NDArray[np.uint8],
     out: Floats,
     over: bool = False,
@@ -42,18 +44,14 @@ def sample(
 
     Parameters
     ----------
-    quaternions
-        (n_samp, 4) boresight, ICRS; the first sample is a multiple of `CHUNK` of the observation.
-    pixel_matrix
-        (3, 3) ICRS direction to homogeneous working-grid pixel, 0-based.
+    chunks
+        `pointing` for the samples of ``out``, of its type.
     xi, eta
         (n_rows,) focal-plane offsets of the detectors at ``rows`` of ``out``.
     coefficients
         (ny, nx) cubic B-spline coefficients of ``out``'s type, C order, fewer than 2^31.
-    bounds
-        (4,) x_low, x_high, y_low, y_high of the input map on the working grid.
     covered
-        (ny, nx) 1 where the input map has data, or (0, 0): everywhere within ``bounds``.
+        (ny, nx) 1 where the input map has data, or (0, 0): everywhere within its bounds.
     over
         Put the map into ``out``, whatever is there, and zeros where there is no map.
 
@@ -61,7 +59,6 @@ def sample(
     in both numbers.
     """
     kind = out.dtype.type
-    chunks = pointing(quaternions, pixel_matrix, coefficients.shape, bounds, kind)
     of_map = rows, coefficients.reshape(-1), coefficients.shape[1], covered, CONSTANTS.astype(kind)
     beyond, behind = _sample(*chunks, xi.astype(kind), eta.astype(kind), *of_map, over, out)
     return int(beyond), int(behind)
@@ -73,8 +70,21 @@ CONSTANTS = np.array([1 / 6, 2 / 3, 0.5, 1.0, 2.0, 1e6, 0.0])
 
 def pointing(
     quaternions: NDArray[np.float64], matrix: NDArray[np.float64], shape: tuple[int, ...], bounds: NDArray[np.float64], kind: Any
-) -> tuple[Floats, NDArray[np.float64], Floats, NDArray[np.int32]]:
-    """Where the boresight is on a grid of ``shape``, in m chunks of `CHUNK` samples, each counted from its own origin.
+) -> Chunks:
+    """Where the boresight is on a working grid, in m chunks of `CHUNK` samples, each counted from its own origin.
+
+    Parameters
+    ----------
+    quaternions
+        (n_samp, 4) boresight, ICRS; the first sample is a multiple of `CHUNK` of the observation.
+    matrix
+        (3, 3) ICRS direction to homogeneous working-grid pixel, 0-based.
+    shape
+        (ny, nx) of the grid.
+    bounds
+        (4,) x_low, x_high, y_low, y_high of the input map on it.
+    kind
+        Type of the samples, float32 or float64.
 
     Returns
     -------

@@ -29,7 +29,7 @@ from .linear import sample_linear
 from .placement import kelvin, placed
 from .read import HealpixMap, WcsMap, read_map
 from .resample import resample_healpix, resample_image, tangent_wcs
-from .sampling import sample
+from .sampling import Chunks, pointing, sample
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -126,17 +126,16 @@ class SkyMap(Operator):
         stream = block.new("sky", zero=not over)
         index = state.index[block.detectors]
         xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
-        quaternions = np.ascontiguousarray(observation.boresight_radec[block.samples], np.float64)
         beyond = behind = 0
         if not state.beams:
-            beyond, behind = stream.size, _behind(state.sky, quaternions, xi, eta)
+            beyond, behind = stream.size, _behind(state.sky, observation.boresight_radec[block.samples], xi, eta)
         for number, beam in enumerate(state.beams):
             rows = np.flatnonzero(index == number)
             if rows.size:
                 coefficients = beam.convolved.coefficients[stream.dtype.name]
-                of_beam = coefficients, beam.convolved.bounds, beam.covered
+                chunks = state.chunks(block, number, stream.dtype.type)
                 interpolate = sample_linear if self.interpolation == "linear" else sample
-                found = interpolate(quaternions, beam.matrix, xi[rows], eta[rows], rows, *of_beam, stream, over)
+                found = interpolate(chunks, xi[rows], eta[rows], rows, coefficients, beam.covered, stream, over)
                 beyond, behind = beyond + found[0], behind + found[1]
         if self.outside:
             stream += stream.dtype.type(self.outside)
@@ -282,10 +281,9 @@ class SkyMap(Operator):
 class Memory:
     """What an operator has computed, kept for its next observation. Thread-safe; copies and pickles are empty."""
 
-    LIMIT = 2**30
-    """Bytes kept; the values least recently used go first (an observation that needs them holds them itself)."""
-
-    def __init__(self) -> None:
+    def __init__(self, limit: int = 2**30) -> None:
+        """``limit``: bytes kept; the values least recently used go first (an observation that needs them holds them itself)."""
+        self._limit = limit
         self._lock = threading.RLock()
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
@@ -294,7 +292,7 @@ class Memory:
         with self._lock:
             if key not in self._kept:
                 self._kept[key] = make()
-                while len(self._kept) > 1 and sum(v.nbytes for v in self._kept.values()) > self.LIMIT:
+                while len(self._kept) > 1 and sum(v.nbytes for v in self._kept.values()) > self._limit:
                     self._kept.popitem(last=False)
             value = self._kept[key]
             self._kept.move_to_end(key)
@@ -305,8 +303,8 @@ class Memory:
 
     __hash__ = None  # type: ignore[assignment]
 
-    def __reduce__(self) -> tuple[type[Memory], tuple[()]]:
-        return Memory, ()
+    def __reduce__(self) -> tuple[type[Memory], tuple[int]]:
+        return Memory, (self._limit,)
 
 
 @dataclass(frozen=True)
@@ -346,6 +344,15 @@ class Beam:
         return self.covered.nbytes + sum(c.nbytes for c in self.convolved.coefficients.values())
 
 
+@dataclass(frozen=True)
+class _Held:
+    chunks: Chunks
+
+    @property
+    def nbytes(self) -> int:
+        return sum(part.nbytes for part in self.chunks)
+
+
 @dataclass
 class State:
     """What `SkyMap.exec` needs; ``index`` (n_det,) numbers each detector's beam."""
@@ -354,6 +361,19 @@ class State:
     beams: list[Beam]
     index: NDArray[np.int64]
     _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+    _chunks: Memory = field(default_factory=lambda: Memory(2**22))
+
+    def chunks(self, block: Block, number: int, kind: Any) -> Chunks:
+        """`pointing` of a block for a beam, which blocks of other detectors share."""
+
+        def make() -> _Held:
+            quaternions = np.ascontiguousarray(block.observation.boresight_radec[block.samples], np.float64)
+            beam = self.beams[number]
+            shape = beam.convolved.coefficients["float64"].shape
+            return _Held(pointing(quaternions, beam.matrix, shape, beam.convolved.bounds, kind))
+
+        held: _Held = self._chunks.get((block.samples.start, block.samples.stop, number, kind), make)
+        return held.chunks
 
     def record(self, block: Block, beyond: int, behind: int) -> None:
         """Keep a block's counts under its place; a block that is made again is counted once."""
