@@ -244,7 +244,7 @@ def run(
     from .compile_ahead import Helper
     from .files import check_output_folder, write_text
     from .lock import lock
-    from .plan import table
+    from .plan.outcome import line
     from .plan.remembered import outcome
 
     if only and verify:
@@ -270,7 +270,7 @@ def run(
     helper = Helper()
     click.get_current_context().call_on_close(helper.close)
     made = outcome(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
-    click.echo(table.line(made), err=True)
+    click.echo(line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
     command = _command(pipelines, settings, keep, drop, no_prune, only)
