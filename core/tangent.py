@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .fits_image import Cards
 from .projection import central
-
-if TYPE_CHECKING:
-    from astropy.io.fits import Header
 
 Floats = NDArray[np.float64]
 
@@ -84,11 +82,9 @@ class TangentWcs:
         world = np.degrees(np.arctan2(b, a)) % 360.0, np.degrees(np.arctan2(c, np.hypot(a, b)))
         return np.stack(world, axis=1) if len(pixels) == 1 else list(world)
 
-    def to_header(self, relax: bool = True) -> Header:
+    def to_header(self, relax: bool = True) -> Cards:
         """The keys that astropy writes."""
-        from astropy.io.fits import Header
-
-        header = Header([("WCSAXES", 2, "Number of coordinate axes")])
+        header = Cards([("WCSAXES", 2, "Number of coordinate axes")])
         degrees = "Units of coordinate increment and value"
         for key, values, text in (
             ("CRPIX", self.crpix, ["Pixel coordinate of reference point"] * 2),

@@ -36,7 +36,6 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
-from zonda.core.focalplane import Focalplane
 
 from .radiative_transfer import EARTH_RADIUS
 
@@ -206,13 +205,20 @@ class Track:
 
     def place(self, unrolled: Floats, seconds: Floats, height: float, wind: Floats) -> tuple[Floats, Floats]:
         """As `positions`, of crossings that `unroll` has been applied to (they are the same for every layer)."""
-        offset = height * self.alpha - self.advection @ wind
-        p = self.effective(height) * unrolled
-        p += offset[:, None, None] - (self.drift @ wind)[:, None, None] * seconds
+        matrix, start, velocity = self.affine(height, wind)
+        across, along = (
+            m[0] * unrolled[0] + m[1] * unrolled[1] + (b + v * seconds) for m, b, v in zip(matrix, start, velocity, strict=True)
+        )
+        return across, along
+
+    def affine(self, height: float, wind: Floats) -> tuple[Floats, Floats, Floats]:
+        """What `place` does: (across, along) = matrix (2, 2) unrolled + start (2,) [m] + velocity (2,) [m/s] seconds."""
         along = self.frame @ wind
         speed = float(np.hypot(*along))
-        c, s = along / speed if speed > 0 else np.array([1.0, 0.0])
-        return -s * p[0] + c * p[1], c * p[0] + s * p[1]
+        c, s = along / speed if speed > 0 else (1.0, 0.0)
+        turn = np.array([[-s, c], [c, s]])
+        start = turn @ (height * self.alpha - self.advection @ wind)
+        return self.effective(height) * turn, start, turn @ (self.drift @ -wind)
 
 
 def plane(observation: Observation) -> Track:
@@ -223,7 +229,7 @@ def plane(observation: Observation) -> Track:
     the rim of the field. One plane is used where it is good to `FLAT`, else the cone where it is better.
     """
     every = max(1, observation.n_samples // 2000)
-    xi, eta = rim(observation.focalplane)
+    xi, eta = rim(observation.focalplane.xi, observation.focalplane.eta)
     u = rays(axes(observation.boresight_azel[::every]), np.r_[0.0, xi], np.r_[0.0, eta])
     boresight = u[:, 0]
     n = boresight.mean(1)
@@ -260,11 +266,11 @@ def _mean_drift(cone: Cone, crossings: Floats) -> tuple[Floats, float]:
     return mean, float(np.linalg.norm((mean - each) @ np.linalg.inv(each), 2, axis=(1, 2)).max())
 
 
-def rim(focalplane: Focalplane, number: int = 12) -> tuple[Floats, Floats]:
-    """The outermost detectors in ``number`` directions: xi, eta."""
+def rim(xi: Floats, eta: Floats, number: int = 12) -> tuple[Floats, Floats]:
+    """The outermost points in ``number`` directions: xi, eta."""
     angle = 2 * np.pi * np.arange(number) / number
-    outer = np.unique(np.argmax(np.outer(np.cos(angle), focalplane.xi) + np.outer(np.sin(angle), focalplane.eta), axis=1))
-    return focalplane.xi[outer], focalplane.eta[outer]
+    outer = np.unique(np.argmax(np.outer(np.cos(angle), xi) + np.outer(np.sin(angle), eta), axis=1))
+    return xi[outer], eta[outer]
 
 
 def _error(metric: Floats, u: Floats) -> float:

@@ -256,7 +256,8 @@ class AtmosphereLayers(Operator):
         n = observation.n_samples
         first, count = times(slice(0, n), plan.step)
         kind = np.float64 if plan.nodes.shape else np.float32
-        turbulence = Layers(observation, track, drifting, plan.step, first, first + count, kind)
+        points = plan.nodes.xi, plan.nodes.eta
+        turbulence = Layers(observation, track, *points, drifting, plan.step, first, first + count, kind)
 
         shares, heights = np.array([layer.amplitude for layer in layers]), np.array([layer.height for layer in layers])
         vapour_height = float(shares @ heights / shares.sum())
@@ -466,13 +467,17 @@ def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
 
 
 def _check_pointing(observation: Observation) -> None:
-    bad = np.flatnonzero(~np.isfinite(observation.boresight_azel).all(axis=1))
-    if len(bad):
+    quaternions = observation.boresight_azel
+    if not np.isfinite(quaternions.sum()):
+        bad = np.flatnonzero(~np.isfinite(quaternions).all(axis=1))
         raise PointingError(
             f"the boresight of sample {bad[0]} is not a number ({len(bad)} of {observation.n_samples} samples)",
             place=observation.name,
             cure="repair the pointing, or leave these samples out",
         )
+    x, y = quaternions[:, 0], quaternions[:, 1]
+    if 1 - 2 * (x * x + y * y).max() > math.sin(ELEVATION_MIN) + 1e-9:
+        return
     elevation = observation.elevation
     if 0 <= elevation.min() < ELEVATION_MIN:
         raise PointingError(

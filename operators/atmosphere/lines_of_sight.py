@@ -70,7 +70,7 @@ class LinesOfSight:
         axes = axes_at(observation.boresight_azel, index, step)  # (n, 3 components, 3 axes)
         # Components of u before normalization: rows (east, north, up), columns (1, xi, eta).
         linear = np.stack([axes[:, :, 2], -axes[:, :, 1], -axes[:, :, 0]], axis=2)
-        xi, eta = rim(observation.focalplane)
+        xi, eta = rim(observation.focalplane.xi, observation.focalplane.eta)
         self.low, self.high = self._sines(linear[:, 2], np.r_[0.0, xi], np.r_[0.0, eta])
         self._cone = track.cone
         if track.cone is None:

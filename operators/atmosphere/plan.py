@@ -42,11 +42,11 @@ MEAN_SHARE = 0.1
 WINDOWS = (16, 1 << 14)
 """Number and length [samples] of the parts of a longer scan at which its path is looked at."""
 
-LOOKED_AT = 4096
+LOOKED_AT = 1024
 """Samples of a scan whose velocity and elevation are looked at."""
 
-IN_A_CELL = 16
-"""Samples between two steps at which the path's error is looked at."""
+IN_A_CELL = 4
+"""Samples between two steps at which the path's error is looked at: it is a polynomial there, whose square is right to 1 %."""
 
 PAYS_FROM = 1 << 18
 """Points (nodes x times) from which coarser steps for single layers are worth their interpolation."""
@@ -100,9 +100,11 @@ def make_plan(
     # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the water fluctuated where none does).
     kelvin = float(band.emission(pwv, elevations[1]))
     allowed = max(MEAN_SHARE * tolerance * kelvin * max(pwv_rms, 1e-4), 1e-9)
+    truth = _mean_emission(xi, eta, band, pwv, elevations)
     for size in GRIDS:
         mean_nodes = grid(xi, eta, size)
-        if _mean_error(mean_nodes, xi, eta, band, pwv, elevations) <= allowed:
+        at_nodes = _mean_emission(mean_nodes.xi, mean_nodes.eta, band, pwv, elevations)
+        if float(abs(truth - mean_nodes.weights @ at_nodes).max()) <= allowed:
             break
 
     velocity = path.velocity(track)
@@ -165,17 +167,10 @@ def _slope(band: BandAtmosphere, pwv: float, elevation: Floats) -> Floats:
     return np.asarray((band.emission(pwv, low + h) - band.emission(pwv, low)) / h, np.float64)
 
 
-def _mean_error(nodes: Nodes, xi: Floats, eta: Floats, band: BandAtmosphere, pwv: float, elevations: Floats) -> float:
-    """Largest error of the mean emission interpolated over the focal plane, K_RJ, at some elevations of the boresight."""
-    worst = 0.0
-    for elevation in elevations:
-        c, s = math.cos(elevation), math.sin(elevation)
-
-        def at(x: Floats, e: Floats, c: float = c, s: float = s) -> Floats:
-            return band.emission(pwv, np.arcsin((s + e * c) / np.sqrt(1 + x * x + e * e)))
-
-        worst = max(worst, float(abs(at(xi, eta) - nodes.weights @ at(nodes.xi, nodes.eta)).max()))
-    return worst
+def _mean_emission(xi: Floats, eta: Floats, band: BandAtmosphere, pwv: float, elevations: Floats) -> Floats:
+    """The mean emission over the focal plane at some elevations of the boresight: (len(xi), len(elevations)), K_RJ."""
+    c, s = np.cos(elevations), np.sin(elevations)
+    return band.emission(pwv, np.arcsin((s + eta[:, None] * c) / np.sqrt(1 + xi * xi + eta * eta)[:, None]))
 
 
 class _Path:

@@ -86,10 +86,11 @@ class Layers:
         """The same layers with all water multiplied so that it amounts to ``pwv`` [m]. The pressure stays as it is."""
         if pwv == 0:
             return replace(self, h2o=np.zeros_like(self.h2o))
-        layers = self
+        air, h2o = -np.diff(self.pressure) / GRAVITY, self.h2o
         for _ in range(8):  # the number of molecules depends on the water by a few per mille: converges as 0.005^n
-            layers = replace(layers, h2o=layers.h2o * (pwv / layers.pwv))
-        return layers
+            mass = MOLAR_MASS_DRY_AIR + (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) * h2o
+            h2o = h2o * (pwv * WATER_DENSITY / (MOLAR_MASS_WATER * np.sum(air * h2o / mass)))
+        return replace(self, h2o=h2o)
 
     def cross_sections(self, cells: slice = slice(None)) -> CrossSections:
         """Of each layer at its mean pressure and temperature (they do not depend on the water)."""
@@ -182,12 +183,19 @@ def emission(slant_opacity: Array, source: Array) -> Array:
     source
         (n + 1, ...) J at the boundaries, K.
     """
-    absorbed = -np.expm1(-slant_opacity)
-    mean = np.divide(absorbed, slant_opacity, out=np.ones_like(absorbed), where=slant_opacity > 0)
-    total = np.cumsum(slant_opacity, axis=0)
-    below = np.ones_like(total)
-    np.exp(-total[:-1], out=below[1:])
-    return np.asarray(np.sum(below * (source[:-1] * absorbed + np.diff(source, axis=0) * (mean - 1 + absorbed)), axis=0))
+    opacity = np.maximum(slant_opacity, np.finfo(np.float64).tiny)  # so that (1 - e^-t) / t is 1 where t is 0
+    absorbed = np.expm1(-opacity)
+    np.negative(absorbed, out=absorbed)
+    mean = np.divide(absorbed, opacity, out=opacity)
+    below = np.ones_like(absorbed)
+    np.cumprod(1 - absorbed[:-1], axis=0, out=below[1:])
+    absorbed *= slant_opacity > 0
+    mean -= 1
+    mean += absorbed
+    mean *= source[1:] - source[:-1]
+    absorbed *= source[:-1]
+    mean += absorbed
+    return np.asarray(np.einsum("i...,i...->...", below, mean))
 
 
 def spectrum(

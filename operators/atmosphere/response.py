@@ -13,6 +13,7 @@ exact where nothing fluctuates. Ranges too wide for polynomials of `_DEGREES` (s
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numba as nb
 import numpy as np
@@ -25,6 +26,9 @@ Floats = NDArray[np.float64]
 
 ERROR = 1e-5
 """Largest error of f / y, of the largest |f / y|."""
+
+LOOKED_AT = 13
+"""Points along each axis at which a fit of low degree is judged; twice as many for others."""
 
 _DEGREES = ((2, 2), (3, 3), (4, 4), (5, 6), (7, 8), (10, 12), (14, 16))
 
@@ -117,15 +121,17 @@ class Response:
             y = np.where(abs(y) < 1e-7, 1e-7, y)
             return function(y, s) / y
 
-        grids = np.meshgrid(np.cos(np.linspace(0.1, 3.1, 23)), np.cos(np.linspace(0, 3.14, 23)), indexing="ij")
-        truth = over_y(*self._unscaled(*grids))
+        known: dict[int, Floats] = {}
         for n_y, n_s in _DEGREES:
-            a, b = (np.cos(np.pi * (np.arange(n) + 0.5) / n) for n in (n_y, n_s))
+            looked_at = LOOKED_AT if max(n_y, n_s) <= 4 else 2 * LOOKED_AT
+            if looked_at not in known:
+                known[looked_at] = over_y(*self._unscaled(*np.meshgrid(*_ends(looked_at), indexing="ij")))
+            truth, (a, b) = known[looked_at], (_points(n) for n in (n_y, n_s))
             values = over_y(*self._unscaled(*np.meshgrid(a, b, indexing="ij")))
-            to_a, to_b = (np.linalg.inv(np.polynomial.chebyshev.chebvander(x, len(x) - 1)) for x in (a, b))
-            series = np.einsum("iu,uv,jv->ij", to_a, values, to_b)
-            if abs(np.polynomial.chebyshev.chebval2d(*grids, series) - truth).max() <= ERROR * abs(truth).max():
-                return np.ascontiguousarray(_powers(_powers(series).T).T)
+            series = np.einsum("iu,uv,jv->ij", _to_series(n_y), values, _to_series(n_s))
+            found = np.einsum("pi,ij,qj->pq", *(_vander(looked_at, 0, n_y), series, _vander(looked_at, 1, n_s)))
+            if abs(found - truth).max() <= ERROR * abs(truth).max():
+                return np.ascontiguousarray(np.einsum("ki,ij,lj->kl", _to_powers(n_y), series, _to_powers(n_s)))
         return None
 
     def _unscaled(self, a: Floats, b: Floats) -> tuple[Floats, Floats]:
@@ -137,14 +143,35 @@ def airmass(elevation: Floats, height: float) -> Floats:
     return np.asarray(1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64)
 
 
-def _powers(series: Floats) -> Floats:
-    """Columns of Chebyshev coefficients as columns of power coefficients, lowest first."""
-    n = len(series)
+def _ends(number: int) -> tuple[Floats, Floats]:
+    """Points of Y and of S at which a fit is judged, the ends among them."""
+    return np.cos(np.linspace(0.1, 3.1, number)), np.cos(np.linspace(0, 3.14, number))
+
+
+def _points(n: int) -> Floats:
+    return np.asarray(np.cos(np.pi * (np.arange(n) + 0.5) / n), np.float64)
+
+
+@lru_cache
+def _to_series(n: int) -> Floats:
+    """From values at `_points` to Chebyshev coefficients, (n, n)."""
+    return np.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(_points(n), n - 1)), np.float64)
+
+
+@lru_cache
+def _vander(number: int, which: int, n: int) -> Floats:
+    """From Chebyshev coefficients to values at the points of `_ends`, (number, n)."""
+    return np.asarray(np.polynomial.chebyshev.chebvander(_ends(number)[which], n - 1), np.float64)
+
+
+@lru_cache
+def _to_powers(n: int) -> Floats:
+    """From Chebyshev to power coefficients, lowest first, (n, n)."""
     matrix = np.zeros((n, n))
     for k in range(n):
         powers = np.polynomial.chebyshev.cheb2poly(np.eye(n)[k])
         matrix[: len(powers), k] = powers
-    return np.asarray(np.einsum("ij,jk->ik", matrix, series), np.float64)
+    return matrix
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -2,7 +2,7 @@
 
 A layer's spline coefficients are made in tiles that overlap by the three cells a cubic spline needs, so that every point is
 interpolated from one tile. Tiles are kept while there is room; any tile has the same bits whenever it is made, and a point
-the same bits in whatever company it is asked for.
+the same bits in whatever company it is asked for. Where a scan sweeps over few cells they are made as one piece.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .lines_of_sight import LinesOfSight
 from .turbulence import Field, Turbulence
 
 Floats = NDArray[np.float64]
-Counts = NDArray[np.int64]
+_Key = tuple[int, tuple[int, int, int, int]]
 
 SQUARE, STRIP = (8, 8), (5, 10)
 """Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the path is narrow."""
@@ -36,6 +36,12 @@ NARROW = 96
 
 APRON = 3
 """Cells by which tiles overlap."""
+
+ONE_PIECE = 1 << 16
+"""Cells of a layer, with `AROUND` more on every side, up to which all that a scan sweeps over is made as one piece."""
+
+AROUND, SPARE = 20, 2
+"""Cells about the made ones that the pyramid works out too, about; and those beyond what the rim of the points sweeps over."""
 
 BYTES_KEPT = 512 << 20
 """Memory of the tiles that are kept."""
@@ -47,6 +53,9 @@ TIMES_AT_ONCE = 2048
 """Coarse times whose tiles are held at once."""
 
 _CHUNK, _RUN = 256, 16
+
+_WHOLE = 30
+"""Side of the only tile, as a power of two of cells: none is so large."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +73,14 @@ class Tiles:
     """The coefficients of several layers, as many as `BYTES_KEPT` allow. Threads may ask at the same time."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[int, int, int], tuple[Field, int]] = {}
-        self._making: dict[tuple[int, int, int], Future[tuple[Field, int]]] = {}
+        self._kept: dict[_Key, tuple[Field, int]] = {}
+        self._making: dict[_Key, Future[tuple[Field, int]]] = {}
         self._lock = threading.Lock()
         self._room = BYTES_KEPT
 
-    def get(self, field: Turbulence, sides: tuple[int, int], layer: int, i: int, j: int) -> tuple[Field, int]:
-        """Tile (i, j) of a layer and its address: coefficients from cell (i << sides[0], j << sides[1]) on, with the apron."""
-        key = (layer, i, j)
+    def get(self, field: Turbulence, layer: int, box: tuple[int, int, int, int]) -> tuple[Field, int]:
+        """Coefficients of a layer and their address: of the cells low <= i < high, low <= j < high of a box, with the apron."""
+        key = (layer, box)
         kept = self._kept.get(key)
         if kept is not None:
             return kept
@@ -84,8 +93,8 @@ class Tiles:
         if not mine:
             return making.result()
         try:
-            a, b = i << sides[0], j << sides[1]
-            tile = field.coefficients(a, a + (1 << sides[0]) + APRON, b, b + (1 << sides[1]) + APRON)
+            a, b, c, d = box
+            tile = field.coefficients(a, b + APRON, c, d + APRON)
             made = tile, tile.ctypes.data
         except BaseException as error:
             making.set_exception(error)
@@ -112,6 +121,8 @@ class Layers:
     ----------
     observation, track
         The scan and its plane.
+    xi, eta
+        The focal-plane points that will be asked for.
     drifting
         The layers; their steps are ``step`` times powers of two.
     step
@@ -133,6 +144,8 @@ class Layers:
         self,
         observation: Observation,
         track: Track,
+        xi: Floats,
+        eta: Floats,
         drifting: Sequence[Drifting],
         step: int,
         first: int,
@@ -148,8 +161,9 @@ class Layers:
             np.array([1 / 6, 2 / 3, 0.5, 1.0, d.amplitude], dtype) for d in self._drifting
         ]
         self._places = [_place(track, d, self.paths[d.step].seconds) for d in self._drifting]
-        swept = [self._swept(n, observation) for n in range(len(drifting))]
-        self._sides = [STRIP if across < NARROW else SQUARE for across, _ in swept]
+        swept = self._swept(*rim(xi, eta))
+        self._sides = [STRIP if box[1] - box[0] < NARROW else SQUARE for box, _ in swept]
+        self._pieces = [_widened(box) for box, _ in swept]
         self.cells = sum(cells for _, cells in swept)
         """Lattice points swept over, about."""
         if self.cells > CELLS_IN_ALL:
@@ -192,28 +206,54 @@ class Layers:
         layer, sides, (matrix, i, j) = self._drifting[n], self._sides[n], self._places[n]
         i, j = i[start : start + x.shape[1]], j[start : start + x.shape[1]]
         low_i, high_i, low_j, high_j = _extent(matrix, boxes, i, j)
-        first_i, first_j = low_i >> sides[0], low_j >> sides[1]
-        wanted = np.zeros(((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8)
-        _mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
-        addresses, held = np.zeros(wanted.shape, np.uint64), []
-        for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
-            tile, addresses[a, b] = self._tiles.get(layer.field, sides, n, first_i + a, first_j + b)
-            held.append(tile)  # or it might be dropped while it is read
-        _interpolate(matrix, x, y, i, j, *sides, first_i, first_j, addresses, self._constants[n], out)
+        piece = self._pieces[n]
+        if piece and piece[0] <= low_i <= high_i < piece[1] and piece[2] <= low_j <= high_j < piece[3]:
+            tile, address = self._tiles.get(layer.field, n, piece)
+            addresses, held = np.array([[address]], np.uint64), [tile]
+            sides, origin, width = (_WHOLE, _WHOLE), (piece[0], piece[2]), tile.shape[1]
+        else:
+            first_i, first_j = low_i >> sides[0], low_j >> sides[1]
+            wanted = np.zeros(((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8)
+            _mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
+            addresses, held = np.zeros(wanted.shape, np.uint64), []
+            for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
+                k, m = (first_i + a) << sides[0], (first_j + b) << sides[1]
+                box = (k, k + (1 << sides[0]), m, m + (1 << sides[1]))
+                tile, addresses[a, b] = self._tiles.get(layer.field, n, box)
+                held.append(tile)  # or it might be dropped while it is read
+            origin, width = (first_i << sides[0], first_j << sides[1]), (1 << sides[1]) + APRON
+        _interpolate(matrix, x, y, i, j, *sides, *origin, width, addresses, self._constants[n], out)
 
-    def _swept(self, n: int, observation: Observation) -> tuple[int, float]:
-        """Cells across the wind, and lattice points over which the field sweeps: bounds from its rim."""
-        path, (matrix, i, j) = self.paths[self._drifting[n].step], self._places[n]
-        xi, eta = rim(observation.focalplane)
-        sum_of_boxes, whole = 0.0, np.array([np.inf, -np.inf, np.inf, -np.inf])
-        for start in range(0, path.count, TIMES_AT_ONCE):
-            count = min(TIMES_AT_ONCE, path.count - start)
-            x, y, _ = path(xi, eta, path.first + start, count)
-            box = _extent(matrix, _boxes(x, y), i[start : start + count], j[start : start + count])
-            sum_of_boxes += (box[1] - box[0] + 40.0) * (box[3] - box[2] + 40.0)
-            whole[::2], whole[1::2] = np.minimum(whole[::2], box[::2]), np.maximum(whole[1::2], box[1::2])
-        across, along = whole[1] - whole[0], whole[3] - whole[2]
-        return int(across), min(sum_of_boxes, (across + 40) * (along + 40))
+    def _swept(self, xi: Floats, eta: Floats) -> list[tuple[tuple[int, int, int, int], float]]:
+        """For each layer the first and last cells, across and along the wind, that the lines of sight of the rim (xi, eta) of
+        the points reach; and about how many lattice points they sweep over."""
+        whole = [(1 << 62, -(1 << 62), 1 << 62, -(1 << 62))] * len(self._drifting)
+        cells = [0.0] * len(self._drifting)
+        for own, path in self.paths.items():
+            for start in range(0, path.count, TIMES_AT_ONCE):
+                count = min(TIMES_AT_ONCE, path.count - start)
+                x, y, _ = path(xi, eta, path.first + start, count)
+                boxes = _boxes(x, y)
+                for n, layer in enumerate(self._drifting):
+                    if layer.step == own:
+                        matrix, i, j = self._places[n]
+                        a, b, c, d = _extent(matrix, boxes, i[start : start + count], j[start : start + count])
+                        cells[n] += (b - a + 2.0 * AROUND) * (d - c + 2.0 * AROUND)
+                        k, m, p, q = whole[n]
+                        whole[n] = min(k, a), max(m, b), min(p, c), max(q, d)
+        return [(box, min(some, _cells_of(box))) for box, some in zip(whole, cells, strict=True)]
+
+
+def _cells_of(box: tuple[int, int, int, int]) -> float:
+    """Lattice points of a box, with those about it."""
+    return (box[1] - box[0] + 2.0 * AROUND) * (box[3] - box[2] + 2.0 * AROUND)
+
+
+def _widened(box: tuple[int, int, int, int]) -> tuple[int, int, int, int] | None:
+    """What is made as one piece, low <= i < high, low <= j < high; None where that is too much."""
+    if _cells_of(box) > ONE_PIECE:
+        return None
+    return box[0] - SPARE, box[1] + 1 + SPARE, box[2] - SPARE, box[3] + 1 + SPARE
 
 
 def _coarse(first: int, stop: int, ratio: int) -> tuple[int, int]:
@@ -226,14 +266,10 @@ def _place(track: Track, layer: Drifting, seconds: Floats) -> tuple[Floats, Floa
 
     Equation (2) of `geometry`; matrix (4,), i and j at ``seconds``, both about 0 where the scan begins.
     """
-    across, along = track.place(np.zeros((2, 1, len(seconds))), seconds, layer.height, layer.wind)
-    unit = np.zeros((2, 2, 1))
-    unit[0, 0] = unit[1, 1] = 1.0  # columns: the images of (1, 0) and (0, 1)
-    moved = track.place(unit, np.zeros(1), layer.height, layer.wind)
-    zero = track.place(np.zeros((2, 1, 1)), np.zeros(1), layer.height, layer.wind)
-    matrix = np.array([m[:, 0] - z[0, 0] for m, z in zip(moved, zero, strict=True)]).ravel()
+    matrix, start, velocity = track.affine(layer.height, layer.wind)
     d = layer.field.spacing
-    return matrix / d, across[0] / d, along[0] / d
+    i, j = (np.asarray((b + v * seconds) / d, np.float64) for b, v in zip(start, velocity, strict=True))
+    return matrix.ravel() / d, i, j
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
@@ -288,17 +324,18 @@ def _mark(matrix, boxes, i, j, side_i, side_j, first_i, first_j, wanted):  # typ
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _interpolate(matrix, x, y, i, j, side_i, side_j, first_i, first_j, addresses, constants, out):  # type: ignore[no-untyped-def]
+def _interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, width, addresses, constants, out):  # type: ignore[no-untyped-def]
     """out += amplitude * the cubic B-spline whose coefficients lie at ``addresses`` (uint64, one for each tile).
 
-    ``constants``: 1/6, 2/3, 1/2, 1 and the amplitude, of the type that the spline is summed in.
+    (low_i, low_j): the first cell of the first tile; ``width``: cells in a row of a tile. ``constants``: 1/6, 2/3, 1/2, 1 and the
+    amplitude, of the type that the spline is summed in.
     """
     a, b, c, d = matrix[0], matrix[1], matrix[2], matrix[3]
     inside_i, inside_j = nb.int32((1 << side_i) - 1), nb.int32((1 << side_j) - 1)
-    width, columns_of_tiles = nb.int32((1 << side_j) + APRON), nb.int32(addresses.shape[1])
+    width, columns_of_tiles = nb.int32(width), nb.int32(addresses.shape[1])
     shift_i, shift_j = nb.int32(side_i), nb.int32(side_j)
     # Cells are counted from the first tile's, in 32 bits: what the box of one call holds fits.
-    origin_i, origin_j = float(first_i << side_i), float(first_j << side_j)
+    origin_i, origin_j = float(low_i), float(low_j)
     stride, flat = nb.uint64(width), addresses.reshape(-1)
     sixth, two_thirds, half, one, amplitude = constants[0], constants[1], constants[2], constants[3], constants[4]
     tile, inside = np.empty(_CHUNK, np.int32), np.empty(_CHUNK, np.int32)

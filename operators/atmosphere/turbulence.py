@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numba as nb
 import numpy as np
@@ -153,7 +153,7 @@ class Turbulence:
         self._keys = [_stream_key(seed, *names, "level", level.exponent) for level in self.levels]
         self._weights = _kriging(self.fidelity.taps, self.fidelity.resolution)
 
-    @property
+    @cached_property
     def variance(self) -> float:
         """Variance after the beam (1 before it)."""
         if self.aperture:

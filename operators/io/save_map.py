@@ -14,9 +14,10 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
 from zonda.core.files import check_output_folder, product_path
+from zonda.core.fits_image import Cards
 from zonda.core.operator import Operator
 
-from .map_file import Provenance, Value, write_map
+from .map_file import Provenance, write_map
 from .map_view import MapView, NoiseFigure, maps_of, noise_figures, noise_sources
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ class SaveMap(Operator):
                         "is there already", place=str(path), cure="remove it, choose another output folder or set overwrite: true"
                     )
         figures = noise_figures(maps, self.central_diameter)
-        cards: dict[Path, dict[str, tuple[Value, str]]] = {}
+        cards: dict[Path, Cards] = {}
         for path, name in noise.items():
             view = views[path] = MapView.of(f"noise_{name}", maps[name])
             view.planes = {of: np.asarray(getattr(product, plane)) for of, (product, plane) in noise_sources(maps, name).items()}
@@ -97,10 +98,10 @@ def no_output_folder(place: str) -> OutputError:
     )
 
 
-def noise_cards(figures: list[NoiseFigure], diameter: float) -> dict[str, tuple[Value, str]]:
+def noise_cards(figures: list[NoiseFigure], diameter: float) -> Cards:
     """Header cards of a noise map: weighted rms about zero in the central circle; undefined where no pixel is there."""
     where = f"central {np.degrees(diameter) * 60:.3g} arcmin"
-    cards: dict[str, tuple[Value, str]] = {}
+    cards = Cards()
     for figure in figures:
         keyword = {"half_difference": "RMSHALF", "source_free": "RMSFREE"}[figure.of]
         cards[keyword] = (figure.rms if np.isfinite(figure.rms) else None, f"[K] rms, {where}")

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
+    from zonda.core.fits_image import Cards
+
 
 @dataclass
 class Image:
@@ -21,13 +23,13 @@ class Image:
     values
         (ny, nx) float64, NaN where nothing is known; row 0 is the FITS file's first row.
     header
-        FITS header with a two-dimensional celestial WCS.
+        FITS keywords with a two-dimensional celestial WCS; a dict that `astropy.io.fits.Header` takes.
     unit
         Unit of ``values``, e.g. ``K_RJ``.
     """
 
     values: NDArray[np.float64]
-    header: Header
+    header: Cards | Header
     unit: str = "K_RJ"
 
     @property

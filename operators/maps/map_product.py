@@ -17,6 +17,9 @@ from zonda.core.errors import InputError
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
+    from zonda.core.fits_image import Cards
+    from zonda.core.tangent import TangentWcs
+
 Floats = NDArray[np.float64]
 
 ARCMIN = math.pi / 180 / 60
@@ -43,7 +46,7 @@ class MapProduct:
         Noise map from the difference of the even and odd scans,
         (m_e - m_o) sqrt(w_e w_o) / (w_e + w_o): its variance is that of ``signal`` where both have hits; NaN elsewhere.
     header
-        FITS header with the WCS (TAN maps), else None.
+        Keywords of the WCS (TAN maps), else None; a dict that `astropy.io.fits.Header` takes.
     centre
         (lon, lat) [rad] of the map's centre in ``frame``.
     pixel
@@ -61,7 +64,7 @@ class MapProduct:
     weights: Floats
     noise: Floats
     half_difference: Floats | None
-    header: Header | None
+    header: Cards | Header | None
     centre: tuple[float, float]
     pixel: float
     frame: str = "icrs"
@@ -90,7 +93,8 @@ class MapProduct:
         """Angle [rad] of every pixel from the centre, shape of ``signal``."""
         if self.header is not None:
             find = _tangent_distance if self.signal.size <= SMALL else _tangent_distance.__wrapped__
-            return find(self.header.tostring(), self.signal.shape, self.centre)
+            world = tangent.plain(self.header) or self.header.tostring()
+            return find(world, self.signal.shape, self.centre)
         import healpy
 
         colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
@@ -237,15 +241,13 @@ def _symmetric(values: Floats, taps: Floats) -> Floats:
 
 
 @lru_cache(maxsize=1)  # the maps of all runs share it
-def _tangent_distance(header: str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
-    from astropy.io.fits import Header
-
-    cards = Header.fromstring(header)
-    wcs: Any = tangent.plain(cards)
-    if wcs is None:
+def _tangent_distance(world: TangentWcs | str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
+    """``world``: what the header says, or the header itself."""
+    wcs: Any = world
+    if isinstance(world, str):
         from astropy.wcs import WCS
 
-        wcs = WCS(cards)
+        wcs = WCS(world)
     y, x = np.indices(shape)
     phi, theta = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
     found = _angle(phi, theta, centre)

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from zonda.core import tangent
 from zonda.core.errors import InputError
-from zonda.core.files import first_line
+from zonda.core.files import check_memory, first_line
 from zonda.core.fits_files import check_size, opened
+from zonda.core.fits_image import read_image
 
 Floats = NDArray[np.float64]
 
@@ -130,6 +131,10 @@ def read_map(
         Unreadable file; no map in it; unit, scale or position missing; unknown unit; NaN; a cube.
     """
     place = f"sky map {path}"
+    plain = read_image(path)
+    if plain is not None and tangent.plain(plain[0]) is not None:  # nothing that astropy need be asked
+        check_memory(8 * plain[1].size, "the array or table", place)
+        return _image(place, plain[1].astype(np.float64), plain[0], unit, pixel_size, centred, missing)
     with opened(path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again") as hdus:
         for hdu in hdus:
             if _is_healpix(hdu):
@@ -273,7 +278,8 @@ def _geometry(
     kinds = {str(header[f"CTYPE{axis}"]).upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH"):  # they are for equatorial axes; astropy would take ICRS
-            header.remove(key, ignore_missing=True)
+            if key in header:
+                del header[key]
     elif kinds != {"RA--", "DEC-"}:
         raise InputError(
             f"the axes {header['CTYPE1']}, {header['CTYPE2']} are neither equatorial nor Galactic",

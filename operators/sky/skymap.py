@@ -18,6 +18,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Kelvin
 from zonda.core.data import Block, Data, Observation
+from zonda.core.fits_image import Cards
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.projection import pixel_matrix, rotation_matrices
@@ -167,14 +168,12 @@ class SkyMap(Operator):
             if image is not None and image.header.get("OPERATOR") == self.label:
                 del data.products[key]
                 wanted = first and not data.run
-                return {"key": key, "values": image.values, "header": image.header.tostring()} if wanted else None
+                return {"key": key, "values": image.values, "header": dict(image.header.items())} if wanted else None
         return None
 
     def merge(self, data: Data, part: Mapping[str, Any]) -> None:
         """Put it among the products."""
-        from astropy.io.fits import Header
-
-        data.products.setdefault(part["key"], Image(part["values"], Header.fromstring(part["header"])))
+        data.products.setdefault(part["key"], Image(part["values"], Cards(part["header"].items())))
 
     def memory(self, observation: Observation) -> int:
         """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""

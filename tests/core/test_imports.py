@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 HEAVY = {
-    "astropy.coordinates", "astropy.table", "astropy.time", "astropy.visualization", "astropy.wcs",
+    "astropy", "astropy.coordinates", "astropy.io.fits", "astropy.table", "astropy.time", "astropy.units",
+    "astropy.visualization", "astropy.wcs",
     "h5py", "healpy", "matplotlib", "numba.np.linalg", "numba.np.arrayobj", "numpy.testing",
     "scipy.fft", "scipy.interpolate", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.spatial",
     "scipy.special", "scipy.stats",

@@ -256,6 +256,13 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(Turbulence, "coefficients", watched)
     expected = series()
+    assert len(made) == 2  # a piece for each layer
+    monkeypatch.setattr(sampling, "SPARE", -1)  # of the path's end nothing is in the piece: the others' tiles serve
+    np.testing.assert_array_equal(series(), expected)
+    assert len(made) > 4
+    monkeypatch.setattr(sampling, "ONE_PIECE", 0)
+    made.clear()
+    np.testing.assert_array_equal(series(), expected)
     once = len(made)
     for strip, kept, times in (((3, 4), 512 << 20, 1024), ((5, 5), 0, 7), ((8, 8), 1 << 20, 100)):
         monkeypatch.setattr(fluctuations, "TIMES_AT_ONCE", times)
@@ -724,6 +731,8 @@ def test_units_and_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> 
         return out
 
     expected = series()
+    monkeypatch.setattr(sampling, "ONE_PIECE", 0)
+    np.testing.assert_array_equal(series(), expected)
     monkeypatch.setattr(sampling, "SQUARE", (6, 6))
     monkeypatch.setattr(sampling, "BYTES_KEPT", 1 << 20)
     np.testing.assert_array_equal(series(), expected)

@@ -99,9 +99,9 @@ def test_layers_are_those_of_the_lattice_at_the_positions(kind: str, spacing: in
     other = Turbulence(1, "more", outer_scale=500.0, sigma=3.1)
     wind = np.array([7.0, -3.0])
     drifting = [Drifting(field, 800.0, 0.7, wind, 4), Drifting(other, 3000.0, 0.3, 2 * wind, spacing)]
-    layers = Layers(o, track, drifting, 4, -30, 330)
-    assert (layers.cells > 1e4) is True
     xi, eta = o.focalplane.xi, o.focalplane.eta
+    layers = Layers(o, track, xi, eta, drifting, 4, -30, 330)
+    assert (layers.cells > 1e4) is True
     total, sine = layers(xi, eta, 0, 300)
     u = rays(axes(o.boresight_azel[::4]), xi, eta)
     np.testing.assert_allclose(sine, u[2], atol=1e-13)
@@ -127,7 +127,7 @@ def test_a_scan_that_sweeps_over_too_much_is_refused(monkeypatch: pytest.MonkeyP
     o = observation(*SCANS["cone"])
     field = Turbulence(1, "air", outer_scale=500.0, sigma=2.6)
     with pytest.raises(ZondaError, match=r"sweep over .* lattice points .* limit is 1e\+04"):
-        Layers(o, tracks([o])[0], [Drifting(field, 800.0, 1.0, np.zeros(2), 4)], 4, -30, 330)
+        Layers(o, tracks([o])[0], np.zeros(1), np.zeros(1), [Drifting(field, 800.0, 1.0, np.zeros(2), 4)], 4, -30, 330)
 
 
 def test_spline_coefficients_are_scipys_and_local() -> None:
