@@ -10,7 +10,6 @@ kelvin) and its turbulent part (float32) are such fields; see ``docs/atmosphere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .records import dataclass
 from .transforms import spline_filter
 
 Floats = NDArray[np.floating]

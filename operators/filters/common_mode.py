@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numba as nb
@@ -38,6 +38,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
+from zonda.core.records import dataclass
 from zonda.core.streams import columns, forget_pages
 from zonda.core.tiles import TILE_SAMPLES
 
