@@ -26,10 +26,9 @@ if TYPE_CHECKING:
 def ready(operator: Operator) -> bool:
     """Whether it can be configured and prepared ahead: it says so itself, or it has neither to do. A class that overrides one of
     the two must say so anew."""
-    order = type(operator).__mro__
-    says = next(n for n, c in enumerate(order) if "prepares_ahead" in vars(c))
-    does = next(n for n, c in enumerate(order) if "prepare" in vars(c) or "configure" in vars(c))
-    return order[does] is Operator or (operator.prepares_ahead and says <= does)
+    mine = type(operator)
+    neither = mine.prepare is Operator.prepare and mine.configure is Operator.configure
+    return neither or operator.declares("prepares_ahead", "prepare", "configure")
 
 
 def reach(operators: Sequence[Operator]) -> int:

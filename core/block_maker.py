@@ -11,6 +11,7 @@ from typing import Any
 from .blocks import pieces, trimmed, within
 from .data import Block, Floats, Observation, Stream, Tally
 from .operator import Operator
+from .repeated import Repeated
 from .settings import Settings, Timer
 from .streams import Ledger, Stage
 from .tiles import TILE_SAMPLES
@@ -27,6 +28,8 @@ class BlockMaker:
         As in `Layout`.
     stopped
         True: what is made is of no use any more.
+    repeated
+        Streams that this run keeps for later ones, or that it finds there.
     """
 
     def __init__(
@@ -39,9 +42,11 @@ class BlockMaker:
         timer: Timer,
         ledger: Ledger,
         stopped: Callable[[], bool],
+        repeated: Repeated | None = None,
     ) -> None:
         self._observation, self._dtype, self._states = observation, settings.dtype, states
         self._streams, self._timer, self._ledger, self._stopped = frozenset(streams), timer, ledger, stopped
+        self._repeated = repeated
         self._labels = {id(operator): operator.label for operator in operators}  # the property is slow
         self._local = threading.local()
 
@@ -81,7 +86,13 @@ class BlockMaker:
             if self._stopped():
                 return
             label = self._labels[id(operator)]
-            operator.exec(block, self._states[label])
+            alike = self._repeated if self._repeated is not None and label in self._repeated.names else None
+            if alike is not None and alike.complete:
+                alike.repeat(label, block)
+            else:
+                operator.exec(block, self._states[label])
+                if alike is not None:
+                    alike.record(label, block)
             now = time.thread_time()
             self._timer.add(label, "exec", now - start)
             start = now

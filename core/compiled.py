@@ -1,4 +1,4 @@
-"""Where compiled code is kept and how many threads BLAS takes, before numpy and numba are imported; bytecode after a run."""
+"""Where compiled code is kept and how many threads BLAS takes, before numpy and numba are imported; bytecode."""
 
 from __future__ import annotations
 

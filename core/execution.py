@@ -22,12 +22,13 @@ import numpy as np
 from .ahead import Ahead, reach
 from .block_maker import BlockMaker
 from .blocks import Segment, cut, least_block
-from .data import Block, Data, Floats, Observation, Stream, in_order
+from .data import Block, Data, Floats, Observation, Stream, Tally, in_order
 from .errors import PipelineError
 from .frozen import Frozen
 from .layout import Layout, read
 from .machine import resident_memory
 from .operator import Operator
+from .repeated import Repeated
 from .settings import Settings, Timer
 from .smooth import SmoothField
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain, forget_pages
@@ -48,9 +49,10 @@ class Execution:
         timer: Timer,
         keep: Sequence[str],
         frozen: Frozen | None = None,
+        repeated: Repeated | None = None,
     ) -> None:
         self.operators, self.observation, self.settings, self.timer = list(operators), observation, settings, timer
-        self.keep, self.frozen = tuple(keep), frozen
+        self.keep, self.frozen, self.repeated = tuple(keep), frozen, repeated
         self.states: dict[str, Any] = {}
         self.beforehand: Future[None] | None = None
         self._ahead = Ahead(False)
@@ -59,7 +61,9 @@ class Execution:
         self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
         streams = read(operators) | set(keep)
         self.layout = Layout(observation, settings, streams)
-        self._blocks = BlockMaker(operators, observation, settings, self.states, streams, timer, self.ledger, self._stop.is_set)
+        self._blocks = BlockMaker(
+            operators, observation, settings, self.states, streams, timer, self.ledger, self._stop.is_set, repeated
+        )
 
     def run(
         self,
@@ -73,7 +77,6 @@ class Execution:
 
         ``following``: what ``ahead`` may prepare meanwhile.
         """
-        observation = self.observation
         self._ahead = ahead or self._ahead
         try:
             if self.beforehand is not None:
@@ -83,14 +86,18 @@ class Execution:
             self._prepare(self.operators[len(self.states) :], before, after)
             self._same_use("", "prepared")
             self._keep_to_ceiling()
+            if self.repeated is not None and not self.repeated.complete:
+                self.repeated.begin(self.layout.shape, self.settings)
             self._ahead.start(following)
             self._leave_out()
             self._execute(before, after)
             self._keep_out()
             for operator in self.operators:
                 start = time.thread_time()
-                operator.collect(data, observation, self.states[operator.label])
+                self._collect(operator, data)
                 self.timer.add(operator.label, "collect", time.thread_time() - start)
+            if self.repeated is not None:
+                self.repeated.complete = True
         except BaseException:
             self.abandon()
             raise
@@ -152,6 +159,18 @@ class Execution:
                     self.frozen.kept_out[operator.label] = kept_out
             self.frozen.complete = True
 
+    def _collect(self, operator: Operator, data: Data) -> None:
+        """`Operator.collect`; where the step is not carried out again, what it told in the main run."""
+        observation, label = self.observation, operator.label
+        if self.repeated is None or label not in self.repeated.names:
+            operator.collect(data, observation, self.states[label])
+            return
+        if not self.repeated.complete:
+            before, observation.tally = observation.tally, Tally()
+            operator.collect(data, observation, self.states[label])
+            self.repeated.told[label], observation.tally = observation.tally, before
+        observation.tally.update(self.repeated.told[label])
+
     # ---- segments
 
     def _execute(self, before: Callable[..., None], after: Callable[..., None]) -> None:
@@ -189,8 +208,8 @@ class Execution:
         settings = self.settings
         if settings.ceiling is None:
             return
-        spare = sum(a.nbytes for a in settings.spare)
-        room = max(settings.ceiling - (resident_memory() - spare), 1)
+        known = sum(a.nbytes for a in (*settings.spare, *settings.kept))
+        room = max(settings.ceiling - (resident_memory() - known), 1)
         if room < settings.memory:
             self.settings = settings = copy.copy(settings)
             settings.memory = room

@@ -69,6 +69,8 @@ def _survey(path: str | os.PathLike[str], place: str) -> None:
 
 
 _PACKED = {b"\x1f\x8b\x08": "gzip", b"BZh": "bz2", b"\xfd7z": "lzma"}
+_END = re.compile(rb"END( {0,76}[^A-Z0-9_-]|$)")
+"""What astropy takes for the end of a header."""
 _NUMBER = re.compile(rb"(NAXIS\d{0,3}|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *(-?\d+)")
 
 
@@ -84,7 +86,7 @@ def _next_header(file: IO[bytes], place: str) -> int:
                 if key in (b"NAXIS", b"TFIELDS") and value > FIELDS_MAX:
                     message = f"{key.decode()} = {value}, more than the {FIELDS_MAX} that FITS allows"
                     raise InputError(message, place=place, cure="the file is corrupt: copy or make it again")
-            if card.rstrip() == b"END":
+            if _END.match(card):
                 size = math.prod(found.get(b"NAXIS%d" % k, 0) for k in range(1, found.get(b"NAXIS", 0) + 1))
                 size = size if found.get(b"NAXIS", 0) > 0 else 0
                 size = abs(found.get(b"BITPIX", 8)) // 8 * found.get(b"GCOUNT", 1) * (size + found.get(b"PCOUNT", 0))

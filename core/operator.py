@@ -66,6 +66,11 @@ class Operator(Parameters):
     linear
         True where what `exec` makes of the components, or of ``signal``, is linear in them, with the same transmission of the air
         and, for ``couples = "all"``, with what `freeze` kept. A run may then be derived from others (`core.derived`).
+    same_in_all_runs
+        True where the streams that `exec` makes are the same in all runs of a pipeline: they follow from the pointing and from
+        this step alone, never from other streams, flags, noise levels or the air. It adds no mean, and tells the tally in
+        `prepare` and `collect` only, which ``only_tells``. Runs after the main run may then copy its streams (`core.repeated`):
+        `exec` and `collect` are not called. A class that overrides `configure`, `prepare`, `exec` or `collect` must say so anew.
     only_tells
         True where `collect` puts nothing into ``data.products`` that differs from run to run: it only tells the tally.
     product_only
@@ -86,6 +91,7 @@ class Operator(Parameters):
     prepares_ahead: ClassVar[bool] = False
     at_end: ClassVar[bool] = False
     linear: ClassVar[bool] = False
+    same_in_all_runs: ClassVar[bool] = False
     only_tells: ClassVar[bool] = False
     product_only: ClassVar[bool] = False
     knobs: ClassVar[tuple[Knob, ...]] = ()
@@ -220,6 +226,13 @@ class Operator(Parameters):
         """Whether its products of a run may be derived from those of others: it has `subtract`, or makes none in `collect`."""
         mine = type(self)
         return mine.subtract is not Operator.subtract or mine.collect is Operator.collect or self.only_tells
+
+    def declares(self, flag: str, *methods: str) -> bool:
+        """Whether ``flag`` is true, and no class derived from the one that says so overrides one of the ``methods``."""
+        order = type(self).__mro__
+        says = next(n for n, c in enumerate(order) if flag in vars(c))
+        does = next((n for n, c in enumerate(order) if any(m in vars(c) for m in methods)), len(order))
+        return bool(getattr(self, flag)) and says <= does
 
     def keep_out(self, observation: Observation, state: Any) -> Any:
         """What the main run left out sample by sample because of their values, for `leave_out`; None: nothing."""

@@ -34,6 +34,8 @@ class Settings:
         Whom to tell.
     spare
         Memory to use again.
+    kept
+        Memory of streams kept for later runs (`core.repeated`), which neither ``memory`` nor ``ceiling`` count.
     """
 
     threads: int = 1
@@ -41,6 +43,7 @@ class Settings:
     dtype: type[np.floating[Any]] = np.float32
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
     spare: list[Floats] = field(default_factory=list)
+    kept: list[Floats] = field(default_factory=list)
     ceiling: int | None = None
     prefer: Held | None = None
 

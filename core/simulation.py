@@ -10,6 +10,7 @@ from .ahead import Ahead
 from .data import Data, Observation, Tally
 from .execution import Execution
 from .frozen import Frozen
+from .repeated import Repeated, affordable, alike
 from .selection import Selection
 from .settings import Settings, Timer
 
@@ -47,7 +48,8 @@ class Simulation:
         self._pristine = [(o.focalplane, o.flags, o.detector_flags) for o in data.observations]
         freeze = any(run.modes == "full" for run in selection.runs.values())
         self._frozen = [Frozen() if freeze else None for _ in data.observations]
-        self._main = list(self._pristine)
+        self._main = [_left(o) for o in data.observations]
+        self._repeated, self._last_repeat = self._keep_for_later_runs()
         self._following: Execution | None = None
         """What is begun of the next scan, or of the first scan of the next run."""
 
@@ -62,7 +64,10 @@ class Simulation:
             execution.run(data, hooks.zonda_before_operator, hooks.zonda_after_operator, self._ahead, self._following)
             data.tally.update(observation.tally, prefix=f"{run}/" if run else "")
             if not run:
-                self._main[number - 1] = observation.focalplane, observation.flags, observation.detector_flags
+                self._main[number - 1] = _left(observation)
+            if (repeated := self._repeated[number - 1]) is not None and run == self._last_repeat:
+                repeated.forget(self._settings)
+                self._repeated[number - 1] = None
             after_scan()
 
     @property
@@ -71,9 +76,25 @@ class Simulation:
         return frozenset().union(*(found.kept_out for found in self._frozen if found))
 
     def leave_main(self) -> None:
-        """Let observations carry what the main run left of detectors and flags."""
+        """Let observations carry what the main run left of detectors, flags, smooth fields and tallies."""
         for observation, found in zip(self._data.observations, self._main, strict=True):
-            observation.focalplane, observation.flags, observation.detector_flags = found
+            for name, value in found.items():
+                setattr(observation, name, value)
+
+    def _keep_for_later_runs(self) -> tuple[list[Repeated | None], str]:
+        """What the main run keeps of each scan, for which less is left of ``settings.memory``; the last run to copy it."""
+        steps, observations, settings = self._selection.steps(""), self._data.observations, self._settings
+        names, users = alike(steps), list[str]()
+        for run in (r for r in self._order if r and r not in self._derived):
+            if any(o.label in names for o in self._selection.steps(run)):
+                users.append(run)
+        later = {o.label for run in users for o in self._selection.steps(run)}
+        names = {label: streams for label, streams in names.items() if label in later}
+        sizes = affordable(steps, names, observations, settings)
+        settings.memory -= sum(sizes)
+        if settings.ceiling is not None:
+            settings.ceiling -= sum(sizes)
+        return [Repeated(names) if size else None for size in sizes], users[-1] if users else ""
 
     def _next_run(self, run: str) -> Execution | None:
         """The first scan of the run after this one, unless it is the scan that is being executed, or is probably derived.
@@ -95,4 +116,9 @@ class Simulation:
         observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
         kept = self._frozen[number] if not run or self._selection.runs[run].modes == "full" else None
         steps, keep = self._selection.steps(run), self._keep if not run else ()
-        return Execution(steps, observation, self._settings, self._timer, keep, kept)
+        return Execution(steps, observation, self._settings, self._timer, keep, kept, self._repeated[number])
+
+
+def _left(observation: Observation) -> dict[str, Any]:
+    """What a run leaves behind in an observation."""
+    return {name: getattr(observation, name) for name in ("focalplane", "flags", "detector_flags", "smooth", "tally")}

@@ -10,6 +10,7 @@ kelvin) and its turbulent part (float32) are such fields; see ``docs/atmosphere.
 
 from __future__ import annotations
 
+from dataclasses import field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .columns import fused
 from .records import dataclass
 from .transforms import spline_filter
 
@@ -25,6 +27,9 @@ Floats = NDArray[np.floating]
 PAD = 1
 """Coefficients before the first sample's interval, so that every sample has its four neighbours."""
 
+
+LINES_KEPT = 1 << 18
+"""Coefficients of all detectors up to which they are worked out once, not for every block."""
 
 SPLINE_MARGIN = 12
 """Values on either side that `spline_coefficients` uses up: its filter is cut where it has fallen to 1.4e-7."""
@@ -56,26 +61,20 @@ def coarse_times(n_samples: int, step: int) -> NDArray[np.int64]:
     return (np.arange(cells + 3, dtype=np.int64) - PAD) * step
 
 
-def bspline_weights(step: int, dtype: type = np.float64) -> Floats:
-    """The four cubic B-spline weights at r = 0 .. step - 1. Shape (4, step)."""
-    u = np.arange(step) / step
-    v = 1.0 - u
-    return np.array([v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6]).astype(dtype)
-
-
 @lru_cache(maxsize=32)
-def _basis(step: int, dtype: str) -> Floats:
-    return bspline_weights(step, np.dtype(dtype).type)
+def _inside(step: int, dtype: str) -> Floats:
+    """(step,) r / step."""
+    return (np.arange(step) / step).astype(dtype)
 
 
 class Series(NamedTuple):
     """A field over a block, for kernels that evaluate it where they use it with `series_into`."""
 
     lines: Floats
-    """(n_det_block, n): each detector's B-spline coefficients from cell ``first`` on."""
+    """(n_det_block, n): each detector's B-spline coefficients from cell ``first`` on, C order."""
     first: int
-    basis: Floats
-    """(4, step): the weights B_j."""
+    inside: Floats
+    """(step,): r / step, where a sample stands in its cell."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +97,8 @@ class SmoothField:
     coefficients: Floats
     step: int
     n_samples: int
+    _kept: dict[str, Floats] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """All detectors' lines by type, where they are small."""
 
     @classmethod
     def from_values(cls, weights: Floats, values: Floats, step: int, n_samples: int, dtype: type = np.float64) -> SmoothField:
@@ -139,10 +140,19 @@ class SmoothField:
         start, stop = samples.start, samples.stop
         if not 0 <= start <= stop <= self.n_samples:
             raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
+        kind = dtype.str
+        if (kept := self._kept.get(kind)) is not None:
+            return Series(kept[detectors], 0, _inside(self.step, kind))
+        shape = len(self.weights), -(-self.n_samples // self.step) + 3
+        if shape[0] * shape[1] <= LINES_KEPT:
+            lines = np.empty(shape, dtype)
+            _lines(self.weights, self.coefficients, 0, lines)
+            self._kept[kind] = lines
+            return Series(lines[detectors], 0, _inside(self.step, kind))
         weights, first = self.weights[detectors], start // self.step
         lines = np.empty((len(weights), -(-stop // self.step) - first + 3), dtype)
         _lines(weights, self.coefficients, first, lines)
-        return Series(lines, first, _basis(self.step, lines.dtype.str))
+        return Series(lines, first, _inside(self.step, kind))
 
 
 @dataclass(frozen=True)
@@ -169,7 +179,7 @@ class DetectorField:
         rows = self.coefficients[detectors]
         if out is None:
             out = np.empty((len(rows), stop - start))
-        _evaluate_rows(rows, _basis(self.step, out.dtype.str), start, out)
+        _evaluate_rows(rows, _inside(self.step, out.dtype.str), start, out)
         return out
 
 
@@ -191,9 +201,9 @@ def _prefilter(values, taps, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
-def _evaluate_rows(coefficients, basis, start, out):  # type: ignore[no-untyped-def]
+def _evaluate_rows(coefficients, inside, start, out):  # type: ignore[no-untyped-def]
     for d in range(out.shape[0]):
-        series_into(coefficients[d], 0, basis, start, out[d])
+        series_into(coefficients[d], 0, inside, start, out[d])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
@@ -211,21 +221,24 @@ def _lines(weights, coefficients, first, lines):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
-def _evaluate(lines, first, basis, start, out):  # type: ignore[no-untyped-def]
+def _evaluate(lines, first, inside, start, out):  # type: ignore[no-untyped-def]
     for d in range(out.shape[0]):
-        series_into(lines[d], first, basis, start, out[d])
+        series_into(lines[d], first, inside, start, out[d])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
-def series_into(line, first, basis, start, into):  # type: ignore[no-untyped-def]
+def series_into(line, first, inside, start, into):  # type: ignore[no-untyped-def]
     """One detector of a `Series` at the samples start .. start + into.size - 1 (absolute). For use in kernels."""
-    step, size = nb.uint64(basis.shape[1]), nb.uint64(into.size)
-    b0, b1, b2, b3 = basis[0], basis[1], basis[2], basis[3]
+    step, size = nb.uint64(inside.size), nb.uint64(into.size)
+    one, two, six = inside.dtype.type(1), inside.dtype.type(2), inside.dtype.type(6)
     m, done = nb.uint64(start) // step, nb.uint64(0)
     k, r = m - nb.uint64(first), nb.uint64(start) - m * step
     while done < size:
         n = min(step - r, size - done)
         c0, c1, c2, c3 = line[k], line[k + nb.uint64(1)], line[k + nb.uint64(2)], line[k + nb.uint64(3)]
+        p0, p1 = (c0 + (two + two) * c1 + c2) / six, (c2 - c0) / two
+        p2, p3 = (c0 - two * c1 + c2) / two, (c3 - c0 + (two + one) * (c1 - c2)) / six
         for t in range(n):
-            into[done + t] = c0 * b0[r + t] + c1 * b1[r + t] + c2 * b2[r + t] + c3 * b3[r + t]
+            x = inside[r + t]
+            into[done + t] = fused(x, fused(x, fused(x, p3, p2), p1), p0)
         done, k, r = done + n, k + nb.uint64(1), nb.uint64(0)

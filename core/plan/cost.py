@@ -16,6 +16,7 @@ import numpy as np
 
 from .. import user_cache
 from ..forecast import BASE, forecast
+from ..repeated import affordable, alike
 from ..settings import Settings
 from .context import Context
 from .estimate import Cost
@@ -100,27 +101,34 @@ def predict(
         On the reference machine, not on this one.
     """
     factors = dict.fromkeys(REFERENCE, 1.0) if portable else calibrate()
-    seconds = {}
-    for label, cost in costs.items():
-        if cost is None:
-            continue
-        runs = context.runs.get(label, 1) or 1
-        each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
-        seconds[label] = factors[cost.kernel] * (runs * each + cost.once)
-    unknown = tuple(label for label, cost in costs.items() if cost is None)
     late = {o.label for o in context.operators if o.at_end}
     longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
     own = {o.label: o.memory(longest) for o in context.operators}
     held = sum(own.get(label) or cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
-    after = sum(cost.bytes for label, cost in costs.items() if cost is not None and label in late)
-    startup = factors[STARTUP.kernel] * STARTUP.once
     steps = [o for o in context.operators if not o.at_end and "boresight" not in o.provides]
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
+    acting: dict[str, float] = {label: max(number, 1) for label, number in context.runs.items()}
+    copied = {label: names for label, names in alike(steps).items() if acting.get(label, 1) > 1}
+    kept = affordable(steps, copied, context.observations, settings)
+    sizes = [o.n_samples * o.n_detectors for o in context.observations]
+    share = sum(size for size, bytes_kept in zip(sizes, kept, strict=True) if bytes_kept) / max(sum(sizes), 1)
+    acting |= {label: acting[label] - (acting[label] - 1) * share for label in copied}
+    settings.memory -= sum(kept)
+    seconds = {}
+    for label, cost in costs.items():
+        if cost is None:
+            continue
+        runs = acting.get(label, 1)
+        each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
+        seconds[label] = factors[cost.kernel] * (runs * each + cost.once)
+    unknown = tuple(label for label, cost in costs.items() if cost is None)
+    after = sum(cost.bytes for label, cost in costs.items() if cost is not None and label in late)
+    startup = factors[STARTUP.kernel] * STARTUP.once
     found = forecast(steps, longest, settings)
-    during = held + found.bytes
+    during = held + found.bytes + sum(kept)
     for label, times in found.again.items():  # prepared once, made again
         if (cost := costs.get(label)) is not None:
-            runs = context.runs.get(label, 1) or 1
+            runs = acting.get(label, 1)
             each = sum(cost.seconds(o.n_samples, o.n_detectors) - cost.fixed for o in context.observations)
             seconds[label] += factors[cost.kernel] * runs * times * each
-    return Prediction(seconds, BASE + max(during, after), unknown, startup, factors)
+    return Prediction(seconds, BASE + max(during, after), unknown, startup, acting, factors)

@@ -203,7 +203,7 @@ def _decide(
             if name in kept or name in forced:
                 continue
             for k in range(chosen[name] + 1, len(d.effect.choices)):
-                saved = _seconds(d, k, now, context) - _seconds(d, chosen[name], now, context)
+                saved = _seconds(d, k, now) - _seconds(d, chosen[name], now)
                 more = {m: _bound(d, k, m) - _bound(d, chosen[name], m) for m in left}
                 if saved < worth or any(not extra <= left[m] for m, extra in more.items()):
                     continue
@@ -226,9 +226,9 @@ def _bound(d: Decided, k: int, metric: str) -> float:
     return value if value == value else math.inf  # a bound that is not a number allows nothing
 
 
-def _seconds(d: Decided, k: int, now: Prediction, context: Context) -> float:
+def _seconds(d: Decided, k: int, now: Prediction) -> float:
     """CPU seconds that a choice saves on this machine, all runs."""
-    runs = max(context.runs.get(d.operator, 1), 1)
+    runs = now.runs.get(d.operator, 1)
     return d.effect.choices[k].seconds * runs * max(now.factors.values(), default=1.0)
 
 
@@ -257,7 +257,7 @@ def _why(
         return "--no-prune"
     if len(choices) == 1:
         return ""
-    if max(_seconds(d, j, now, context) for j in range(1, len(choices))) < worth:
+    if max(_seconds(d, j, now) for j in range(1, len(choices))) < worth:
         return "leaving it out would save nothing"
     return "a coarser form would exceed the budget"
 
@@ -265,7 +265,7 @@ def _why(
 def _saving(now: Prediction, decided: Iterable[Decided], context: Context) -> Prediction:
     seconds, memory = dict(now.seconds), now.bytes
     for d in decided:
-        saved = _seconds(d, d.chosen, now, context) if d.chosen else 0.0
+        saved = _seconds(d, d.chosen, now) if d.chosen else 0.0
         if d.choice.leave_out:
             saved = seconds.get(d.operator, 0.0)
         if d.operator in seconds:

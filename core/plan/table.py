@@ -22,7 +22,7 @@ def _row(plan: Plan, d: Decided) -> dict[str, Any]:
     choice = d.choice
     metrics = plan.context.metrics
     bound = {k: float(v) for k, v in choice.bound.items() if k in metrics}
-    runs = max(plan.context.runs.get(d.operator, 1), 1)
+    runs = plan.prediction.runs.get(d.operator, 1)
     return {
         "operator": d.operator,
         "effect": d.effect.name,
@@ -81,7 +81,7 @@ def _effects(plan: Plan, metrics: frozenset[str], width: int) -> list[str]:
         lines.append(f"  {d.effect.name:<{column}}{decision}")
         added = d.chosen > 0 or choice.decision == "not simulated"
         bounds = describe(choice.bound if added else d.effect.size, metrics)
-        saves = choice.seconds * max(plan.context.runs.get(d.operator, 1), 1) if d.chosen else 0.0
+        saves = choice.seconds * plan.prediction.runs.get(d.operator, 1) if d.chosen else 0.0
         notes = [f"{'error within' if added else 'without it'} {bounds}" if bounds else ""]
         notes += [f"saves {saves:.2g} s" if saves >= 0.01 else "", d.reason]
         new = choice.formula or d.effect.formula

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +12,7 @@ from zonda.core.records import dataclass
 
 from .flat_map import FlatMap
 from .plots import SHOWN, Track, map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
+from .png import png_of
 from .series import Spectrum, TimeStream
 from .sky_axes import SkyAxes
 
@@ -34,21 +34,6 @@ class Style:
     smooth: float | None
     central_diameter: float
     least_coverage: float
-
-
-def png_of(ax: Any) -> bytes:
-    """The figure as a PNG file, drawn once: without the rehearsal and the opaque alpha channel of ``figure.savefig``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
-    canvas, about, stream = FigureCanvasAgg(ax.figure), PngInfo(), io.BytesIO()
-    canvas.draw()  # type: ignore[no-untyped-call]
-    about.add_text("Software", "zonda")
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
-    dpi = (ax.figure.dpi, ax.figure.dpi)
-    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "png", compress_level=2, dpi=dpi, pnginfo=about)
-    return stream.getvalue()
 
 
 def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any]) -> list[Picture]:

@@ -45,8 +45,8 @@ SEQUENCE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 DPI = 110
 MAP_SIZE = (6.4, 5.2)
 """Largest width and height of a picture of one map, in."""
-_TOP, _BOTTOM, _BAR = 0.34, 0.58, 1.12
-"""Margins for a title, for tick labels with an axis label, and for a colour bar with its labels, in."""
+_TOP, _BOTTOM, _BAR, _GAP = 0.34, 0.58, 1.12, 0.2
+"""Margins for a title, for tick labels with an axis label, for a colour bar with its labels, and before the next map, in."""
 MANY = 2000
 """Points of a track that are drawn, however near to one another."""
 _CHARACTER, _LINE = 0.078, 0.17
@@ -70,15 +70,16 @@ class Track:
         return cls(observation.name, observation.centre, directions)
 
 
-def _axes(ax: Any, size: tuple[float, float] = (7.2, 5.0), left: float = 0.85, top: float = _TOP) -> Any:
-    """``ax``, or the Axes of a new figure that belongs to nobody else (not to pyplot). ``left``, ``top``: margins, in."""
+def _axes(ax: Any, size: tuple[float, float] = (7.2, 5.0), left: float = 0.85, top: float = _TOP, right: float = 0.12) -> Any:
+    """``ax``, or the Axes of a new figure that belongs to nobody else (not to pyplot). ``left``, ``top``, ``right``: margins,
+    in."""
     if ax is not None:
         return ax
     from matplotlib.figure import Figure
 
     width, height = size
     figure = Figure(figsize=size, dpi=DPI)
-    inside = (left / width, _BOTTOM / height, 1 - (left + 0.12) / width, 1 - (_BOTTOM + top) / height)
+    inside = (left / width, _BOTTOM / height, 1 - (left + right) / width, 1 - (_BOTTOM + top) / height)
     return figure.add_axes(inside)
 
 
@@ -94,6 +95,7 @@ def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int 
     """Axes of a new figure for ``count`` images (ny, nx) side by side, each with one for its colour bar as ``bar_axes``.
 
     They have the image's pixel coordinates, with tick marks where ``axes`` has them, or are astropy's world axes of ``wcs``.
+    Latitudes are written at the first one only, since they are the same for all.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import FixedFormatter, FixedLocator
@@ -107,7 +109,8 @@ def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int 
     width, height = nx * scale, ny * scale
     bar = max(0.9 * height, min(1.2, MAP_SIZE[1] - _TOP - _BOTTOM))
     tall = max(height, bar)
-    size = (left + width + _BAR) * count, tall + _TOP + _BOTTOM
+    pitch = width + _BAR + (_GAP if marks else left)
+    size = left + width + _BAR + (count - 1) * pitch, tall + _TOP + _BOTTOM
     figure = Figure(figsize=size, dpi=DPI)
 
     def placed(x: float, y: float, w: float, h: float, **more: Any) -> Any:
@@ -115,7 +118,7 @@ def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int 
 
     made = []
     for k in range(count):
-        x, y = (left + width + _BAR) * k + left, _BOTTOM + (tall - height) / 2
+        x, y = left + k * pitch, _BOTTOM + (tall - height) / 2
         if marks is None:
             from astropy.wcs import WCS
 
@@ -126,9 +129,11 @@ def map_axes(shape: tuple[int, ...], axes: SkyAxes | None, wcs: Any, count: int 
                 axis.set_major_locator(FixedLocator(marks[edge].places.tolist()))
                 axis.set_major_formatter(FixedFormatter(marks[edge].labels))
                 axis.set_tick_params(labelsize=9)
+            ax.yaxis.set_tick_params(labelleft=k == 0)
             ax.plot(marks["top"].places, np.full(len(marks["top"].places), ny - 0.5), **_tick_style(2))
             ax.plot(np.full(len(marks["right"].places), nx - 0.5), marks["right"].places, **_tick_style(1))
         ax.bar_axes = placed(x + width + 0.1, _BOTTOM + (tall - bar) / 2, 0.2, bar)
+        ax.names_latitude = k == 0 or marks is None
         made.append(ax)
     return made
 
@@ -208,7 +213,7 @@ def _show(ax: Any, wcs: Any, axes: SkyAxes | None, values: Floats, label: str, *
                 coordinate.set_ticklabel(size=9)
         else:
             ax.set_xlabel(names[0])
-            ax.set_ylabel(names[1])
+            ax.set_ylabel(names[1] if ax.names_latitude else "")
     else:
         dx, dy = (60 * scale for scale in _scales(wcs, axes))
         half_x, half_y = nx * dx / 2 * flip, ny * dy / 2
@@ -478,7 +483,12 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
         ax.set_xlim(stream.seconds[0], stream.seconds[-1])
     ax.grid(color="0.92", linewidth=0.7)
     if values.shape[0]:
-        legend = ax.legend(frameon=False, fontsize=8, ncols=min(6, len(stream.names)), loc="upper right")
+        rows = -(-len(stream.names) // 6)
+        if rows <= 3:  # above the lines
+            low, high = ax.get_ylim()
+            ax.set_ylim(low, high + (high - low) * 0.08 * rows)
+        frame = {"frameon": rows > 3, "framealpha": 0.85, "edgecolor": "none"}
+        legend = ax.legend(**frame, fontsize=8, ncols=min(6, len(stream.names)), loc="upper right")
         for line in legend.get_lines():
             line.set_linewidth(2)
     if own:
@@ -492,8 +502,10 @@ def plot_scan(observations: Sequence[Observation | Track], *, ax: Any = None, ti
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
-    ax = _axes(ax, (5.6, 5.2), left=0.65)
     tracks = [o if isinstance(o, Track) else Track.of(o) for o in observations]
+    named, own = len(tracks) <= 8, ax is None
+    right = 0.55 + _CHARACTER * max(len(track.name) for track in tracks) if named and own else 0.0
+    ax = _axes(ax, (5.6 + right, 5.2), left=0.65, right=0.12 + right)
     offsets = [_offsets(track, tracks[0].centre) for track in tracks]
     known = np.concatenate(offsets)
     known = known[np.isfinite(known).all(axis=1)]
@@ -508,8 +520,10 @@ def plot_scan(observations: Sequence[Observation | Track], *, ax: Any = None, ti
     ax.set_xlabel("RA offset [arcmin]")
     ax.set_ylabel("Dec offset [arcmin]")
     ax.grid(color="0.92", linewidth=0.7)
-    if len(tracks) <= 8:
-        legend = ax.legend(frameon=False, fontsize=8, loc="upper right")
+    if named:
+        beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}
+        within = {"loc": "upper right", "framealpha": 0.85, "edgecolor": "none"}
+        legend = ax.legend(fontsize=8, **(beside if own else within))
         for line in legend.get_lines():
             line.set_linewidth(2)
     _title(ax, title)

@@ -32,7 +32,7 @@ ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 
 
 CHUNK = 8
-"""Segments that are transformed at a time."""
+"""Segments that are transformed at a time: numpy works out the roots of unity at every call. It is slower in float32."""
 
 
 class Welch:
@@ -58,7 +58,7 @@ class Welch:
         self._segments = (n - length) // self._step + 1
         self._line = np.arange(length) - (length - 1) / 2
         self._slope = self._line / (self._line**2).sum()
-        self._window, self._trend = w, np.array([w, w * self._line])
+        self._window = w
         self._scale = np.full(length // 2, 2 / (self._segments * sample_rate * (w**2).sum()))
         if length % 2 == 0:
             self._scale[-1] /= 2
@@ -74,20 +74,23 @@ class Welch:
         views = np.lib.stride_tricks.sliding_window_view(values, self._length)[:: self._step]
         for first in range(0, self._segments, CHUNK):
             view = views[first : first + CHUNK]
-            segment, trend, found = (part[: len(view)] for part in self._scratch())
-            line = np.stack([view.mean(axis=1), np.einsum("st,t->s", view, self._slope)], axis=1)
-            np.multiply(view, self._window, out=segment)
-            segment -= np.matmul(line, self._trend, out=trend)
-            parts = np.fft.rfft(segment, out=found).view(np.float64)
+            segments, found = (part[: len(view)] for part in self._scratch())
+            lines = zip(view.mean(axis=1), np.einsum("st,t->s", view, self._slope), strict=True)
+            for row, (mean, slope), segment in zip(view, lines, segments, strict=True):  # each stays in the cache
+                np.multiply(self._line, -slope, out=segment)
+                segment -= mean
+                segment += row
+                segment *= self._window
+            parts = np.fft.rfft(segments, out=found).view(np.float64)
             power += np.einsum("sk,sk->k", parts, parts)
         return np.asarray((power[2::2] + power[3::2]) * self._scale, np.float64)
 
     def _scratch(self) -> tuple[NDArray[Any], ...]:
-        """This thread's memory for the segments, their straight lines and their transforms."""
+        """This thread's memory for the segments and their transforms."""
         if not hasattr(self._memory, "arrays"):
             count = min(CHUNK, self._segments)
             real, spectrum = (count, self._length), (count, self._length // 2 + 1)
-            self._memory.arrays = np.empty(real), np.empty(real), np.empty(spectrum, np.complex128)
+            self._memory.arrays = np.empty(real), np.empty(spectrum, np.complex128)
         return self._memory.arrays  # type: ignore[no-any-return]
 
 

@@ -227,7 +227,7 @@ class Streams:
             origin = number * TILE_DETECTORS
             low, high = max(detector, origin), min(end, origin + TILE_DETECTORS)
             rows = slice(low - detector, high - detector)
-            part = Series(level.lines[rows], level.first, level.basis)
+            part = Series(level.lines[rows], level.first, level.inside)
             self._add_tile(number, low - origin, sample, part, common, shares, over, out[rows])
 
     def _add_tile(
@@ -278,17 +278,17 @@ def _pieces(start: int, stop: int) -> list[tuple[int, int]]:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, basis, common, shares, over, out):  # type: ignore[no-untyped-def]
+def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, inside, common, shares, over, out):  # type: ignore[no-untyped-def]
     """Equation (2) of `one_over_f` for 16 detectors x n samples; adds level * y of those from ``lane`` on to ``out`` (``over``:
     puts it there).
 
     ``state`` (K, 16), K a multiple of 4, is moved on by n samples. Deviate 16 t + lane of stream ``tile`` drives sample t.
-    ``lines, cell, basis``: the `Series` of the level. Where there is a ``common`` stream, shares[0] y + shares[1] common
-    takes the place of y.
+    ``lines, cell, inside``: the `Series` of the level. shares[0] y + shares[1] common takes the place of y; an empty ``common``
+    stream is 0.
     """
     x = np.empty(16 * _CHUNK, np.float32)
     words, bits, _ = normal_scratch()
-    level, mixed = np.empty(_CHUNK, out.dtype), np.empty(_CHUNK, out.dtype)
+    level, mixed, nothing = np.empty(_CHUNK, out.dtype), np.empty(_CHUNK, out.dtype), np.zeros(_CHUNK, np.float32)
     for done in range(0, n, _CHUNK):
         m = min(_CHUNK, n - done)
         origin = nb.int64(16) * (nb.int64(start) + done)
@@ -301,18 +301,14 @@ def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, basis, com
             _four_sections(x[: 16 * m], state[k : k + 4].ravel(), rate[k : k + 4], tap[k : k + 4])
         for d in range(uint64(out.shape[0])):
             row, size = out[d, done : done + m], level[:m]
-            series_into(lines[d], cell, basis, start + done, size)
+            series_into(lines[d], cell, inside, start + done, size)
             if over:
                 row[:] = 0
-            if common.size:
-                shared = common[done : done + m]
-                for t in range(uint64(m)):
-                    mixed[t] = shares[0] * x[uint64(16) * t + uint64(lane) + d] + shares[1] * shared[t]
-                for t in range(uint64(m)):
-                    row[t] += size[t] * mixed[t]
-            else:
-                for t in range(uint64(m)):
-                    row[t] += size[t] * x[uint64(16) * t + uint64(lane) + d]
+            shared = common[done : done + m] if common.size else nothing[:m]
+            for t in range(uint64(m)):
+                mixed[t] = shares[0] * x[uint64(16) * t + uint64(lane) + d] + shares[1] * shared[t]
+            for t in range(uint64(m)):
+                row[t] += size[t] * mixed[t]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})

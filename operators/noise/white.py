@@ -127,8 +127,8 @@ class _State:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add_normals(key, first, start, lines, cell, basis, add, out):  # type: ignore[no-untyped-def]
-    """out[d, t] = (or, to ``add``, +=) level n: level the `Series` (lines, cell, basis) of detector first + d at sample
+def _add_normals(key, first, start, lines, cell, inside, add, out):  # type: ignore[no-untyped-def]
+    """out[d, t] = (or, to ``add``, +=) level n: level the `Series` (lines, cell, inside) of detector first + d at sample
     start + t, n normal deviate start + t of stream first + d."""
     words, bits, tile = normal_scratch()
     level = np.empty(TILE, out.dtype)
@@ -139,7 +139,7 @@ def _add_normals(key, first, start, lines, cell, basis, add, out):  # type: igno
             low, high = max(start, origin), min(stop, origin + TILE)
             normal_tile(key, first + d, number, words, bits, tile)
             deviates, row, size = tile[low - origin : high - origin], out[d, low - start : high - start], level[: high - low]
-            series_into(lines[d], cell, basis, low, size)
+            series_into(lines[d], cell, inside, low, size)
             if add:
                 for t in range(uint64(row.size)):  # unsigned: vectorized
                     row[t] += size[t] * deviates[t]

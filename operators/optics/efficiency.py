@@ -123,7 +123,7 @@ class Efficiency(Operator):
         have = block.detdata
         signal = block.buffer("signal", shape)
         absent = np.empty((0, 0), block.dtype)
-        nothing = Series(absent, 0, absent)
+        nothing = Series(absent, 0, np.ones(1, block.dtype))
         divisor = mean = nothing
         noisy = any(name in have for name in ("atmosphere", "white", "pink"))
         if state.transmission is not None and noisy:
@@ -132,9 +132,10 @@ class Efficiency(Operator):
         if instantaneous and state.mean is not None:
             mean = state.mean.series(rows, block.samples, signal.dtype)
         streams = [have.get(name, absent) for name in ("sky", "transmission", "atmosphere", "white", "pink")]
-        smooth = divisor.lines, divisor.basis, mean.lines, mean.basis
+        first = np.array([block.samples.start, divisor.first, mean.first], np.int64)
+        smooth = divisor.lines, divisor.inside, mean.lines, mean.inside
         factors = np.array([a[rows] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
-        clipped = _calibrate(*streams, block.samples.start, *smooth, factors, instantaneous, signal)
+        clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
         if instantaneous:
             block.observation.tally.count(self.label, f"samples whose fluctuating e^-tau was raised to {OPAQUE:g}", clipped)
         have["signal"] = signal
@@ -155,67 +156,46 @@ class Calibration:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _calibrate(sky, wet, air, white, pink, start, divisor, basis, mean, mean_basis, factors, instantaneous, out):  # type: ignore[no-untyped-def]
-    """Equation (2); absent streams have no rows. ``wet`` is x; ``divisor``, t, and ``mean``, M (instantaneous only), are lines of
-    `Series` of the samples from ``start`` on, with their bases; ``factors`` (3, n_det): gain, epsilon, zeta.
+def _calibrate(sky, wet, air, white, pink, first, divisor, inside, mean, mean_inside, factors, at_once, out):  # type: ignore[no-untyped-def]
+    """Equation (2); absent streams have no rows. ``wet`` is x; ``divisor``, t, and ``mean``, M, are lines of `Series`;
+    ``first`` (3,): the first sample, and the first cells of t and M; ``factors`` (3, n_det): gain, epsilon, zeta.
+    ``at_once``: by the instantaneous transmission.
 
     Returns how many samples of 1 + x were raised to `OPAQUE`.
     """
     gain, epsilon, zeta = factors[0], factors[1], factors[2]
+    start, cell, mean_cell = first[0], first[1], first[2]
     n_det, n = out.shape
     clipped = 0
     one, opaque = out.dtype.type(1), out.dtype.type(OPAQUE)
+    noisy = air.shape[0] or white.shape[0] or pink.shape[0]
     piece = 2048
-    noise, scale = np.empty(piece, out.dtype), np.empty(piece, out.dtype)
+    nothing, scale, level = np.zeros(piece, out.dtype), np.empty(piece, out.dtype), np.zeros(piece, out.dtype)
     for d in range(n_det):
+        factor = gain[d] / zeta[d] if noisy else out.dtype.type(0)
         for begin in range(0, n, piece):
             m = min(piece, n - begin)
+            s = sky[d, begin : begin + m] if sky.shape[0] else nothing[:m]
+            x = wet[d, begin : begin + m] if wet.shape[0] else nothing[:m]
+            a = air[d, begin : begin + m] if air.shape[0] else nothing[:m]
+            w = white[d, begin : begin + m] if white.shape[0] else nothing[:m]
+            p = pink[d, begin : begin + m] if pink.shape[0] else nothing[:m]
             row = out[d, begin : begin + m]
-            row[:] = 0
-            if instantaneous:
-                x = wet[d, begin : begin + m]
+            scale[:] = one
+            if divisor.shape[0]:
+                series_into(divisor[d], cell, inside, start + begin, scale[:m])
+            if not at_once:
                 for t in range(m):
+                    noise = epsilon[d] * a[t] + w[t] + p[t]
+                    row[t] = gain[d] * s[t] * (one + x[t]) + noise * (factor / max(scale[t], opaque))
+            else:
+                if mean.shape[0]:
+                    series_into(mean[d], mean_cell, mean_inside, start + begin, level[:m])
+                for t in range(m):
+                    passed = max(one + x[t], opaque)
                     clipped += not one + x[t] >= opaque
-            if sky.shape[0]:
-                a = sky[d, begin : begin + m]
-                for t in range(m):  # an expression of arrays would take 2 s more to compile
-                    row[t] = gain[d] * a[t]
-                if wet.shape[0] and not instantaneous:
-                    x = wet[d, begin : begin + m]
-                    for t in range(m):
-                        row[t] *= one + x[t]
-            noise[:] = 0
-            if air.shape[0]:
-                a = air[d, begin : begin + m]
-                for t in range(m):
-                    noise[t] = epsilon[d] * a[t]
-            if white.shape[0]:
-                a = white[d, begin : begin + m]
-                for t in range(m):
-                    noise[t] += a[t]
-            if pink.shape[0]:
-                a = pink[d, begin : begin + m]
-                for t in range(m):
-                    noise[t] += a[t]
-            if air.shape[0] or white.shape[0] or pink.shape[0]:
-                factor = gain[d] / zeta[d]
-                if divisor.shape[0]:
-                    series_into(divisor[d], start // basis.shape[1], basis, start + begin, scale[:m])
-                    for t in range(m):
-                        scale[t] = factor / max(scale[t], opaque)
-                else:
-                    scale[:] = factor
-                if instantaneous:
-                    x = wet[d, begin : begin + m]
-                    for t in range(m):
-                        scale[t] /= max(one + x[t], opaque)
-                for t in range(m):
-                    row[t] += noise[t] * scale[t]
-            if instantaneous and mean.shape[0]:
-                x = wet[d, begin : begin + m]
-                series_into(mean[d], start // mean_basis.shape[1], mean_basis, start + begin, scale[:m])
-                for t in range(m):
-                    row[t] -= scale[t] * x[t] / max(one + x[t], opaque)
+                    noise = epsilon[d] * a[t] + w[t] + p[t]
+                    row[t] = gain[d] * s[t] + (noise * (factor / max(scale[t], opaque)) - level[t] * x[t]) / passed
     return clipped
 
 

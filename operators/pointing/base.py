@@ -24,7 +24,7 @@ from .limits import Moved, check_elevation, excess, lower_elevation
 from .motion import POINTS, Peak, Quantity, motion, rate_text
 from .observed import centre_of, observed, state_times
 from .samples_per_beam import Sampled
-from .transform import CelestialTransform, unit_vectors
+from .transform import CelestialTransform, Track, unit_vectors
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -107,11 +107,10 @@ class Pointing(Operator):
 
     def directions(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
         """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the scan."""
-        x, y = self.path(seconds)
-        x, y = x + offset[0], y + offset[1]
         if target.frame == "horizontal":
-            return _on_tangent_plane(-target.longitude, target.latitude, -x, y)
-        return transform.horizontal(_on_tangent_plane(*target.icrs(), x, y), seconds)
+            x, y = self.path(seconds)
+            return _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])
+        return transform.horizontal(self._on_the_sky(target, offset, seconds), seconds)
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
         """Sample flags (n,); nonzero means: do not use."""
@@ -125,6 +124,17 @@ class Pointing(Operator):
         from .estimate import pointing_estimate
 
         return pointing_estimate(self, context)
+
+    def _on_the_sky(self, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
+        """ICRS unit vectors (n, 3) of a `path` about a celestial target."""
+        x, y = self.path(seconds)
+        return _on_tangent_plane(*target.icrs(), x + offset[0], y + offset[1])
+
+    def _track(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Track:
+        if type(self).directions is Pointing.directions and target.frame != "horizontal":
+            return transform.track(self._on_the_sky(target, offset, seconds), seconds)
+        horizontal = self.directions(transform, target, offset, seconds)
+        return Track(horizontal, *transform.boresight(horizontal, seconds))
 
     # -- the scans --
 
@@ -192,13 +202,15 @@ class Pointing(Operator):
         beam = float(focalplane.fwhm.min())
         transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
 
-        horizontal = self.directions(transform, target, offset, seconds)
+        track = self._track(transform, target, offset, seconds)
+        horizontal = track.horizontal
         centre = centre_of(transform, target, seconds)
         place = f"{self.label}, scan {index} from {start}"
         total = self.scans * self.scan_duration + (self.scans - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)
 
-        observation = observed(self.label, scene, index, start, seconds, rate, transform, horizontal, centre, self.flag(seconds))
+        flags = self.flag(seconds)
+        observation = observed(self.label, scene, index, start, seconds, rate, transform, track[1:], centre, flags)
         self._check_motion(observation, transform, target, offset, None if self.jitter else horizontal, place, moved)
         if self.jitter > 0:
             state_times(self.label, observation)
@@ -307,6 +319,8 @@ def _on_tangent_plane(longitude: float, latitude: float, x: Floats, y: Floats) -
     east = np.array([-math.sin(longitude), math.cos(longitude), 0.0])
     centre = unit_vectors(longitude, latitude)
     north = np.cross(centre, east)
-    plane = centre + np.multiply.outer(x, east) + np.multiply.outer(y, north)
-    directions: Floats = plane / np.sqrt(1 + x * x + y * y)[:, None]
+    scale = 1 / np.sqrt(1 + x * x + y * y)
+    directions = np.empty((len(x), 3))
+    for k in range(3):
+        np.multiply(centre[k] + x * east[k] + y * north[k], scale, out=directions[:, k])
     return directions

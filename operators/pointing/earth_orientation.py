@@ -5,9 +5,8 @@ The files are read here rather than through `astropy.utils.iers`, which takes a 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
-from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -76,19 +75,19 @@ def _finals(first: int, last: int) -> Floats | None:
 
 def _rows(file: str, first: int, last: int, fields: Callable[[bytes], list[bytes]]) -> Floats | None:
     """The rows of ``first`` to ``last`` of a file with one line per day, or None where it does not hold them all."""
-    lines = _lines(file)
-    try:
-        offset = first - int(float(fields(lines[0])[0]))
-        table = np.array([fields(line) for line in lines[max(offset, 0) : max(offset, 0) + last - first + 1]], dtype="S").astype(
-            float
-        )
-    except (IndexError, ValueError):  # blank columns: days to come
+    with open(file, "rb") as table:
+        while (line := table.readline())[:1] == b"#":
+            pass
+        begin = table.tell() - len(line)
+        even = (os.stat(file).st_size - begin) % max(len(line), 1) == 0
+        try:
+            offset = max(first - int(float(fields(line)[0])), 0)
+            table.seek(begin + offset * len(line) if even else begin)  # lines of one length: 5 MB of days gone by are passed over
+            lines = table.read((last - first + 1) * len(line) if even else -1).splitlines()
+            found = [fields(line) for line in lines[0 if even else offset :][: last - first + 1]]
+            rows = np.array(found, dtype="S").astype(float)
+        except (IndexError, ValueError):  # blank columns: days to come
+            return None
+    if rows.ndim != 2 or not np.array_equal(rows[:, 0], np.arange(first, last + 1)):
         return None
-    if table.ndim != 2 or not np.array_equal(table[:, 0], np.arange(first, last + 1)):
-        return None
-    return np.ascontiguousarray(table[:, 1:])
-
-
-@lru_cache(2)
-def _lines(file: str) -> list[bytes]:
-    return [line for line in Path(file).read_bytes().splitlines() if line[:1] != b"#"]
+    return np.ascontiguousarray(rows[:, 1:])

@@ -29,7 +29,8 @@ def check_elevation(
 
     ``total`` [s] is how long all scans take, for the message.
     """
-    elevation = np.arctan2(horizontal[:, 2], np.hypot(horizontal[:, 0], horizontal[:, 1]))
+    lowest, highest = horizontal[[horizontal[:, 2].argmin(), horizontal[:, 2].argmax()]]
+    elevation = np.array([math.atan2(v[2], math.hypot(v[0], v[1])) for v in (lowest, highest)])
     low, high = telescope.elevation_min, telescope.elevation_max
     under, over = low - elevation.min(), elevation.max() - high
     if max(under, over) <= 1e-12:

@@ -82,28 +82,29 @@ def motion(
 def _peaks(track: Floats, step: float) -> dict[Quantity, Peak]:
     azimuth = np.unwrap(np.arctan2(-track[:, 1], track[:, 0]))
     elevation = np.arctan2(track[:, 2], np.hypot(track[:, 0], track[:, 1]))
+    fine, coarse = _derivatives(azimuth, elevation, 1, step), _derivatives(azimuth, elevation, 2, step)
     found = {}
-    for axis, order in QUANTITIES:
-        fine = _derivative(azimuth, elevation, axis, order, step)
-        if not len(fine):
-            continue
-        k, largest = int(fine.argmax()), float(fine.max())
-        coarse = [_derivative(azimuth[first::2], elevation[first::2], axis, order, 2 * step) for first in (0, 1)]
-        error = abs(largest - max((float(d.max()) for d in coarse if len(d)), default=0.0)) / 3
+    for (axis, order), rates in fine.items():
+        k = int(rates.argmax())
+        largest = float(rates[k])
+        error = abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3
         there = float(elevation[min(k + order // 2, len(elevation) - 1)])
         found[axis, order] = Peak(largest, (k + order / 2) * step, there, error)
     return found
 
 
-def _derivative(azimuth: Floats, elevation: Floats, axis: str, order: int, step: float) -> Floats:
-    """Magnitude of the ``order``-th difference quotient, (n - order,)."""
-    if axis == "azimuth":
-        return np.asarray(abs(np.diff(azimuth, order)) / step**order)
-    if axis == "elevation":
-        return np.asarray(abs(np.diff(elevation, order)) / step**order)
-    first = order // 2
-    cosine = np.cos(elevation[first : first + max(len(elevation) - order, 0)])
-    return np.asarray(np.hypot(np.diff(azimuth, order) * cosine, np.diff(elevation, order)) / step**order)
+def _derivatives(azimuth: Floats, elevation: Floats, lag: int, step: float) -> dict[Quantity, Floats]:
+    """Magnitudes of difference quotients over ``lag`` steps, (n - order lag,) each; without those of no points."""
+    axes, found = {"azimuth": azimuth, "elevation": elevation}, {}
+    for order in (1, 2, 3):
+        axes = {axis: values[lag:] - values[:-lag] for axis, values in axes.items()}
+        per = (lag * step) ** order
+        if ("sky", order) in QUANTITIES:
+            first = order // 2 * lag
+            cosine = np.cos(elevation[first : first + len(axes["azimuth"])])
+            found["sky", order] = np.hypot(axes["azimuth"] * cosine, axes["elevation"]) / per
+        found |= {(axis, order): np.asarray(abs(values) / per) for axis, values in axes.items()}
+    return {q: found[q] for q in QUANTITIES if len(found[q]) or lag > 1}
 
 
 def rate_text(value: float, order: int) -> str:

@@ -31,13 +31,12 @@ def observed(
     seconds: Floats,
     rate: float,
     transform: CelestialTransform,
-    horizontal: Floats,
+    boresight: tuple[Floats, Floats],
     centre: tuple[float, float],
     flags: NDArray[np.uint8],
 ) -> Observation:
-    """The scan that looks at ``horizontal`` (n, 3) north, west, up at ``seconds`` (n,) since ``start``."""
+    """The scan whose ``boresight`` is at `Track.azel` and `Track.radec` at ``seconds`` (n,) since ``start``."""
     instrument = scene.instrument
-    azel, radec = transform.boresight(horizontal, seconds)
     observation = Observation(
         name=f"scan-{index:03d}",
         index=index,
@@ -47,8 +46,8 @@ def observed(
         start=start,
         seconds=seconds,
         sample_rate=rate,
-        boresight_azel=azel,
-        boresight_radec=radec,
+        boresight_azel=boresight[0],
+        boresight_radec=boresight[1],
         centre=centre,
         seed=scene.seed,
         flags=flags,

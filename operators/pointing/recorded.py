@@ -141,8 +141,9 @@ class PointingRecorded(Operator):
             )
         target = self.target or scene.target
         centre = centre_of(transform, target, seconds) if target else _middle(transform, horizontal, seconds, scan.flags == 0)
+        boresight = transform.boresight(horizontal, seconds)
         observation = observed(
-            self.label, scene, index, start, seconds, scan.rate, transform, horizontal, centre, scan.flags.copy()
+            self.label, scene, index, start, seconds, scan.rate, transform, boresight, centre, scan.flags.copy()
         )
         state_times(self.label, observation)
         return observation

@@ -15,7 +15,7 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from .sampling import CHUNK, chunk, count_covered, locate, misses, span_on_grid
+from .sampling import CHUNK, CONSTANTS, count_covered, locate, misses, pointing, span_on_grid
 
 Floats = NDArray[np.floating]
 
@@ -34,32 +34,28 @@ def sample_linear(
 ) -> tuple[int, int]:
     """As `sampling.sample`, from the grid's ``values`` (ny, nx). Samples within two points of its border are left as they are."""
     kind = out.dtype.type
-    constants = np.array([1 / 6, 2 / 3, 0.5, 1.0, 2.0, 1e6, 0.0], kind)
-    a, b = xi.astype(kind), eta.astype(kind)
-    flat, (ny, nx) = values.reshape(-1), values.shape
-    beyond, behind = _sample(quaternions, pixel_matrix, a, b, rows, flat, ny, nx, bounds, covered, constants, over, out)
+    chunks = pointing(quaternions, pixel_matrix, values.shape, bounds, kind)
+    of_map = rows, values.reshape(-1), values.shape[1], covered, CONSTANTS.astype(kind)
+    beyond, behind = _sample(*chunks, xi.astype(kind), eta.astype(kind), *of_map, over, out)
     return int(beyond), int(behind)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, constants, over, out):  # type: ignore[no-untyped-def]
-    h, box = np.empty((9, CHUNK), out.dtype), np.empty((9, 2))
-    limits, edge = np.empty(4, out.dtype), np.empty(4, out.dtype)
-    scratch = np.empty((24, CHUNK))
+def _sample(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out):  # type: ignore[no-untyped-def]
     place = np.empty(CHUNK, np.int32)
     u, v = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
     beyond, behind = 0, 0
-    for start in range(0, out.shape[1], CHUNK):
+    for k in range(len(h)):
+        start = k * CHUNK
         count = min(CHUNK, out.shape[1] - start)
-        x0, y0 = chunk(quaternions[start : start + count], matrix, ny, nx, bounds, scratch, h, box, limits, edge)
         for d in range(rows.size):
             row = out[rows[d], start : start + count]
-            if over:
-                row[:] = 0
-            if misses(box, xi[d], eta[d], limits, edge):
+            for t in range(count if over else 0):
+                row[t] = constants[6]
+            if misses(box[k], xi[d], eta[d], limits[k]):
                 beyond += count
                 continue
-            inside, front = locate(h, xi[d], eta[d], count, limits, edge, constants, x0, y0, int32(nx), place, u, v)
+            inside, front = locate(h[k], xi[d], eta[d], count, limits[k], constants, ones[k], int32(nx), place, u, v)
             if covered.size > 0:
                 inside = count_covered(place, u, v, count, nx, covered)
             beyond += count - inside
@@ -70,7 +66,7 @@ def _sample(quaternions, matrix, xi, eta, rows, f, ny, nx, bounds, covered, cons
     return beyond, behind
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
 def _add_bilinear(f, place, u, v, first, stop, nx, constants, row):  # type: ignore[no-untyped-def]
     """The four grid points around each sample, one right and one up of its first spline coefficient; 0 off the grid."""
     one, zero = constants[3], constants[6]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from zonda.core import tangent
 from zonda.core.errors import InputError
-from zonda.core.files import check_memory, first_line
+from zonda.core.files import check_memory, first_line, reading
 from zonda.core.fits_files import check_size, opened
 from zonda.core.fits_image import read_image
 from zonda.core.records import dataclass
@@ -132,11 +132,13 @@ def read_map(
         Unreadable file; no map in it; unit, scale or position missing; unknown unit; NaN; a cube.
     """
     place = f"sky map {path}"
+    cure = "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
     plain = read_image(path)
     if plain is not None and tangent.plain(plain[0]) is not None:  # nothing that astropy need be asked
-        check_memory(8 * plain[1].size, "the array or table", place)
-        return _image(place, plain[1].astype(np.float64), plain[0], unit, pixel_size, centred, missing)
-    with opened(path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again") as hdus:
+        with reading(place, "FITS", cure):
+            check_memory(8 * plain[1].size, "the array or table", place)
+            return _image(place, plain[1].astype(np.float64), plain[0], unit, pixel_size, centred, missing)
+    with opened(path, place, cure) as hdus:
         for hdu in hdus:
             if _is_healpix(hdu):
                 check_size(path, hdu, place)

@@ -59,6 +59,7 @@ class SkyMap(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
     prepares_ahead: ClassVar[bool] = True
     only_tells: ClassVar[bool] = True
+    same_in_all_runs: ClassVar[bool] = True
     knobs: ClassVar[tuple[Knob, ...]] = (
         Knob("pixels_per_fwhm", (2, 3, 4, 6, 8), "sky interpolated between points"),
         Knob("interpolation", ("linear", "cubic"), "sky linear between points, not by cubic splines"),

@@ -13,6 +13,7 @@ from zonda.core.operator import Operator
 from zonda.core.order import check_order
 from zonda.core.pipeline import Pipeline
 from zonda.core.random import normals
+from zonda.core.smooth import SmoothField
 
 
 class Point(Operator):
@@ -139,23 +140,32 @@ def test_what_acts_at_the_end_hears_of_what_is_done(scene):
 
 
 class Flag(Operator):
-    """Flags as many samples as the run has an rms in K, and a detector where that is small."""
+    """Flags a sample, and the detectors where there is no white noise; says how often it was prepared before."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    _prepared: int = PrivateAttr(0)
+
+    def prepare(self, observation):
+        observation.tally.state(self.label, "prepared before", f"{self._prepared} times")
+        observation.smooth["transmission"] = SmoothField.constant(np.full(1, self._prepared), observation.n_samples)
+        self._prepared += 1
 
     def exec(self, block, state):
         block.observation.flags[0] = 1
         block.observation.detector_flags[:] |= np.uint8(not {"white"} & block.detdata.keys())
 
 
-def test_observations_end_with_the_flags_of_the_main_run(scene):
+def test_observations_end_with_what_the_main_run_left(scene):
     """What acts at the end, and whoever has the data, sees those; a companion run may have flagged all detectors."""
     runs = {"noiseless": {"only": ["sky"]}}
     data = Pipeline([Point(), Sky(), White(), Sum(), Flag(), Total()], runs=runs).run(scene, threads=1)
-    for observation in data.observations:
+    for number, observation in enumerate(data.observations):
         assert observation.flags[0] == 1
         assert not observation.detector_flags.any()
+        assert observation.smooth["transmission"].weights[0, 0] == number
+        assert ("Flag", "prepared before", f"{number} times") in list(observation.tally)
+    assert ("noiseless/Flag", "prepared before", "3 times") in list(data.tally)
 
 
 def test_same_seed_same_bits_two_seeds_incoherent(scene):

@@ -1,8 +1,14 @@
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import signal
+import subprocess
+import sys
+import time
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -45,3 +51,34 @@ def test_it_ends_with_its_owner():
     process = made._process
     del made
     assert process.wait(10) is not None
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+@pytest.mark.parametrize("wait", [0.0, 0.3])
+def test_it_ends_with_an_owner_that_is_killed(wait):
+    """Also while it is importing."""
+    source = f"""
+import os, signal, time
+from zonda.operators.diagnostics.artist import Artist
+artist = Artist()
+print(artist._process.pid, flush=True)
+time.sleep({wait})
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    run = subprocess.run([sys.executable, "-c", source], stdout=subprocess.PIPE, text=True)
+    assert run.returncode == -signal.SIGKILL
+    pid, patience = int(run.stdout), time.monotonic() + 30
+    while time.monotonic() < patience and _alive(pid):
+        time.sleep(0.02)
+    assert not _alive(pid)
+
+
+def _alive(pid):
+    """Whether a process runs (one that nobody has waited for yet does not)."""
+    stat = Path(f"/proc/{pid}/stat")
+    with contextlib.suppress(OSError):
+        if Path("/proc/self").is_dir():
+            return stat.read_text().rpartition(")")[2].split()[0] != "Z" if stat.exists() else False
+        os.kill(pid, 0)
+        return True
+    return False

@@ -17,8 +17,9 @@ from matplotlib.text import Text
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics import pictures
 from zonda.operators.diagnostics.plot_operators import Plots
-from zonda.operators.diagnostics.plots import plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
+from zonda.operators.diagnostics.plots import map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
 from zonda.operators.diagnostics.power_spectrum import Spectrum
+from zonda.operators.diagnostics.sky_axes import SkyAxes
 from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
 from zonda.operators.maps.image import Image
 from zonda.operators.maps.map_product import MapProduct
@@ -456,3 +457,26 @@ def test_time_streams_are_kept_whole(make_observation, data):
     )
     assert observation.tally.get("TimeStreams", "stream pink is absent at this step") == 1
     assert TimeStreams(observation=1).prepare(observation) is None
+
+
+@pytest.mark.parametrize("picture", ["streams", "scans"])
+def test_the_legend_touches_no_line(picture, stream, make_observation):
+    scans = [make_observation(500, index=k) for k in range(3)]
+    ax = plot_tod(stream) if picture == "streams" else plot_scan(scans)
+    FigureCanvasAgg(ax.figure).draw()
+    box = ax.get_legend().get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= ax.figure.bbox.x1
+    for line in ax.get_lines():
+        path = line.get_transform().transform_path(line.get_path())
+        assert not path.intersects_bbox(box, filled=False)
+
+
+def test_maps_side_by_side_have_their_latitudes_written_once(values, wcs):
+    first, second = map_axes(values.shape, SkyAxes.of(wcs), wcs, 2)
+    for ax in (first, second):
+        plot_map(values, SkyAxes.of(wcs), ax=ax)
+    assert first.get_ylabel()
+    assert not second.get_ylabel()
+    assert first.get_position().width == pytest.approx(second.get_position().width)
+    assert second.get_position().x1 < 1
+    assert second.bar_axes.get_position().x1 < 1

@@ -2,6 +2,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from zonda.core.site import Site
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.stare import PointingStare
-from zonda.operators.pointing.transform import CelestialTransform, from_angles, unit_vectors
+from zonda.operators.pointing.transform import CelestialTransform, from_angles, unit_vectors, upright
 
 GREEN_BANK = Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m")
 POLE = Site(name="South Pole", latitude="-90 deg", longitude="0 deg", altitude="2835 m")
@@ -71,6 +72,45 @@ def test_there_and_back(site: Site) -> None:
     seconds = np.linspace(0, 86400, 40000)  # more than two chunks
     sky = random_directions(len(seconds))
     assert np.abs(transform.icrs(transform.horizontal(sky, seconds), seconds) - sky).max() < 2e-15
+
+
+@pytest.mark.parametrize("frame", ["field", "whole sky"])
+def test_a_track_is_there_and_back_at_once(frame: str) -> None:
+    transform = CelestialTransform(GREEN_BANK, START, 3600.0)
+    seconds = np.linspace(0, 3600, 40000)  # more than two chunks
+    sky = (
+        unit_vectors(1.3 + 0.01 * np.sin(seconds), 0.3 + 0.01 * np.cos(1.7 * seconds))
+        if frame == "field"
+        else random_directions(40000)
+    )
+    track = transform.track(sky, seconds)
+    assert np.array_equal(track.horizontal, transform.horizontal(sky, seconds))
+    azel, radec = transform.boresight(track.horizontal, seconds)
+    assert np.array_equal(track.azel, azel)
+    assert np.abs(track.radec - radec).max() < 5e-15
+    rounding = 2e-15 if frame == "field" else 1e-12  # longitudes of random directions are unwrapped to 1e3 rad
+    assert angle(rotation_matrices(track.radec)[:, :, 2], sky).max() < rounding
+
+
+@pytest.mark.parametrize("sweep", [0.1, 2.0, 2.7, 3.2, 40.0])
+@pytest.mark.parametrize("start", [0.0, 1.0, math.pi - 1e-9, -math.pi, 3.0])
+def test_upright_is_from_angles(sweep: float, start: float) -> None:
+    """Within 150 deg of the first direction by half angles, else by angles; through south, round the sky, up to the zenith."""
+    way = np.linspace(0, 1, 4001)
+    longitude, latitude = start + sweep * way, 1.57 * np.sin(7 * way)
+    found = upright(unit_vectors(longitude, latitude))
+    expected = from_angles(longitude, latitude)
+    expected *= np.sign((found[0] * expected[0]).sum())  # the first longitude is counted from -pi to pi
+    assert np.abs(found - expected).max() < 3e-13  # near the zenith a direction's rounding turns it: 1e-16 / cos(1.57)
+    assert np.linalg.norm(np.diff(found, axis=0), axis=1).max() < 0.1
+    assert np.abs(np.linalg.norm(found, axis=1) - 1).max() < 1e-15
+
+
+def test_upright_where_there_is_no_longitude() -> None:
+    found = upright(np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]))
+    assert np.isfinite(found).all()
+    assert np.abs(rotation_matrices(found)[:, :, 2] - [[0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]]).max() < 1e-15
+    assert upright(np.empty((0, 3))).shape == (0, 4)
 
 
 def test_near_the_sun(reference: Any) -> None:
@@ -217,9 +257,7 @@ def test_a_leap_second_is_a_second(reference: Any) -> None:
     assert angle(transform.horizontal(sky, seconds), reference.horizontal(sky, start, seconds)).max() < 1e-11
 
 
-def test_tables_agree_where_they_overlap_and_follow_astropy() -> None:
-    from astropy.utils import iers
-
+def test_tables_agree_where_they_overlap() -> None:
     from zonda.operators.pointing import earth_orientation
 
     final, latest = earth_orientation._c04(58000, 60000), earth_orientation._finals(58000, 60000)
@@ -229,6 +267,30 @@ def test_tables_agree_where_they_overlap_and_follow_astropy() -> None:
     end = next(mjd for mjd in range(60000, 90000) if earth_orientation._c04(mjd, mjd) is None)
     assert earth_orientation._finals(end, end + 30) is not None  # a year of predictions
     assert earth_orientation._c04(end - 1, end) is None
+    assert earth_orientation._c04(30000, 30001) is None
+
+
+def test_a_table_whose_lines_differ_in_length_is_read_whole(tmp_path: Path) -> None:
+    from zonda.operators.pointing.earth_orientation import _rows
+
+    def rows(lines: list[str], first: int, last: int) -> Any:
+        (tmp_path / "table").write_text("# a table\n" + "".join(f"{line}\n" for line in lines))
+        return _rows(str(tmp_path / "table"), first, last, bytes.split)
+
+    even = [f"{day}.00 {day % 7}.5" for day in range(57000, 57100)]
+    ragged = [line + " " * (k % 3) for k, line in enumerate(even)] + ["57100.00 "]
+    for lines in (even, ragged):
+        assert rows(lines, 57011, 57013).tolist() == [[3.5], [4.5], [5.5]]
+        assert rows(lines, 57000, 57000).tolist() == [[6.5]]
+        assert rows(lines, 57098, 57100) is None
+        assert rows(lines, 56999, 57001) is None
+        assert rows(lines[:20] + lines[21:], 57018, 57022) is None
+    assert rows([], 57000, 57001) is None
+
+
+def test_it_follows_astropy() -> None:
+    from astropy.utils import iers
+
     mjd = np.array([57753.0, 57753.9, 57754.2, 60639.29])  # across the leap second of 2016
     ours = orientation(mjd)
     table = iers.IERS_B.open()

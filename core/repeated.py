@@ -1,0 +1,109 @@
+"""Streams that a step makes alike in all runs: made in the main run, copied in the runs after it.
+
+With `Operator.same_in_all_runs` a step's streams, and what it tells, depend on no other step. As many scans of them as fit into
+a quarter of the memory for streams and blocks are kept until the last run that has the step; of the others they are made anew.
+A copy has the same bits and takes 1 ns a sample, less than a tenth of what it takes to sample a map.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import mmap
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .data import Block, Floats, Observation, Tally
+from .forecast import forecast
+from .layout import read
+from .operator import Operator
+from .settings import Settings
+
+SHARE = 4
+"""Of the memory for streams and blocks, one part in so many may hold what is kept for later runs."""
+
+
+def alike(steps: Sequence[Operator]) -> dict[str, frozenset[str]]:
+    """Streams of each step of the main run, by label, that later runs may copy: nothing has made them before this step."""
+    found, made, wanted = dict[str, frozenset[str]](), set[str](), read(steps)
+    for operator in steps:
+        declared = operator.declares("same_in_all_runs", "configure", "prepare", "exec", "collect")
+        alone = operator.couples == "sample" and type(operator).halo is Operator.halo and not operator.provides & made
+        if declared and operator.only_tells and alone and operator.provides & wanted:
+            found[operator.label] = frozenset(operator.provides & wanted)
+        made |= operator.provides
+    return found
+
+
+def affordable(
+    steps: Sequence[Operator], names: Mapping[str, Collection[str]], observations: Sequence[Observation], settings: Settings
+) -> list[int]:
+    """Bytes that are kept of each scan, the first ones first; 0: nothing of it.
+
+    Nothing at all where other streams would lack the room.
+    """
+    each = sum(len(streams) for streams in names.values()) * np.dtype(settings.dtype).itemsize
+    sizes, left = list[int](), settings.memory // SHARE
+    for observation in observations:
+        size = each * observation.n_detectors * observation.n_samples
+        sizes.append(size if size <= left else 0)
+        left = left - size if size <= left else 0
+    if not any(sizes):
+        return [0] * len(sizes)
+    longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
+    less = dataclasses.replace(settings, memory=settings.memory - sum(sizes))
+    with_all, with_less = (forecast(steps, longest, s) for s in (settings, less))
+    fits = with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
+    return sizes if fits else [0] * len(sizes)
+
+
+def untouched(shape: tuple[int, int], dtype: type[np.floating[Any]]) -> Floats:
+    """An array of anything, in pages of ordinary size.
+
+    numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
+    """
+    if not hasattr(mmap, "MAP_ANONYMOUS") or not all(shape):
+        return np.empty(shape, dtype)
+    size = shape[0] * shape[1] * np.dtype(dtype).itemsize
+    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return np.frombuffer(pages, dtype).reshape(shape)
+
+
+class Repeated:
+    """One scan's streams that the main run makes for later runs.
+
+    Parameters
+    ----------
+    names
+        By label of the step: its streams (`alike`).
+    """
+
+    def __init__(self, names: Mapping[str, Collection[str]]) -> None:
+        self.names = names
+        self.told: dict[str, Tally] = {}
+        """What the steps told in `Operator.collect` of the main run."""
+        self.complete = False
+        """The main run is through: `repeat` may be called, `record` not any more."""
+        self._arrays: dict[tuple[str, str], Floats] = {}
+
+    def begin(self, shape: tuple[int, int], settings: Settings) -> None:
+        """Take memory; ``settings`` knows of it."""
+        self._arrays = {(who, name): untouched(shape, settings.dtype) for who, names in self.names.items() for name in names}
+        settings.kept += self._arrays.values()
+
+    def record(self, label: str, block: Block) -> None:
+        """Keep what the main run made of a block for the first time."""
+        for name in self.names[label] if not block.again else ():
+            self._arrays[label, name][block.detectors, block.samples] = block.detdata[name]
+
+    def repeat(self, label: str, block: Block) -> None:
+        """Put it into a later run's block."""
+        for name in self.names[label]:
+            block.new(name, zero=False)[...] = self._arrays[label, name][block.detectors, block.samples]
+
+    def forget(self, settings: Settings) -> None:
+        """Give the memory back."""
+        mine = {id(a) for a in self._arrays.values()}
+        settings.kept[:] = [a for a in settings.kept if id(a) not in mine]
+        self._arrays.clear()

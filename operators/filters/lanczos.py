@@ -1,0 +1,126 @@
+"""Leading eigenpairs of G = A A^T by the Lanczos iteration (full reorthogonalization, float64).
+
+One step reads the stream once and gives A^T q and A A^T q together. It starts near the detector mean and stops when
+
+    |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is wanted.                        (1)
+"""
+
+from __future__ import annotations
+
+from dataclasses import field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.records import dataclass
+
+from .gram import Gram, directions, near_the_mean
+
+Floats = NDArray[np.float64]
+
+EMPTY = 1e-13
+"""Share of the stream's energy, per detector, that G cannot tell from rounding."""
+
+NOTHING = 1e-26
+"""Share of the stream's energy below which what is left after subtraction is float64 rounding: there is no further mode."""
+
+
+@dataclass
+class Ritz:
+    """Approximate leading eigenpairs of G, largest first.
+
+    Attributes
+    ----------
+    values
+        sigma_i^2; may be longer than ``detectors``. `energies`: |v_i|^2 of the modes at hand.
+    detectors, times
+        u_i (k, n_det) and v_i = A^T u_i (k, n_samp).
+    residuals
+        Left side of (1) over sigma_i^2.
+    rank
+        Rank of A as far as it matters here (a lower bound).
+    """
+
+    values: Floats
+    detectors: Floats
+    times: Floats
+    residuals: Floats
+    rank: int
+    steps: int
+    what: str = "singular modes"
+    count: int = 0
+    """How many of them are removed."""
+    energies: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.energies = np.einsum("kt,kt->k", self.times, self.times)
+
+    @classmethod
+    def of_mean(cls, gram: Gram) -> Ritz:
+        """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
+        if gram.n_good == 0:
+            return cls.nothing(gram.use.size, gram.n_samples)
+        u = gram.use / np.sqrt(gram.n_good)
+        _, v = gram.apply(u)
+        rank = 1 + (gram.left(u[None], v[None]) > NOTHING * gram.energy)
+        return cls(np.array([v @ v]), u[None], v[None], np.zeros(1), rank, 1, "detector mean")
+
+    @classmethod
+    def nothing(cls, n_det: int, n_samples: int) -> Ritz:
+        """No mode at all: no detector is left."""
+        return cls(np.zeros(0), np.zeros((0, n_det)), np.zeros((0, n_samples)), np.zeros(0), 0, 0, "no good detector")
+
+
+def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz:
+    """The leading ``wanted`` modes of ``gram`` to a residual, equation (1).
+
+    ``gap``: the largest ratio of a singular value to the one before at which the modes are of use; where every ratio is larger
+    the iteration ends at residuals of a tenth. None: they are wanted in any case.
+    """
+    n = gram.n_good
+    if n == 0:
+        return Ritz.nothing(gram.use.size, gram.n_samples)
+    basis: list[Floats] = [near_the_mean(gram.use)]
+    times: list[Floats] = []
+    projected = np.zeros((n, n)) if n <= 4096 else np.zeros((512, 512))
+    while True:
+        m = len(basis)
+        image, time = gram.apply(basis[-1])
+        times.append(time)
+        space = np.array(basis)
+        column = space @ image
+        projected[:m, m - 1] = projected[m - 1, :m] = column
+        rest = image - column @ space
+        again = space @ rest
+        rest -= again @ space
+        rest[~gram.use] = 0.0
+        beta = float(np.linalg.norm(rest))
+        values, vectors = np.linalg.eigh(projected[:m, :m])
+        values, vectors = values[::-1], vectors[:, ::-1]
+        floor = EMPTY * n * gram.energy
+        residuals = beta * np.abs(vectors[-1]) / np.maximum(values, floor)
+        exhausted = m == min(n, len(projected)) or gram.energy - float(values.sum()) <= floor
+        enough = m > wanted
+        converged = bool((residuals[:wanted] <= residual).all())
+        closed = False
+        if enough and gap is not None and m >= wanted + 3:
+            size = np.sqrt(np.maximum(values, 0.0))
+            rough = bool((residuals[: wanted + 1] <= 0.1).all())
+            closed = rough and all(size[i + 1] > gap * size[i] for i in range(wanted))
+        if exhausted or closed or (enough and converged):
+            k = min(wanted, m)
+            detectors = np.array(vectors[:, :k].T @ space)
+            series = np.array(vectors[:, :k].T @ np.array(times))
+            rank = int(np.count_nonzero(values > floor))
+            if not exhausted:
+                rank += 1
+            elif rank < n:  # G squares what is small: look at the remainder itself
+                seen = vectors[:, :rank].T
+                rank += gram.left(seen @ space, seen @ np.array(times)) > NOTHING * gram.energy
+            return Ritz(values, detectors, series, residuals[:k], rank, m)
+        if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
+            rest = gram.use * directions(m, gram.use.size)
+            for _ in range(2):
+                rest = rest - (space @ rest) @ space
+            beta = float(np.linalg.norm(rest))
+        basis.append(rest / beta)
