@@ -17,7 +17,8 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+
+from .records import dataclass
 
 Measured = float | tuple[float, str]
 """A figure, or a figure and a remark."""

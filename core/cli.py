@@ -217,6 +217,7 @@ def run(
     (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
     """
     from . import early
+    from .compile_ahead import Helper
     from .compiled import ensure_cache, one_blas_thread
     from .machine import available_threads
 
@@ -225,11 +226,17 @@ def run(
     click.get_current_context().call_on_close(gc.enable)
     gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
     pipeline = pipelines[0]
-    if available_threads() > 1 and threads != 1 and not (len(pipelines) > 1 or engine or workers or scheduler or share):
+    helper = Helper()
+    click.get_current_context().call_on_close(helper.close)
+    several = len(pipelines) > 1 or engine or workers or scheduler or share
+    if available_threads() > 1 and threads != 1 and not several:
         click.get_current_context().call_on_close(early.end)
         early.begin(pipeline)
+    if not several:
+        helper.prepare()
     file = _load(pipeline, settings)
-    if len(pipelines) > 1 or file.header.campaign is not None or engine or workers or scheduler or share:
+    if several or file.header.campaign is not None:
+        helper.close()
         if verify or only:
             raise click.UsageError(f"{'--verify' if verify else '--only'} is for one run, not for a campaign")
         gc.enable()
@@ -241,10 +248,9 @@ def run(
             command=_command(pipelines, settings, keep, drop, no_prune),
         )  # fmt: skip
         return
-    from .compile_ahead import Helper
     from .files import check_output_folder, write_text
     from .lock import lock
-    from .plan import table
+    from .plan.outcome import line
     from .plan.remembered import outcome
 
     if only and verify:
@@ -267,10 +273,9 @@ def run(
         from .campaign.folder import check_free, make_way
 
         check_free(folder)
-    helper = Helper()
-    click.get_current_context().call_on_close(helper.close)
+    helper.begin()
     made = outcome(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
-    click.echo(table.line(made), err=True)
+    click.echo(line(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
     command = _command(pipelines, settings, keep, drop, no_prune, only)

@@ -8,6 +8,7 @@ load the kernels in a thread while they point the telescope.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -20,21 +21,24 @@ from itertools import accumulate
 from threading import Event, Thread
 from typing import Any
 
-from . import kernel_cache, user_cache
+from . import user_cache
 from .compiled import cache_folder, keep_bytecode
 from .machine import available_threads
 from .program import fingerprint
 from .versions import versions
 
 KIND = "compiled"
+COMPILING = (100_000, 20, 100)
+"""Thresholds of garbage collection while kernels are compiled: by Python's own it takes 7 % of the time."""
 _CHILD = "import sys; sys.path[:] = {path!r}; from zonda.core.compile_ahead import serve; serve()"
 
 
 class Helper:
     """The second process of a first run, the thread of a later one; nothing where there is one processor only.
 
-    Make it when the operators are imported: the child compiles the kernels of modules that are imported here. `close` it in any
-    case; after `succeeded` there is no first run any more.
+    `prepare` starts the process at once, before this one has imported anything heavy; `begin`, when the operators are imported,
+    tells it their modules, whose kernels it compiles, or starts the thread. `close` it in any case; after `succeeded` there is no
+    first run any more.
     """
 
     def __init__(self) -> None:
@@ -48,14 +52,12 @@ class Helper:
         self._first = user_cache.recall(KIND, self._key) is None
         self._thread: Thread | None = None
         self._enough = Event()
-        modules = [name for name in sys.modules if name.startswith("zonda.")]
-        if available_threads() == 1 or not sys.executable:
-            return
-        if not self._first:
-            self._thread = Thread(target=compile_listed, args=(modules, False, self._enough), daemon=True)
-            self._thread.start()
-        else:
-            kernel_cache.share()
+        self._alone = available_threads() == 1 or not sys.executable
+        self._thresholds = gc.get_threshold()
+
+    def prepare(self) -> None:
+        """Start the process of a first run."""
+        if self._first and not self._alone:
             with suppress(OSError):
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", _CHILD.format(path=sys.path)],
@@ -64,7 +66,20 @@ class Helper:
                     stderr=subprocess.DEVNULL,
                     start_new_session=True,  # Ctrl-C is the parent's affair
                 )
-                assert self._process.stdin is not None
+
+    def begin(self) -> None:
+        """Let the process compile, or the thread load, the kernels of the modules that are imported now."""
+        modules = [name for name in sys.modules if name.startswith("zonda.")]
+        if self._first:
+            gc.set_threshold(*COMPILING)
+        elif not self._alone:
+            self._thread = Thread(target=compile_listed, args=(modules, False, self._enough), daemon=True)
+            self._thread.start()
+        if self._process is not None and self._process.stdin is not None:
+            from . import kernel_cache
+
+            kernel_cache.share()
+            with suppress(OSError):  # it has ended
                 self._process.stdin.write(json.dumps(modules).encode() + b"\n")
                 self._process.stdin.flush()
 
@@ -76,6 +91,7 @@ class Helper:
 
     def close(self) -> None:
         """End the process and the thread."""
+        gc.set_threshold(*self._thresholds)
         self._enough.set()
         if self._thread is not None:
             self._thread.join()
@@ -88,6 +104,10 @@ class Helper:
 
 def serve() -> None:
     """The child's side: it ends when there is nothing left to compile, or when the parent has hung up."""
+    from . import kernel_cache, random  # the second with numba, whose compiler is made ready while the parent reads its file
+
+    random.fill_normals.targetctx.refresh()
+    random.fill_normals.typingctx.refresh()
     modules = json.loads(sys.stdin.buffer.readline())
 
     def leave_with_parent() -> None:
@@ -96,11 +116,14 @@ def serve() -> None:
 
     Thread(target=leave_with_parent, daemon=True).start()
     kernel_cache.share(polite=True)
+    gc.freeze()
+    gc.set_threshold(*COMPILING)
     compile_listed(modules)
 
 
 def compile_listed(modules: list[str], as_child: bool = True, enough: Event | None = None) -> int:
     """Compile or load the listed kernels of these modules until ``enough``; returns how many there were."""
+    from . import random  # noqa: F401  it says where kernels are kept, before any is defined
     from .kernels import KERNELS
 
     rows = [row for line in KERNELS if (row := line.split())[1] in modules]

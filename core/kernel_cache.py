@@ -215,8 +215,8 @@ def _without_bitcode(reduced: Any) -> Any:
         (name, kind, (machine, bitcode)), description, *others = reduced
         if known and kind == "object":
             names = [getattr(description, f"llvm_{what}_name") for what in ("func", "cpython_wrapper", "cfunc_wrapper")]
-            defined = {f.name for f in ll.parse_bitcode(bitcode).functions if not f.is_declaration}
-            text = "".join(f'define void @"{function}"() {{ ret void }}\n' for function in names if function in defined)
+            defined = [function for function in names if function.encode() in machine]
+            text = "".join(f'define void @"{function}"() {{ ret void }}\n' for function in defined)
             return ((name, kind, (machine, ll.parse_assembly(text).as_bitcode())), description, *others), bitcode
     return reduced, None
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from .fits_image import Cards
 from .projection import central
+from .records import dataclass
 
 Floats = NDArray[np.float64]
 

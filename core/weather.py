@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from pydantic_core import PydanticCustomError, core_schema
 from .configuration.parameters import Parameters
 from .configuration.units import Unit
 from .errors import InputError, ZondaError
+from .records import dataclass
 
 if TYPE_CHECKING:
     from .configuration.time import Instant

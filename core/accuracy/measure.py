@@ -16,11 +16,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 from ..errors import ZondaError
+from ..records import dataclass
 
 REST = "(rest)"
 """CPU seconds that no operator's stage accounts for."""

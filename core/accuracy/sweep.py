@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import combinations, pairwise
 
 import numpy as np
 
 from ..errors import ZondaError
+from ..records import dataclass
 from .measure import Measured
 from .metrics import Metric
 from .settings import PipelineKnob, Setting

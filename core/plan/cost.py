@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -21,6 +20,7 @@ from ..repeated import affordable, alike
 from ..settings import Settings
 from .context import Context
 from .estimate import Cost
+from .outcome import Prediction
 
 REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
 """Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""
@@ -82,24 +82,6 @@ def measure_speed(budget: float = 0.3) -> dict[str, float]:
             kernel()
             best[name] = min(best[name], time.process_time() - start)
     return {name: seconds / REFERENCE[name] for name, seconds in best.items()}
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """CPU seconds by operator, memory, and the operators whose cost nobody stated."""
-
-    seconds: Mapping[str, float]
-    bytes: float
-    unknown: tuple[str, ...] = ()
-    startup: float = 0.0
-    runs: Mapping[str, float] = field(default_factory=dict)
-    """Runs in which each operator is carried out; of one whose streams later runs copy (`core.repeated`), only the first."""
-    factors: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def total(self) -> float:
-        """CPU seconds of the whole run."""
-        return self.startup + sum(self.seconds.values())
 
 
 def predict(

@@ -9,7 +9,7 @@ from ..companion import Companion
 from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..errors import ZondaError
-from .planner import same_labels
+from .outcome import same_labels
 
 
 def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:

@@ -5,22 +5,23 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 from ..configuration.diagnostics import nearest
-from ..configuration.pipeline_file import PipelineFile, Step
+from ..configuration.pipeline_file import PipelineFile
 from ..data import Data
 from ..derived import derivation
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
 from ..pipeline import Pipeline
+from ..records import dataclass
 from .budget import limits
 from .context import Context, look
-from .cost import Prediction, predict
+from .cost import predict
 from .estimate import METRICS, Bound, Choice, Cost, Effect, Estimate, full
+from .outcome import Prediction, apply
 from .structure import Structure, prune, selected
 
 LARGEST_RATIO = 1e5
@@ -337,31 +338,6 @@ def _check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Se
         if mine and name not in labels and all(len(d.effect.choices) == 1 for d in mine):
             what = "is not simulated" if mine[0].choice.decision == "not simulated" else "has no coarser form"
             raise ZondaError(f"{name!r} cannot be dropped: it {what}", place="zonda plan", cure="leave out --drop for it")
-
-
-def apply(
-    file: PipelineFile, operators: Collection[str], names: Collection[str], settings: Mapping[str, Mapping[str, Any]]
-) -> PipelineFile:
-    """``file`` with these operators (labels) and companion runs only, parameters changed by ``settings``."""
-    labels = [o.label for o in Pipeline(file.operators, runs=file.runs).operators]
-    steps, kept = [], []
-    for label, step in zip(labels, file.steps, strict=True):
-        if label in operators:
-            update = settings.get(label, {})
-            steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
-            kept.append(label)
-    runs = {name: run for name, run in file.runs.items() if name in names}
-    header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **settings.get("pipeline", {})})
-    return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
-
-
-def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
-    """Steps named so that each keeps its label, on which its random numbers depend, though a namesake is left out."""
-    named = []
-    for step, label, new in zip(steps, labels, Pipeline([s.operator for s in steps]).operators, strict=True):
-        same = new.label == label
-        named.append(step if same else Step(step.key, step.operator.model_copy(update={"name": label})))
-    return named
 
 
 def describe(bound: Bound, metrics: Iterable[str]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,39 +21,11 @@ from ..discovery import HOST, discover, normalized
 from ..machine import available_memory, available_threads
 from ..program import fingerprint
 from ..versions import versions
-from . import table
-from .cost import Prediction
-from .planner import apply, plan
+from .outcome import Outcome, Prediction
 
 KIND = "plan"
 FOREIGN = ("operators", "mapmakers", "noise_models", "spectra", "weather_sources")
 """Groups of entry points whose components decide what a plan says."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a run takes from a `Plan`; attributes as there.
-
-    Attributes
-    ----------
-    operators, runs
-        Labels of the operators, and names of the companion runs, that act.
-    settings
-        Changed parameters by operator.
-    short
-        Rows for headers and the report (`table.short`).
-    """
-
-    operators: tuple[str, ...]
-    runs: tuple[str, ...]
-    settings: Mapping[str, Mapping[str, Any]]
-    short: list[tuple[str, str, str, str]]
-    prediction: Prediction
-    unpruned: Prediction
-
-    def apply(self, file: PipelineFile) -> PipelineFile:
-        """See `Plan.apply`."""
-        return apply(file, self.operators, self.runs, self.settings)
 
 
 def outcome(
@@ -73,8 +45,11 @@ def outcome(
         found = _read(user_cache.recall(KIND, {**(key or {}), "memory": ceiling}))
         if found is not None:
             return found
+    from .planner import plan
+    from .table import short
+
     made = plan(file, keep=keep, drop=drop, prune_all=prune_all, threads=threads, memory=memory)
-    fresh = Outcome(made.operators, made.structure.runs, made.settings(), table.short(made), made.prediction, made.unpruned)
+    fresh = Outcome(made.operators, made.structure.runs, made.settings(), short(made), made.prediction, made.unpruned)
     if key:
         value = {**asdict(fresh), **{k: list(getattr(fresh, k)) for k in ("operators", "runs")}}
         value |= {"short": [list(row) for row in fresh.short]}

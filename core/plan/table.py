@@ -6,10 +6,11 @@ import shutil
 import textwrap
 from typing import TYPE_CHECKING, Any
 
+from .outcome import duration, line
 from .planner import Decided, Plan, describe, figure, kelvin
 
 if TYPE_CHECKING:
-    from .remembered import Outcome
+    pass
 
 
 def rows(plan: Plan) -> list[dict[str, Any]]:
@@ -75,7 +76,7 @@ def _effects(plan: Plan, metrics: frozenset[str], width: int) -> list[str]:
         if d.operator != operator:
             operator, formula = d.operator, ""
             seconds = plan.prediction.seconds.get(operator)
-            lines.append(operator + (f"  {_time(seconds)} of CPU time" if seconds is not None else ""))
+            lines.append(operator + (f"  {duration(seconds)} of CPU time" if seconds is not None else ""))
         decision = choice.decision if choice.decision == choice.what else f"{choice.decision}: {choice.what}"
         lines.append(f"  {d.effect.name:<{column}}{decision}")
         added = d.chosen > 0 or choice.decision == "not simulated"
@@ -89,23 +90,6 @@ def _effects(plan: Plan, metrics: frozenset[str], width: int) -> list[str]:
         indent = " " * (column + 2)
         lines += textwrap.wrap("; ".join(filter(None, notes)), width, initial_indent=indent, subsequent_indent=indent)
     return lines
-
-
-def line(plan: Plan | Outcome) -> str:
-    """The prediction in one line."""
-    p, u = plan.prediction, plan.unpruned
-    words = f"about {_time(p.total)} of CPU time and {p.bytes / 1e9:.2g} GB"
-    if u.total - p.total > 0.01 * u.total:
-        words += f" (everything on: {_time(u.total)}, {u.bytes / 1e9:.2g} GB)"
-    if p.unknown:
-        words += f", not counting {', '.join(p.unknown)}"
-    return words
-
-
-def _time(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def as_dict(plan: Plan) -> dict[str, Any]:

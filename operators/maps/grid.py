@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numba as nb
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
+from zonda.core.records import dataclass
 from zonda.core.tangent import TangentWcs
 
 if TYPE_CHECKING:

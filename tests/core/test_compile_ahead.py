@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 from importlib import import_module
 from threading import Event
 
@@ -7,7 +8,8 @@ import pytest
 from numba import types
 from numba.core.dispatcher import Dispatcher
 
-from zonda.core import compile_ahead, kernels
+import zonda.core.random  # noqa: F401  it says where kernels are kept, before any is defined
+from zonda.core import compile_ahead, kernel_cache, kernels
 from zonda.core.compile_ahead import Helper, compile_listed, for_child, text_of, type_of
 
 CHEAP = ("0.1", "zonda.operators.maps.sums", "_scales", "f8", "f8", "b1")
@@ -71,19 +73,27 @@ def test_listed_kernels_are_compiled_and_what_is_wrong_is_passed_over(monkeypatc
 def test_there_is_one_first_run(monkeypatch, tmp_path):
     monkeypatch.setenv("ZONDA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(compile_ahead, "available_threads", lambda: 2)
-    monkeypatch.setattr(compile_ahead.kernel_cache, "_CLAIMS", compile_ahead.kernel_cache._Claims())
-    started = []
+    monkeypatch.setattr(kernel_cache, "_CLAIMS", kernel_cache._Claims())
+    started, before = [], gc.get_threshold()
     monkeypatch.setattr(compile_ahead.subprocess, "Popen", lambda command, **options: started.append(command) or Process())
     for expected in (1, 2):  # the first failed
         helper = Helper()
+        helper.prepare()
+        helper.begin()
+        assert gc.get_threshold() == compile_ahead.COMPILING
         helper.close()
+        assert gc.get_threshold() == before
         assert len(started) == expected
     helper = Helper()
+    helper.prepare()
+    helper.begin()
     helper.succeeded()
     helper.close()
     loaded = []
     monkeypatch.setattr(compile_ahead, "compile_listed", lambda *arguments: loaded.append(arguments))
     later = Helper()
+    later.prepare()
+    later.begin()
     later.close()
     assert len(started) == 3
     ((modules, as_child, enough),) = loaded
@@ -107,4 +117,6 @@ class Process:
 def test_one_processor_compiles_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("ZONDA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(compile_ahead, "available_threads", lambda: 1)
-    assert Helper()._process is None
+    helper = Helper()
+    helper.prepare()
+    assert helper._process is None

@@ -9,7 +9,8 @@ import pytest
 
 import zonda
 from zonda.core.configuration import locate
-from zonda.core.plan import remembered, table
+from zonda.core.plan import planner, remembered, table
+from zonda.core.plan.outcome import line
 from zonda.core.plan.planner import plan
 from zonda.core.plan.remembered import outcome
 
@@ -32,7 +33,7 @@ def no_planning(monkeypatch):
         raise RuntimeError("planned again")
 
     def switch():
-        monkeypatch.setattr(remembered, "plan", refuse)
+        monkeypatch.setattr(planner, "plan", refuse)
 
     return switch
 
@@ -45,7 +46,7 @@ def test_the_same_as_planned(file, no_planning):
     assert again == first
     assert again.short == table.short(made)
     assert again.apply(file).resolved_yaml() == made.apply(file).resolved_yaml()
-    assert table.line(again).startswith("about ")
+    assert line(again).startswith("about ")
 
 
 def test_what_it_depends_on_makes_it_anew(file, tmp_path, no_planning, monkeypatch):

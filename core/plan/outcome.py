@@ -1,0 +1,102 @@
+"""What a run takes from a plan: a run whose plan is remembered imports this, and not the planner."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from dataclasses import field
+from typing import TYPE_CHECKING, Any
+
+from ..configuration.pipeline_file import PipelineFile, Step
+from ..pipeline import Pipeline
+from ..records import dataclass
+
+if TYPE_CHECKING:
+    from .planner import Plan
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """CPU seconds by operator, memory, and the operators whose cost nobody stated."""
+
+    seconds: Mapping[str, float]
+    bytes: float
+    unknown: tuple[str, ...] = ()
+    startup: float = 0.0
+    runs: Mapping[str, float] = field(default_factory=dict)
+    """Runs in which each operator is carried out; of one whose streams later runs copy (`core.repeated`), only the first."""
+    factors: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def total(self) -> float:
+        """CPU seconds of the whole run."""
+        return self.startup + sum(self.seconds.values())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run takes from a `planner.Plan`; attributes as there.
+
+    Attributes
+    ----------
+    operators, runs
+        Labels of the operators, and names of the companion runs, that act.
+    settings
+        Changed parameters by operator.
+    short
+        Rows for headers and the report (`table.short`).
+    """
+
+    operators: tuple[str, ...]
+    runs: tuple[str, ...]
+    settings: Mapping[str, Mapping[str, Any]]
+    short: list[tuple[str, str, str, str]]
+    prediction: Prediction
+    unpruned: Prediction
+
+    def apply(self, file: PipelineFile) -> PipelineFile:
+        """See `planner.Plan.apply`."""
+        return apply(file, self.operators, self.runs, self.settings)
+
+
+def apply(
+    file: PipelineFile, operators: Collection[str], names: Collection[str], settings: Mapping[str, Mapping[str, Any]]
+) -> PipelineFile:
+    """``file`` with these operators (labels) and companion runs only, parameters changed by ``settings``."""
+    labels = [o.label for o in Pipeline(file.operators, runs=file.runs).operators]
+    steps, kept = [], []
+    for label, step in zip(labels, file.steps, strict=True):
+        if label in operators:
+            update = settings.get(label, {})
+            steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
+            kept.append(label)
+    runs = {name: run for name, run in file.runs.items() if name in names}
+    header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **settings.get("pipeline", {})})
+    return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
+
+
+def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
+    """Steps named so that each keeps its label, on which its random numbers depend, though a namesake is left out."""
+    named = []
+    for step, label, new in zip(steps, labels, Pipeline([s.operator for s in steps]).operators, strict=True):
+        same = new.label == label
+        named.append(step if same else Step(step.key, step.operator.model_copy(update={"name": label})))
+    return named
+
+
+def line(plan: Plan | Outcome) -> str:
+    """The prediction in one line."""
+    p, u = plan.prediction, plan.unpruned
+    words = f"about {duration(p.total)} of CPU time and {p.bytes / 1e9:.2g} GB"
+    if u.total - p.total > 0.01 * u.total:
+        words += f" (everything on: {duration(u.total)}, {u.bytes / 1e9:.2g} GB)"
+    if p.unknown:
+        words += f", not counting {', '.join(p.unknown)}"
+    return words
+
+
+def duration(seconds: float) -> str:
+    """In s, min or h."""
+    if seconds < 120:
+        return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
