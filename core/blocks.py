@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from .data import Block, Observation
 from .operator import Operator
-from .records import dataclass
 from .tiles import TILE_DETECTORS, TILE_SAMPLES
 
 PIECE = 4 * TILE_SAMPLES

@@ -17,8 +17,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-
-from .records import dataclass
+from dataclasses import dataclass
 
 Measured = float | tuple[float, str]
 """A figure, or a figure and a remark."""

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from .focalplane import Focalplane
 from .random import stream_key
-from .records import dataclass
 from .smooth import SmoothField
 from .tiles import TILE_DETECTORS, TILE_SAMPLES
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from .errors import PipelineError
 from .layout import Layout, read
 from .machine import available_memory, resident_memory
 from .operator import Operator
-from .records import dataclass
 from .settings import Settings
 from .streams import Source, Stage
 

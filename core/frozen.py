@@ -8,14 +8,13 @@ because of their values (not finite) are left out too, so that every map has the
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .data import Observation
-from .records import dataclass
 
 T = TypeVar("T", bound=np.generic)
 Used = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, cast
 
 from pydantic import BaseModel, TypeAdapter
-
-from .records import dataclass
 
 
 @dataclass(frozen=True)

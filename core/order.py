@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from .operator import Operator
-from .records import dataclass
 from .sky_signal import place_of_signal
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +19,6 @@ from .machine import available_memory, available_threads
 from .memory_budget import divide
 from .operator import Operator
 from .order import check_order
-from .records import dataclass
 from .selection import Selection
 from .settings import Settings, Timer
 from .simulation import Simulation

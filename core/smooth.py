@@ -10,7 +10,7 @@ kelvin) and its turbulent part (float32) are such fields; see ``docs/atmosphere.
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import fused
-from .records import dataclass
 from .transforms import spline_filter
 
 Floats = NDArray[np.floating]

@@ -20,14 +20,13 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from .data import Floats, Observation, Stream
 from .errors import OutputError, PipelineError
-from .records import dataclass
 from .smooth import SmoothField
 
 if TYPE_CHECKING:

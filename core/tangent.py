@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from .fits_image import Cards
 from .projection import central
-from .records import dataclass
 
 Floats = NDArray[np.float64]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -12,7 +13,6 @@ from pydantic_core import PydanticCustomError, core_schema
 from .configuration.parameters import Parameters
 from .configuration.units import Unit
 from .errors import InputError, ZondaError
-from .records import dataclass
 
 if TYPE_CHECKING:
     from .configuration.time import Instant

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-from ..records import dataclass
 from .settings import Setting
 from .sweep import Alone, Bench, Sweep
 

@@ -16,12 +16,11 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..errors import ZondaError
-from ..records import dataclass
 
 REST = "(rest)"
 """CPU seconds that no operator's stage accounts for."""

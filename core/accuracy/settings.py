@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..configuration import yaml_places
 from ..configuration.diagnostics import nearest
 from ..errors import InputError
 from ..knobs import PRECISION, Knob
-from ..records import dataclass
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile

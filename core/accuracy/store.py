@@ -9,13 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ..files import write_text
-from ..records import dataclass
 from .front import Point, cheapest
 from .metrics import get
 from .settings import LENGTH, Setting, knobs_of, overrides

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from ..records import dataclass
 from .front import Point, cheapest, pareto, point, search
 from .measure import Measured, Request, measure
 from .metrics import get

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import combinations, pairwise
 
 import numpy as np
 
 from ..errors import ZondaError
-from ..records import dataclass
 from .measure import Measured
 from .metrics import Metric
 from .settings import PipelineKnob, Setting

@@ -11,12 +11,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 from ..errors import PipelineError
 from ..machine import available_memory, available_threads
-from ..records import dataclass
 from .settings import Engine, Tls
 
 SCHEDULER_FILE_WAIT = 20.0

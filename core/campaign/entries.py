@@ -6,13 +6,13 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..configuration import overrides
 from ..configuration.diagnostics import Diagnostic
 from ..configuration.time import Instant
 from ..errors import InputError
-from ..records import dataclass
 from .settings import MOST_TASKS, Campaign, Nights
 
 if TYPE_CHECKING:

@@ -9,12 +9,11 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ..errors import InputError
 from ..files import write_text
-from ..records import dataclass
 
 FORMAT = 1
 FILE = "campaign.json"

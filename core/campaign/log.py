@@ -10,12 +10,11 @@ import errno
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 from ..errors import InputError
 from ..files import output_error, writing
-from ..records import dataclass
 
 DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """What reading a damaged file may raise; the second from the text of the first."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, ZondaError
 from ..files import product_path
-from ..records import dataclass
 from . import parts
 from .entries import Entry, entries
 from .job import TASKS, Combination, Job, Task, digest_of_text, key_of

@@ -8,7 +8,7 @@ to the tree.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,6 @@ import numpy as np
 from ..data import Data, Observation
 from ..errors import ZondaError
 from ..files import check_output_folder
-from ..records import dataclass
 from . import parts
 from .job import TASKS, Job, Task
 from .prepare import scene_of

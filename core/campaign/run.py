@@ -8,13 +8,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..files import check_output_folder, discard
-from ..records import dataclass
 from . import parts
 from .engines import Pool, engine_failed
 from .folder import RESOLVED, Say, check_free, clean, make_way, open_log, opened, publish, sources_of, verify, write_sources

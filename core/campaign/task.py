@@ -8,12 +8,12 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
-from ..records import dataclass
 from . import parts
 from .job import TASKS, Task
 

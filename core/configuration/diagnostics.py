@@ -5,9 +5,9 @@ from __future__ import annotations
 import difflib
 import unicodedata
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from ..errors import ZondaError
-from ..records import dataclass
 from .yaml_places import Span
 
 WIDTH = 140

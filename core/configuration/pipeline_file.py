@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -16,7 +17,6 @@ from ..operator import Operator
 from ..order import check_order
 from ..pipeline import Pipeline
 from ..plan.budget import Limits
-from ..records import dataclass
 from ..scene import Scene
 from ..weather import WeatherSource, resolve
 from . import overrides as settings

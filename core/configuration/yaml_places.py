@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import copy
 import re
+from dataclasses import dataclass
 from typing import Any
 
 import yaml
-
-from ..records import dataclass
 
 Path = tuple[Any, ...]
 """Keys and indices that lead to a value: ("operators", 2, "BinMap", "pixel")."""

@@ -12,6 +12,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,7 +24,6 @@ from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
 from ..focalplane import Focalplane
 from ..operator import Operator
-from ..records import dataclass
 from .context import Context
 from .cost import calibrate
 from .estimate import Choice, Cost

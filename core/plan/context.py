@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +14,6 @@ from ..data import Data, Observation
 from ..operator import Operator
 from ..pipeline import Pipeline
 from ..projection import rotation_matrices
-from ..records import dataclass
 from ..scene import Scene
 from .estimate import Traits
 from .structure import STREAMS, Structure, selected

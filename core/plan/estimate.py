@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, Literal
-
-from ..records import dataclass
 
 METRICS = {
     "map_rms": "rms error of a map pixel, K",

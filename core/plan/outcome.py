@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..pipeline import Pipeline
-from ..records import dataclass
 
 if TYPE_CHECKING:
     from .planner import Plan

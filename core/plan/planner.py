@@ -6,6 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +17,6 @@ from ..derived import derivation
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
 from ..pipeline import Pipeline
-from ..records import dataclass
 from .budget import limits
 from .context import Context, look
 from .cost import predict

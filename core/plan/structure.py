@@ -9,13 +9,12 @@ of the components can take its place, and no run needs the main run's singular m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 
 from ..companion import Companion
 from ..derived import derivable, derivation
 from ..operator import Operator
 from ..pipeline import Pipeline
-from ..records import dataclass
 
 STREAMS = frozenset({"sky", "atmosphere", "transmission", "white", "pink", "signal"})
 """Names whose only use is to be read by a later operator of the same run."""

@@ -7,6 +7,7 @@ temperatures. It is read once, in a few hundredths of a second.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.files import own_data
-from zonda.core.records import dataclass
 
 Array = NDArray[np.float64]
 

@@ -20,12 +20,11 @@ Interpolation errors are bounded with (1 + 2 m k^2 / 3)^(-3/2) >= B^2, which is 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from zonda.core.records import dataclass
 
 from .covariance import NU
 

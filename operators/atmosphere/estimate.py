@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from zonda.core.instrument import Band
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
-from zonda.core.records import dataclass
 
 from .averaging import shares
 from .band import BandAtmosphere, _BandTransfer

@@ -12,11 +12,11 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.records import dataclass
 from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, Floats, SmoothField, spline_coefficients
 
 from .nodes import Nodes

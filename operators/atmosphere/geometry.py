@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -36,7 +36,6 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
-from zonda.core.records import dataclass
 
 from .radiative_transfer import EARTH_RADIUS
 

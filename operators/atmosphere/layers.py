@@ -12,6 +12,7 @@ elevation of the ray (`response`). All of it is smooth, so it is computed at nod
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -25,7 +26,6 @@ from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
-from zonda.core.records import dataclass
 from zonda.core.smooth import SmoothField
 
 from . import weather

@@ -19,13 +19,13 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.records import dataclass
 from zonda.core.smooth import PAD, SPLINE_MARGIN
 
 from .beams import Aperture

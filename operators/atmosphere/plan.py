@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
-from zonda.core.records import dataclass
 from zonda.core.smooth import SmoothField
 
 from .band import BandAtmosphere

@@ -11,14 +11,13 @@ results are as good as am's (see data/README.md), for clear sky.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.radiation import BOLTZMANN, T_CMB, rayleigh_jeans
-from zonda.core.records import dataclass
 
 from .absorption import OZONE_PARTS, AbsorptionTable, CrossSections, absorption_table
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 from zonda.core.columns import four_columns_at
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
-from zonda.core.records import dataclass
 from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
 
 from .geometry import Track, rim

@@ -28,6 +28,7 @@ fine, 12, 12, 0.7: S       2.5e-5  3.4e-5  5.0e-5  5.3e-5  5.7e-5  6.1e-5  5.0e-
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numba as nb
@@ -37,7 +38,6 @@ from numpy.typing import NDArray
 from zonda.core.columns import fused
 from zonda.core.errors import InputError
 from zonda.core.random import lattice_normals, stream_key
-from zonda.core.records import dataclass
 
 from .beams import Aperture
 from .covariance import NU, beam_correlation, mixture_between, spectrum_between

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from calendar import isleap
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from statistics import NormalDist
@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.files import own_data
-from zonda.core.records import dataclass
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
-from zonda.core.records import dataclass
 
 from .band import BandAtmosphere
 from .weather import PWV_MAX, Profile, profile

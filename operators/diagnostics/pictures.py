@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from zonda.core.records import dataclass
 
 from .flat_map import FlatMap
 from .plots import SHOWN, Track, map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -19,7 +19,6 @@ from zonda.core.data import Data
 from zonda.core.early import take
 from zonda.core.files import atomic_path, product_path
 from zonda.core.operator import Operator
-from zonda.core.records import dataclass
 from zonda.operators.io.map_view import MapView, maps_of, noise_sources
 from zonda.operators.io.save_map import MOST_AT_ONCE, output_folder
 from zonda.operators.maps.image import Image

@@ -8,12 +8,11 @@ labels are plain Unicode text: measuring the one and parsing the other take long
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from zonda.core.records import dataclass
 
 from .sky_axes import SkyAxes, names_of
 

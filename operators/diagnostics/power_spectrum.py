@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -16,7 +16,6 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation, Tally
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.records import dataclass
 from zonda.operators.io.streams import StreamsAsked
 
 from .series import Spectrum

@@ -20,6 +20,7 @@ through the window.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -33,7 +34,6 @@ from zonda.core.data import Data, html_table
 from zonda.core.errors import PipelineError
 from zonda.core.files import product_path
 from zonda.core.operator import Operator
-from zonda.core.records import dataclass
 from zonda.operators.io.ecsv import Column, write_ecsv
 from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 

@@ -23,6 +23,7 @@ freedom in N_samples for each mode, and for terms of order sigma_2 / sigma_1.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numba as nb
@@ -34,7 +35,6 @@ from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
-from zonda.core.records import dataclass
 
 from . import focal_plane_mean
 from .gram import Gram, Usable

@@ -8,12 +8,13 @@ however the stream is cut. A second reading is made only where the first finds d
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Stream
-from zonda.core.records import dataclass
 from zonda.core.tiles import TILE_DETECTORS, TILE_SAMPLES
 
 Floats = NDArray[np.float64]

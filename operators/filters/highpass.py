@@ -17,7 +17,7 @@ error of the low part is (K / 2M)^4 at the cut, less below it; the polynomial is
 from __future__ import annotations
 
 import math
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -32,7 +32,6 @@ from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
-from zonda.core.records import dataclass
 from zonda.core.tiles import TILE_DETECTORS
 from zonda.core.transforms import cosine_transform, fast_length
 

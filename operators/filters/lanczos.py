@@ -7,12 +7,10 @@ One step reads the stream once and gives A^T q and A A^T q together. It starts n
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-
-from zonda.core.records import dataclass
 
 from .gram import Gram, directions, near_the_mean
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from zonda.core.files import write_text
-from zonda.core.records import dataclass
 
 
 @dataclass(frozen=True)

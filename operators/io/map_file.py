@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from zonda.core import tangent
 from zonda.core.data import Data
 from zonda.core.files import atomic_path
 from zonda.core.fits_image import BLOCK, Cards, image_pieces
-from zonda.core.records import dataclass
 
 from .map_view import MapView
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.records import dataclass
 from zonda.operators.maps.map_product import MapProduct
 
 Floats = NDArray[np.floating]

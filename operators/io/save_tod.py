@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
@@ -16,7 +16,6 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import OutputError
 from zonda.core.files import atomic_path, check_output_folder, discard, product_path, publish, temporary_sibling
 from zonda.core.operator import Operator
-from zonda.core.records import dataclass
 
 from . import fits_table, toast_hdf5
 from .save_map import no_output_folder, output_folder

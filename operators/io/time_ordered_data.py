@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
-from zonda.core.records import dataclass
 
 Floats = NDArray[np.floating]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numba as nb
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
-from zonda.core.records import dataclass
 from zonda.core.tangent import TangentWcs
 
 if TYPE_CHECKING:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from zonda.core.records import dataclass
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from zonda.core import tangent
 from zonda.core.data import html_table
 from zonda.core.errors import InputError
-from zonda.core.records import dataclass
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header

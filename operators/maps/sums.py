@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numba as nb
@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import PipelineError
-from zonda.core.records import dataclass
 
 from .grid import Grid, TangentGrid
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.random import normals, stream_key
-from zonda.core.records import dataclass
 from zonda.core.smooth import SmoothField
 
 from .models import FixedNet, NoiseModel, time_mean

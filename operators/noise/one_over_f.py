@@ -29,6 +29,7 @@ value at f_min: a sharp corner is beyond real poles.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -36,7 +37,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.records import dataclass
 
 Array = NDArray[np.float64]
 

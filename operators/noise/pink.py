@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -18,7 +18,6 @@ from zonda.core.errors import InputError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import TILE, fill_normals, normal_scratch, normal_tile, normals
-from zonda.core.records import dataclass
 from zonda.core.smooth import Series, SmoothField, series_into
 from zonda.core.tiles import TILE_DETECTORS
 

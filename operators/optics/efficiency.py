@@ -12,6 +12,7 @@ M, tens of kelvin, stays beside the stream as a float64 `SmoothField`; everythin
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numba as nb
@@ -24,7 +25,6 @@ from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
 from zonda.core.operator import Operator
 from zonda.core.random import normals
-from zonda.core.records import dataclass
 from zonda.core.smooth import Series, SmoothField, series_into
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from zonda.core.configuration.time import SECOND, Instant
 from zonda.core.configuration.units import read_unit
 from zonda.core.errors import InputError
-from zonda.core.records import dataclass
 
 Floats = NDArray[np.float64]
 

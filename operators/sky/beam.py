@@ -25,11 +25,12 @@ Beyond its edge the image has the value `outside`; the grid reaches `REACH` sigm
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.records import dataclass
 from zonda.core.transforms import fast_length, spline_filter, spline_response
 
 Floats = NDArray[np.float64]

@@ -21,6 +21,7 @@ Cosmology: astropy's Planck18. The figures of the shipped map are the defaults b
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,6 @@ from numpy.typing import NDArray
 
 from zonda.core.files import atomic_path
 from zonda.core.radiation import thermal_sz
-from zonda.core.records import dataclass
 
 Floats = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ keys and the parameters that would mend it.
 from __future__ import annotations
 
 import re
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +19,6 @@ from zonda.core.errors import InputError
 from zonda.core.files import check_memory, first_line, reading
 from zonda.core.fits_files import check_size, opened
 from zonda.core.fits_image import read_image
-from zonda.core.records import dataclass
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -22,7 +22,6 @@ from zonda.core.fits_image import Cards
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.projection import pixel_matrix, rotation_matrices
-from zonda.core.records import dataclass
 
 from ..maps.image import Image
 from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct
