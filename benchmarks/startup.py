@@ -112,7 +112,7 @@ def child(folder: Path, caches: Path, pipeline: str, kernels: bool = False, know
     result = folder / "result.json"
     begun, used = time.time(), os.times()
     environment["ZONDA_STARTED"] = repr(begun)
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # installed modules have their bytecode; see core.compiled.keep_bytecode
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # as of a package that pip has installed: it makes the bytecode
     command = [sys.executable, __file__, "--child", str(folder), "--pipeline", pipeline, *(["--listen"] if kernels else [])]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:

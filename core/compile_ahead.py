@@ -22,7 +22,7 @@ from threading import Event, Thread
 from typing import Any
 
 from . import user_cache
-from .compiled import cache_folder, keep_bytecode
+from .compiled import cache_folder
 from .machine import available_threads
 from .program import fingerprint
 from .versions import versions
@@ -84,10 +84,9 @@ class Helper:
                 self._process.stdin.flush()
 
     def succeeded(self) -> None:
-        """Remember that this was the first run, and keep what later ones would compile again."""
+        """Remember that this was the first run."""
         if self._first:
             user_cache.remember(KIND, self._key, True)
-            keep_bytecode()
 
     def close(self) -> None:
         """End the process and the thread."""

@@ -1,11 +1,10 @@
-"""Where compiled code is kept and how many threads BLAS takes, before numpy and numba are imported; bytecode."""
+"""Where compiled code is kept and how many threads BLAS takes, before numpy and numba are imported."""
 
 from __future__ import annotations
 
 import atexit
 import os
 import shutil
-import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -32,22 +31,6 @@ def ensure_cache() -> None:
 def cache_folder() -> str:
     """Where compiled code is kept, as far as the environment says; empty: beside the source, or in the user's cache folder."""
     return os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or ""
-
-
-def keep_bytecode() -> None:
-    """Compile zonda's own modules to bytecode beside them, as pip does when it installs, if kernels are kept there too.
-
-    Python does so by itself but where PYTHONDONTWRITEBYTECODE forbids it, as many containers do: every run, and every process
-    that it starts, then compiles some hundred modules again, 0.3 s. What cannot be written is left out.
-    """
-    if not sys.dont_write_bytecode or os.environ.get("NUMBA_CACHE_DIR"):
-        return
-    import compileall
-
-    from .program import folders
-
-    for folder in folders():
-        compileall.compile_dir(folder, quiet=2)
 
 
 def one_blas_thread() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from zonda.core import compiled, program
+from zonda.core import compiled
 
 
 @pytest.fixture
@@ -38,18 +38,6 @@ def test_writable(tmp_path: Path) -> None:
     assert compiled._writable(tmp_path / "not" / "there" / "yet")
     (tmp_path / "file").touch()
     assert not compiled._writable(tmp_path / "file" / "below")
-
-
-def test_bytecode_is_kept_where_kernels_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "deep").mkdir()
-    (tmp_path / "deep" / "module.py").write_text("x = 1\n")
-    (tmp_path / "broken.py").write_text("x = \n")
-    monkeypatch.setattr(program, "folders", lambda: [str(tmp_path), "/nowhere"])
-    for forbidden, kernels, number in ((False, "", 0), (True, str(tmp_path), 0), (True, "", 1)):
-        monkeypatch.setattr("sys.dont_write_bytecode", forbidden)
-        monkeypatch.setenv("NUMBA_CACHE_DIR", kernels)
-        compiled.keep_bytecode()
-        assert len(list(tmp_path.rglob("module*.pyc"))) == len(list(tmp_path.rglob("*.pyc"))) == number
 
 
 def test_blas_takes_one_thread_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
