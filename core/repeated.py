@@ -7,15 +7,15 @@ A copy has the same bits and takes 1 ns a sample, less than a tenth of what it t
 
 from __future__ import annotations
 
-import dataclasses
 import mmap
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from .data import Block, Floats, Observation, Tally
-from .forecast import forecast
+from .forecast import spares
 from .layout import read
 from .operator import Operator
 from .settings import Settings
@@ -52,10 +52,7 @@ def affordable(
     if not any(sizes):
         return [0] * len(sizes)
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
-    less = dataclasses.replace(settings, memory=settings.memory - sum(sizes))
-    with_all, with_less = (forecast(steps, longest, s) for s in (settings, less))
-    fits = with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
-    return sizes if fits else [0] * len(sizes)
+    return sizes if spares(steps, longest, settings, sum(sizes)) else [0] * len(sizes)
 
 
 def untouched(shape: tuple[int, int], dtype: type[np.floating[Any]]) -> Floats:
@@ -63,11 +60,12 @@ def untouched(shape: tuple[int, int], dtype: type[np.floating[Any]]) -> Floats:
 
     numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
     """
-    if not hasattr(mmap, "MAP_ANONYMOUS") or not all(shape):
-        return np.empty(shape, dtype)
     size = shape[0] * shape[1] * np.dtype(dtype).itemsize
-    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    return np.frombuffer(pages, dtype).reshape(shape)
+    if size and hasattr(mmap, "MAP_ANONYMOUS"):
+        with suppress(OSError):  # refused: numpy's MemoryError says so
+            pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            return np.frombuffer(pages, dtype).reshape(shape)
+    return np.empty(shape, dtype)
 
 
 class Repeated:
