@@ -8,9 +8,7 @@ A copy has the same bits and takes 1 ns a sample, less than a tenth of what it t
 from __future__ import annotations
 
 import dataclasses
-import mmap
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +17,7 @@ from .forecast import forecast
 from .layout import read
 from .operator import Operator
 from .settings import Settings
+from .streams import untouched
 
 SHARE = 4
 """Of the memory for streams and blocks, one part in so many may hold what is kept for later runs."""
@@ -56,18 +55,6 @@ def affordable(
     with_all, with_less = (forecast(steps, longest, s) for s in (settings, less))
     fits = with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
     return sizes if fits else [0] * len(sizes)
-
-
-def untouched(shape: tuple[int, int], dtype: type[np.floating[Any]]) -> Floats:
-    """An array of anything, in pages of ordinary size.
-
-    numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
-    """
-    if not hasattr(mmap, "MAP_ANONYMOUS") or not all(shape):
-        return np.empty(shape, dtype)
-    size = shape[0] * shape[1] * np.dtype(dtype).itemsize
-    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    return np.frombuffer(pages, dtype).reshape(shape)
 
 
 class Repeated:
