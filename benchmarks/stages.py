@@ -23,6 +23,10 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from zonda.core.compiled import one_blas_thread
+
+one_blas_thread()  # as `zonda run` does: idle threads of BLAS take CPU time
+
 
 @dataclass(frozen=True)
 class Case:
@@ -207,11 +211,10 @@ def main() -> int:
     if len(options.case) == 1:
         measure(options.case[0], options.threads, options.repeat, options.prototypes)
         return 0
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     for case in options.case or CASES:
         arguments = [case, "--threads", str(options.threads), "--repeat", str(options.repeat)]
         arguments += ["--prototypes", str(options.prototypes)] if options.prototypes else []
-        subprocess.run([sys.executable, __file__, *arguments], check=True, env=environment)
+        subprocess.run([sys.executable, __file__, *arguments], check=True)
     return 0
 
 

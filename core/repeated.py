@@ -7,10 +7,7 @@ A copy has the same bits and takes 1 ns a sample, less than a tenth of what it t
 
 from __future__ import annotations
 
-import mmap
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +16,7 @@ from .forecast import spares
 from .layout import read
 from .operator import Operator
 from .settings import Settings
+from .streams import untouched
 
 SHARE = 4
 """Of the memory for streams and blocks, one part in so many may hold what is kept for later runs."""
@@ -53,19 +51,6 @@ def affordable(
         return [0] * len(sizes)
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
     return sizes if spares(steps, longest, settings, sum(sizes)) else [0] * len(sizes)
-
-
-def untouched(shape: tuple[int, int], dtype: type[np.floating[Any]]) -> Floats:
-    """An array of anything, in pages of ordinary size.
-
-    numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
-    """
-    size = shape[0] * shape[1] * np.dtype(dtype).itemsize
-    if size and hasattr(mmap, "MAP_ANONYMOUS"):
-        with suppress(OSError):  # refused: numpy's MemoryError says so
-            pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-            return np.frombuffer(pages, dtype).reshape(shape)
-    return np.empty(shape, dtype)
 
 
 class Repeated:
