@@ -7,7 +7,6 @@ depends on it: an observation's preparation reads and writes what belongs to tha
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 import time
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from .data import Observation
-from .forecast import forecast
+from .forecast import spares
 from .operator import Operator
 from .settings import Settings
 
@@ -50,11 +49,7 @@ def affordable(operators: Sequence[Operator], observations: Sequence[Observation
     """`memory`, where streams and blocks do the same without it; None where it would take room that they need."""
     size = memory(operators, observations)
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
-    less = dataclasses.replace(settings, memory=settings.memory - size)
-    if less.memory <= 0:
-        return None
-    with_all, with_less = (forecast(operators, longest, s) for s in (settings, less))
-    return size if with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory else None
+    return size if spares(operators, longest, settings, size) else None
 
 
 class Ahead:

@@ -237,6 +237,7 @@ def run(
     file = _load(pipeline, settings)
     if several or file.header.campaign is not None:
         helper.close()
+        early.end()
         if verify or only:
             raise click.UsageError(f"{'--verify' if verify else '--only'} is for one run, not for a campaign")
         gc.enable()

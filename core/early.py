@@ -34,7 +34,10 @@ def begin(path_or_name: str) -> None:
     from .discovery import discover
 
     with suppress(Exception):  # no such file, a broken plugin: whoever needs it says so
-        text = read(locate(path_or_name))
+        path = locate(path_or_name)
+        if not path.is_file():  # a pipe can be read only once
+            return
+        text = read(path)
         if re.search(r"^campaign\s*:", text, re.MULTILINE):  # other processes do the work
             return
         for found in discover(GROUP):

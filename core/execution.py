@@ -104,6 +104,9 @@ class Execution:
         finally:
             self.states.clear()
             self._store.close()
+            for field in self.observation.smooth.values():
+                if isinstance(field, SmoothField):
+                    field.forget()
 
     def prepare_ahead(self) -> None:
         """Configure, and prepare what can be prepared while another observation is executed (`core.ahead`); nobody is told."""

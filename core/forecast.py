@@ -70,6 +70,18 @@ def forecast(operators: Sequence[Operator], observation: Observation, settings: 
     return Forecast(most, least, tuple(elsewhere), again)
 
 
+def spares(operators: Sequence[Operator], observation: Observation, settings: Settings, size: int) -> bool:
+    """Whether streams and blocks do the same with ``size`` bytes less than ``settings.memory``."""
+    less = dataclasses.replace(settings, memory=settings.memory - size)
+    if less.memory <= 0:
+        return False
+    try:
+        with_all, with_less = (forecast(operators, observation, s) for s in (settings, less))
+    except PipelineError:  # a stream would go to a disk that has no room for it
+        return False
+    return with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
+
+
 def room(
     operators: Sequence[Operator], observations: Sequence[Observation], settings: Settings, budget: int, place: str
 ) -> tuple[int, int]:

@@ -7,13 +7,12 @@ A copy has the same bits and takes 1 ns a sample, less than a tenth of what it t
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from .data import Block, Floats, Observation, Tally
-from .forecast import forecast
+from .forecast import spares
 from .layout import read
 from .operator import Operator
 from .settings import Settings
@@ -51,10 +50,7 @@ def affordable(
     if not any(sizes):
         return [0] * len(sizes)
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
-    less = dataclasses.replace(settings, memory=settings.memory - sum(sizes))
-    with_all, with_less = (forecast(steps, longest, s) for s in (settings, less))
-    fits = with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
-    return sizes if fits else [0] * len(sizes)
+    return sizes if spares(steps, longest, settings, sum(sizes)) else [0] * len(sizes)
 
 
 class Repeated:

@@ -153,6 +153,10 @@ class SmoothField:
         _lines(weights, self.coefficients, first, lines)
         return Series(lines, first, _inside(self.step, kind))
 
+    def forget(self) -> None:
+        """Give back the memory of what was kept for other blocks."""
+        self._kept.clear()
+
 
 @dataclass(frozen=True)
 class DetectorField:

@@ -21,6 +21,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -173,11 +174,12 @@ def untouched(shape: tuple[int, int], dtype: Any) -> Floats:
 
     numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
     """
-    if not hasattr(mmap, "MAP_ANONYMOUS") or not all(shape):
-        return np.empty(shape, dtype)
     size = shape[0] * shape[1] * np.dtype(dtype).itemsize
-    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    return np.frombuffer(pages, dtype).reshape(shape)
+    if size and hasattr(mmap, "MAP_ANONYMOUS"):
+        with suppress(OSError):  # refused: numpy's MemoryError says so
+            pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            return np.frombuffer(pages, dtype).reshape(shape)
+    return np.empty(shape, dtype)
 
 
 class Store:

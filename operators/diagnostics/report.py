@@ -65,7 +65,9 @@ class Report(Operator):
     def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         """Write what no later step changes while the last pictures are drawn."""
         if done == "runs":
-            self._known = _known(data, self.central_diameter)
+            self._known = None
+            with suppress(Exception):  # `finalize` says so, when the maps are written
+                self._known = _known(data, self.central_diameter)
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)

@@ -58,11 +58,13 @@ def write_map(path: Path, view: MapView, about: Provenance, cards: Cards | None 
 
     Raises `OutputError` where it cannot be written.
     """
-    pieces = _table if view.is_healpix else _images
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        for piece in pieces(view, about, cards or Cards()):
-            file.write(piece)
-        file.write(about.tables)
+    with atomic_path(path) as temporary:
+        if view.is_healpix:
+            _write_table(temporary, view, about, cards or Cards())
+        with open(temporary, "ab") as file:
+            for piece in () if view.is_healpix else _images(view, about, cards or Cards()):
+                file.write(piece)
+            file.write(about.tables)
     return path
 
 
@@ -95,10 +97,8 @@ def _beam(view: MapView) -> Cards:
     return Cards(cards if view.fwhm else ())
 
 
-def _table(view: MapView, about: Provenance, cards: Cards) -> Iterator[bytes]:
+def _write_table(path: Path, view: MapView, about: Provenance, cards: Cards) -> None:
     """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that healpy reads."""
-    import io
-
     from astropy.io import fits
 
     order = np.argsort(view.pixels, kind="stable")
@@ -126,9 +126,7 @@ def _table(view: MapView, about: Provenance, cards: Cards) -> Iterator[bytes]:
             hdu.header[key] = value, more.comments.get(key, "")
         for line in more.history:
             hdu.header.add_history(line or " ")
-    stream = io.BytesIO()
-    fits.HDUList(hdus).writeto(stream, output_verify="exception")
-    yield stream.getvalue()
+    fits.HDUList(hdus).writeto(path, output_verify="exception")
 
 
 def _origin(data: Data) -> Cards:

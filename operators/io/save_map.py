@@ -79,7 +79,8 @@ class SaveMap(Operator):
             view.units = dict.fromkeys(view.planes, "K")
             cards[path] = noise_cards([f for f in figures if f.product == name], self.central_diameter)
         about = Provenance.of(data)
-        with ThreadPoolExecutor(MOST_AT_ONCE, "SaveMap") as pool:  # the disk takes most of the time
+        at_once = 1 if any(view.is_healpix for view in views.values()) else MOST_AT_ONCE  # a table is copied, an image is not
+        with ThreadPoolExecutor(at_once, "SaveMap") as pool:  # the disk takes most of the time
             written = [pool.submit(write_map, path, view, about, cards.get(path)) for path, view in views.items()]
         data.products["map_file"] = [file.result() for file in written]
 

@@ -27,6 +27,14 @@ def broken():
     raise OSError("no more processes")
 """
 
+MINIMAL = """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T02:00-05:00
+target: 05h00m00s +20d00m00s
+operators: [PointingDaisy: {radius: 4 arcmin, speed: 50 arcsec/s, scan_duration: 1 min}, WhiteNoise]
+"""
+
 
 @pytest.fixture
 def started(plugin: Callable[..., Path]):
@@ -69,6 +77,32 @@ def test_what_nobody_takes_is_closed(started, tmp_path):
 
 def test_a_file_that_is_not_there_is_somebody_elses_affair(tmp_path):
     early.begin(str(tmp_path / "none.yaml"))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_a_pipe_is_left_to_who_reads_the_file(monkeypatch, tmp_path):
+    """``zonda run <(...)``: what is read of it is gone."""
+    opened: list[Path] = []
+    monkeypatch.setattr("zonda.core.configuration.locate.read", opened.append)
+    os.mkfifo(tmp_path / "pipe")
+    early.begin(str(tmp_path / "pipe"))
+    assert opened == []
+
+
+def test_a_campaign_that_the_text_does_not_show_closes_it_before_it_begins(started, tmp_path, monkeypatch):
+    """Its tasks run for hours."""
+    from click.testing import CliRunner
+
+    from zonda.core import cli
+    from zonda.core.campaign import command
+
+    (tmp_path / "p.yaml").write_text('"campaign": {realizations: 2}\nx-list:\n- Draws\n' + MINIMAL)
+    monkeypatch.setattr("zonda.core.machine.available_threads", lambda: 2)
+    monkeypatch.setattr(command, "run", lambda *a, **k: seen.extend(p.open for p in started()))
+    seen: list[bool] = []
+    done = CliRunner().invoke(cli.zonda, ["run", str(tmp_path / "p.yaml")], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert seen == [False]
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="looks for processes in /proc")

@@ -168,6 +168,27 @@ def test_observations_end_with_what_the_main_run_left(scene):
     assert ("noiseless/Flag", "prepared before", "3 times") in list(data.tally)
 
 
+class Uses(Operator):
+    """Evaluates a smooth field."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    kept: ClassVar[list[int]] = []
+
+    def exec(self, block, state):
+        found = block.observation.smooth["transmission"]
+        found.evaluate(block.detectors, block.samples)
+        self.kept.append(len(found._kept))
+
+
+def test_observations_do_not_end_with_every_detectors_lines(scene):
+    """They are quicker than made for every block, but up to 2 MB for each field of each scan."""
+    steps = [Point(), Sky(), White(), Sum(), Flag(), Uses(), Total()]
+    data = Pipeline(steps, runs={"noiseless": {"only": ["sky"]}}).run(scene, threads=1)
+    assert set(Uses.kept) == {1}
+    assert [len(o.smooth["transmission"]._kept) for o in data.observations] == [0] * len(data.observations)
+
+
 def test_same_seed_same_bits_two_seeds_incoherent(scene):
     def total(seed, **settings):
         out = Pipeline([Point(scans=1), White(), Sum(), Total()]).run(scene.model_copy(update={"seed": seed}), **settings)

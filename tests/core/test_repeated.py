@@ -1,5 +1,6 @@
 """Streams that later runs copy from the main run: the same bits and counts as made anew, within a share of the memory."""
 
+import errno
 from typing import ClassVar
 
 import numpy as np
@@ -7,10 +8,12 @@ import pytest
 
 import zonda
 from tests.core.test_derived import BOTH, FILTERS, MAP, SKY, Several, observed, steps
-from tests.core.test_execution import Demean, Level, Sink, Source, observation
+from tests.core.test_execution import CHAIN, Demean, Level, Sink, Source, observation
 from tests.core.test_forecast import labelled
-from zonda.core import repeated
+from zonda.core import repeated, streams
 from zonda.core.data import Observation
+from zonda.core.errors import PipelineError
+from zonda.core.forecast import forecast, spares
 from zonda.core.layout import Layout
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.planner import plan
@@ -99,8 +102,21 @@ def test_nothing_is_kept_where_other_streams_would_go_to_disk():
         settings = Settings(memory=int(share * each), threads=1)
         less = Settings(memory=settings.memory - each, threads=1)
         found = affordable(chain, names, [obs], settings)
-        same = repeated.forecast(chain, obs, settings).elsewhere == repeated.forecast(chain, obs, less).elsewhere
+        same = forecast(chain, obs, settings).elsewhere == forecast(chain, obs, less).elsewhere
         assert found == [each if same else 0]
+
+
+def test_nothing_is_kept_where_other_streams_would_need_a_disk_that_is_full(monkeypatch):
+    """With all of the memory two streams are held at once and the run fits; with what is left it would be refused."""
+    obs = observation()
+    each = 4 * obs.n_detectors * obs.n_samples
+    settings = Settings(memory=int(6.5 * each), threads=1)
+    monkeypatch.setattr("zonda.core.streams.free_disk", lambda: 0)
+    assert forecast(labelled(CHAIN), obs, settings).elsewhere == ()
+    with pytest.raises(PipelineError, match="nor on the disk"):
+        forecast(labelled(CHAIN), obs, Settings(memory=settings.memory - each, threads=1))
+    assert affordable(labelled(CHAIN), {"Source.0": {"signal"}}, [obs], settings) == [0]
+    assert not spares(labelled(CHAIN), obs, settings, each)
 
 
 def test_only_what_says_so_and_comes_first_is_copied():
@@ -124,6 +140,18 @@ def test_only_what_says_so_and_comes_first_is_copied():
     assert names(MAP, MAP) == {"SkyMap"}, "the second adds to what is there"
     assert names(Silent(file=MAP.file)) == names(Wide(file=MAP.file)) == set()
     assert names(Silent(file=MAP.file), MAP) == set()
+
+
+def test_memory_that_the_system_refuses_is_a_memory_error(monkeypatch):
+    """As with numpy's own arrays, where the system has a limit (``ulimit -v``): the command line knows it."""
+
+    def refused(*given, **named):
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr(streams.mmap, "mmap", refused)
+    assert streams.untouched((2, 3), np.float32).shape == (2, 3)
+    with pytest.raises(MemoryError):
+        streams.untouched((1 << 31, 1 << 26), np.float32)
 
 
 def test_a_plan_counts_the_copied_step_once_and_the_memory(monkeypatch):

@@ -166,3 +166,20 @@ def test_the_ranges_of_a_scan_are_those_of_its_samples(make_observation):
     around = np.degrees(np.unwrap(scan.azimuth))
     assert azimuth == pytest.approx((around.min(), around.max()), abs=1e-9)
     assert elevation == pytest.approx(np.degrees([scan.elevation.min(), scan.elevation.max()]), abs=1e-9)
+
+
+def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeypatch):
+    """Maps are written before the report is: nothing is lost with it."""
+
+    def broken(*given):
+        raise MemoryError("of a map")
+
+    report()
+    operator = Report()
+    monkeypatch.setattr("zonda.operators.diagnostics.report.noise_figures", broken)
+    operator.meanwhile(data, "runs")
+    with pytest.raises(MemoryError):
+        operator.finalize(data)
+    monkeypatch.undo()
+    operator.meanwhile(data, "runs")
+    operator.finalize(data)

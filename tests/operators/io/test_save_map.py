@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tracemalloc
 
 import healpy as hp
 import numpy as np
@@ -234,3 +235,20 @@ def test_a_missing_folder_is_refused_before_the_run(data, tmp_path):
     data.output = None
     with pytest.raises(OutputError, match="no output folder"):
         SaveMap().observe(data)
+
+
+def test_healpix_tables_are_copied_one_at_a_time(run):
+    """Tables of 0.5 MB (pixel numbers and four planes): copies of one while it is written, not of all files' at once."""
+    maps = {"map": healpix_map(4096), **{f"r{k}__map": healpix_map(4096) for k in range(5)}}
+    for made in maps.values():
+        for name in ("signal", "hits", "weights", "noise", "pixels"):
+            setattr(made, name, np.tile(getattr(made, name), 3))
+        made.pixels = np.arange(made.signal.size)
+    run(**maps)  # what is imported and compiled once
+    tracemalloc.start()
+    try:
+        run(**maps)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert 5 * 8 * 3 * 4096 < peak < 4 * 5 * 8 * 3 * 4096
