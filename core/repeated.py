@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from .data import Block, Floats, Observation, Tally
+from .errors import PipelineError
 from .forecast import spares
 from .layout import read
 from .operator import Operator
@@ -78,6 +79,9 @@ class Repeated:
     def record(self, label: str, block: Block) -> None:
         """Keep what the main run made of a block for the first time."""
         for name in self.names[label] if not block.again else ():
+            if name not in block.detdata:
+                cure = "let exec make it, or leave same_in_all_runs out"
+                raise PipelineError(f"made no stream {name!r}, which it provides", place=label, cure=cure)
             self._arrays[label, name][block.detectors, block.samples] = block.detdata[name]
 
     def repeat(self, label: str, block: Block) -> None:

@@ -165,3 +165,15 @@ def test_a_plan_counts_the_copied_step_once_and_the_memory(monkeypatch):
     samples = sum(o.n_samples * o.n_detectors for o in made.context.observations)
     assert made.prediction.bytes - before.prediction.bytes == pytest.approx(4 * samples)
     assert made.prediction.seconds["SkyMap"] < before.prediction.seconds["SkyMap"]
+
+
+def test_a_step_that_does_not_make_what_it_promised(monkeypatch):
+    class Idle(zonda.SkyMap):
+        same_in_all_runs: ClassVar[bool] = True
+
+        def exec(self, block, state):
+            pass
+
+    monkeypatch.setattr(zonda, "SkyMap", Idle)
+    with pytest.raises(PipelineError, match="made no stream 'sky', which it provides"):
+        observed(steps(*FILTERS["mean"]), RUNS)
