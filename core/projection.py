@@ -33,6 +33,10 @@ GALACTIC = (
 """The rotation from ICRS to Galactic coordinates as astropy makes it, which takes half a second to import."""
 
 
+STRETCH = 1 << 14
+"""Instants that are worked on at a time."""
+
+
 def rotation_matrices(quaternions: Floats) -> Floats:
     """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x, y, z, w; they need not be normalized."""
     return np.moveaxis(_rotations(quaternions), 2, 0)
@@ -40,19 +44,27 @@ def rotation_matrices(quaternions: Floats) -> Floats:
 
 def _rotations(quaternions: Floats) -> Floats:
     """As `rotation_matrices`, (3, 3, n): each element lies in one piece."""
-    x, y, z, w = _normalized(quaternions)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows)
+    found = np.empty((3, 3, len(quaternions)))
+    for s in _stretches(len(quaternions)):
+        x, y, z, w = _normalized(quaternions[s])
+        found[0, 0, s], found[0, 1, s], found[0, 2, s] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+        found[1, 0, s], found[1, 1, s], found[1, 2, s] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+        found[2, 0, s], found[2, 1, s], found[2, 2, s] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    return found
 
 
 def boresights(quaternions: Floats) -> Floats:
     """Unit vectors (3, n) that boresight quaternions (n, 4) look at: the last column of `rotation_matrices`."""
-    x, y, z, w = _normalized(quaternions)
-    return np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+    found = np.empty((3, len(quaternions)))
+    for s in _stretches(len(quaternions)):
+        x, y, z, w = _normalized(quaternions[s])
+        found[0, s], found[1, s], found[2, s] = 2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)
+    return found
+
+
+def _stretches(n: int) -> list[slice]:
+    """Of ``n`` instants, so that what is only used for a moment stays in the cache: fresh memory takes longer than the sums."""
+    return [slice(k, k + STRETCH) for k in range(0, n, STRETCH)]
 
 
 def _normalized(quaternions: Floats) -> Floats:
@@ -138,12 +150,14 @@ def homographies(quaternions: Floats, wcs: WCS | TangentWcs) -> Floats:
     0-based, with integer coordinates at pixel centres. Error: some 1e-13 of the distance to the image centre in pixels.
     Each coefficient lies in one piece (Fortran's order).
     """
-    matrix, turn = pixel_matrix(wcs), _rotations(quaternions)
-    h = np.empty((9, turn.shape[2]))
-    for row in range(3):
-        for column, (sign, axis) in enumerate(((-1, 1), (-1, 0), (1, 2))):
-            a, b, c = sign * matrix[row]
-            h[3 * row + column] = a * turn[0, axis] + b * turn[1, axis] + c * turn[2, axis]
+    matrix = pixel_matrix(wcs)
+    h = np.empty((9, len(quaternions)))
+    for s in _stretches(len(quaternions)):
+        turn = _rotations(quaternions[s])
+        for row in range(3):
+            for column, (sign, axis) in enumerate(((-1, 1), (-1, 0), (1, 2))):
+                a, b, c = sign * matrix[row]
+                h[3 * row + column, s] = a * turn[0, axis] + b * turn[1, axis] + c * turn[2, axis]
     return h.T
 
 
