@@ -25,7 +25,7 @@ from .outcome import Prediction
 REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
 """Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""
 
-STARTUP = Cost(once=1.4, kernel="python")
+STARTUP = Cost(once=0.9, kernel="python")
 """Imports and compiled code from the cache; planning is measured."""
 
 

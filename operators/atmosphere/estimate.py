@@ -158,9 +158,9 @@ def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimat
     points = _points(operator, context, a, operator.tolerance) / len(context.observations)
     layers = len(a.layers) - len(set(operator.omit))
     fixed = 0.02 + (POINT * layers + TRANSFER) * points
-    nodes = max(a.planning["seconds"] - FIRST, 0.11)
-    once = 0.1 + nodes * len(context.observations)  # companions use the same plan
-    cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=0.9e-9, once=once, bytes=20.0 * points + 60e6)
+    nodes = max(a.planning["seconds"] - FIRST, 0.04)
+    once = 0.05 + nodes * len(context.observations)  # companions use the same plan
+    cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=0.6e-9, once=once, bytes=20.0 * points + 60e6)
     return Estimate(tuple(effects), cost)
 
 

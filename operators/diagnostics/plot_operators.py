@@ -97,7 +97,7 @@ class Plots(Operator):
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(once=2.0, bytes=150e6, kernel="python"))
+        return Estimate((), Cost(once=1.2, bytes=150e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)

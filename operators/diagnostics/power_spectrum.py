@@ -142,7 +142,7 @@ class PowerSpectrum(Operator):
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(0.02, 0.0, 6e-9 * min(1.0, self.detectors / context.first.n_detectors) * 14))
+        return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.detectors / context.first.n_detectors) * 14))
 
     def prepare(self, observation: Observation) -> _State:
         usable = np.flatnonzero(observation.detector_flags == 0)

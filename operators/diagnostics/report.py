@@ -60,7 +60,7 @@ class Report(Operator):
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(once=0.35, bytes=10e6, kernel="python"))
+        return Estimate((), Cost(once=0.1, bytes=10e6, kernel="python"))
 
     def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         """Write what no later step changes while the last pictures are drawn."""

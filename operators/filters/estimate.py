@@ -26,7 +26,7 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
     """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
     o = context.first
     knots = operator.oversampling * operator.frequency * o.duration
-    cost = Cost(fixed=0.02, per_time=5e-8, per_sample=3.1e-9 + 2e-8 * knots / o.n_samples, bytes=64.0 * o.n_samples)
+    cost = Cost(fixed=0.01, per_time=5e-8, per_sample=2e-9 + 2e-8 * knots / o.n_samples, bytes=64.0 * o.n_samples)
     choices = [full(f"{operator.oversampling:g} knots per cycle of the cut")]
     cut = operator.frequency
     near = LEAKS * context.weighted(lambda f: min((f / cut) ** 4, 1.0), 0.0, cut)
@@ -45,7 +45,7 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
     return Estimate((effect,), cost)
 
 
-LANCZOS = 1.2e-9
+LANCZOS = 0.5e-9
 """Seconds per sample of one step of the iteration, which reads the stream once."""
 
 
@@ -68,7 +68,7 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
     having sigma_2 <= gap sigma_1: equation (2) of `common_mode`, Davis & Kahan (1970).
     """
     count = steps(operator.residual, operator.modes, context) if operator.method == "svd" else 1.0
-    cost = Cost(fixed=0.02, per_sample=1e-9 + LANCZOS * count)
+    cost = Cost(fixed=0.01, per_sample=0.4e-9 + LANCZOS * count)
     if operator.method == "mean":
         return Estimate((), cost)
     choices = [full(f"residual {operator.residual:g}")]

@@ -56,7 +56,7 @@ class SaveMap(Operator):
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(once=0.06 * (1 + max(context.runs.values(), default=1)), bytes=20e6, kernel="python"))
+        return Estimate((), Cost(once=0.02 * (1 + max(context.runs.values(), default=1)), bytes=20e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)

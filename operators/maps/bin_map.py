@@ -232,7 +232,7 @@ class BinMap(Operator):
         from zonda.core.plan.estimate import Cost, Estimate
 
         n = self._n_pixels()
-        return Estimate((), Cost(0.01 + 5e-8 * n, 3e-7, 6.5e-9, bytes=n * 8.0 * 4 * 4))
+        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9, bytes=n * 8.0 * 4 * 4))
 
     def exec(self, block: Block, state: Binning) -> None:
         """Add one block to this thread's sums."""

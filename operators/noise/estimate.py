@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
     from .pink import PinkNoise
 
-WHITE = Cost(per_sample=3.3e-9, kernel="random")
+WHITE = Cost(per_sample=2e-9, kernel="random")
 
 
 def pink_cost(poles: int) -> Cost:
     """The kernel takes poles four at a time."""
-    return Cost(fixed=0.01, per_sample=2.4e-9 + 1.05e-9 * math.ceil(poles / 4), kernel="random")
+    return Cost(fixed=0.01, per_sample=1.7e-9 + 0.75e-9 * math.ceil(poles / 4), kernel="random")
 
 
 def white_traits(level: NoiseLevel, observation: Observation) -> Traits:

@@ -115,7 +115,7 @@ class Efficiency(Operator):
         """Its cost."""
         from zonda.core.plan.estimate import Cost, Estimate
 
-        return Estimate((), Cost(0.005, 1e-8, 2.9e-9))
+        return Estimate((), Cost(0.005, 1e-8, 0.9e-9))
 
     def exec(self, block: Block, state: Calibration) -> None:
         """Equation (2) on one block."""

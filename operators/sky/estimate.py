@@ -40,7 +40,7 @@ def sky_estimate(operator: SkyMap, context: Context, sky: Sky, reached: bool) ->
     fwhm = float(operator.fwhm or o.focalplane.fwhm.max()) if operator.beam == "gaussian" else 0.0
     points = 2.0 * sky.values.size
     convolution = 6e-7 * points
-    cost = Cost(fixed=0.01 + 3e-8 * points, per_time=1e-7, per_sample=9e-9 if reached else 0.3e-9,
+    cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8, per_sample=5e-9 if reached else 0.3e-9,
                 once=convolution if reached else 0.0, bytes=8.0 * sky.values.size + 24.0 * points)  # fmt: skip
     choices = [full("none" if fwhm == 0 else "Gaussian" if reached else "not convolved: no detector reaches the map")]
     if fwhm and reached and context.coverage:
