@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
     from ..configuration.time import Instant
 
-MEMORY = 2 << 30
-"""Memory budget that plans are made for: they must not depend on the machine, for all parts of a map must be made alike."""
-
 
 @dataclass(frozen=True)
 class Source:
@@ -99,7 +96,7 @@ def job(
                 if (entry.settings, share) not in groups:
                     with _placed(about(entry) or source.file.header.name):
                         file = _with_budget(source.load(entry.settings), share)
-                        made = plan(file, keep=keep, drop=drop, prune_all=prune_all, threads=1, memory=MEMORY, portable=True)
+                        made = plan(file, keep=keep, drop=drop, prune_all=prune_all)
                     groups[entry.settings, share] = len(pipelines)
                     planned_files.append(made.apply(file))
                     pipelines.append(planned_files[-1].resolved_yaml())

@@ -30,6 +30,10 @@ LARGEST_RATIO = 1e5
 LEAST_SAVING = 0.005
 """Share of the predicted time that a decision must save to be worth an error."""
 
+AMPLE = 1 << 60
+"""Memory of the machine for which decisions are made: it holds all streams. They must not depend on the real one, its speed, threads,
+memory and disk: the same file and seed give the same bits, and all parts of a campaign's map are made alike."""
+
 
 @dataclass(frozen=True)
 class Decided:
@@ -127,9 +131,8 @@ def plan(
     threads: int | None = None,
     memory: int | None = None,
     measure: bool = False,
-    portable: bool = False,
 ) -> Plan:
-    """Plan a pipeline file.
+    """Plan a pipeline file: decide as on a reference machine (one thread, memory for all), predict for this one.
 
     Parameters
     ----------
@@ -140,9 +143,7 @@ def plan(
     prune_all
         False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
     measure
-        Run a slice of a few seconds to find the cost of operators that do not state it.
-    portable
-        Decide as on the reference machine, so that every machine makes the same plan.
+        Run a slice of a few seconds to find the cost of operators that do not state it; decisions do not depend on it.
 
     Raises
     ------
@@ -165,14 +166,16 @@ def plan(
     effects += [Decided("pipeline", e, 0) for e in _of_pipeline(pipeline, context)]
     kept, forced = _named(keep, effects, labels), _named(drop, effects, labels)
     _check_droppable(drop, effects, labels)
-    settings = threads or available_threads(), 8 if pipeline.precision == "float64" else 4, memory or available_memory() // 2
+    item = 8 if pipeline.precision == "float64" else 4
+    settings = threads or available_threads(), item, memory or available_memory() // 2
     costs = {label: estimate.cost for label, estimate in estimates.items()}
+    reference = predict(context, costs, 1, item, AMPLE, portable=True)
+    decided = _decide(effects, kept, forced, allowed, reference, context, prune_all)
     if measure and any(costs[o.label] is None for o in context.operators):
         from .audit import measured
 
         costs |= measured(file, [label for label, cost in costs.items() if cost is None])
-    now = predict(context, costs, *settings, portable=portable)
-    decided = _decide(effects, kept, forced, allowed, now, context, prune_all)
+    now = predict(context, costs, *settings)
     spent = {m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed}
     noise = (context.noise, context.map_noise, context.coverage.hits if context.coverage else 0.0)
     prediction = _saving(now, decided, context)

@@ -11,7 +11,6 @@ and, where what all detectors have in common is removed, at most K times what th
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -46,8 +45,8 @@ SAFETY = 1.25
 POINT, TRANSFER, LATTICE = 1.2e-8, 6e-8, 4e-8
 """Seconds per point (node x time) of one layer and of the radiative transfer and splines; per lattice point."""
 
-FIRST = 0.8
-"""Seconds that the first choice of nodes and steps takes more: compiled code, tables."""
+CHOICE = 0.01, 5e-4
+"""Seconds that the choice of nodes and steps takes for each scan: a + b times the square of the number of nodes."""
 
 PAYS = 0.3
 """Seconds of evaluation from which coarser nodes are looked for."""
@@ -71,7 +70,7 @@ class Air:
     elevations: tuple[float, float]
     velocities: list[Floats]
     points: dict[float, float] = field(default_factory=dict)
-    planning: dict[str, float] = field(default_factory=dict)
+    nodes: dict[float, int] = field(default_factory=dict)
     averages: dict[str, list[float]] = field(default_factory=dict)
 
     @property
@@ -158,8 +157,8 @@ def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimat
     points = _points(operator, context, a, operator.tolerance) / len(context.observations)
     layers = len(a.layers) - len(set(operator.omit))
     fixed = 0.02 + (POINT * layers + TRANSFER) * points
-    nodes = max(a.planning["seconds"] - FIRST, 0.04)
-    once = 0.05 + nodes * len(context.observations)  # companions use the same plan
+    choice = CHOICE[0] + CHOICE[1] * a.nodes[operator.tolerance] ** 2
+    once = 0.05 + choice * len(context.observations)  # companions use the same plan
     cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=0.6e-9, once=once, bytes=20.0 * points + 60e6)
     return Estimate(tuple(effects), cost)
 
@@ -246,11 +245,10 @@ def _points(operator: AtmosphereLayers, context: Context, a: Air, tolerance: flo
         track = operator._tracks.get(o.name) or tracks([o])[0]
         variance = sum(m.amplitude**2 * v for m, v in zip(a.models, a.variances, strict=True))
         winds = [layer.wind for layer in a.layers]
-        start = time.thread_time()
         plan = make_plan(o, track, a.models, winds, variance, tolerance, a.band, a.pwv, operator.pwv_rms)
-        a.planning.setdefault("seconds", time.thread_time() - start)
         share = sum(plan.step / s for s in plan.steps) / len(plan.steps)
-        a.points[tolerance] = len(plan.nodes.xi) * o.n_samples / plan.step * share
+        a.nodes[tolerance] = len(plan.nodes.xi)
+        a.points[tolerance] = a.nodes[tolerance] * o.n_samples / plan.step * share
     return a.points[tolerance] * context.times / context.first.n_samples
 
 

@@ -379,3 +379,16 @@ def test_float64_is_not_taken_away_where_the_mean_emission_needs_it(steps, coars
         found = audit(file, zonda.plan(file, threads=1, drop=["precision"]), threads=1, seconds=20.0)
         assert not found.violated, str(found)
         assert any(r.effect == "pipeline.precision" and r.actual > 0 for r in found.rows)
+
+
+def test_decisions_do_not_depend_on_the_machine(monkeypatch):
+    """A machine with a slow random generator, eight threads and little memory predicts other times for the same plan; decisions
+    made for it would find that a coarser form is not worth its error."""
+    file = zonda.load("mustang2_cluster")
+    made = zonda.plan(file, threads=1)
+    monkeypatch.setattr("zonda.core.plan.cost.calibrate", lambda: {"random": 300.0, "stream": 1.0, "python": 300.0})
+    slow = zonda.plan(file, threads=8, memory=1 << 29)
+    assert slow.prediction.total > 10 * made.prediction.total
+    assert slow.settings() == made.settings()
+    assert made.settings()  # something is coarsened in this scene
+    assert slow.operators == made.operators
