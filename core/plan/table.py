@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import textwrap
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from .outcome import duration, line
 from .planner import Decided, Plan, describe, figure, kelvin
@@ -49,6 +52,11 @@ def text(plan: Plan, width: int | None = None) -> str:
     sample, pixel, hits = plan.noise
     if pixel:
         lines.append(f"noise: {kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part), {kelvin(sample)} per sample")
+        fwhm, side = float(np.mean(plan.context.first.focalplane.fwhm)), plan.context.coverage.pixel if plan.context.coverage else 0.0
+        smoothing = side / fwhm * math.sqrt(2 * math.log(2) / math.pi)  # sqrt(pixel area / (4 pi sigma^2))
+        if smoothing < 0.5:
+            beam = f"{math.degrees(fwhm) * 3600:.3g} arcsec"
+            lines[-1] += f";\n  {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam}), the white noise alone"
     else:
         lines.append(f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none")
     for metric, limit in plan.limits.items():

@@ -45,8 +45,8 @@ SAFETY = 1.25
 POINT, TRANSFER, LATTICE = 1.2e-8, 6e-8, 4e-8
 """Seconds per point (node x time) of one layer and of the radiative transfer and splines; per lattice point."""
 
-CHOICE = 0.01, 5e-4
-"""Seconds that the choice of nodes and steps takes for each scan: a + b times the square of the number of nodes."""
+CHOICE = 0.02, 2e-5
+"""Seconds that the choice of nodes and steps takes for each scan: a + b per detector."""
 
 PAYS = 0.3
 """Seconds of evaluation from which coarser nodes are looked for."""
@@ -70,7 +70,6 @@ class Air:
     elevations: tuple[float, float]
     velocities: list[Floats]
     points: dict[float, float] = field(default_factory=dict)
-    nodes: dict[float, int] = field(default_factory=dict)
     averages: dict[str, list[float]] = field(default_factory=dict)
 
     @property
@@ -157,7 +156,7 @@ def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimat
     points = _points(operator, context, a, operator.tolerance) / len(context.observations)
     layers = len(a.layers) - len(set(operator.omit))
     fixed = 0.02 + (POINT * layers + TRANSFER) * points
-    choice = CHOICE[0] + CHOICE[1] * a.nodes[operator.tolerance] ** 2
+    choice = CHOICE[0] + CHOICE[1] * context.first.n_detectors
     once = 0.05 + choice * len(context.observations)  # companions use the same plan
     cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=0.6e-9, once=once, bytes=20.0 * points + 60e6)
     return Estimate(tuple(effects), cost)
@@ -247,8 +246,7 @@ def _points(operator: AtmosphereLayers, context: Context, a: Air, tolerance: flo
         winds = [layer.wind for layer in a.layers]
         plan = make_plan(o, track, a.models, winds, variance, tolerance, a.band, a.pwv, operator.pwv_rms)
         share = sum(plan.step / s for s in plan.steps) / len(plan.steps)
-        a.nodes[tolerance] = len(plan.nodes.xi)
-        a.points[tolerance] = a.nodes[tolerance] * o.n_samples / plan.step * share
+        a.points[tolerance] = len(plan.nodes.xi) * o.n_samples / plan.step * share
     return a.points[tolerance] * context.times / context.first.n_samples
 
 

@@ -497,27 +497,28 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
 
 
 def plot_scan(observations: Sequence[Observation | Track], *, ax: Any = None, title: str = "Boresight track") -> Axes:
-    """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin, a line per scan.
+    """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin or deg, a line per scan.
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
     tracks = [o if isinstance(o, Track) else Track.of(o) for o in observations]
     named, own = len(tracks) <= 8, ax is None
     right = 0.55 + _CHARACTER * max(len(track.name) for track in tracks) if named and own else 0.0
-    ax = _axes(ax, (5.6 + right, 5.2), left=0.65, right=0.12 + right)
+    ax = _axes(ax, (5.7 + right, 5.2), left=0.75, right=0.12 + right)
     offsets = [_offsets(track, tracks[0].centre) for track in tracks]
     known = np.concatenate(offsets)
     known = known[np.isfinite(known).all(axis=1)]
     extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
+    scale, unit = (60, "deg") if extent > 120 else (1, "arcmin")
     for k, (track, offset) in enumerate(zip(tracks, offsets, strict=True)):
         width = 0.6 + 1.2 * (1 - (k + 1) / len(tracks))
-        x, y = _apart(offset, extent / 1000).T
+        x, y = _apart(offset, extent / 1000).T / scale
         ax.plot(x, y, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=track.name)
     ax.set_aspect("equal", adjustable="datalim")
     if not ax.xaxis_inverted():
         ax.invert_xaxis()
-    ax.set_xlabel("RA offset [arcmin]")
-    ax.set_ylabel("Dec offset [arcmin]")
+    ax.set_xlabel(f"RA offset [{unit}]")
+    ax.set_ylabel(f"Dec offset [{unit}]")
     ax.grid(color="0.92", linewidth=0.7)
     if named:
         beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}

@@ -20,12 +20,14 @@ from zonda.core.data import Data, Observation
 from zonda.core.errors import ZondaError
 from zonda.core.files import write_text
 from zonda.core.operator import Operator
+from zonda.core.radiation import to_kelvin_rj
 from zonda.operators.io.map_view import maps_of, noise_figures
 from zonda.operators.io.save_map import output_folder
 
 from .plot_operators import Picture, Plots, pictures
 
 if TYPE_CHECKING:
+    from zonda.core.configuration.target import Target
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
 
@@ -163,6 +165,15 @@ def _brightness(kelvin: float) -> str:
     return f"{kelvin:.3g}\u00a0K_RJ".replace("-", "−")
 
 
+def _flux_density(kelvin: float, fwhm: float, data: Data) -> str:
+    """Of a point source with a flat spectrum whose peak is ``kelvin`` behind a Gaussian beam of ``fwhm`` [rad]."""
+    jansky = kelvin / to_kelvin_rj("Jy/beam", data.scene.instrument.band, beam_solid_angle=math.pi / math.log(16) * fwhm**2)
+    for factor, unit in ((1, "Jy"), (1e3, "mJy")):
+        if abs(jansky) * factor >= 0.9995:
+            return f"{jansky * factor:.3g}\u00a0{unit}"
+    return f"{jansky * 1e6:.3g}\u00a0µJy"
+
+
 def _results(data: Data, diameter: float) -> str:
     maps = maps_of(data.products)
     seconds = sum(o.duration for o in data.observations)
@@ -177,10 +188,15 @@ def _results(data: Data, diameter: float) -> str:
     for figure in noise_figures(maps, diameter):
         label = "" if figure.product == "map" else f", {figure.product}"
         smoothed = math.isfinite(figure.smoothed)
+        if not (smoothed or math.isfinite(figure.rms)):
+            cards.append(("unknown", f"rms, {where}, {words[figure.of]}{label}: too few pixels; set central_diameter"))
+            continue
+        beam = math.sqrt(2) * maps[figure.product].fwhm  # the telescope's, and the one that smooths
+        density = f" ({_flux_density(figure.smoothed, beam, data)} per beam of {_angle(beam)})" if smoothed else ""
         cards.append(
             (
                 _brightness(figure.smoothed if smoothed else figure.rms),
-                f"rms, {where}, {words[figure.of]}{', beam-smoothed' * smoothed}{label}",
+                f"rms, {where}, {words[figure.of]}{', beam-smoothed' * smoothed}{density}{label}",
             )
         )
         if smoothed:
@@ -232,7 +248,7 @@ def _scene(data: Data) -> str:
             "Band",
             f"{band.name}: {band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz about {band.centre / 1e9:.4g} GHz",
         ),
-        ("Target", scene.target if scene.target is not None else "given by the pointing step"),
+        ("Target", _target(scene.target) if scene.target is not None else "given by the pointing step"),
         ("Start", scene.time),
         ("Seed", scene.seed),
     ]
@@ -240,6 +256,7 @@ def _scene(data: Data) -> str:
         plane, rate = data.observations[0].focalplane, data.observations[0].sample_rate
         rows[4:4] = [
             ("Beam (FWHM)", _spread(plane.fwhm * 648000 / np.pi, "″")),
+            ("1 K_RJ at a point source's peak", _flux_density(1.0, float(np.mean(plane.fwhm)), data)),
             ("Main-beam efficiency ζ", _spread(plane.main_beam_efficiency)),
             ("Illumination efficiency ε", _spread(plane.illumination_efficiency)),
             ("NET on the sky", _spread(plane.net * 1e3, " mK_RJ √s")),
@@ -255,6 +272,21 @@ def _scene(data: Data) -> str:
     return _table(rows)
 
 
+def _target(target: Target) -> str:
+    if target.frame == "icrs":
+        return f"{_sexagesimal(target.longitude, target.latitude)} (ICRS)"
+    names = ("azimuth", "elevation") if target.frame == "horizontal" else ("galactic l", "b")
+    return f"{names[0]} {np.degrees(target.longitude):.6g}°, {names[1]} {np.degrees(target.latitude):.6g}°"
+
+
+def _sexagesimal(ra: float, dec: float) -> str:
+    """``02h32m11.00s −04°40′00.0″``, from rad."""
+    seconds, arcseconds = round(ra % (2 * math.pi) * 43200 / math.pi, 2) % 86400, round(abs(dec) * 648000 / math.pi, 1)
+    hours, degrees = f"{seconds // 3600:02.0f}h{seconds % 3600 // 60:02.0f}m", f"{arcseconds // 3600:02.0f}°"
+    sign = "−" if dec < 0 else "+"
+    return f"{hours}{seconds % 60:05.2f}s {sign}{degrees}{arcseconds % 3600 // 60:02.0f}′{arcseconds % 60:04.1f}″"
+
+
 def _spread(values: Any, unit: str = "") -> str:
     low, high = float(np.min(values)), float(np.max(values))
     same = math.isclose(low, high, rel_tol=1e-9)
@@ -266,7 +298,7 @@ def _scans(data: Data) -> str:
     for o in data.observations:
         azimuth, elevation = _ranges(o)
         flagged = f"{np.count_nonzero(o.flags)} / {np.count_nonzero(o.detector_flags)}"
-        centre = f"{np.degrees(o.centre[0]):.5f}°, {np.degrees(o.centre[1]):+.5f}°"
+        centre = _sexagesimal(o.centre[0], o.centre[1])
         rows.append(
             (
                 o.name,
@@ -328,7 +360,8 @@ def readable(text: str) -> str:
         return text
     if value == 0:
         return f"0 {unit.replace(' / ', '/')}"
-    factor, name = next(((f, n) for f, n in scales if abs(value) * f >= 0.9999995), scales[-1])
+    fitting = [(f, n) for f, n in scales if abs(value) * f >= 0.9999995] or scales[-1:]
+    factor, name = next(((f, n) for f, n in fitting if len(f"{value * f:.6g}") < 6), fitting[0])
     return f"{value * factor:.6g} {name}"
 
 

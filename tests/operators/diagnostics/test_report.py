@@ -8,9 +8,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from zonda.core.configuration.target import Target
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
-from zonda.operators.diagnostics.report import Report, _ranges, readable
+from zonda.operators.diagnostics.report import Report, _flux_density, _ranges, _sexagesimal, _target, readable
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
 EVIL = "<script>alert('x')</script>&\"quoted\""
@@ -154,10 +155,40 @@ def test_no_output_folder(data):
         ("-1.5707963267948966 rad", "-90 deg"),
         ("12 parsec", "12 parsec"),
         ("0.00024240684055 rad / s", "50 arcsec/s"),
+        ("128 s", "128 s"),
+        ("516 s", "8.6 min"),
     ],
 )
 def test_quantities_are_readable(text, shown):
     assert readable(text) == shown
+
+
+@pytest.mark.parametrize("dec", ["-04d40m00s", "-00d00m00.04s", "89d59m59.96s", "20d"])
+@pytest.mark.parametrize("ra", ["02h32m11s", "23h59m59.996s", "0h"])
+def test_positions_are_sexagesimal(ra, dec):
+    """Half of the last figure is the largest error: 0.005 s of right ascension, 0.05 arcsec of declination."""
+    target = Target.parse(f"{ra} {dec}")
+    again = Target.parse(_sexagesimal(target.longitude, target.latitude).translate(str.maketrans("−°′″", "-dms")))
+    turn = 2 * np.pi
+    assert abs((again.longitude - target.longitude + np.pi) % turn - np.pi) <= 0.0051 * turn / 86400
+    assert again.latitude == pytest.approx(target.latitude, abs=0.051 * turn / 1296000)
+
+
+def test_targets_are_readable():
+    assert _target(Target.parse("02h32m11s -04d40m00s")) == "02h32m11.00s −04°40′00.0″ (ICRS)"
+    assert _target(Target.parse("az 180 deg el 60 deg")) == "azimuth 180°, elevation 60°"
+    assert _target(Target.parse("galactic 120.5 deg -30 deg")) == "galactic l 120.5°, b -30°"
+
+
+def test_the_flux_density_of_a_beam(data):
+    """S = 2 k T Omega / c^2 / <nu^-2>, Omega = 1.1331 FWHM^2; of a flat band <nu^-2> = 1 / (nu_1 nu_2)."""
+    band = data.scene.instrument.band
+    low, high = band.frequency[0], band.frequency[-1]
+    fwhm = np.radians(10 / 3600)
+    expected = 2 * 1.380649e-23 * 1e-3 * 1.13309 * fwhm**2 / 299792458.0**2 * low * high / 1e-26  # Jy for 1 mK
+    shown = _flux_density(1e-3, fwhm, data)
+    value, unit = shown.split("\u00a0")
+    assert float(value) * {"Jy": 1, "mJy": 1e-3, "µJy": 1e-6}[unit] == pytest.approx(expected, rel=5e-3)  # three figures
 
 
 def test_the_ranges_of_a_scan_are_those_of_its_samples(make_observation):
