@@ -136,7 +136,7 @@ class Instrument(Parameters):
     name: str
     """Registered name."""
     description: str = ""
-    """One line for `zonda plugins`."""
+    """What it is, in one line."""
     telescope: Telescope
     """The dish it is mounted on."""
     band: Band

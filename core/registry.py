@@ -126,7 +126,7 @@ class Registry:
             near = self.suggest(name)
             raise RegistryError(
                 f"unknown {self.kind} '{name}'",
-                label=f"did you mean '{near}'?" if near else f"no such {self.kind}",
+                label=f"did you mean '{near}'?" if near else "not installed",
                 cure=f"installed: {', '.join(self) or 'none'}; `zonda plugins` lists where each comes from",
             )
         if len(found) > 1:
@@ -186,8 +186,8 @@ class Registry:
             module, _, attribute = self.base.partition(":")
             base = getattr(import_module(module), attribute)
             if not (isinstance(component, type) and issubclass(component, base) if self.classes else isinstance(component, base)):
-                noun = f"subclass of {attribute}" if self.classes else attribute
-                raise RegistryError(f"{who} is not a {noun}", label=f"it is {component!r:.60}", cure=f"mend {found.reference}")
+                noun = f"a subclass of {attribute}" if self.classes else f"a{'n' * (attribute[0] in 'AEIOU')} {attribute}"
+                raise RegistryError(f"{who} is not {noun}", label=f"it is {component!r:.60}", cure=f"mend {found.reference}")
         return component
 
 
@@ -222,10 +222,19 @@ def _reference(component: Any) -> str:
 def _broken(kind: str, found: Found, err: Exception) -> RegistryError:
     return RegistryError(
         f"{kind} '{found.name}' could not be loaded from the plugin {found.origin}",
-        label=f"{type(err).__name__}: {err}".splitlines()[0],
+        label=_first_words(err),
         cure=f"this is a fault in {found.distribution} ({found.reference}), not in your pipeline; "
         "`zonda plugins --check` shows the traceback",
     )
+
+
+def _first_words(err: Exception) -> str:
+    """The first line of what an exception says; of pydantic's, which has none to the point, all fields with their mistakes."""
+    from pydantic import ValidationError
+
+    if isinstance(err, ValidationError):
+        return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in err.errors())
+    return f"{type(err).__name__}: {err}".splitlines()[0]
 
 
 operators = Registry("operator", "zonda.operators", "zonda.core.operator:Operator", classes=True)

@@ -14,7 +14,7 @@ class Site(Parameters):
     name: str
     """Registered name."""
     description: str = ""
-    """One line for `zonda plugins`."""
+    """What it is, in one line."""
     latitude: Angle = Field(ge=-1.5707963267948966, le=1.5707963267948966)
     """Geodetic latitude, north positive."""
     longitude: Angle = Field(ge=-6.283185307179586, le=6.283185307179586)
@@ -22,6 +22,6 @@ class Site(Parameters):
     altitude: Metres = quantity("0 m", ge=-500, le=9000)
     """Height above the ellipsoid."""
     climatology: str | None = None
-    """Name of the embedded climatology (see `zonda.operators.atmosphere.weather`), where there is one."""
+    """Name of the embedded climatology, where there is one: those of the built-in sites that have one (docs/weather.md)."""
     provenance: str = ""
     """Where these numbers come from."""

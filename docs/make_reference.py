@@ -1,4 +1,4 @@
-"""Write docs/operators.md from the operators themselves: python docs/make_reference.py (a test holds the two together)."""
+"""Write docs/operators.md from the classes themselves: python docs/make_reference.py (a test holds the two together)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from pathlib import Path
 
 from zonda.core.configuration.parameters import described
 from zonda.core.configuration.units import Unit
-from zonda.core.registry import mapmakers, operators
+from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.registry import mapmakers, noise_models, operators
+from zonda.core.site import Site
 
 PAGE = Path(__file__).with_name("operators.md")
 FOLDERS = {
@@ -23,6 +25,7 @@ FOLDERS = {
     "diagnostics": "Spectra, pictures, report",
     "io": "Files",
 }
+SCENE = {Site: "site", Instrument: "instrument", Telescope: "instrument.telescope", Band: "instrument.band"}
 
 
 def page() -> str:
@@ -31,23 +34,38 @@ def page() -> str:
     lines = [
         "# The operators",
         "",
-        "Every operator that comes with zonda, made from their own docstrings by `docs/make_reference.py`. Defaults that say",
-        "*none* are taken from the instrument, the site or the scene, as the text says.",
+        "Every operator that comes with zonda, then [noise models](#noise-models), [sites and instruments](#sites-and-instruments),",
+        "made from their own docstrings by `docs/make_reference.py`. Defaults that say *none* are taken from the instrument, the site",
+        "or the scene, as the text says.",
     ]
     for folder, title in FOLDERS.items():
         lines += ["", f"## {title}"]
         for cls in sorted((c for c in classes if c.__module__.split(".")[2] == folder), key=lambda c: c.__name__):
             lines += ["", f"### {cls.__name__}", "", inspect.cleandoc(cls.__doc__ or ""), ""]
             needs, gives = (", ".join(f"`{n}`" for n in sorted(names)) or "nothing" for names in (cls.requires, cls.provides))
-            lines += [f"Requires {needs}; provides {gives}.", "", "| parameter | default | |", "|---|---|---|"]
-            for name, field in described(cls).items():
-                if name != "name":
-                    text = " ".join((field.description or "").split()).replace("|", "\\|")
-                    lines.append(f"| `{name}` | {default(field)} | {text} |")
+            lines += [f"Requires {needs}; provides {gives}.", "", *table(cls, but="name")]
             for knob in cls.knobs:
                 ladder = ", ".join(f"`{value}`" for value in knob.ladder)
                 lines += ["", f"Knob ([accuracy](accuracy.md)): `{knob.parameter}`, {ladder}: {knob.approximates}."]
+    lines += ["", "## Noise models", "", "What `WhiteNoise: {model: ...}` takes: a name, or `{name: background_limited, modes: 1}`."]
+    for found in sorted((c for c in noise_models.candidates() if c.distribution == "zonda"), key=lambda c: c.name):
+        cls = noise_models.get(found.name)
+        lines += ["", f"### {found.name}", "", inspect.cleandoc(cls.__doc__ or ""), "", *table(cls, but="name")]
+    lines += ["", "## Sites and instruments", "", "What `site:` and `instrument:` take where they are written out in a pipeline file"]
+    lines += ["([pipelines.md](pipelines.md)), and what the classes of those names take in Python ([plugins.md](plugins.md))."]
+    for cls, key in SCENE.items():
+        lines += ["", f"### {cls.__name__}", "", f"`{key}`. {inspect.cleandoc(cls.__doc__ or '')}", "", *table(cls)]
     return "\n".join(lines) + "\n"
+
+
+def table(cls: typing.Any, but: str = "") -> list[str]:
+    """One row per parameter of a class."""
+    lines = ["| parameter | default | |", "|---|---|---|"]
+    for name, field in described(cls).items():
+        if name != but:
+            text = " ".join((field.description or "").split()).replace("|", "\\|")
+            lines.append(f"| `{name}` | {default(field)} | {text} |")
+    return lines
 
 
 def default(field: typing.Any) -> str:
@@ -55,7 +73,7 @@ def default(field: typing.Any) -> str:
     if field.is_required():
         return "required"
     value = field.get_default(call_default_factory=True)
-    if value is None:
+    if value is None or value == "":
         return "*none*"
     has_unit = any(isinstance(m, Unit) for m in field.metadata)
     return f"`{value}`" if has_unit or isinstance(value, str) else f"`{json.dumps(value, default=str)}`"

@@ -29,12 +29,16 @@ def test_python(text, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("text", [b for b in blocks("yaml") if "operators:" in b.values[0]])
-def test_yaml(text, tmp_path, monkeypatch):
-    from zonda.core.configuration.pipeline_file import load
+def test_yaml(text, tmp_path, monkeypatch, capsys):
+    """As `zonda check` sees it: its targets are up, its scans within the telescope's limits."""
+    from zonda.core import cli
 
     in_a_folder_with_a_map(tmp_path, monkeypatch)
     (tmp_path / "page.yaml").write_text(text)
-    assert load(tmp_path / "page.yaml").pipeline().operators
+    status = cli.main(["check", "page.yaml"])
+    out, err = capsys.readouterr()
+    assert status == 0, err
+    assert "no mistakes" in out
 
 
 def test_the_readme_shows_one_pipeline_twice(tmp_path, monkeypatch):

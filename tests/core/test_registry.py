@@ -70,6 +70,14 @@ def test_factory_that_fails_or_returns_something_else(plugin: Plugin) -> None:
             registry.sites.create(name)
 
 
+def test_every_wrong_field_of_a_factory_is_named(plugin: Plugin) -> None:
+    source = "from zonda import Site\ndef bog():\n    return Site(name='bog', latitude='20 deg', colour='green')\n"
+    plugin("zonda-bog", "3", {"zonda.sites": {"bog": "zt_bog:bog"}}, zt_bog=source)
+    with pytest.raises(RegistryError) as caught:
+        registry.sites.create("bog")
+    assert caught.value.label == "longitude: Field required; colour: Extra inputs are not permitted"
+
+
 def test_operator_must_be_a_class_of_operators(plugin: Plugin) -> None:
     plugin("zonda-odd", "2", {"zonda.operators": {"Odd": "zt_odd:Odd"}}, zt_odd="class Odd: ...\n")
     with pytest.raises(RegistryError, match="operator 'Odd' from zonda-odd 2 is not a subclass of Operator"):
