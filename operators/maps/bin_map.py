@@ -143,7 +143,7 @@ class BinMap(Operator):
         first = data.observations[0]
         instrument = first.instrument
         if before is None:
-            net = instrument.net
+            net = float(np.median(first.focalplane.net)) or instrument.net
             found: dict[str, Any] = {
                 "variance": 2.0 ** round(math.log2(net**2 * first.sample_rate)) if net > 0 else 2.0**-12,
                 "fwhm": instrument.beam_fwhm,
@@ -209,8 +209,11 @@ class BinMap(Operator):
                 self._variance_unknown = True
         weight = np.rint(weight * WEIGHT) / WEIGHT  # so that the sums of w d and of w use the same w
         if weight.max(initial=0.0) > 2.0**20 or weight.min(initial=1.0) < 2.0**-20:
+            spread = net.max() > 1000 * net.min()
+            much = "the detectors' NETs differ by more than a factor of 1000"
+            far = "the NET is more than 1000 times larger or smaller than that of the first scan"
             raise PipelineError(
-                "the detectors' NETs differ by more than a factor of 1000", place=self.label, cure="set weights: uniform"
+                much if spread else far, place=self.label, cure="set weights: uniform"
             )
         noise = weight**2 * variance
         alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numba as nb
@@ -60,6 +61,17 @@ class WhiteNoise(Operator):
         if self.reference == "detector" and self.net is None:
             raise ValueError("reference: detector needs net; the instrument's NET is quoted on the sky")
         return self
+
+    def observe(self, data: Data) -> None:
+        """See `agree`."""
+        self.agree(data)
+
+    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
+        """Tell map makers a stated level, for which they lay out their sums; what it becomes for each detector follows."""
+        if self.net is not None and self.model is None and self.reference == "sky":
+            for observation in data.observations:
+                observation.focalplane.net = np.full(observation.n_detectors, self.net)
+        return None
 
     def configure(self, observation: Observation) -> None:
         """Announce the level to `PinkNoise`; set ``focalplane.net`` where it is already known."""

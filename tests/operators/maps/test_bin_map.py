@@ -12,6 +12,7 @@ from astropy.coordinates import SkyCoord
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import zonda
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.projection import directions, frame_rotation
 from zonda.core.smooth import SmoothField
@@ -408,3 +409,18 @@ def test_equal_samples_have_no_scatter_and_are_counted(bench):
     rng = np.random.default_rng(1).normal(0, 1e-3, (7, 3000))
     run = bench.run([BinMap(pixel="4 arcsec", noise="scatter")], bench.observation(7, 3000), {"signal": rng})
     assert run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"] == "0"
+
+
+@pytest.mark.parametrize("net", ["1e-3 uK s(1/2)", "1 uK s(1/2)", "5 K s(1/2)", "100 K s(1/2)"])
+def test_noise_far_from_the_instruments(net):
+    """Sums are laid out for the level that the pipeline states, be it 60 000 times the instrument's or a millionth of it.
+
+    White noise of P pixels with weights 1 / variance: sum w m^2 = P (1 +- sqrt(2 / P)); four standard errors are allowed.
+    """
+    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+    steps = [zonda.PointingDaisy(scan_duration="5 s"), zonda.WhiteNoise(net=net), zonda.Efficiency(), BinMap(pixel="8 arcsec")]
+    found = zonda.Pipeline(steps).run(scene).products["map"]
+    seen = found.hits > 0
+    pixels = np.count_nonzero(seen)
+    assert np.sum(found.weights[seen] * found.signal[seen] ** 2) == pytest.approx(pixels, abs=4 * np.sqrt(2 * pixels))
+    assert found.weights.sum() * scene.instrument.sample_rate == pytest.approx(found.hits.sum() / steps[1].net ** 2, rel=1e-6)
