@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from .operator import Operator
@@ -37,9 +38,10 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                     )
                 )
             else:
-                problems.append(
-                    OrderProblem(index, f"{name} needs {what}, which no step provides", f"add a step that provides {what} above")
-                )
+                found = makers(what)
+                cure = f"{' or '.join(found)} would" if found else ""
+                message = f"{name} needs {what}, which no step provides"
+                problems.append(OrderProblem(index, message, f"add a step that provides {what} above", cure))
         for what in sorted((operator.optional - operator.requires) & set(later)):
             if not operator.at_end:
                 problems.append(
@@ -59,3 +61,16 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
     if operators and not any("boresight" in o.provides | o.requires for o in operators):
         problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step, e.g. PointingDaisy"))
     return problems
+
+
+def makers(what: str) -> list[str]:
+    """Installed operators that provide ``what`` and do not need it themselves. Imports them all: for messages only."""
+    from .registry import RegistryError, steps
+
+    found = []
+    for name in steps:
+        with suppress(RegistryError):  # a broken plugin is another message's
+            operator = steps.get(name)
+            if what in operator.provides - operator.requires:
+                found.append(name)
+    return found

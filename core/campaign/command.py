@@ -214,13 +214,14 @@ def _counts(table: Sequence[tuple[Task, Row | None]]) -> dict[str, int]:
 
 
 def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> list[str]:
+    from .job import plural
     from .log import WAITING
 
     counts = _counts(table)
     done = [(task, row) for task, row in table if row and row.state == "done"]
     samples = sum(task.samples for task, _ in done)
     seconds = sum(row.seconds for _, row in done)
-    lines = [f"{job.name}: {len(job.tasks)} tasks, {len(job.combinations)} sets of products"]
+    lines = [f"{job.name}: {plural(len(job.tasks), 'task')}, {plural(len(job.combinations), 'set')} of products"]
     lines += [f"  {state:<8} {number}" for state, number in counts.items() if number or state == "done"]
     share = samples / job.samples if job.samples else 1.0
     rate = f", {samples / seconds:.3g} samples/s of each worker" if seconds else ""

@@ -22,6 +22,11 @@ TASKS = "tasks"
 """Folder of partial products and layouts."""
 
 
+def plural(number: int, noun: str) -> str:
+    """``1 task``, ``2 tasks``."""
+    return f"{number} {noun}{'s' if number != 1 else ''}"
+
+
 @dataclass(frozen=True)
 class Task:
     """Some scans of one entry.

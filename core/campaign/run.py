@@ -17,7 +17,7 @@ from ..files import check_output_folder, discard
 from . import parts
 from .engines import Pool, engine_failed
 from .folder import RESOLVED, Say, check_free, clean, make_way, open_log, opened, publish, sources_of, verify, write_sources
-from .job import FILE, LOG, TASKS, Job, Task, digest_of_text
+from .job import FILE, LOG, TASKS, Job, Task, digest_of_text, plural
 from .log import Log
 from .prepare import Source, changed, restore_layout
 from .prepare import job as prepare
@@ -385,13 +385,17 @@ def _progress() -> Callable[[int, int, str], None]:
 
 def _describe(job: Job, folder: Path, say: Say) -> None:
     entries = len({task.entry for task in job.tasks})
-    counts = [f"{entries} entries", f"{len(job.tasks)} tasks", f"{len(job.combinations)} sets of products"]
+    counts = [
+        "1 entry" if entries == 1 else f"{entries} entries",
+        plural(len(job.tasks), "task"),
+        f"{plural(len(job.combinations), 'set')} of products",
+    ]
     say(f"campaign: {', '.join(counts)}, {job.samples:.3g} samples; zonda status {folder}")
 
 
 def _tell(result: Result, say: Say) -> None:
     rate = result.samples / result.seconds if result.seconds else 0.0
-    say(f"{result.tasks} tasks in {result.seconds:.1f} s, {rate:.3g} samples/s")
+    say(f"{plural(result.tasks, 'task')} in {result.seconds:.1f} s, {rate:.3g} samples/s")
 
 
 def _fail(folder: Path, failed: dict[int, str], total: int) -> None:

@@ -21,6 +21,9 @@ Floats = NDArray[np.float64]
 
 DAY = 86400.0
 
+STILL = 1e-9
+"""An axis that is slower [rad/s^order] stands still: rounding, 0.2 mas/s."""
+
 
 def check_elevation(
     horizontal: Floats, transform: CelestialTransform, target: Target, telescope: Telescope, total: float, place: str
@@ -64,7 +67,7 @@ def _when(horizontal: Floats, transform: CelestialTransform, target: Target, low
         f"{start.shifted(seconds[a]).datetime:%Y-%m-%dT%H:%M:%SZ} to {start.shifted(seconds[b - 1]).datetime:%Y-%m-%dT%H:%M:%SZ}"
         for a, b in edges.reshape(-1, 2)
     ]
-    need = f"the scans take {total / 60:.1f} min"
+    need = f"the scans take {total / 60:.1f} min" if total < 7200 else f"the scans take {total / 3600:.1f} h"
     return f"within the next 24 h it is up (UTC) from {' and from '.join(spans)}: start then ({need})"
 
 
@@ -151,8 +154,9 @@ class Moved:
             for axis in ("azimuth", "elevation", "sky"):
                 peak, limit = self._found.get((axis, order)), self.limits.get((axis, order))
                 if peak is not None and (limit or axis != "sky"):
-                    share = f" ({100 * peak.figure / limit:.3g} % of {rate_text(limit, order)})" if limit else ""
-                    parts.append(f"{axis} {rate_text(peak.figure, order)}{share}")
+                    figure = peak.figure if peak.figure > STILL else 0.0
+                    share = f" ({100 * figure / limit:.3g} % of {rate_text(limit, order)})" if limit else ""
+                    parts.append(f"{axis} {rate_text(figure, order)}{share}")
             if parts:
                 none = "" if self.limits else f"; {self.telescope.name} states no limits"
                 said.append((f"largest {WORDS[order]} of the axes", ", ".join(parts) + none))

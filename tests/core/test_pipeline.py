@@ -10,7 +10,7 @@ import zonda
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.order import check_order
+from zonda.core.order import check_order, makers
 from zonda.core.pipeline import Pipeline
 from zonda.core.random import normals
 from zonda.core.smooth import SmoothField
@@ -233,6 +233,15 @@ def test_misordered_steps(steps, words):
     assert words in str(err.value)
     assert "mine" in str(err.value)
     assert any(words == p.message for p in check_order(steps))
+
+
+def test_the_cure_names_the_operators_that_would_do():
+    assert "PointingDaisy" in makers("boresight")
+    assert "Efficiency" in makers("signal")
+    assert "HighpassFilter" not in makers("signal")  # it needs one itself
+    assert makers("nothing of the kind") == []
+    problem = next(p for p in check_order([Point(), Total()]) if "needs signal" in p.message)
+    assert "Efficiency" in problem.cure
 
 
 def test_all_mistakes_of_order_at_once():
