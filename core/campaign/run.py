@@ -71,7 +71,11 @@ def begin(
     if (folder / RESOLVED).exists() and not (folder / FILE).exists():
         say(f"{folder} holds products of an earlier run: those of the same names are replaced, others stay")
     make_way(folder)
-    made = prepare(sources, folder, command, keep, drop, prune_all, _progress())
+    try:
+        made = prepare(sources, folder, command, keep, drop, prune_all, _progress())
+    except BaseException:
+        make_way(folder)  # of the layouts of a campaign that does not begin
+        raise
     _describe(made, folder, say)
     write_sources(made, folder)
     with contextlib.closing(open_log(folder / LOG, made)) as log:

@@ -142,6 +142,15 @@ def failing(times, error="it broke", **more):
     return work
 
 
+def test_a_campaign_that_cannot_begin_leaves_nothing(bench, capsys):
+    """The first of two sets of products is laid out before the second is found to be impossible."""
+    path = bench.file("{nights: 2, grid: {target: ['az 180 deg el 60 deg', 'az 180 deg el 1 deg']}, combine: [night]}")
+    folder = bench.folder / "out"
+    assert bench.command("run", path, "--output", folder, "--engine", "serial") == 2
+    assert "elevation" in capsys.readouterr().err
+    assert [p.name for p in folder.rglob("*")] in ([], [".zonda-lock"])
+
+
 def test_a_failed_task_is_tried_again(undisturbed, bench, monkeypatch):
     monkeypatch.setattr(campaign, "perform", failing(2))
     out = bench.run(bench.CAMPAIGN, *SERIAL)
