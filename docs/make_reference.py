@@ -34,9 +34,9 @@ def page() -> str:
     lines = [
         "# The operators",
         "",
-        "Every operator that comes with zonda, then [noise models](#noise-models), [sites and instruments](#sites-and-instruments),",
-        "made from their own docstrings by `docs/make_reference.py`. Defaults that say *none* are taken from the instrument, the site",
-        "or the scene, as the text says.",
+        "Every operator that comes with zonda, then [noise models](#noise-models), [sites and",
+        "instruments](#sites-and-instruments), made from their own docstrings by `docs/make_reference.py`. Defaults that say",
+        "*none* are taken from the instrument, the site or the scene, as the text says.",
     ]
     for folder, title in FOLDERS.items():
         lines += ["", f"## {title}"]
@@ -47,12 +47,12 @@ def page() -> str:
             for knob in cls.knobs:
                 ladder = ", ".join(f"`{value}`" for value in knob.ladder)
                 lines += ["", f"Knob ([accuracy](accuracy.md)): `{knob.parameter}`, {ladder}: {knob.approximates}."]
-    lines += ["", "## Noise models", "", "What `WhiteNoise: {model: ...}` takes: a name, or `{name: background_limited, modes: 1}`."]
+    lines += ["", "## Noise models", "", "What `model` of `WhiteNoise` takes: a name, or `{name: background_limited, modes: 1}`."]
     for found in sorted((c for c in noise_models.candidates() if c.distribution == "zonda"), key=lambda c: c.name):
         cls = noise_models.get(found.name)
         lines += ["", f"### {found.name}", "", inspect.cleandoc(cls.__doc__ or ""), "", *table(cls, but="name")]
-    lines += ["", "## Sites and instruments", "", "What `site:` and `instrument:` take where they are written out in a pipeline file"]
-    lines += ["([pipelines.md](pipelines.md)), and what the classes of those names take in Python ([plugins.md](plugins.md))."]
+    lines += ["", "## Sites and instruments", "", "What `site:` and `instrument:` take, written out in a pipeline file"]
+    lines += ["([pipelines.md](pipelines.md)), and what the classes of these names take in Python ([plugins.md](plugins.md))."]
     for cls, key in SCENE.items():
         lines += ["", f"### {cls.__name__}", "", f"`{key}`. {inspect.cleandoc(cls.__doc__ or '')}", "", *table(cls)]
     return "\n".join(lines) + "\n"

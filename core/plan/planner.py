@@ -31,8 +31,8 @@ LEAST_SAVING = 0.005
 """Share of the predicted time that a decision must save to be worth an error."""
 
 AMPLE = 1 << 60
-"""Memory of the machine for which decisions are made: it holds all streams. They must not depend on the real one, its speed, threads,
-memory and disk: the same file and seed give the same bits, and all parts of a campaign's map are made alike."""
+"""Memory of the machine for which decisions are made: it holds all streams. They must not depend on the real one, its speed,
+threads, memory and disk: the same file and seed give the same bits, and all parts of a campaign's map are made alike."""
 
 
 @dataclass(frozen=True)

@@ -52,9 +52,9 @@ def text(plan: Plan, width: int | None = None) -> str:
     sample, pixel, hits = plan.noise
     if pixel:
         lines.append(f"noise: {kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part), {kelvin(sample)} per sample")
-        fwhm, side = float(np.mean(plan.context.first.focalplane.fwhm)), plan.context.coverage.pixel if plan.context.coverage else 0.0
-        smoothing = side / fwhm * math.sqrt(2 * math.log(2) / math.pi)  # sqrt(pixel area / (4 pi sigma^2))
-        if smoothing < 0.5:
+        coverage, fwhm = plan.context.coverage, float(np.mean(plan.context.first.focalplane.fwhm))
+        smoothing = (coverage.pixel if coverage else math.inf) / fwhm * math.sqrt(2 * math.log(2) / math.pi)
+        if smoothing < 0.5:  # sqrt(pixel area / (4 pi sigma^2)), where pixels are small
             beam = f"{math.degrees(fwhm) * 3600:.3g} arcsec"
             lines[-1] += f";\n  {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam}), the white noise alone"
     else:

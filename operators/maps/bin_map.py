@@ -212,9 +212,7 @@ class BinMap(Operator):
             spread = net.max() > 1000 * net.min()
             much = "the detectors' NETs differ by more than a factor of 1000"
             far = "the NET is more than 1000 times larger or smaller than that of the first scan"
-            raise PipelineError(
-                much if spread else far, place=self.label, cure="set weights: uniform"
-            )
+            raise PipelineError(much if spread else far, place=self.label, cure="set weights: uniform")
         noise = weight**2 * variance
         alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
         good = (observation.flags == 0).astype(np.uint8)
