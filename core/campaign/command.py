@@ -48,7 +48,7 @@ def run(
 
     sources = [source(p, settings, len(pipelines) > 1) for p in pipelines]
     if len({s.name for s in sources}) < len(sources):
-        raise click.UsageError("two of the pipeline files have the same name")
+        raise click.UsageError("two of the pipeline files have the same name: give one of them another with the key `name:`")
     folder = output or (sources[0].file.output if len(sources) == 1 else Path("out/campaign"))
     options = _engine(sources[0].campaign, engine, workers, scheduler)
     with opened(**options, threads=threads, memory=memory) as pool:

@@ -18,7 +18,7 @@ from ..data import Data, Observation
 from ..errors import ZondaError
 from ..files import check_output_folder
 from . import parts
-from .job import TASKS, Job, Task
+from .job import TASKS, Job, Task, plural
 from .prepare import scene_of
 from .task import _file, _layouts, product_path
 
@@ -104,7 +104,7 @@ def _begin(job: Job, folder: Path, number: int, tasks: Sequence[Task]) -> tuple[
     scene = scene_of(file, first.seed, Instant(first.time))
     source = job.source[0] if len(job.source) == 1 else job.pipelines[first.pipeline]
     extra = {"resolved_yaml": source, "command": job.command, "plan": job.plans[first.pipeline]}
-    extra["campaign"] = f"{combination.name or job.name}: {len(tasks)} tasks"
+    extra["campaign"] = f"{combination.name or job.name}: {plural(len(tasks), 'task')}"
     return pipeline, Data(scene=scene, provenance={**pipeline._provenance(scene), **extra})
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
+    from zonda.operators.maps.map_product import MapProduct
 
 _WIDE = 1000
 """Pictures wider than this many pixels take a whole row."""
@@ -201,6 +202,8 @@ def _results(data: Data, diameter: float) -> str:
         )
         if smoothed:
             cards.append((_brightness(figure.rms), f"the same before smoothing, per {_angle(maps[figure.product].pixel)} pixel"))
+    if _has_white_noise(data):
+        cards += [card for name, product in maps.items() if "/" not in name for card in _expected(name, product, diameter, data)]
     if (image := data.products.get("input")) is not None and hasattr(image, "values") and np.isfinite(image.values).any():
         cards.append((_brightness(_extreme(image.values)), "strongest pixel of the input"))
     if (product := maps.get("noiseless/map")) is not None and np.isfinite(product.signal).any():
@@ -210,6 +213,31 @@ def _results(data: Data, diameter: float) -> str:
         + "".join(f"<div class=card><b>{escape(b)}</b><span>{escape(s)}</span></div>" for b, s in cards)
         + "</div>"
     )
+
+
+def _has_white_noise(data: Data) -> bool:
+    classes = (_class(kind) for _, kind, _ in data.provenance.get("operators", []))
+    return any(cls is not None and "white" in cls.provides for cls in classes)
+
+
+def _expected(name: str, product: MapProduct, diameter: float, data: Data) -> list[tuple[str, str]]:
+    """What the NET and the samples promise for the centre of a map: a card, or none where nothing is known.
+
+    Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 / A.
+    """
+    noise = product.noise[product.distance() <= diameter / 2]
+    known = np.isfinite(noise) & (noise > 0)
+    if not known.any() or product.noise_from != "net" or product.contents != "all":
+        return []
+    rms = float(1 / np.sqrt(np.sum(noise[known] ** -2.0) / noise.size))  # of the mean weight
+    label = "" if name == "map" else f", {name}"
+    where = f"central {np.degrees(diameter) * 60:.3g}′"
+    factor = product.pixel / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
+    if product.smoothed_by or factor > 0.5:  # pixels that are not small beside the beam
+        return [(_brightness(rms), f"white noise by NET and samples, {where}{label}")]
+    beam = math.sqrt(2) * product.fwhm
+    density = f"{_flux_density(rms * factor, beam, data)} per beam of {_angle(beam)}"
+    return [(_brightness(rms * factor), f"white noise by NET and samples, {where}, beam-smoothed ({density}){label}")]
 
 
 def _extreme(values: Any) -> float:

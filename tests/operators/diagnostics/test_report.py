@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
+import zonda
 from zonda.core.configuration.target import Target
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
-from zonda.operators.diagnostics.report import Report, _flux_density, _ranges, _sexagesimal, _target, readable
+from zonda.operators.diagnostics.report import (
+    Report,
+    _expected,
+    _flux_density,
+    _ranges,
+    _results,
+    _sexagesimal,
+    _target,
+    readable,
+)
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
 EVIL = "<script>alert('x')</script>&\"quoted\""
@@ -189,6 +200,24 @@ def test_the_flux_density_of_a_beam(data):
     shown = _flux_density(1e-3, fwhm, data)
     value, unit = shown.split("\u00a0")
     assert float(value) * {"Jy": 1, "mJy": 1e-3, "µJy": 1e-6}[unit] == pytest.approx(expected, rel=5e-3)  # three figures
+
+
+def test_the_white_noise_that_is_expected():
+    """Beside the map's own smoothing, which weighs every pixel: the formula takes the circle to be covered evenly (5 %)."""
+    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+    steps = [zonda.PointingDaisy(scan_duration="20 s"), zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="3 arcsec")]
+    data = zonda.Pipeline(steps).run(scene)
+    product, circle = data.products["map"], np.radians(2 / 60)
+    ((shown, what),) = _expected("map", product, circle, data)
+    value, unit = shown.split("\u00a0")
+    smoothed = product.smoothed(product.fwhm).noise[product.distance() <= circle / 2]
+    expected = np.nanmedian(smoothed)
+    assert float(value) * {"µK_RJ": 1e-6, "mK_RJ": 1e-3}[unit] == pytest.approx(expected, rel=0.05)
+    assert "beam-smoothed" in what
+    assert what in _results(data, circle).replace("&#x27;", "'")
+    ((shown, what),) = _expected("map", dataclasses.replace(product, fwhm=0.0), circle, data)
+    assert "beam" not in what
+    assert _expected("map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle, data) == []
 
 
 def test_the_ranges_of_a_scan_are_those_of_its_samples(make_observation):
