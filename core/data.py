@@ -105,6 +105,8 @@ class Observation:
         (n_det, n_samp) arrays that an output asked to keep.
     resolved
         What operators resolved for one another (noise levels). It outlives the main run: companion runs use the same.
+    components
+        Names of the streams that the steps of the run in progress make before there is a signal: ``sky``, ``white`` ...
     tally
         What was counted or approximated.
     output
@@ -130,6 +132,7 @@ class Observation:
     resolved: dict[str, Any] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
     output: Any = None
+    components: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if not self.flags.size:

@@ -49,12 +49,20 @@ Floats = NDArray[np.float64]
 FLAG_DEAD = 8
 """Bit set in ``detector_flags`` of detectors whose signal is constant or not finite."""
 
+OF_THE_SKY = frozenset({"sky", "atmosphere", "transmission", "pwv", "opacity", "path_delay"})
+"""Streams of which a detector in order may see nothing, or nothing that changes."""
+
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
 
 
 class CommonModeFilter(Operator):
-    """Remove the first singular modes of each scan: equation (1). Flagged samples and detectors take no part."""
+    """Remove the first singular modes of each scan: equation (1). Flagged samples and detectors take no part.
+
+    Detectors whose signal is not finite are flagged, and those whose signal is constant: they are dead. In a run without noise
+    (the sky alone) a constant signal is that of a detector that sees nothing: a valid zero, which takes part. Flagged are then
+    those that were dead in the main run, where that has noise.
+    """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -111,7 +119,7 @@ class CommonModeFilter(Operator):
             gram, found = self._mean(stream)
         else:
             with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-                gram = Gram(stream, pool)
+                gram = Gram(stream, pool, noiseless=self._same_as_main(observation))
                 self._flag(gram, observation)
                 found = lanczos(gram, self.modes, self.residual, None if self.on_undetermined == "remove" else self.gap)
                 found.count = self._choose(found, gram, observation)
@@ -129,14 +137,26 @@ class CommonModeFilter(Operator):
         for name, dead in (("not finite", found.not_finite), ("constant", found.constant)):
             observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
             observation.detector_flags[dead] |= FLAG_DEAD
+        if not _noiseless(observation):
+            observation.resolved[f"{self.label}: dead"] = found.not_finite | found.constant
+
+    def _same_as_main(self, observation: Observation) -> bool:
+        """Whether the run has no noise; detectors that were dead in a main run that has it are then flagged."""
+        if not _noiseless(observation):
+            return False
+        dead = observation.resolved.get(f"{self.label}: dead")
+        if dead is not None:
+            observation.tally.count(self.label, "detectors flagged: dead in the main run", int(dead.sum()))
+            observation.detector_flags[dead] |= FLAG_DEAD
+        return True
 
     def _mean(self, stream: Stream) -> tuple[Usable, Ritz]:
         """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
         observation = stream.observation
-        good = observation.flags == 0
+        noiseless, good = self._same_as_main(observation), observation.flags == 0
         usable = Usable(observation.detector_flags == 0, int(good.sum()))
         reading = focal_plane_mean.read(stream, usable.use, good)
-        if usable.judge(reading.sums, reading.squares):
+        if usable.judge(reading.sums, reading.squares, noiseless):
             reading = focal_plane_mean.read(stream, usable.use, good)
         self._flag(usable, observation)
         if usable.n_good == 0:
@@ -221,6 +241,11 @@ class CommonModeFilter(Operator):
             del block.means["signal"]
         for u, v in zip(state.detectors, state.times, strict=True):
             _remove(signal, u[block.detectors], v[block.samples])
+
+
+def _noiseless(observation: Observation) -> bool:
+    """Whether all that the run in progress simulates is what the sky and the air emit."""
+    return bool(observation.components) and observation.components <= OF_THE_SKY
 
 
 @dataclass

@@ -44,12 +44,15 @@ class Usable:
         """Number of good detectors."""
         return int(self.use.sum())
 
-    def judge(self, total: Floats, square: Floats) -> bool:
-        """Leave out detectors that are constant or not finite, from their sums (n_det,); whether there are any."""
+    def judge(self, total: Floats, square: Floats, noiseless: bool = False) -> bool:
+        """Leave out detectors that are constant or not finite, from their sums (n_det,); whether there are any.
+
+        ``noiseless``: without noise a constant one is none the worse: it sees nothing.
+        """
         finite = np.isfinite(square)
         with np.errstate(invalid="ignore"):
             spread = square - total**2 / max(1, self.n_used)
-        steady = ~(spread > 1e-12 * square)
+        steady = ~(spread > 1e-12 * square) & (not noiseless)
         self.not_finite, self.constant = self.use & ~finite, self.use & finite & steady
         self.use = self.use & finite & ~steady
         self.energy = float(np.where(self.use, square, 0.0).sum())
@@ -64,8 +67,10 @@ class Gram:
     iteration begins with; where no detector turns out dead, `apply` has it at hand.
     """
 
-    def __init__(self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None) -> None:
-        """``use``: the detectors to use, where they are known; they are found otherwise."""
+    def __init__(
+        self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None, noiseless: bool = False
+    ) -> None:
+        """``use``: the detectors to use, where they are known; they are found otherwise. ``noiseless``: see `Usable.judge`."""
         self.stream, self.pool = stream, pool
         self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.flags == 0
@@ -81,7 +86,7 @@ class Gram:
         vector = near_the_mean(use)
         total, square, image, times = self._pass(vector, np.flatnonzero(use), moments=True)
         self.usable = Usable(use, self.n_used)
-        self.usable.judge(total, square)
+        self.usable.judge(total, square, noiseless)
         self._known = (vector, image, times) if np.array_equal(self.use, use) else None
 
     @property
