@@ -294,6 +294,8 @@ class Stream:
         What must be added in float64 to have all of it, see `Block.means`.
     threads
         Threads an operator's ``measure`` may use.
+    room
+        Bytes that it may take for a while, beyond what `Operator.memory` said.
     """
 
     name: str
@@ -301,6 +303,7 @@ class Stream:
     array: Floats
     means: dict[str, SmoothField]
     threads: int
+    room: int = 0
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -35,9 +35,10 @@ from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
-from .gram import Gram, Usable
+from .gram import MOST_COPIED, Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
 
 if TYPE_CHECKING:
@@ -96,9 +97,12 @@ class CommonModeFilter(Operator):
         return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
 
     def memory(self, observation: Observation) -> int:
-        """Series over the scan: one for each step of the iteration, or what `focal_plane_mean` adds up."""
-        series = 8 if self.method == "mean" else 20 + 8 * self.modes
-        return 8 * series * observation.n_samples + 100 * observation.n_detectors
+        """Series over the scan: one for each step of the iteration, or what `focal_plane_mean` adds up; the copy of one tile."""
+        n_det, n_samp = observation.n_detectors, observation.n_samples
+        if self.method == "mean":
+            return 8 * 8 * n_samp + 100 * n_det
+        copy = min(8 * n_det * min(TILE_SAMPLES, n_samp), MOST_COPIED)
+        return 8 * (20 + 8 * self.modes) * n_samp + 200 * n_det + copy
 
     def sweeps(self, observation: Observation) -> int:
         """One reading for the mean; the singular modes want the stream whole."""
