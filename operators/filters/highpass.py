@@ -28,7 +28,7 @@ from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Seconds
-from zonda.core.data import Block, Observation
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
@@ -47,6 +47,8 @@ FLAG_TRIM = 2
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
 
+ONLY_A_LINE = "only the mean and a line are removed"
+
 SHORTEST_STEP = 8
 """Samples per coarse knot below which the full DCT is cheaper and is used instead."""
 
@@ -54,7 +56,9 @@ SHORTEST_STEP = 8
 class HighpassFilter(Operator):
     """Brick-wall high-pass filter of each detector's scan, zero phase: equations (1) and (2).
 
-    The modelled mean emission that accompanies the signal is dropped analytically, before anything else.
+    The modelled mean emission that accompanies the signal is dropped analytically, before anything else. A scan that is shorter
+    than 1 / `frequency` loses its mean and a line alone, which is said. A cut so near the Nyquist frequency that nothing of a
+    scan is left is refused.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -72,6 +76,15 @@ class HighpassFilter(Operator):
     """Flag this long at either end of each scan."""
     oversampling: float = Field(24.0, ge=8, le=1000)
     """Coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut is about oversampling^-4."""
+
+    def check(self, data: Data) -> list[str]:
+        """Scans that are shorter than one cycle of the cut."""
+        short = sum(o.duration * self.frequency < 1 for o in data.observations)
+        if not short:
+            return []
+        return [
+            f"{short} of {len(data.observations)} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {ONLY_A_LINE}"
+        ]
 
     def prepare(self, observation: Observation) -> tuple[HighpassPlan, NDArray[np.intp]]:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
@@ -99,7 +112,14 @@ class HighpassFilter(Operator):
             tally.state(self.label, "smooth mean emission", "removed analytically")
         plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)
         if plan.cut == 0:
-            tally.state(self.label, f"{observation.name} is shorter than 1/frequency", "only the mean and a line are removed")
+            text = ONLY_A_LINE if n > plan.degree + 1 else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+            tally.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
+        elif plan.cut >= n:
+            raise PipelineError(
+                f"a cut at {self.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz hold no faster wave",
+                place=f"{self.label}, {observation.name}",
+                cure=f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan",
+            )
         return plan, np.flatnonzero(bad)
 
     def memory(self, observation: Observation) -> int:
@@ -153,6 +173,8 @@ class HighpassPlan:
         (n_group,): column of s and c, m + 1, of the first knot that the `GROUP` samples from GROUP g on reach.
     weights
         (n_group, 5 or 6, GROUP): B at that knot and those after it; 0 past the end.
+    degree
+        Of the polynomial that is removed.
     modes
         (degree + 1, M + 3): coarse coefficients of orthonormal polynomials; `spread_modes`, the same shape, their s.
     polynomials
@@ -163,6 +185,7 @@ class HighpassPlan:
 
     n: int
     cut: int
+    degree: int
     knots: int
     first: NDArray[np.int64]
     weights: Floats
@@ -278,7 +301,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     if not knots:
         powers = np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree)
         basis, none = np.linalg.qr(powers)[0].T.copy(), np.zeros((0, 0))
-        return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), np.zeros((0, 5, GROUP)), none, none, basis, np.zeros(0))
+        return HighpassPlan(n, cut, degree, 0, np.zeros(0, np.int64), np.zeros((0, 5, GROUP)), none, none, basis, np.zeros(0))
     # polynomials through their B-spline coefficients: B * (t^2) = t^2 + 1/3, B * (t^3) = t^3 + t
     t = (np.arange(knots + 3) - 1) * (2 / knots) - 1
     third = (2 / knots) ** 2 / 3
@@ -291,7 +314,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
     first, grouped = _grouped(cell, weights)
-    return HighpassPlan(n, cut, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
+    return HighpassPlan(n, cut, degree, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
 
 
 def _grouped(cell: NDArray[np.int64], weights: Floats) -> tuple[NDArray[np.int64], Floats]:
