@@ -112,7 +112,7 @@ class HighpassFilter(Operator):
             tally.state(self.label, "smooth mean emission", "removed analytically")
         plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)
         if plan.cut == 0:
-            text = ONLY_A_LINE if n > plan.degree + 1 else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+            text = ONLY_A_LINE if n > 1 + min(self.degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
             tally.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
         elif plan.cut >= n:
             raise PipelineError(
@@ -173,8 +173,6 @@ class HighpassPlan:
         (n_group,): column of s and c, m + 1, of the first knot that the `GROUP` samples from GROUP g on reach.
     weights
         (n_group, 5 or 6, GROUP): B at that knot and those after it; 0 past the end.
-    degree
-        Of the polynomial that is removed.
     modes
         (degree + 1, M + 3): coarse coefficients of orthonormal polynomials; `spread_modes`, the same shape, their s.
     polynomials
@@ -185,7 +183,6 @@ class HighpassPlan:
 
     n: int
     cut: int
-    degree: int
     knots: int
     first: NDArray[np.int64]
     weights: Floats
@@ -301,7 +298,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     if not knots:
         powers = np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree)
         basis, none = np.linalg.qr(powers)[0].T.copy(), np.zeros((0, 0))
-        return HighpassPlan(n, cut, degree, 0, np.zeros(0, np.int64), np.zeros((0, 5, GROUP)), none, none, basis, np.zeros(0))
+        return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), np.zeros((0, 5, GROUP)), none, none, basis, np.zeros(0))
     # polynomials through their B-spline coefficients: B * (t^2) = t^2 + 1/3, B * (t^3) = t^3 + t
     t = (np.arange(knots + 3) - 1) * (2 / knots) - 1
     third = (2 / knots) ** 2 / 3
@@ -314,7 +311,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
     first, grouped = _grouped(cell, weights)
-    return HighpassPlan(n, cut, degree, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
+    return HighpassPlan(n, cut, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
 
 
 def _grouped(cell: NDArray[np.int64], weights: Floats) -> tuple[NDArray[np.int64], Floats]:
