@@ -24,6 +24,8 @@ SCENES = {
     "M2, 1 h": {"instrument": "mustang2", "scan_duration": "1 h"},
     "M2, 2 h, svd": {"instrument": "mustang2", "scan_duration": "2 h", "method": "svd"},  # its stream must be whole: on disk
     "ACT-like, 60 s": {"instrument": "act", "scan_duration": "60 s"},
+    # a tile of all detectors is larger than what is copied of it at a time
+    "SO LAT, 60 s, svd": {"instrument": "so_lat", "scan_duration": "60 s", "method": "svd", "pixel": "1 arcmin"},
 }
 BUDGETS = (0.6, 0.8, 1.2, 4.0)
 
@@ -55,7 +57,7 @@ def peak_memory():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
-def chain(scan_duration, method="mean"):
+def chain(scan_duration, method="mean", pixel="2 arcsec"):
     import zonda
 
     cluster = Path(zonda.__file__).resolve().parents[1] / "pipelines" / "data" / "merging_cluster.fits"
@@ -69,7 +71,7 @@ def chain(scan_duration, method="mean"):
             zonda.Efficiency(),
             zonda.HighpassFilter(frequency="0.08 Hz"),
             zonda.CommonModeFilter(method=method),
-            zonda.BinMap(pixel="2 arcsec", half_difference=False),
+            zonda.BinMap(pixel=pixel, half_difference=False),
         ]
     )
 
@@ -86,8 +88,9 @@ def one(name, budget, threads):
     from zonda.core.forecast import forecast, room
     from zonda.core.settings import Settings
 
-    case = SCENES[name]
-    pipeline, where = chain(case["scan_duration"], case.get("method", "mean")), scene(case["instrument"])
+    case = dict(SCENES[name])
+    where = scene(case.pop("instrument"))
+    pipeline = chain(**case)
     told = {}
 
     def listen(operators, observations, settings, ceiling, place):
@@ -97,9 +100,9 @@ def one(name, budget, threads):
         told["elsewhere"] = ", ".join(blocks.elsewhere)
         return left, products
 
-    import zonda.core.pipeline
+    import zonda.core.memory_budget
 
-    zonda.core.pipeline.room = listen
+    zonda.core.memory_budget.room = listen
     try:
         data = pipeline.run(where, threads=threads, ceiling=int(budget * 1e9))
     except PipelineError as error:

@@ -76,9 +76,9 @@ class Helper:
             self._thread = Thread(target=compile_listed, args=(modules, False, self._enough), daemon=True)
             self._thread.start()
         if self._process is not None and self._process.stdin is not None:
-            from . import kernel_cache
+            from . import keep_kernels
 
-            kernel_cache.share()
+            keep_kernels.share()
             with suppress(OSError):  # it has ended
                 self._process.stdin.write(json.dumps(modules).encode() + b"\n")
                 self._process.stdin.flush()
@@ -103,7 +103,7 @@ class Helper:
 
 def serve() -> None:
     """The child's side: it ends when there is nothing left to compile, or when the parent has hung up."""
-    from . import kernel_cache, random  # the second with numba, whose compiler is made ready while the parent reads its file
+    from . import keep_kernels, random  # the second with numba, whose compiler is made ready while the parent reads its file
 
     random.fill_normals.targetctx.refresh()
     random.fill_normals.typingctx.refresh()
@@ -114,7 +114,7 @@ def serve() -> None:
         os._exit(0)
 
     Thread(target=leave_with_parent, daemon=True).start()
-    kernel_cache.share(polite=True)
+    keep_kernels.share(polite=True)
     gc.freeze()
     gc.set_threshold(*COMPILING)
     compile_listed(modules)

@@ -105,6 +105,8 @@ class Observation:
         (n_det, n_samp) arrays that an output asked to keep.
     resolved
         What operators resolved for one another (noise levels). It outlives the main run: companion runs use the same.
+    components
+        Names of the streams that the steps of the run in progress make before there is a signal: ``sky``, ``white`` ...
     tally
         What was counted or approximated.
     output
@@ -130,6 +132,7 @@ class Observation:
     resolved: dict[str, Any] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
     output: Any = None
+    components: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if not self.flags.size:
@@ -291,6 +294,8 @@ class Stream:
         What must be added in float64 to have all of it, see `Block.means`.
     threads
         Threads an operator's ``measure`` may use.
+    room
+        Bytes that it may take for a while, beyond what `Operator.memory` said.
     """
 
     name: str
@@ -298,6 +303,7 @@ class Stream:
     array: Floats
     means: dict[str, SmoothField]
     threads: int
+    room: int = 0
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -236,6 +236,7 @@ class Execution:
             stream = StreamMadeAgain(name, self.observation, source.means, threads, self.settings.dtype, sweeper)
         else:
             stream = source.streams[names[0]]
+            stream.room = max(self.settings.memory - self._store.held, 0)
         before(operator=operator, observation=self.observation, stage="measure")
         start, others = time.process_time(), self._seconds("exec") + self._ahead.seconds()
         state, frozen = self.states[operator.label], self.frozen

@@ -32,6 +32,8 @@ from numba.core import caching, codegen, dispatcher, environment
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
+from .keep_kernels import CHANGED, left_to_numba
+
 FORMAT = 2
 _DIGEST = 16
 SUFFIX = ".zkc"
@@ -102,16 +104,21 @@ def share(polite: bool = False) -> None:
 
 
 def install() -> None:
-    """Let zonda's kernels be kept as described here; those of other packages stay with numba. Call it before any is defined."""
-    if not hasattr(dispatcher, "FunctionCache") or dispatcher.FunctionCache is _cache_of:
-        return
-    dispatcher.FunctionCache = _cache_of
+    """Let zonda's kernels be kept as described here; those of other packages stay with numba. Call it before any is defined.
+
+    Raises AttributeError where numba's inside has changed.
+    """
+    inside: Any = dispatcher
+    if inside.FunctionCache is not _cache_of:
+        inside.FunctionCache = _cache_of
 
 
 def _cache_of(function: Any) -> Any:
     if str(function.__module__).partition(".")[0] == "zonda":
-        with suppress(AttributeError, TypeError):  # a numba whose inside has changed: its own cache serves
+        try:
             return KernelCache(function)
+        except CHANGED as error:
+            left_to_numba(error)
     return caching.FunctionCache(function)
 
 
@@ -131,8 +138,10 @@ class _TriedOnce:
 
 
 class _Reduced(caching.CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes: ClassVar[list[Any]] = [
-        type(found.__name__, (_TriedOnce, found), {}) for found in caching.CompileResultCacheImpl._locator_classes
+    _locator_classes: ClassVar[
+        list[Any]
+    ] = [  # a numba without them, or told others by NUMBA_CACHE_LOCATOR_CLASSES, tries each time
+        type(found.__name__, (_TriedOnce, found), {}) for found in getattr(caching.CompileResultCacheImpl, "_locator_classes", ())
     ]
 
 
@@ -192,6 +201,8 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
             super().save_overload(sig, data)
         except OSError as error:
             warnings.warn(f"compiled code cannot be kept for the next run: {error.strerror or error}", stacklevel=2)
+        except CHANGED as error:
+            left_to_numba(error)
         finally:
             if _CLAIMS.held:
                 _CLAIMS.release(self._cache_file.path(self._index_key(sig, data.codegen)))

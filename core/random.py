@@ -29,9 +29,9 @@ import numpy as np
 from numba import float32, int32, int64, uint32, uint64
 from numpy.typing import NDArray
 
-from . import kernel_cache
+from . import keep_kernels
 
-kernel_cache.install()  # before the first kernel: every module with kernels imports this one, if only through core.data
+keep_kernels.keep()  # before the first kernel: every module with kernels imports this one, if only through core.data
 
 TILE = 1024
 """Numbers made together."""

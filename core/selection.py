@@ -69,6 +69,11 @@ class Selection:
         """Labels of the steps whose components a run keeps."""
         return self._kind(self.runs[run] if run else None)[0]
 
+    def streams(self, run: str) -> frozenset[str]:
+        """Names of the streams that the steps of a run make before there is a signal."""
+        kept = self.components(run)
+        return frozenset[str]().union(*(o.provides for o in self.generators() if o.label in kept))
+
     def is_frozen(self, run: str) -> bool:
         """Whether a companion run takes singular modes from the main run (which itself never does)."""
         return bool(run) and self._kind(self.runs[run])[2]

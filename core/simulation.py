@@ -112,7 +112,7 @@ class Simulation:
         if not run:
             observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
         observation.focalplane, observation.smooth = focalplane.copy(), {}
-        observation.output = self._data.output
+        observation.output, observation.components = self._data.output, self._selection.streams(run)
         observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
         kept = self._frozen[number] if not run or self._selection.runs[run].modes == "full" else None
         steps, keep = self._selection.steps(run), self._keep if not run else ()
@@ -121,4 +121,5 @@ class Simulation:
 
 def _left(observation: Observation) -> dict[str, Any]:
     """What a run leaves behind in an observation."""
-    return {name: getattr(observation, name) for name in ("focalplane", "flags", "detector_flags", "smooth", "tally")}
+    names = ("focalplane", "flags", "detector_flags", "smooth", "tally", "components")
+    return {name: getattr(observation, name) for name in names}

@@ -1,4 +1,5 @@
-"""For all tests: nothing is read from or left in the user's cache folder (compiled kernels aside)."""
+"""For all tests: nothing is read from or left in the user's cache folder (compiled kernels aside); what a test registers goes
+with it."""
 
 from __future__ import annotations
 
@@ -6,9 +7,19 @@ from collections.abc import Iterator
 
 import pytest
 
+from zonda.core.registry import registries
+
 
 @pytest.fixture(scope="session", autouse=True)
 def own_user_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ZONDA_CACHE_DIR", str(tmp_path_factory.mktemp("user-cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays_registered() -> Iterator[None]:
+    before = [dict(each._registered) for each in registries]
+    yield
+    for each, registered in zip(registries, before, strict=True):
+        each._registered = registered

@@ -95,8 +95,8 @@ def modes_beyond_the_rank(patch: Patch) -> None:
 def dead_detectors_that_take_part(patch: Patch) -> None:
     begin = common_mode.Gram.__init__
 
-    def all_of_them(self: Any, *arguments: Any) -> None:
-        begin(self, *arguments)
+    def all_of_them(self: Any, *arguments: Any, **others: Any) -> None:
+        begin(self, *arguments, **others)
         self.constant[:] = False
         self.not_finite[:] = False
 

@@ -42,10 +42,6 @@ COST = 20.0
 ROUNDING = 1e-6
 """Of the stream's rms: differences below are float32 arithmetic in another order, not the effect."""
 
-UNLIKE = 0.05
-"""Share of the pixels of the sky alone that may be left out of the comparison because the two maps hold other samples there: a
-detector whose only sight of the sky is the foot of a beam is flagged as constant in one run and not in the other."""
-
 
 class Slice(Operator):
     """Keep the first samples of the first observations, and every so many detectors: random numbers are addressed, not drawn in
@@ -276,9 +272,6 @@ def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: 
             add("map_rms", _rms(squares), _rms_error(squares), scale)
     if full.sky is not None and other.sky is not None:
         difference = np.abs(full.sky.signal - other.sky.signal)
-        unlike = np.asarray(full.sky.hits != other.sky.hits)
-        if unlike.sum() <= UNLIKE * np.count_nonzero(full.sky.hits):
-            difference = difference[~unlike]
         largest = float(np.nanmax(difference, initial=0.0))
         strongest = float(np.nanmax(np.abs(full.sky.signal), initial=0.0))
         add("peak", largest, 0.0, ROUNDING * strongest)

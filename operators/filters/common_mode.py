@@ -35,9 +35,10 @@ from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
-from .gram import Gram, Usable
+from .gram import MOST_COPIED, Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
 
 if TYPE_CHECKING:
@@ -49,12 +50,20 @@ Floats = NDArray[np.float64]
 FLAG_DEAD = 8
 """Bit set in ``detector_flags`` of detectors whose signal is constant or not finite."""
 
+OF_THE_SKY = frozenset({"sky", "atmosphere", "transmission", "pwv", "opacity", "path_delay"})
+"""Streams of which a detector in order may see nothing, or nothing that changes."""
+
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
 
 
 class CommonModeFilter(Operator):
-    """Remove the first singular modes of each scan: equation (1). Flagged samples and detectors take no part."""
+    """Remove the first singular modes of each scan: equation (1). Flagged samples and detectors take no part.
+
+    Detectors whose signal is not finite are flagged, and those whose signal is constant: they are dead. In a run without noise
+    (the sky alone) a constant signal is that of a detector that sees nothing: a valid zero, which takes part. Flagged are then
+    those that were dead in the main run, where that has noise.
+    """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -88,9 +97,12 @@ class CommonModeFilter(Operator):
         return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
 
     def memory(self, observation: Observation) -> int:
-        """Series over the scan: one for each step of the iteration, or what `focal_plane_mean` adds up."""
-        series = 8 if self.method == "mean" else 20 + 8 * self.modes
-        return 8 * series * observation.n_samples + 100 * observation.n_detectors
+        """Series over the scan: one for each step of the iteration, or what `focal_plane_mean` adds up; the copy of one tile."""
+        n_det, n_samp = observation.n_detectors, observation.n_samples
+        if self.method == "mean":
+            return 8 * 8 * n_samp + 100 * n_det
+        copy = min(8 * n_det * min(TILE_SAMPLES, n_samp), MOST_COPIED)
+        return 8 * (20 + 8 * self.modes) * n_samp + 200 * n_det + copy
 
     def sweeps(self, observation: Observation) -> int:
         """One reading for the mean; the singular modes want the stream whole."""
@@ -111,7 +123,7 @@ class CommonModeFilter(Operator):
             gram, found = self._mean(stream)
         else:
             with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-                gram = Gram(stream, pool)
+                gram = Gram(stream, pool, noiseless=self._same_as_main(observation))
                 self._flag(gram, observation)
                 found = lanczos(gram, self.modes, self.residual, None if self.on_undetermined == "remove" else self.gap)
                 found.count = self._choose(found, gram, observation)
@@ -129,14 +141,26 @@ class CommonModeFilter(Operator):
         for name, dead in (("not finite", found.not_finite), ("constant", found.constant)):
             observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
             observation.detector_flags[dead] |= FLAG_DEAD
+        if not _noiseless(observation):
+            observation.resolved[f"{self.label}: dead"] = found.not_finite | found.constant
+
+    def _same_as_main(self, observation: Observation) -> bool:
+        """Whether the run has no noise; detectors that were dead in a main run that has it are then flagged."""
+        if not _noiseless(observation):
+            return False
+        dead = observation.resolved.get(f"{self.label}: dead")
+        if dead is not None:
+            observation.tally.count(self.label, "detectors flagged: dead in the main run", int(dead.sum()))
+            observation.detector_flags[dead] |= FLAG_DEAD
+        return True
 
     def _mean(self, stream: Stream) -> tuple[Usable, Ritz]:
         """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
         observation = stream.observation
-        good = observation.flags == 0
+        noiseless, good = self._same_as_main(observation), observation.flags == 0
         usable = Usable(observation.detector_flags == 0, int(good.sum()))
         reading = focal_plane_mean.read(stream, usable.use, good)
-        if usable.judge(reading.sums, reading.squares):
+        if usable.judge(reading.sums, reading.squares, noiseless):
             reading = focal_plane_mean.read(stream, usable.use, good)
         self._flag(usable, observation)
         if usable.n_good == 0:
@@ -221,6 +245,11 @@ class CommonModeFilter(Operator):
             del block.means["signal"]
         for u, v in zip(state.detectors, state.times, strict=True):
             _remove(signal, u[block.detectors], v[block.samples])
+
+
+def _noiseless(observation: Observation) -> bool:
+    """Whether all that the run in progress simulates is what the sky and the air emit."""
+    return bool(observation.components) and observation.components <= OF_THE_SKY
 
 
 @dataclass

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from threading import Semaphore
 from typing import Any
 
 import numba as nb
@@ -12,13 +14,22 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Stream
 from zonda.core.random import normals, stream_key
-from zonda.core.streams import columns, forget_pages
-from zonda.core.tiles import TILE_SAMPLES
+from zonda.core.streams import columns
+from zonda.core.tiles import TILE_DETECTORS, TILE_SAMPLES
 
 Floats = NDArray[np.float64]
 
-MOST_COPIED = 64 << 20
-"""Bytes of a tile of a spilled stream up to which it is read into an array of its own."""
+MOST_COPIED = 100_000_000
+"""Bytes of a tile's copy. Tiles of more detectors are shorter, down to `SHORTEST_TILE`, in memory too: the bits are the same."""
+
+SHORTEST_TILE = 64
+"""Samples."""
+
+ROWS = 16 * TILE_DETECTORS
+"""Detectors of a tile that are worked on in float64 at a time."""
+
+PARTS = 1 << 20
+"""Bytes of the sums of several tiles that a thread makes before they are added."""
 
 LANES = 16
 """Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples at a time."""
@@ -44,12 +55,15 @@ class Usable:
         """Number of good detectors."""
         return int(self.use.sum())
 
-    def judge(self, total: Floats, square: Floats) -> bool:
-        """Leave out detectors that are constant or not finite, from their sums (n_det,); whether there are any."""
+    def judge(self, total: Floats, square: Floats, noiseless: bool = False) -> bool:
+        """Leave out detectors that are constant or not finite, from their sums (n_det,); whether there are any.
+
+        ``noiseless``: without noise a constant one is none the worse: it sees nothing.
+        """
         finite = np.isfinite(square)
         with np.errstate(invalid="ignore"):
             spread = square - total**2 / max(1, self.n_used)
-        steady = ~(spread > 1e-12 * square)
+        steady = ~(spread > 1e-12 * square) & (not noiseless)
         self.not_finite, self.constant = self.use & ~finite, self.use & finite & steady
         self.use = self.use & finite & ~steady
         self.energy = float(np.where(self.use, square, 0.0).sum())
@@ -59,20 +73,27 @@ class Usable:
 class Gram:
     """G = A A^T as an operator on vectors over detectors, without flagged samples, flagged and dead detectors.
 
-    Work is cut into absolute tiles of `TILE_SAMPLES` samples, whose parts are added in order: the bits do not depend on the
-    number of threads. The detectors' moments, which tell the dead ones, are taken on the way of the product that the
-    iteration begins with; where no detector turns out dead, `apply` has it at hand.
+    Work is cut into absolute tiles of `tile_length` samples, whose parts are added in order: the bits do not depend on the
+    number of threads. A spilled stream is read from its file, tile by tile, by as many threads as there is room for copies: pages
+    that are touched in a mapping count as the process's memory, and the system maps those around them too.
+
+    The detectors' moments, which tell the dead ones, are taken on the way of the product that the iteration begins with; where no
+    detector turns out dead, `apply` has it at hand.
     """
 
-    def __init__(self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None) -> None:
-        """``use``: the detectors to use, where they are known; they are found otherwise."""
+    def __init__(
+        self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None, noiseless: bool = False
+    ) -> None:
+        """``use``: the detectors to use, where they are known; they are found otherwise. ``noiseless``: see `Usable.judge`."""
         self.stream, self.pool = stream, pool
         self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.flags == 0
         self.n_used = int(self.good_samples.sum())
-        tile = stream.shape[0] * TILE_SAMPLES * stream.dtype.itemsize
-        self.copied = isinstance(stream.array, np.memmap) and tile <= MOST_COPIED
+        self.length = tile_length(stream.shape[0], stream.dtype.itemsize)
+        self.copied = isinstance(stream.array, np.memmap)
         self.whole = stream.means.get("signal") is None and bool(self.good_samples.all()) and not self.copied
+        copy = stream.shape[0] * min(self.length, self.n_samples) * stream.dtype.itemsize
+        self._copies = Semaphore(max(1, min(stream.threads, 1 + stream.room // max(1, copy))))
         self._known: tuple[Floats, Floats, Floats] | None = None
         if use is not None:
             self.usable = Usable(use, self.n_used)
@@ -81,7 +102,7 @@ class Gram:
         vector = near_the_mean(use)
         total, square, image, times = self._pass(vector, np.flatnonzero(use), moments=True)
         self.usable = Usable(use, self.n_used)
-        self.usable.judge(total, square)
+        self.usable.judge(total, square, noiseless)
         self._known = (vector, image, times) if np.array_equal(self.use, use) else None
 
     @property
@@ -110,38 +131,49 @@ class Gram:
         return self.usable.energy
 
     def _tiles(self) -> list[slice]:
-        return [slice(a, min(a + TILE_SAMPLES, self.n_samples)) for a in range(0, self.n_samples, TILE_SAMPLES)]
+        return [slice(a, min(a + self.length, self.n_samples)) for a in range(0, self.n_samples, self.length)]
 
     def _tile(self, samples: slice) -> tuple[NDArray[Any], int, int]:
         """An array that holds these samples (mean emission included, zero where flagged), and where in it they are."""
-        array, mean, good = np.asarray(self.stream.array), self.stream.means.get("signal"), self.good_samples[samples]
-        if mean is None and good.all() and not self.copied:
-            return array, samples.start, samples.stop
-        copy = columns(self.stream.array if self.copied else array, samples)
+        if not self._copies_tile(samples):
+            return np.asarray(self.stream.array), samples.start, samples.stop
+        copy, mean, good = columns(self.stream.array, samples), self.stream.means.get("signal"), self.good_samples[samples]
         if mean is not None:
-            copy += mean.evaluate(slice(0, copy.shape[0]), samples)
+            for rows in _some_rows(copy.shape[0]):
+                copy[rows] += mean.evaluate(rows, samples)
         copy[:, ~good] = 0
         return copy, 0, copy.shape[1]
+
+    def _copies_tile(self, samples: slice) -> bool:
+        return not self.whole and (
+            self.copied or self.stream.means.get("signal") is not None or not bool(self.good_samples[samples].all())
+        )
+
+    def _room(self, samples: slice) -> AbstractContextManager[Any]:
+        """Wait until there is room for this tile's copy, if it needs one."""
+        return self._copies if self._copies_tile(samples) else nullcontext()
 
     def _pass(self, q: Floats, rows: NDArray[np.intp], moments: bool = False) -> tuple[Floats, Floats, Floats, Floats]:
         """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the stream."""
         times, tiles = np.zeros(self.n_samples), self._tiles()
-        parts = np.zeros((len(tiles), 3, q.size))
+        found = np.zeros((3, q.size))
 
-        def work(some: range) -> None:
-            if self.whole:  # no tile needs a copy: all in one call
-                samples = slice(tiles[some[0]].start, tiles[some[-1]].stop)
-                _products(
-                    np.asarray(self.stream.array), samples.start, samples.stop, q, rows, times[samples], moments, parts[some[0] :]
-                )
-            else:
-                for k in some:
-                    _products(*self._tile(tiles[k]), q, rows, times[tiles[k]], moments, parts[k:])
-            forget_pages(self.stream.array)
+        def work(some: list[slice]) -> Floats:
+            parts = np.zeros((len(some), 3, q.size))
+            if self.whole and self.length == TILE_SAMPLES:  # no tile needs a copy: all in one call
+                at = slice(some[0].start, some[-1].stop)
+                _products(np.asarray(self.stream.array), at.start, at.stop, q, rows, times[at], moments, parts)
+                return parts
+            for samples, part in zip(some, parts, strict=True):
+                with self._room(samples):
+                    _products(*self._tile(samples), q, rows, times[samples], moments, part[None])
+            return parts
 
-        some = max(1, len(tiles) // (4 * self.stream.threads))
-        self._each(work, [range(k, min(k + some, len(tiles))) for k in range(0, len(tiles), some)])
-        total, square, image = parts.sum(axis=0)
+        some = max(1, min(len(tiles) // (4 * self.stream.threads), PARTS // (24 * q.size)))
+        for parts in self._each(work, [tiles[k : k + some] for k in range(0, len(tiles), some)]):
+            for part in parts:
+                found += part
+        total, square, image = found
         return total, square, image, times
 
     def apply(self, q: Floats) -> tuple[Floats, Floats]:
@@ -154,17 +186,34 @@ class Gram:
         """Energy of A - sum u v^T, formed without cancellation."""
 
         def work(samples: slice) -> float:
-            array, start, stop = self._tile(samples)
-            rest = array[self.use, start:stop].astype(np.float64)
-            for u, v in zip(detectors, times, strict=True):
-                rest -= np.outer(u[self.use], v[samples])
-            return float(np.einsum("dt,dt->", rest, rest))
+            energy = 0.0
+            with self._room(samples):
+                array, start, stop = self._tile(samples)
+                for rows in _some_rows(array.shape[0]):
+                    use = self.use[rows]
+                    rest = array[rows, start:stop][use].astype(np.float64)
+                    for u, v in zip(detectors, times, strict=True):
+                        rest -= np.outer(u[rows][use], v[samples])
+                    energy += float(np.einsum("dt,dt->", rest, rest))
+            return energy
 
         return float(sum(self._each(work, self._tiles())))
 
-    def _each(self, work: Callable[[Any], Any], items: list[Any]) -> list[Any]:
+    def _each(self, work: Callable[[Any], Any], items: list[Any]) -> Iterable[Any]:
         """Results of ``work``, in order."""
-        return list(map(work, items) if self.stream.threads == 1 else self.pool.map(work, items))
+        return map(work, items) if self.stream.threads == 1 else self.pool.map(work, items)
+
+
+def tile_length(n_detectors: int, itemsize: int) -> int:
+    """Samples of a tile: as many as `MOST_COPIED` allows, `TILE_SAMPLES` or less by a power of two."""
+    length = TILE_SAMPLES
+    while n_detectors * length * itemsize > MOST_COPIED and length > SHORTEST_TILE:
+        length //= 2
+    return length
+
+
+def _some_rows(n_detectors: int) -> list[slice]:
+    return [slice(d, min(d + ROWS, n_detectors)) for d in range(0, n_detectors, ROWS)]
 
 
 def near_the_mean(use: NDArray[np.bool_]) -> Floats:

@@ -28,7 +28,7 @@ from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Seconds
-from zonda.core.data import Block, Observation
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
@@ -47,6 +47,8 @@ FLAG_TRIM = 2
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
 
+ONLY_A_LINE = "only the mean and a line are removed"
+
 SHORTEST_STEP = 8
 """Samples per coarse knot below which the full DCT is cheaper and is used instead."""
 
@@ -54,7 +56,9 @@ SHORTEST_STEP = 8
 class HighpassFilter(Operator):
     """Brick-wall high-pass filter of each detector's scan, zero phase: equations (1) and (2).
 
-    The modelled mean emission that accompanies the signal is dropped analytically, before anything else.
+    The modelled mean emission that accompanies the signal is dropped analytically, before anything else. A scan that is shorter
+    than 1 / `frequency` loses its mean and a line alone, which is said. A cut so near the Nyquist frequency that nothing of a
+    scan is left is refused.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -72,6 +76,15 @@ class HighpassFilter(Operator):
     """Flag this long at either end of each scan."""
     oversampling: float = Field(24.0, ge=8, le=1000)
     """Coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut is about oversampling^-4."""
+
+    def check(self, data: Data) -> list[str]:
+        """Scans that are shorter than one cycle of the cut."""
+        short = sum(o.duration * self.frequency < 1 for o in data.observations)
+        if not short:
+            return []
+        return [
+            f"{short} of {len(data.observations)} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {ONLY_A_LINE}"
+        ]
 
     def prepare(self, observation: Observation) -> tuple[HighpassPlan, NDArray[np.intp]]:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
@@ -99,7 +112,14 @@ class HighpassFilter(Operator):
             tally.state(self.label, "smooth mean emission", "removed analytically")
         plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)
         if plan.cut == 0:
-            tally.state(self.label, f"{observation.name} is shorter than 1/frequency", "only the mean and a line are removed")
+            text = ONLY_A_LINE if n > 1 + min(self.degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+            tally.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
+        elif plan.cut >= n:
+            raise PipelineError(
+                f"a cut at {self.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz hold no faster wave",
+                place=f"{self.label}, {observation.name}",
+                cure=f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan",
+            )
         return plan, np.flatnonzero(bad)
 
     def memory(self, observation: Observation) -> int:

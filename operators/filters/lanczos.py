@@ -64,9 +64,9 @@ class Ritz:
         return cls(np.array([v @ v]), u[None], v[None], np.zeros(1), rank, 1, "detector mean")
 
     @classmethod
-    def nothing(cls, n_det: int, n_samples: int) -> Ritz:
-        """No mode at all: no detector is left."""
-        return cls(np.zeros(0), np.zeros((0, n_det)), np.zeros((0, n_samples)), np.zeros(0), 0, 0, "no good detector")
+    def nothing(cls, n_det: int, n_samples: int, why: str = "no good detector") -> Ritz:
+        """No mode at all."""
+        return cls(np.zeros(0), np.zeros((0, n_det)), np.zeros((0, n_samples)), np.zeros(0), 0, 0, why)
 
 
 def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz:
@@ -78,6 +78,8 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
     n = gram.n_good
     if n == 0:
         return Ritz.nothing(gram.use.size, gram.n_samples)
+    if gram.energy == 0:
+        return Ritz.nothing(gram.use.size, gram.n_samples, "the signal is zero")
     basis: list[Floats] = [near_the_mean(gram.use)]
     times: list[Floats] = []
     projected = np.zeros((n, n)) if n <= 4096 else np.zeros((512, 512))

@@ -323,6 +323,54 @@ def test_beside_a_read_only_installation_the_user_keeps_it(tmp_path):
     assert len(kept(caches)) == 4
 
 
+CHANGED_NUMBA = """
+import importlib.util, os, sys, warnings
+import numba.core.caching as caching, numba.core.dispatcher as dispatcher
+from numba.core import environment
+{change}
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    from zonda.core import keep_kernels, random
+    for name in ("toy_inner", "toy_outer"):
+        spec = importlib.util.spec_from_file_location(f"zonda.{{name}}", f"{{sys.argv[1]}}/{{name}}.py")
+        module = sys.modules[f"zonda.{{name}}"] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    keep_kernels.share()
+    print(module.outer(2.0), module.outer(2), len(told), *{{str(w.message).partition(" (")[0] for w in told}}, sep="|")
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "own"),
+    [
+        ("del caching.CacheImpl._locator_classes", True),
+        ("del caching.CompileResultCacheImpl", False),
+        ("del caching.Cache._save_overload", False),
+        ("del dispatcher.FunctionCache; dispatcher.Dispatcher.enable_caching = lambda self: None", False),
+    ],
+)
+def test_a_numba_with_another_inside_keeps_kernels_itself(tmp_path, change, own):
+    """Whatever of its inside is gone: the numbers are right, and it is said once; never a traceback."""
+    import numba
+
+    if own and not hasattr(numba.config, "CACHE_LOCATOR_CLASSES"):
+        pytest.skip("this numba has no other list of locators")
+    write(tmp_path)
+    env = {**os.environ, "NUMBA_CACHE_LOCATOR_CLASSES": "InTreeCacheLocator,UserWideCacheLocator" if own else ""}
+    env |= {"XDG_CACHE_HOME": str(tmp_path / "caches"), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    env.pop("NUMBA_CACHE_DIR", None)
+    command = [sys.executable, "-c", CHANGED_NUMBA.format(change=change), str(tmp_path)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    first, second, count, *told = done.stdout.strip().split("|")
+    assert (first, second) == ("7.0", "7.0")
+    assert bool(kept(tmp_path)) == own
+    if own:
+        assert count == "0"
+    else:
+        assert (count, told) == ("1", [f"zonda cannot keep compiled code itself with numba {numba.__version__}"])
+
+
 def test_meaning_covers_options_and_constants(folder, monkeypatch):
     outer = fresh(folder, monkeypatch)
     before = meaning(outer.py_func)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
+from pydantic import PrivateAttr
 
 from zonda.core.errors import PipelineError
+from zonda.core.operator import Operator
+from zonda.core.pipeline import Pipeline
 from zonda.core.smooth import SmoothField
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
+from zonda.operators.maps.bin_map import BinMap
+from zonda.plugins.checks import scenes
 
 N_DET, N = 40, 5000
 
@@ -160,3 +167,86 @@ def test_point_source_amplitude_survives_and_is_not_skewed(bench):
     cleaned = run(bench, a).signal
     peak = [cleaned[d, 500 + 100 * d] for d in range(N_DET)]
     assert abs(np.mean(peak) / 1e-3 - (1 - 1 / N_DET)) < 0.01
+
+
+class Given(Operator):
+    """A stream that is given."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    _values: np.ndarray = PrivateAttr(default_factory=lambda: np.zeros((0, 0)))
+
+    def exec(self, block, state):
+        (name,) = self.provides
+        block.new(name)[...] = self._values[block.detectors, block.samples]
+
+
+class Sky(Given):
+    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+
+
+class Noise(Given):
+    provides: ClassVar[frozenset[str]] = frozenset({"white"})
+
+
+class Sum(Operator):
+    optional: ClassVar[frozenset[str]] = frozenset({"sky", "white"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        block.new("signal")[...] = sum(block.detdata[n] for n in ("sky", "white") if n in block.detdata)
+
+
+SEEN = 5
+"""Detectors that see the sky; the others see none of it."""
+
+
+def sky_and_noise(filters, sky=True, noise=True, dead=()):
+    """``data`` of a run with the companion run ``alone`` of the sky; without noise, of that of the sky alone."""
+    n_det, n = 12, 3000
+    one, two, points = Sky(), Noise(), scenes.Points()
+    one._values, two._values = np.zeros((n_det, n)), np.random.default_rng(6).standard_normal((n_det, n))
+    if sky:
+        one._values[:SEEN] = 0.1 * np.sin(np.arange(n) / 70 + np.arange(SEEN)[:, None] / 9)
+    two._values[list(dead)] = 0.0
+    points._observation = scenes.scan(n_det, n)
+    steps = [points, one, *([two] if noise else []), Sum(), *filters, BinMap(pixel="10 arcsec")]
+    runs = {"alone": {"only": ["sky"]}} if noise else {}
+    data = Pipeline(steps, runs=runs, precision="float64").run(scenes.scene(), threads=1, keep=["signal"])
+    return data, one._values
+
+
+def counted(data, what, run=""):
+    return data.tally.get(f"{run}CommonModeFilter", what)
+
+
+@pytest.mark.parametrize("method", ["svd", "mean"])
+def test_detectors_that_see_no_sky_are_valid_zeros_in_a_run_of_the_sky_alone(method):
+    filters = [CommonModeFilter(method=method)]
+    (data, _), (alone, sky) = sky_and_noise(filters), sky_and_noise(filters, noise=False)
+    main, companion, only = data.products["map"], data.products["alone/map"], alone.products["map"]
+    np.testing.assert_array_equal(companion.hits, main.hits)
+    np.testing.assert_array_equal(only.hits, main.hits)
+    np.testing.assert_array_equal(only.signal, companion.signal)
+    assert counted(data, "detectors flagged: signal constant", "alone/") == 0
+    expected = sky - sky.mean(axis=0) if method == "mean" else numpy_removed(sky, 1)
+    tolerance = 1e-12 if method == "mean" else 1e-6  # svd: modes to a residual of 1e-6 of the leading one
+    np.testing.assert_allclose(alone.observations[0].detdata["signal"], expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("method", ["svd", "mean"])
+def test_a_detector_that_is_dead_in_the_main_run_is_none_in_that_of_the_sky(method):
+    data, _ = sky_and_noise([CommonModeFilter(method=method)], dead=(SEEN + 1,))  # it sees no sky either
+    main, companion = data.products["map"], data.products["alone/map"]
+    assert counted(data, "detectors flagged: signal constant") == 1
+    assert counted(data, "detectors flagged: dead in the main run", "alone/") == 1
+    assert counted(data, "detectors flagged: signal constant", "alone/") == 0
+    np.testing.assert_array_equal(companion.hits, main.hits)
+
+
+@pytest.mark.parametrize("method", ["svd", "mean"])
+def test_a_sky_that_no_detector_sees_is_a_map_of_zeros(method):
+    data, _ = sky_and_noise([CommonModeFilter(method=method, modes=1)], sky=False)
+    main, companion = data.products["map"], data.products["alone/map"]
+    np.testing.assert_array_equal(companion.hits, main.hits)
+    assert (companion.signal[companion.hits > 0] == 0).all()
+    assert data.tally.get("CommonModeFilter", "detectors flagged: signal constant") == 0

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.fft import dct, idct
 
+from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.smooth import SmoothField
-from zonda.operators.filters.highpass import HighpassFilter, plan_highpass
+from zonda.operators.filters.highpass import ONLY_A_LINE, HighpassFilter, plan_highpass
 
 RATE, CUT = 100.0, 0.08
 WHITE = 1.7e-3 * np.sqrt(RATE)
@@ -186,3 +187,50 @@ def test_cut_above_nyquist_is_refused(bench):
         HighpassFilter(frequency="0 Hz")
     with pytest.raises(ValueError):
         HighpassFilter(degree=4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 17, 90, 1249])
+def test_a_scan_shorter_than_one_cycle_loses_a_line_and_says_so(bench, n):
+    x = np.random.default_rng(3).standard_normal((3, n)) + 5
+    run = bench.run([HighpassFilter()], bench.observation(3, n), {"signal": x}, precision="float64")
+    np.testing.assert_allclose(run.signal, brick_wall(x, 0, min(1, n - 1)), rtol=0, atol=1e-12)
+    said = run.tally["HighpassFilter", "scan0 is shorter than 1/frequency"]
+    assert said == {1: "nothing is left of 1 sample", 2: "nothing is left of 2 samples"}.get(n, ONLY_A_LINE)
+    data = Data(None, [bench.observation(3, n)])
+    assert HighpassFilter().check(data) == [f"1 of 1 scans are shorter than 1/frequency, 12.5 s: {ONLY_A_LINE}"]
+    assert not HighpassFilter(frequency="90 Hz").check(data) or n == 1
+
+
+@pytest.mark.parametrize("n", [3, 20, 301])
+def test_a_cut_above_the_fastest_wave_of_a_scan_is_refused(bench, n):
+    """Of N cosines the fastest has frequency (N - 1) / N of the Nyquist frequency, 50 Hz."""
+    x = np.random.default_rng(4).standard_normal((2, n))
+    fastest = (n - 1) / n * 50.0
+    with pytest.raises(PipelineError, match="removes everything") as err:
+        bench.run([HighpassFilter(frequency=f"{fastest * 1.001} Hz")], bench.observation(2, n), {"signal": x})
+    assert f"below {fastest:.6g} Hz" in str(err.value)
+    left = bench.run([HighpassFilter(frequency=f"{fastest * 0.999} Hz", degree=0)], bench.observation(2, n), {"signal": x})
+    assert left.signal.std() > 0.05 / np.sqrt(n)  # one cosine of white noise, rms sqrt(2 / n) or so
+
+
+@pytest.mark.parametrize("frequency", [0.08, 0.5, 20.0])
+def test_gaps_at_the_ends_and_inside_of_short_scans_are_bridged(bench, frequency):
+    """Lines between good neighbours, constants at the ends; then as without gaps. The lost samples stay as they are."""
+    n = 700  # 7 s: shorter than a cycle of 0.08 Hz; on a coarse series at 0.5 Hz; with the full DCT at 20 Hz
+    x = np.cumsum(np.random.default_rng(5).standard_normal((4, n)), axis=1)
+    lost = [np.arange(30), np.arange(650, n), np.r_[0, 100:140, n - 1], np.arange(1, n)]
+    bridged = x.copy()
+    for row, gap in zip(bridged, lost, strict=True):
+        good = np.setdiff1d(np.arange(n), gap)
+        row[gap] = np.interp(gap, good, row[good])
+    for d, gap in enumerate(lost):
+        x[d, gap] = np.nan
+    run = bench.run([HighpassFilter(frequency=f"{frequency} Hz")], bench.observation(4, n), {"signal": x}, precision="float64")
+    plan = plan_highpass(n, frequency / 100, 3, 24.0)
+    expected = brick_wall(bridged, plan.cut, min(3, plan.cut - 1) if plan.cut else 1)
+    for d, gap in enumerate(lost):
+        good = np.setdiff1d(np.arange(n), gap)
+        # the coarse series errs by some 1e-6 of the low part
+        np.testing.assert_allclose(run.signal[d, good], expected[d, good], rtol=0, atol=1e-5 * np.abs(bridged).max())
+        assert np.isnan(run.signal[d, gap]).all()
+    assert run.tally["HighpassFilter", "samples not finite"] == str(sum(map(len, lost)))
