@@ -159,8 +159,8 @@ class SmoothField:
 
 
 def product(rows: Floats, matrix: Floats) -> NDArray[np.float64]:
-    """Rows (n, m) times a small matrix (m, k), (n, k): not by BLAS, whose bits in one row depend on how many there are and where it
-    stands among them."""
+    """Rows (n, m) times a small matrix (m, k), (n, k): not by BLAS, whose bits in one row depend on how many there are and
+    where it stands among them."""
     out = np.empty((len(rows), matrix.shape[1]))
     _lines(np.ascontiguousarray(rows, np.float64), np.ascontiguousarray(matrix, np.float64), 0, out)
     return out

@@ -224,7 +224,8 @@ class Layers:
             _mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
             begin, across = first_i << sides[0], 1 << sides[0]
             if slab and sides[0] == _WHOLE:
-                wanted, (begin, across) = wanted.any(axis=0, keepdims=True), (slab[0], slab[1] - slab[0])
+                wanted = wanted.max(axis=0, keepdims=True)
+                begin, across = slab[0], slab[1] - slab[0]
             addresses, held = np.zeros(wanted.shape, np.uint64), []
             for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
                 k, m = begin + a * across, (first_j + b) << sides[1]
@@ -267,7 +268,7 @@ def _widened(box: tuple[int, int, int, int]) -> tuple[int, int, int, int] | None
 
 
 def _slab(box: tuple[int, int, int, int], swept: float) -> tuple[int, int, int] | None:
-    """Of slabs the cells across, low <= i < high, and the side along the wind, as a power of two; None where they do not serve."""
+    """Of slabs the cells across, low <= i < high, and the side along the wind, a power of two; None where they do not serve."""
     low, high = box[0] - SPARE, box[1] + 1 + SPARE
     if high - low > WIDEST or _cells_of(box) > DENSE * swept:
         return None
