@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 MOST_COPIED = 64 << 20
 """Bytes of a tile of a spilled stream up to which it is read into an array of its own."""
 
+SEVERAL = 4
+"""Tiles that are read together: long stretches of a detector, where the stream is larger than the cache."""
+
 LANES = 16
 """Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples at a time."""
 
@@ -139,7 +142,8 @@ class Gram:
                     _products(*self._tile(tiles[k]), q, rows, times[tiles[k]], moments, parts[k:])
             forget_pages(self.stream.array)
 
-        some = max(1, len(tiles) // (4 * self.stream.threads))
+        threads = self.stream.threads
+        some = max(1, min(SEVERAL, -(-len(tiles) // threads)), len(tiles) // (4 * threads) // SEVERAL * SEVERAL)
         self._each(work, [range(k, min(k + some, len(tiles))) for k in range(0, len(tiles), some)])
         total, square, image = parts.sum(axis=0)
         return total, square, image, times
@@ -182,15 +186,15 @@ def directions(step: int, n_detectors: int) -> Floats:
 def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
     """v = A^T q of the samples start .. stop - 1, tile by tile: out (n_tile, 3, n_det) takes each tile's sums and squares,
     where wanted, and A v, of the detectors ``rows``."""
-    for k in range(-(-(stop - start) // TILE_SAMPLES)):
+    for k in range(0, -(-(stop - start) // TILE_SAMPLES), SEVERAL):
         low = start + k * TILE_SAMPLES
-        high = min(low + TILE_SAMPLES, stop)
+        high = min(low + SEVERAL * TILE_SAMPLES, stop)
         series = v[low - start : high - start]
         _project(array, low, high, q, rows, series)
         if moments:
-            _image_and_moments(array, low, high, rows, series, out[k])
+            _image_and_moments(array, low, high, rows, series, out[k:])
         else:
-            _image(array, low, high, rows, series, out[k, 2])
+            _image(array, low, high, rows, series, out[k:])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
@@ -217,71 +221,79 @@ def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _image(array, start, stop, rows, v, out):  # type: ignore[no-untyped-def]
-    """out = A v over samples start .. stop - 1, four detectors at a time."""
-    n, half = np.uintp(stop - start), np.uintp(LANES)
-    whole, last = n // (half + half) * (half + half), rows.size - 1
+def _image(array, begin, end, rows, series, out):  # type: ignore[no-untyped-def]
+    """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time."""
+    half, last = np.uintp(LANES), rows.size - 1
     lanes = np.empty((4, LANES))
     for k in range(0, rows.size, 4):
-        a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
-        c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
-        lanes[:] = 0.0
-        for t in range(np.uintp(0), whole, half + half):
-            for i in range(half):
-                x, y = v[t + i], v[t + half + i]
-                lanes[0, i] += np.float64(a[t + i]) * x + np.float64(a[t + half + i]) * y
-                lanes[1, i] += np.float64(b[t + i]) * x + np.float64(b[t + half + i]) * y
-                lanes[2, i] += np.float64(c[t + i]) * x + np.float64(c[t + half + i]) * y
-                lanes[3, i] += np.float64(d[t + i]) * x + np.float64(d[t + half + i]) * y
-        for j in range(min(4, rows.size - k)):
-            row, total = array[rows[k + j], start:stop], 0.0
-            for i in range(LANES):
-                total += lanes[j, i]
-            for t in range(whole, n):
-                total += np.float64(row[t]) * v[t]
-            out[rows[k + j]] = total
+        for start in range(begin, end, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, end)
+            v, to = series[start - begin : stop - begin], out[(start - begin) // TILE_SAMPLES]
+            a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
+            c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
+            n = np.uintp(stop - start)
+            whole = n // (half + half) * (half + half)
+            lanes[:] = 0.0
+            for t in range(np.uintp(0), whole, half + half):
+                for i in range(half):
+                    x, y = v[t + i], v[t + half + i]
+                    lanes[0, i] += np.float64(a[t + i]) * x + np.float64(a[t + half + i]) * y
+                    lanes[1, i] += np.float64(b[t + i]) * x + np.float64(b[t + half + i]) * y
+                    lanes[2, i] += np.float64(c[t + i]) * x + np.float64(c[t + half + i]) * y
+                    lanes[3, i] += np.float64(d[t + i]) * x + np.float64(d[t + half + i]) * y
+            for j in range(min(4, rows.size - k)):
+                row, total = array[rows[k + j], start:stop], 0.0
+                for i in range(LANES):
+                    total += lanes[j, i]
+                for t in range(whole, n):
+                    total += np.float64(row[t]) * v[t]
+                to[2, rows[k + j]] = total
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _image_and_moments(array, start, stop, rows, v, out):  # type: ignore[no-untyped-def]
-    """out = A 1, squares, A v (3, n_det): `_image` with the moments in the same reading."""
-    n, half = np.uintp(stop - start), np.uintp(LANES)
-    whole, last = n // (half + half) * (half + half), rows.size - 1
+def _image_and_moments(array, begin, end, rows, series, out):  # type: ignore[no-untyped-def]
+    """out = A 1, squares, A v (n_tile, 3, n_det): `_image` with the moments in the same reading."""
+    half, last = np.uintp(LANES), rows.size - 1
     lanes = np.empty((4, 3, LANES))
     for k in range(0, rows.size, 4):
-        a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
-        c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
-        lanes[:] = 0.0
-        for t in range(np.uintp(0), whole, half + half):
-            for i in range(half):
-                x, y = v[t + i], v[t + half + i]
-                p, r = np.float64(a[t + i]), np.float64(a[t + half + i])
-                lanes[0, 0, i] += p + r
-                lanes[0, 1, i] += p * p + r * r
-                lanes[0, 2, i] += p * x + r * y
-                p, r = np.float64(b[t + i]), np.float64(b[t + half + i])
-                lanes[1, 0, i] += p + r
-                lanes[1, 1, i] += p * p + r * r
-                lanes[1, 2, i] += p * x + r * y
-                p, r = np.float64(c[t + i]), np.float64(c[t + half + i])
-                lanes[2, 0, i] += p + r
-                lanes[2, 1, i] += p * p + r * r
-                lanes[2, 2, i] += p * x + r * y
-                p, r = np.float64(d[t + i]), np.float64(d[t + half + i])
-                lanes[3, 0, i] += p + r
-                lanes[3, 1, i] += p * p + r * r
-                lanes[3, 2, i] += p * x + r * y
-        for j in range(min(4, rows.size - k)):
-            row, first, second, third = array[rows[k + j], start:stop], 0.0, 0.0, 0.0
-            for i in range(LANES):
-                first += lanes[j, 0, i]
-                second += lanes[j, 1, i]
-                third += lanes[j, 2, i]
-            for t in range(whole, n):
-                p = np.float64(row[t])
-                first += p
-                second += p * p
-                third += p * v[t]
-            out[0, rows[k + j]] = first
-            out[1, rows[k + j]] = second
-            out[2, rows[k + j]] = third
+        for start in range(begin, end, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, end)
+            v, to = series[start - begin : stop - begin], out[(start - begin) // TILE_SAMPLES]
+            a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
+            c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
+            n = np.uintp(stop - start)
+            whole = n // (half + half) * (half + half)
+            lanes[:] = 0.0
+            for t in range(np.uintp(0), whole, half + half):
+                for i in range(half):
+                    x, y = v[t + i], v[t + half + i]
+                    p, r = np.float64(a[t + i]), np.float64(a[t + half + i])
+                    lanes[0, 0, i] += p + r
+                    lanes[0, 1, i] += p * p + r * r
+                    lanes[0, 2, i] += p * x + r * y
+                    p, r = np.float64(b[t + i]), np.float64(b[t + half + i])
+                    lanes[1, 0, i] += p + r
+                    lanes[1, 1, i] += p * p + r * r
+                    lanes[1, 2, i] += p * x + r * y
+                    p, r = np.float64(c[t + i]), np.float64(c[t + half + i])
+                    lanes[2, 0, i] += p + r
+                    lanes[2, 1, i] += p * p + r * r
+                    lanes[2, 2, i] += p * x + r * y
+                    p, r = np.float64(d[t + i]), np.float64(d[t + half + i])
+                    lanes[3, 0, i] += p + r
+                    lanes[3, 1, i] += p * p + r * r
+                    lanes[3, 2, i] += p * x + r * y
+            for j in range(min(4, rows.size - k)):
+                row, first, second, third = array[rows[k + j], start:stop], 0.0, 0.0, 0.0
+                for i in range(LANES):
+                    first += lanes[j, 0, i]
+                    second += lanes[j, 1, i]
+                    third += lanes[j, 2, i]
+                for t in range(whole, n):
+                    p = np.float64(row[t])
+                    first += p
+                    second += p * p
+                    third += p * v[t]
+                to[0, rows[k + j]] = first
+                to[1, rows[k + j]] = second
+                to[2, rows[k + j]] = third
