@@ -20,8 +20,9 @@ Floats = NDArray[np.float64]
 MOST_COPIED = 64 << 20
 """Bytes of a tile of a spilled stream up to which it is read into an array of its own."""
 
-SEVERAL = 4
-"""Tiles that are read together: long stretches of a detector, where the stream is larger than the cache."""
+SEVERAL, MANY = 4, 1024
+"""Tiles that are read together, and of how many detectors or more: one tile of theirs outgrows the cache, and long stretches of
+each detector are read quicker."""
 
 LANES = 16
 """Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples at a time."""
@@ -186,9 +187,10 @@ def directions(step: int, n_detectors: int) -> Floats:
 def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
     """v = A^T q of the samples start .. stop - 1, tile by tile: out (n_tile, 3, n_det) takes each tile's sums and squares,
     where wanted, and A v, of the detectors ``rows``."""
-    for k in range(0, -(-(stop - start) // TILE_SAMPLES), SEVERAL):
+    together = SEVERAL if rows.size >= MANY else 1
+    for k in range(0, -(-(stop - start) // TILE_SAMPLES), together):
         low = start + k * TILE_SAMPLES
-        high = min(low + SEVERAL * TILE_SAMPLES, stop)
+        high = min(low + together * TILE_SAMPLES, stop)
         series = v[low - start : high - start]
         _project(array, low, high, q, rows, series)
         if moments:
