@@ -21,6 +21,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
+from zonda.core.streams import untouched
 from zonda.core.tiles import TILE_SAMPLES
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
@@ -367,8 +368,12 @@ class BinMap(Operator):
         grid = self._grid
         assert grid is not None
         n, unit = grid.n_pixels, self._variance if self.weights == "inverse_variance" else 1.0
-        hits, signal, weight, noise = np.empty(n, np.int64), np.empty(n), np.empty(n), np.empty(n)
-        half = np.empty(n) if self.half_difference and len(halves.scans) >= 2 and self.contents == "all" else None
+        hits, signal, weight, noise = (untouched((n, 1), kind).reshape(n) for kind in (np.int64, float, float, float))
+        half = (
+            untouched((n, 1), float).reshape(n)
+            if self.half_difference and len(halves.scans) >= 2 and self.contents == "all"
+            else None
+        )
         for start in range(0, n, STRETCH):
             part = slice(start, start + STRETCH)
             total = halves.total(part)

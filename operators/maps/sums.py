@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from zonda.core.columns import prefetch
 from zonda.core.errors import PipelineError
+from zonda.core.streams import untouched
 
 from .grid import Grid, TangentGrid
 
@@ -150,7 +151,7 @@ class Halves:
     """Sums of the even and of the odd observations, in their order."""
 
     def __init__(self, n_pixels: int) -> None:
-        self.sums = np.zeros((2, n_pixels, 4), np.int64)
+        self.sums = untouched((2 * n_pixels, 4), np.int64).reshape(2, n_pixels, 4)
         self.scans: list[str] = []
         self._largest = np.zeros(4)
         self._deepest = [0, 0]
