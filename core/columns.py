@@ -1,4 +1,4 @@
-"""Instructions that numba's compiler does not find by itself: four neighbours at once, and fused multiply-adds."""
+"""Instructions that numba's compiler does not find by itself: four neighbours at once, fused multiply-adds, prefetching."""
 
 from __future__ import annotations
 
@@ -108,3 +108,20 @@ def four_columns_at(typing_context: Any, address: Any, stride: Any, v0: Any, v1:
         return context.get_dummy_value()
 
     return types.void(types.uint64, types.uint64, v0, v1, v2, v3, out, types.uint64), generate
+
+
+@intrinsic
+def prefetch(typing_context: Any, array: Any, place: Any) -> Any:
+    """Fetch element ``place`` (uint64) of a C array, which is going to be written, into the cache. It need not exist."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        integer = ir.IntType(32)
+        data = make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(8).as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [address.type, integer, integer, integer])
+        to_write, keep, of_data = integer(1), integer(3), integer(1)
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
+        builder.call(fetch, [address, to_write, keep, of_data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64), generate

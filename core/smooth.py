@@ -158,6 +158,14 @@ class SmoothField:
         self._kept.clear()
 
 
+def product(rows: Floats, matrix: Floats) -> NDArray[np.float64]:
+    """Rows (n, m) times a small matrix (m, k), (n, k): not by BLAS, whose bits in one row depend on how many there are and
+    where it stands among them."""
+    out = np.empty((len(rows), matrix.shape[1]))
+    _lines(np.ascontiguousarray(rows, np.float64), np.ascontiguousarray(matrix, np.float64), 0, out)
+    return out
+
+
 @dataclass(frozen=True)
 class DetectorField:
     """Equation (1) where every detector is its own node: no weights, and no focal-plane interpolation to pay for.

@@ -169,8 +169,8 @@ class StreamMadeAgain(Stream):
         return self._sweeper(work)
 
 
-def untouched(shape: tuple[int, int], dtype: Any) -> Floats:
-    """An array of anything, in pages of ordinary size.
+def untouched(shape: tuple[int, int], dtype: Any) -> NDArray[Any]:
+    """An array of zeros, in pages of ordinary size.
 
     numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
     """
@@ -179,7 +179,7 @@ def untouched(shape: tuple[int, int], dtype: Any) -> Floats:
         with suppress(OSError):  # refused: numpy's MemoryError says so
             pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
             return np.frombuffer(pages, dtype).reshape(shape)
-    return np.empty(shape, dtype)
+    return np.zeros(shape, dtype)
 
 
 class Store:

@@ -79,7 +79,7 @@ def highpass_without_detrending(patch: Patch) -> None:
     low = highpass.HighpassPlan._low
 
     def without(self: Any, s: Any) -> Any:
-        return low(replace(self, modes=0 * self.modes, spread_modes=0 * self.spread_modes), s)
+        return low(replace(self, modes=0 * self.modes, spread_modes=0 * self.spread_modes, sums=()), s)
 
     patch.setattr(highpass.HighpassPlan, "_low", without)
 

@@ -2,7 +2,8 @@
 
 A layer's spline coefficients are made in tiles that overlap by the three cells a cubic spline needs, so that every point is
 interpolated from one tile. Tiles are kept while there is room; any tile has the same bits whenever it is made, and a point
-the same bits in whatever company it is asked for. Where a scan sweeps over few cells they are made as one piece.
+the same bits in whatever company it is asked for. Where a scan sweeps over few cells they are made as one piece; where it sweeps
+over a strip along the wind, in slabs as wide as that, since what squares would hold beside it is made for nothing.
 """
 
 from __future__ import annotations
@@ -28,11 +29,14 @@ from .turbulence import Field, Turbulence
 Floats = NDArray[np.float64]
 _Key = tuple[int, tuple[int, int, int, int]]
 
-SQUARE, STRIP = (8, 8), (5, 10)
-"""Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the path is narrow."""
+SQUARE = (8, 8)
+"""Sides of a tile, as powers of two of cells (across, along the wind)."""
 
-NARROW = 96
-"""Cells: a path that is narrower than this across the wind is tiled by strips."""
+SLAB, WIDEST, LONGEST = 1 << 16, 1024, 1 << 10
+"""Cells of a slab, about; cells across the wind up to which there are slabs; most cells along it."""
+
+DENSE = 1.5
+"""Slabs serve where all that they hold is at most this many times what is swept over at `TIMES_AT_ONCE` times after another."""
 
 APRON = 3
 """Cells by which tiles overlap."""
@@ -162,7 +166,7 @@ class Layers:
         ]
         self._places = [_place(track, d, self.paths[d.step].seconds) for d in self._drifting]
         swept = self._swept(*rim(xi, eta))
-        self._sides = [STRIP if box[1] - box[0] < NARROW else SQUARE for box, _ in swept]
+        self._slabs = [_slab(box, cells) for box, cells in swept]
         self._pieces = [_widened(box) for box, _ in swept]
         self.cells = sum(cells for _, cells in swept)
         """Lattice points swept over, about."""
@@ -203,7 +207,7 @@ class Layers:
 
     def _add(self, n: int, x: Floats, y: Floats, boxes: Floats, start: int, out: Floats) -> None:
         """out += layer ``n`` at the positions (x, y) per metre of height, at times from number ``start`` of its path."""
-        layer, sides, (matrix, i, j) = self._drifting[n], self._sides[n], self._places[n]
+        layer, sides, (matrix, i, j) = self._drifting[n], SQUARE, self._places[n]
         i, j = i[start : start + x.shape[1]], j[start : start + x.shape[1]]
         low_i, high_i, low_j, high_j = _extent(matrix, boxes, i, j)
         piece = self._pieces[n]
@@ -212,16 +216,23 @@ class Layers:
             addresses, held = np.array([[address]], np.uint64), [tile]
             sides, origin, width = (_WHOLE, _WHOLE), (piece[0], piece[2]), tile.shape[1]
         else:
+            slab = self._slabs[n]
+            if slab and slab[0] <= low_i <= high_i < slab[1]:
+                sides = _WHOLE, slab[2]
             first_i, first_j = low_i >> sides[0], low_j >> sides[1]
             wanted = np.zeros(((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8)
             _mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
+            begin, across = first_i << sides[0], 1 << sides[0]
+            if slab and sides[0] == _WHOLE:
+                wanted = wanted.max(axis=0, keepdims=True)
+                begin, across = slab[0], slab[1] - slab[0]
             addresses, held = np.zeros(wanted.shape, np.uint64), []
             for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
-                k, m = (first_i + a) << sides[0], (first_j + b) << sides[1]
-                box = (k, k + (1 << sides[0]), m, m + (1 << sides[1]))
+                k, m = begin + a * across, (first_j + b) << sides[1]
+                box = (k, k + across, m, m + (1 << sides[1]))
                 tile, addresses[a, b] = self._tiles.get(layer.field, n, box)
                 held.append(tile)  # or it might be dropped while it is read
-            origin, width = (first_i << sides[0], first_j << sides[1]), (1 << sides[1]) + APRON
+            origin, width = (begin, first_j << sides[1]), (1 << sides[1]) + APRON
         _interpolate(matrix, x, y, i, j, *sides, *origin, width, addresses, self._constants[n], out)
 
     def _swept(self, xi: Floats, eta: Floats) -> list[tuple[tuple[int, int, int, int], float]]:
@@ -254,6 +265,14 @@ def _widened(box: tuple[int, int, int, int]) -> tuple[int, int, int, int] | None
     if _cells_of(box) > ONE_PIECE:
         return None
     return box[0] - SPARE, box[1] + 1 + SPARE, box[2] - SPARE, box[3] + 1 + SPARE
+
+
+def _slab(box: tuple[int, int, int, int], swept: float) -> tuple[int, int, int] | None:
+    """Of slabs the cells across, low <= i < high, and the side along the wind, a power of two; None where they do not serve."""
+    low, high = box[0] - SPARE, box[1] + 1 + SPARE
+    if high - low > WIDEST or _cells_of(box) > DENSE * swept:
+        return None
+    return low, high, max(1, min(SLAB // max(high - low, 1), LONGEST)).bit_length() - 1
 
 
 def _coarse(first: int, stop: int, ratio: int) -> tuple[int, int]:

@@ -31,6 +31,10 @@ ROWS = 16 * TILE_DETECTORS
 PARTS = 1 << 20
 """Bytes of the sums of several tiles that a thread makes before they are added."""
 
+SEVERAL, MANY = 4, 1024
+"""Tiles that are read together, and of how many detectors or more: one tile of theirs outgrows the cache, and long stretches of
+each detector are read quicker."""
+
 LANES = 16
 """Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples at a time."""
 
@@ -169,7 +173,9 @@ class Gram:
                     _products(*self._tile(samples), q, rows, times[samples], moments, part[None])
             return parts
 
-        some = max(1, min(len(tiles) // (4 * self.stream.threads), PARTS // (24 * q.size)))
+        threads, most = self.stream.threads, max(1, PARTS // (24 * q.size))
+        at_least = min(SEVERAL, most, -(-len(tiles) // threads))
+        some = max(1, at_least, min(len(tiles) // (4 * threads), most) // SEVERAL * SEVERAL)
         for parts in self._each(work, [tiles[k : k + some] for k in range(0, len(tiles), some)]):
             for part in parts:
                 found += part
@@ -231,15 +237,16 @@ def directions(step: int, n_detectors: int) -> Floats:
 def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
     """v = A^T q of the samples start .. stop - 1, tile by tile: out (n_tile, 3, n_det) takes each tile's sums and squares,
     where wanted, and A v, of the detectors ``rows``."""
-    for k in range(-(-(stop - start) // TILE_SAMPLES)):
+    together = SEVERAL if rows.size >= MANY else 1
+    for k in range(0, -(-(stop - start) // TILE_SAMPLES), together):
         low = start + k * TILE_SAMPLES
-        high = min(low + TILE_SAMPLES, stop)
+        high = min(low + together * TILE_SAMPLES, stop)
         series = v[low - start : high - start]
         _project(array, low, high, q, rows, series)
         if moments:
-            _image_and_moments(array, low, high, rows, series, out[k])
+            _image_and_moments(array, low, high, rows, series, out[k:])
         else:
-            _image(array, low, high, rows, series, out[k, 2])
+            _image(array, low, high, rows, series, out[k:])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
@@ -266,71 +273,79 @@ def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _image(array, start, stop, rows, v, out):  # type: ignore[no-untyped-def]
-    """out = A v over samples start .. stop - 1, four detectors at a time."""
-    n, half = np.uintp(stop - start), np.uintp(LANES)
-    whole, last = n // (half + half) * (half + half), rows.size - 1
+def _image(array, begin, end, rows, series, out):  # type: ignore[no-untyped-def]
+    """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time."""
+    half, last = np.uintp(LANES), rows.size - 1
     lanes = np.empty((4, LANES))
     for k in range(0, rows.size, 4):
-        a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
-        c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
-        lanes[:] = 0.0
-        for t in range(np.uintp(0), whole, half + half):
-            for i in range(half):
-                x, y = v[t + i], v[t + half + i]
-                lanes[0, i] += np.float64(a[t + i]) * x + np.float64(a[t + half + i]) * y
-                lanes[1, i] += np.float64(b[t + i]) * x + np.float64(b[t + half + i]) * y
-                lanes[2, i] += np.float64(c[t + i]) * x + np.float64(c[t + half + i]) * y
-                lanes[3, i] += np.float64(d[t + i]) * x + np.float64(d[t + half + i]) * y
-        for j in range(min(4, rows.size - k)):
-            row, total = array[rows[k + j], start:stop], 0.0
-            for i in range(LANES):
-                total += lanes[j, i]
-            for t in range(whole, n):
-                total += np.float64(row[t]) * v[t]
-            out[rows[k + j]] = total
+        for start in range(begin, end, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, end)
+            v, to = series[start - begin : stop - begin], out[(start - begin) // TILE_SAMPLES]
+            a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
+            c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
+            n = np.uintp(stop - start)
+            whole = n // (half + half) * (half + half)
+            lanes[:] = 0.0
+            for t in range(np.uintp(0), whole, half + half):
+                for i in range(half):
+                    x, y = v[t + i], v[t + half + i]
+                    lanes[0, i] += np.float64(a[t + i]) * x + np.float64(a[t + half + i]) * y
+                    lanes[1, i] += np.float64(b[t + i]) * x + np.float64(b[t + half + i]) * y
+                    lanes[2, i] += np.float64(c[t + i]) * x + np.float64(c[t + half + i]) * y
+                    lanes[3, i] += np.float64(d[t + i]) * x + np.float64(d[t + half + i]) * y
+            for j in range(min(4, rows.size - k)):
+                row, total = array[rows[k + j], start:stop], 0.0
+                for i in range(LANES):
+                    total += lanes[j, i]
+                for t in range(whole, n):
+                    total += np.float64(row[t]) * v[t]
+                to[2, rows[k + j]] = total
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _image_and_moments(array, start, stop, rows, v, out):  # type: ignore[no-untyped-def]
-    """out = A 1, squares, A v (3, n_det): `_image` with the moments in the same reading."""
-    n, half = np.uintp(stop - start), np.uintp(LANES)
-    whole, last = n // (half + half) * (half + half), rows.size - 1
+def _image_and_moments(array, begin, end, rows, series, out):  # type: ignore[no-untyped-def]
+    """out = A 1, squares, A v (n_tile, 3, n_det): `_image` with the moments in the same reading."""
+    half, last = np.uintp(LANES), rows.size - 1
     lanes = np.empty((4, 3, LANES))
     for k in range(0, rows.size, 4):
-        a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
-        c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
-        lanes[:] = 0.0
-        for t in range(np.uintp(0), whole, half + half):
-            for i in range(half):
-                x, y = v[t + i], v[t + half + i]
-                p, r = np.float64(a[t + i]), np.float64(a[t + half + i])
-                lanes[0, 0, i] += p + r
-                lanes[0, 1, i] += p * p + r * r
-                lanes[0, 2, i] += p * x + r * y
-                p, r = np.float64(b[t + i]), np.float64(b[t + half + i])
-                lanes[1, 0, i] += p + r
-                lanes[1, 1, i] += p * p + r * r
-                lanes[1, 2, i] += p * x + r * y
-                p, r = np.float64(c[t + i]), np.float64(c[t + half + i])
-                lanes[2, 0, i] += p + r
-                lanes[2, 1, i] += p * p + r * r
-                lanes[2, 2, i] += p * x + r * y
-                p, r = np.float64(d[t + i]), np.float64(d[t + half + i])
-                lanes[3, 0, i] += p + r
-                lanes[3, 1, i] += p * p + r * r
-                lanes[3, 2, i] += p * x + r * y
-        for j in range(min(4, rows.size - k)):
-            row, first, second, third = array[rows[k + j], start:stop], 0.0, 0.0, 0.0
-            for i in range(LANES):
-                first += lanes[j, 0, i]
-                second += lanes[j, 1, i]
-                third += lanes[j, 2, i]
-            for t in range(whole, n):
-                p = np.float64(row[t])
-                first += p
-                second += p * p
-                third += p * v[t]
-            out[0, rows[k + j]] = first
-            out[1, rows[k + j]] = second
-            out[2, rows[k + j]] = third
+        for start in range(begin, end, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, end)
+            v, to = series[start - begin : stop - begin], out[(start - begin) // TILE_SAMPLES]
+            a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
+            c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
+            n = np.uintp(stop - start)
+            whole = n // (half + half) * (half + half)
+            lanes[:] = 0.0
+            for t in range(np.uintp(0), whole, half + half):
+                for i in range(half):
+                    x, y = v[t + i], v[t + half + i]
+                    p, r = np.float64(a[t + i]), np.float64(a[t + half + i])
+                    lanes[0, 0, i] += p + r
+                    lanes[0, 1, i] += p * p + r * r
+                    lanes[0, 2, i] += p * x + r * y
+                    p, r = np.float64(b[t + i]), np.float64(b[t + half + i])
+                    lanes[1, 0, i] += p + r
+                    lanes[1, 1, i] += p * p + r * r
+                    lanes[1, 2, i] += p * x + r * y
+                    p, r = np.float64(c[t + i]), np.float64(c[t + half + i])
+                    lanes[2, 0, i] += p + r
+                    lanes[2, 1, i] += p * p + r * r
+                    lanes[2, 2, i] += p * x + r * y
+                    p, r = np.float64(d[t + i]), np.float64(d[t + half + i])
+                    lanes[3, 0, i] += p + r
+                    lanes[3, 1, i] += p * p + r * r
+                    lanes[3, 2, i] += p * x + r * y
+            for j in range(min(4, rows.size - k)):
+                row, first, second, third = array[rows[k + j], start:stop], 0.0, 0.0, 0.0
+                for i in range(LANES):
+                    first += lanes[j, 0, i]
+                    second += lanes[j, 1, i]
+                    third += lanes[j, 2, i]
+                for t in range(whole, n):
+                    p = np.float64(row[t])
+                    first += p
+                    second += p * p
+                    third += p * v[t]
+                to[0, rows[k + j]] = first
+                to[1, rows[k + j]] = second
+                to[2, rows[k + j]] = third

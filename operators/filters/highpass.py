@@ -32,6 +32,7 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.smooth import product
 from zonda.core.tiles import TILE_DETECTORS
 from zonda.core.transforms import cosine_transform, fast_length
 
@@ -153,6 +154,9 @@ class HighpassFilter(Operator):
 GROUP = 16
 """Samples that are taken together: their low part comes from the same five knots, or six where knots lie closer."""
 
+FEW = 128
+"""Cosines up to which sums over them are quicker than transforms."""
+
 ABREAST = TILE_DETECTORS
 """Rows whose sums are formed side by side."""
 
@@ -179,6 +183,8 @@ class HighpassPlan:
         (degree + 1, N): the polynomials themselves where the full DCT is used.
     response
         (K,): factor from the DCT-I of s to that of c.
+    sums
+        Where cosines are few, matrices that make c of s in the place of transforms: see `_sums`.
     """
 
     n: int
@@ -190,6 +196,7 @@ class HighpassPlan:
     spread_modes: Floats
     polynomials: Floats
     response: Floats
+    sums: tuple[tuple[Floats, Floats], ...] = ()
     _weights: dict[np.dtype[Any], Floats] = field(default_factory=dict)
 
     def apply(self, rows: Floats, bad: NDArray[np.intp] = NONE) -> int:
@@ -246,6 +253,13 @@ class HighpassPlan:
 
     def _low(self, s: Floats) -> Floats:
         """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s, (n_det, M + 3) each."""
+        if self.sums:
+            half = -(-s.shape[1] // 2)
+            left, right = s[:, :half], s[:, : -half - 1 : -1]
+            even, odd = (product(product(x, a), b) for x, (a, b) in zip((left + right, left - right), self.sums, strict=True))
+            c = np.empty_like(s)
+            c[:, :half], c[:, : -half - 1 : -1] = even + odd, even - odd
+            return c
         # not with BLAS, whose bits in one row depend on how many rows there are and where it stands among them
         amplitude = np.einsum("dm,km->dk", s, self.modes)
         rest = s - np.einsum("dk,km->dm", amplitude, self.spread_modes)
@@ -310,8 +324,29 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     norm = np.linalg.inv(np.linalg.cholesky(raw @ spread.T))
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
-    first, grouped = _grouped(cell, weights)
-    return HighpassPlan(n, cut, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
+    modes, spread = norm @ raw, norm @ spread
+    sums = _sums(modes, spread, response) if 0 < cut <= FEW else ()
+    return HighpassPlan(n, cut, knots, *_grouped(cell, weights), modes, spread, np.zeros((0, n)), response, sums)
+
+
+def _sums(modes: Floats, spread: Floats, response: Floats) -> tuple[tuple[Floats, Floats], ...]:
+    """For what is even and what is odd about the middle, matrices A (h, k) and B (k, h), h the half of the M + 3 knots:
+    (s_j +- s_(M - j)) A B is that part of c, where equation (2) is written out in polynomials p and cosines C,
+
+        c = a p + r (s - a S) C^T C,    a = s p^T,    S what p spreads,    r = 2 (response), and twice that for k > 0.   (3)
+    """
+    knots = modes.shape[1]
+    cosines = np.cos(np.pi * np.multiply.outer(np.arange(response.size), (np.arange(knots) - 1) / (knots - 3)))
+    factor = np.where(np.arange(response.size) > 0, 4.0, 2.0) * response
+    half, found = -(-knots // 2), []
+    for parity in range(2):
+        p, c, r = modes[parity::2], cosines[parity::2], factor[parity::2, None]
+        into = np.concatenate([p, c])[:, :half].T.copy()
+        if knots % 2:
+            into[-1] /= 2  # the knot in the middle comes twice
+        out = np.concatenate([p - product(product(spread[parity::2], c.T), r * c), r * c])
+        found.append((into, out[:, :half].copy()))
+    return tuple(found)
 
 
 def _grouped(cell: NDArray[np.int64], weights: Floats) -> tuple[NDArray[np.int64], Floats]:

@@ -60,7 +60,8 @@ class Ritz:
             return cls.nothing(gram.use.size, gram.n_samples)
         u = gram.use / np.sqrt(gram.n_good)
         _, v = gram.apply(u)
-        rank = 1 + (gram.left(u[None], v[None]) > NOTHING * gram.energy)
+        apart = gram.energy - float(v @ v) > EMPTY * gram.n_good * gram.energy  # else look at the remainder itself
+        rank = 1 + (apart or gram.left(u[None], v[None]) > NOTHING * gram.energy)
         return cls(np.array([v @ v]), u[None], v[None], np.zeros(1), rank, 1, "detector mean")
 
     @classmethod

@@ -21,6 +21,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
+from zonda.core.streams import untouched
 from zonda.core.tiles import TILE_SAMPLES
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
@@ -46,6 +47,10 @@ from .sums import (
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
+
+
+STRETCH = 1 << 15
+"""Pixels whose maps are made at a time: what is only used for a moment stays in the cache."""
 
 
 class _Requires:
@@ -363,20 +368,28 @@ class BinMap(Operator):
     def _product_of(self, halves: Halves) -> MapProduct:
         grid = self._grid
         assert grid is not None
-        total = halves.total()
-        signal, weight = _mean(total)
-        hits = total[:, HITS]
-        noise = self._noise_of(total, signal, weight)
-        half = None
-        if self.contents == "hits":
-            signal, noise, weight = np.full_like(signal, np.nan), np.full_like(noise, np.nan), hits.astype(np.float64)
-        elif self.half_difference and len(halves.scans) >= 2:
-            (even, w_even), (odd, w_odd) = _mean(halves.sums[0]), _mean(halves.sums[1])
-            with np.errstate(invalid="ignore", divide="ignore"):
-                half = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
-        unit = self._variance if self.weights == "inverse_variance" else 1.0
+        n, unit = grid.n_pixels, self._variance if self.weights == "inverse_variance" else 1.0
+        hits, signal, weight, noise = (untouched((n, 1), kind).reshape(n) for kind in (np.int64, float, float, float))
+        half = (
+            untouched((n, 1), float).reshape(n)
+            if self.half_difference and len(halves.scans) >= 2 and self.contents == "all"
+            else None
+        )
+        for start in range(0, n, STRETCH):
+            part = slice(start, start + STRETCH)
+            total = halves.total(part)
+            hits[part] = total[:, HITS]
+            if self.contents == "hits":
+                signal[part], noise[part], weight[part] = np.nan, np.nan, hits[part] / unit
+                continue
+            signal[part], w = _mean(total)
+            weight[part], noise[part] = w / unit, self._noise_of(total, signal[part], w)
+            if half is not None:
+                (even, w_even), (odd, w_odd) = _mean(halves.sums[0, part]), _mean(halves.sums[1, part])
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    half[part] = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
         shape = grid.shape if isinstance(grid, TangentGrid) else (grid.n_pixels,)
-        arrays: list[NDArray[Any]] = [signal, hits, weight / unit, noise] + ([half] if half is not None else [])
+        arrays: list[NDArray[Any]] = [signal, hits, weight, noise] + ([half] if half is not None else [])
         keep = slice(None) if isinstance(grid, TangentGrid) else hits > 0
         arrays = [a[keep].reshape(shape if isinstance(grid, TangentGrid) else -1) for a in arrays]
         common: dict[str, Any] = {

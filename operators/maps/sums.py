@@ -21,7 +21,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.columns import prefetch
 from zonda.core.errors import PipelineError
+from zonda.core.streams import untouched
 
 from .grid import Grid, TangentGrid
 
@@ -43,6 +45,9 @@ MAGIC_BITS = 0x4338000000000000
 
 TOGETHER = 4
 """Detectors that are scattered side by side: successive samples of one often fall in the same pixel and would wait for it."""
+
+AHEAD = 16
+"""Samples by which pixels are fetched beforehand: those of a map larger than the cache come from memory."""
 
 AT_ONCE = 256
 """Samples of `TOGETHER` detectors whose pixels, values and pointing are in the first cache together."""
@@ -146,7 +151,7 @@ class Halves:
     """Sums of the even and of the odd observations, in their order."""
 
     def __init__(self, n_pixels: int) -> None:
-        self.sums = np.zeros((2, n_pixels, 4), np.int64)
+        self.sums = untouched((2 * n_pixels, 4), np.int64).reshape(2, n_pixels, 4)
         self.scans: list[str] = []
         self._largest = np.zeros(4)
         self._deepest = [0, 0]
@@ -160,9 +165,9 @@ class Halves:
         self._check(f"{label}, {observation.name}")
         return inside, dropped
 
-    def total(self) -> Sums:
-        """Both halves together, (n_pixels, 4)."""
-        return np.asarray(self.sums[: len(self.scans)].sum(axis=0) if len(self.scans) > 1 else self.sums[0], np.int64)
+    def total(self, pixels: slice) -> Sums:
+        """Both halves together of some pixels, (n, 4)."""
+        return np.asarray(self.sums[: len(self.scans), pixels].sum(axis=0) if len(self.scans) > 1 else self.sums[0, pixels])
 
     def packed(self) -> dict[str, Any]:
         """As plain values and arrays: numbers of the pixels with hits, and their sums."""
@@ -352,11 +357,16 @@ def _drop(row, fine, limit, places, units, stride, n_rows, dropped):  # type: ig
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _scatter(flat, columns, cells, rows, units):  # type: ignore[no-untyped-def]
     """Add fixed-point values (n_row, n) and hits to the places of the detectors ``rows`` (n_row,)."""
-    hit = np.uintp(HITS)
+    hit, last = np.uintp(HITS), np.uintp(cells.shape[1] - 1)
     if rows.size == TOGETHER:
         a, b, c, d = cells[rows[0]], cells[rows[1]], cells[rows[2]], cells[rows[3]]
         p, q, r, s = units
         for t in range(np.uintp(cells.shape[1])):
+            ahead = min(t + np.uintp(AHEAD), last)
+            prefetch(flat, np.uintp(a[ahead]) * columns)
+            prefetch(flat, np.uintp(b[ahead]) * columns)
+            prefetch(flat, np.uintp(c[ahead]) * columns)
+            prefetch(flat, np.uintp(d[ahead]) * columns)
             at = np.uintp(a[t]) * columns
             flat[at] += p[t]
             flat[at + hit] += 1
@@ -385,16 +395,15 @@ def _fold(sums, ny, nx, weight, noise, out):  # type: ignore[no-untyped-def]
     ``weight``, ``noise``: of every sample, where ``sums`` has two columns.
     """
     inside, outside, most = np.int64(0), np.int64(0), np.int64(0)
-    for at in range(sums.shape[0]):
-        hits = sums[at, HITS]
-        if hits:
-            to = at - 1
-            border = at == 0
-            if ny:
-                y, x = at // (nx + 2), at % (nx + 2)
-                border = (x == 0) | (x == nx + 1) | (y == 0) | (y == ny + 1)
-                to = (y - 1) * nx + x - 1
-            if border:
+    width = nx + 2 if ny else sums.shape[0]
+    for y in range(sums.shape[0] // width):
+        for x in range(width):
+            at = y * width + x
+            hits = sums[at, HITS]
+            if not hits:
+                continue
+            to = (y - 1) * nx + x - 1 if ny else at - 1
+            if x == 0 or (ny and (x == nx + 1 or y == 0 or y == ny + 1)):
                 outside += hits
                 sums[at] = 0
                 continue

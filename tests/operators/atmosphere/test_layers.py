@@ -261,22 +261,30 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
     np.testing.assert_array_equal(series(), expected)
     assert len(made) > 4
     monkeypatch.setattr(sampling, "ONE_PIECE", 0)
+    monkeypatch.setattr(sampling, "SPARE", 2)
     made.clear()
     np.testing.assert_array_equal(series(), expected)
     once = len(made)
-    for strip, kept, times in (((3, 4), 512 << 20, 1024), ((5, 5), 0, 7), ((8, 8), 1 << 20, 100)):
+    for longest, kept, times in ((16, 512 << 20, 1024), (32, 0, 7), (256, 1 << 20, 100)):
         monkeypatch.setattr(fluctuations, "TIMES_AT_ONCE", times)
         monkeypatch.setattr(fluctuations, "POINTS_AT_ONCE", times)
-        monkeypatch.setattr(sampling, "STRIP", strip)
+        monkeypatch.setattr(sampling, "LONGEST", longest)
         monkeypatch.setattr(sampling, "BYTES_KEPT", kept)
         monkeypatch.setattr(sampling, "TIMES_AT_ONCE", times)
         made.clear()
         np.testing.assert_array_equal(series(), expected)
-        assert set(made) == {((1 << strip[0]) + 3, (1 << strip[1]) + 3)}
-    monkeypatch.setattr(sampling, "STRIP", (3, 4))
+        assert {along for _, along in made} == {longest + 3}
+        assert len({across for across, _ in made}) <= 2  # as wide as each layer's path
+    monkeypatch.setattr(sampling, "LONGEST", 8)
     made.clear()
     series()
     assert len(made) > 4 * once
+    monkeypatch.setattr(sampling, "WIDEST", 0)
+    for square in ((3, 4), (5, 5)):
+        monkeypatch.setattr(sampling, "SQUARE", square)
+        made.clear()
+        np.testing.assert_array_equal(series(), expected)
+        assert set(made) == {((1 << square[0]) + 3, (1 << square[1]) + 3)}
     monkeypatch.setattr(sampling, "CELLS_IN_ALL", 300)
     with pytest.raises(ZondaError, match="lattice points of the turbulence"):
         series()
@@ -733,6 +741,7 @@ def test_units_and_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> 
     expected = series()
     monkeypatch.setattr(sampling, "ONE_PIECE", 0)
     np.testing.assert_array_equal(series(), expected)
+    monkeypatch.setattr(sampling, "WIDEST", 0)
     monkeypatch.setattr(sampling, "SQUARE", (6, 6))
     monkeypatch.setattr(sampling, "BYTES_KEPT", 1 << 20)
     np.testing.assert_array_equal(series(), expected)

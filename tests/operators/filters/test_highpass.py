@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -59,6 +61,21 @@ def test_rows_side_by_side_and_close_knots(n, frequency, taps):
         alone = x[20:21].astype(kind)
         plan.apply(alone)
         np.testing.assert_array_equal(alone[0], together[20])
+
+
+@pytest.mark.parametrize(
+    ("n", "cycles", "degree", "oversampling", "knots"),
+    [(20011, 41.5, 3, 24.0, 1000), (20011, 12.5, 2, 25.0, 315), (20011, 5.0, 1, 35.0, 175), (5000, 2.0, 0, 24.0, 48)],
+)
+def test_few_cosines_are_summed_to_what_transforms_make(n, cycles, degree, oversampling, knots):
+    """Both are sums of some 1000 float64 numbers: 1e-13 apart at most."""
+    plan = plan_highpass(n, cycles / n, degree, oversampling)
+    assert plan.knots == knots
+    rows = np.cumsum(np.random.default_rng(4).normal(0, 1.0, (3, n)), axis=1)
+    spread = plan._spread(rows)
+    expected = replace(plan, sums=())._low(spread)
+    assert plan.sums
+    assert np.abs(plan._low(spread) - expected).max() < 1e-13 * np.abs(expected).max()
 
 
 def test_oversampling_buys_accuracy():
