@@ -32,6 +32,7 @@ from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.stretches import stretches, untouched
 from zonda.core.tiles import TILE_DETECTORS
 from zonda.core.transforms import cosine_transform, fast_length
 
@@ -103,8 +104,8 @@ class HighpassFilter(Operator):
         return plan, np.flatnonzero(bad)
 
     def memory(self, observation: Observation) -> int:
-        """Spline weights in both precisions, and what they are made from."""
-        return 200 * observation.n_samples
+        """Spline weights in both precisions; where the full DCT is used, the polynomials and what they are made from."""
+        return 120 * observation.n_samples
 
     def traits(self, observation: Observation) -> Traits:
         """What passes."""
@@ -221,7 +222,9 @@ class HighpassPlan:
 
     def _weights_as(self, kind: np.dtype[Any]) -> Floats:
         if kind not in self._weights:
-            self._weights[kind] = self.weights.astype(kind)
+            groups, taps, _ = self.weights.shape
+            self._weights[kind] = untouched((groups, taps * GROUP), kind).reshape(self.weights.shape)
+            self._weights[kind][...] = self.weights
         return self._weights[kind]
 
     def _low(self, s: Floats) -> Floats:
@@ -270,11 +273,6 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     knots = fast_length(max(16, math.ceil(oversampling * cut / 2)), (2, 3, 5, 7, 11))
     if not cut or n < SHORTEST_STEP * knots:
         knots = 0
-    position = (np.arange(n) + 0.5) * (knots / n)
-    cell = position.astype(np.int64)
-    u = position - cell
-    v = 1.0 - u
-    weights = np.array([v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6])
     if not knots:
         powers = np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree)
         basis, none = np.linalg.qr(powers)[0].T.copy(), np.zeros((0, 0))
@@ -284,25 +282,45 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     third = (2 / knots) ** 2 / 3
     raw = np.array([np.ones_like(t), t, t * t - third, t**3 - 3 * third * t])[: degree + 1]
     spread = np.zeros_like(raw)
-    for c, s in zip(raw, spread, strict=True):
-        sampled = sum(weights[j] * c[cell + j] for j in range(4))
-        s += sum(np.bincount(cell + j, weights[j] * sampled, knots + 3) for j in range(4))
+    for some in stretches(n):
+        cell, weights = _around(some, n, knots)
+        time = (np.arange(some.start, some.stop) + 0.5) * (2 / n) - 1
+        edges = np.flatnonzero(np.diff(cell, prepend=-1))  # of the knots' intervals
+        for j, weight in enumerate(weights):
+            for s in spread:
+                s[cell[edges] + j] += np.add.reduceat(weight, edges)
+                weight *= time
     norm = np.linalg.inv(np.linalg.cholesky(raw @ spread.T))
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
-    first, grouped = _grouped(cell, weights)
+    first, grouped = _grouped(n, knots)
     return HighpassPlan(n, cut, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
 
 
-def _grouped(cell: NDArray[np.int64], weights: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """`HighpassPlan.first` and ``weights`` from each sample's interval (N,) and B at the four knots around it (4, N)."""
-    first = cell[::GROUP].copy()
-    group, place = np.divmod(np.arange(cell.size), GROUP)
-    later = cell - first[group]
-    grouped = np.zeros((first.size, 4 + int(later.max()), GROUP))
-    for j in range(4):
-        grouped[group, later + j, place] = weights[j]
-    return first, grouped if grouped.shape[1] > 4 else np.pad(grouped, ((0, 0), (0, 1), (0, 0)))
+def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], Floats]:
+    """Each sample's interval (m,), counted from the first knot, and B at the four knots around it (4, m)."""
+    position = (np.arange(samples.start, samples.stop) + 0.5) * (knots / n)
+    cell = position.astype(np.int64)
+    u = position - cell
+    v = 1.0 - u
+    return cell, np.array([v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6])
+
+
+def _grouped(n: int, knots: int) -> tuple[NDArray[np.int64], Floats]:
+    """`HighpassPlan.first` and ``weights`` of n samples."""
+    groups = -(-n // GROUP)
+    first = ((np.arange(groups) * GROUP + 0.5) * (knots / n)).astype(np.int64)
+    last = ((np.minimum(np.arange(1, groups + 1) * GROUP, n) - 0.5) * (knots / n)).astype(np.int64)
+    taps = max(5, 4 + int((last - first).max()))
+    grouped = untouched((groups, taps * GROUP)).reshape(groups, taps, GROUP)
+    for some in stretches(groups * GROUP):
+        cell, weights = _around(some, n, knots)
+        weights[:, max(n - some.start, 0) :] = 0.0
+        part = slice(some.start // GROUP, some.stop // GROUP)
+        later, each = cell.reshape(-1, GROUP) - first[part, None], weights.reshape(4, -1, GROUP)
+        for k in range(taps):
+            grouped[part, k] = sum(np.where(later == k - j, each[j], 0.0) for j in range(max(0, k + 4 - taps), min(4, k + 1)))
+    return first, grouped
 
 
 def bridge(row: Floats, gaps: NDArray[np.intp]) -> None:

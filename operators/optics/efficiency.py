@@ -299,7 +299,7 @@ def _knots(field: SmoothField, step: int, offset: float = 0.0) -> Floats:
     """
     cells = -(-field.n_samples // step)
     m, u, v = _cells(field, (np.arange(cells + (offset == 0), dtype=np.float64) + offset) * step)
-    value = (v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6)
+    value = (v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6)
     return _sum(field, m, value)
 
 
