@@ -104,7 +104,7 @@ class HighpassFilter(Operator):
         return plan, np.flatnonzero(bad)
 
     def memory(self, observation: Observation) -> int:
-        """Spline weights in both precisions; where the full DCT is used, the polynomials and what they are made from."""
+        """Spline weights; where the full DCT is used, the polynomials and what they are made from."""
         return 120 * observation.n_samples
 
     def traits(self, observation: Observation) -> Traits:
@@ -152,8 +152,8 @@ class HighpassPlan:
         M; 0: use the full DCT.
     first
         (n_group,): column of s and c, m + 1, of the first knot that the `GROUP` samples from GROUP g on reach.
-    weights
-        (n_group, 5 or 6, GROUP): B at that knot and those after it; 0 past the end.
+    taps
+        Knots from there on that the samples of a group reach, 5 or 6.
     modes
         (degree + 1, M + 3): coarse coefficients of orthonormal polynomials; `spread_modes`, the same shape, their s.
     polynomials
@@ -166,7 +166,7 @@ class HighpassPlan:
     cut: int
     knots: int
     first: NDArray[np.int64]
-    weights: Floats
+    taps: int
     modes: Floats
     spread_modes: Floats
     polynomials: Floats
@@ -206,25 +206,24 @@ class HighpassPlan:
         for start in range(0, len(rows), ABREAST):
             some = rows[start : start + ABREAST]
             sums = np.zeros((self._columns, ABREAST))
-            _spread(some, self.first, self._weights_as(rows.dtype), sums)
+            _spread(some, self.first, self.weights(rows.dtype), sums)
             s[start : start + ABREAST] = sums[: s.shape[1], : len(some)].T
         return s
 
     def _subtract(self, rows: Floats, coarse: Floats) -> None:
         c = np.zeros((len(rows), self._columns), rows.dtype)
         c[:, : coarse.shape[1]] = self._low(coarse)
-        _subtract(rows, self.first, self._weights_as(rows.dtype), c)
+        _subtract(rows, self.first, self.weights(rows.dtype), c)
 
     @property
     def _columns(self) -> int:
         """Of s and c, with those that weigh nothing."""
-        return self.knots - 1 + int(self.weights.shape[1])
+        return self.knots - 1 + self.taps
 
-    def _weights_as(self, kind: np.dtype[Any]) -> Floats:
+    def weights(self, kind: np.dtype[Any]) -> Floats:
+        """(n_group, taps, `GROUP`) of type ``kind``: B at the groups' knots at their samples; 0 past the end."""
         if kind not in self._weights:
-            groups, taps, _ = self.weights.shape
-            self._weights[kind] = untouched((groups, taps * GROUP), kind).reshape(self.weights.shape)
-            self._weights[kind][...] = self.weights
+            self._weights[kind] = _weights(self.n, self.knots, self.first, self.taps, kind)
         return self._weights[kind]
 
     def _low(self, s: Floats) -> Floats:
@@ -276,7 +275,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     if not knots:
         powers = np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree)
         basis, none = np.linalg.qr(powers)[0].T.copy(), np.zeros((0, 0))
-        return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), np.zeros((0, 5, GROUP)), none, none, basis, np.zeros(0))
+        return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), 5, none, none, basis, np.zeros(0))
     # polynomials through their B-spline coefficients: B * (t^2) = t^2 + 1/3, B * (t^3) = t^3 + t
     t = (np.arange(knots + 3) - 1) * (2 / knots) - 1
     third = (2 / knots) ** 2 / 3
@@ -293,8 +292,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     norm = np.linalg.inv(np.linalg.cholesky(raw @ spread.T))
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
-    first, grouped = _grouped(n, knots)
-    return HighpassPlan(n, cut, knots, first, grouped, norm @ raw, norm @ spread, np.zeros((0, n)), response)
+    return HighpassPlan(n, cut, knots, *_groups(n, knots), norm @ raw, norm @ spread, np.zeros((0, n)), response)
 
 
 def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], Floats]:
@@ -306,21 +304,24 @@ def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], Floa
     return cell, np.array([v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6])
 
 
-def _grouped(n: int, knots: int) -> tuple[NDArray[np.int64], Floats]:
-    """`HighpassPlan.first` and ``weights`` of n samples."""
-    groups = -(-n // GROUP)
-    first = ((np.arange(groups) * GROUP + 0.5) * (knots / n)).astype(np.int64)
-    last = ((np.minimum(np.arange(1, groups + 1) * GROUP, n) - 0.5) * (knots / n)).astype(np.int64)
-    taps = max(5, 4 + int((last - first).max()))
-    grouped = untouched((groups, taps * GROUP)).reshape(groups, taps, GROUP)
-    for some in stretches(groups * GROUP):
+def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
+    """`HighpassPlan.first` and ``taps``."""
+    begin = np.arange(0, n, GROUP)
+    first, last = (((at + 0.5) * (knots / n)).astype(np.int64) for at in (begin, np.minimum(begin + GROUP, n) - 1))
+    return first, max(5, 4 + int((last - first).max()))
+
+
+def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]) -> Floats:
+    """See `HighpassPlan.weights`."""
+    found: Floats = untouched((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
+    for some in stretches(first.size * GROUP):
         cell, weights = _around(some, n, knots)
         weights[:, max(n - some.start, 0) :] = 0.0
         part = slice(some.start // GROUP, some.stop // GROUP)
         later, each = cell.reshape(-1, GROUP) - first[part, None], weights.reshape(4, -1, GROUP)
         for k in range(taps):
-            grouped[part, k] = sum(np.where(later == k - j, each[j], 0.0) for j in range(max(0, k + 4 - taps), min(4, k + 1)))
-    return first, grouped
+            found[part, k] = sum(np.where(later == k - j, each[j], 0.0) for j in range(max(0, k + 4 - taps), min(4, k + 1)))
+    return found
 
 
 def bridge(row: Floats, gaps: NDArray[np.intp]) -> None:
