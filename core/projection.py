@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .stretches import stretches, untouched
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
@@ -33,10 +34,6 @@ GALACTIC = (
 """The rotation from ICRS to Galactic coordinates as astropy makes it, which takes half a second to import."""
 
 
-STRETCH = 1 << 14
-"""Instants that are worked on at a time."""
-
-
 def rotation_matrices(quaternions: Floats) -> Floats:
     """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x, y, z, w; they need not be normalized."""
     return np.moveaxis(_rotations(quaternions), 2, 0)
@@ -45,7 +42,7 @@ def rotation_matrices(quaternions: Floats) -> Floats:
 def _rotations(quaternions: Floats) -> Floats:
     """As `rotation_matrices`, (3, 3, n): each element lies in one piece."""
     found = np.empty((3, 3, len(quaternions)))
-    for s in _stretches(len(quaternions)):
+    for s in stretches(len(quaternions)):
         x, y, z, w = _normalized(quaternions[s])
         found[0, 0, s], found[0, 1, s], found[0, 2, s] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
         found[1, 0, s], found[1, 1, s], found[1, 2, s] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
@@ -55,16 +52,11 @@ def _rotations(quaternions: Floats) -> Floats:
 
 def boresights(quaternions: Floats) -> Floats:
     """Unit vectors (3, n) that boresight quaternions (n, 4) look at: the last column of `rotation_matrices`."""
-    found = np.empty((3, len(quaternions)))
-    for s in _stretches(len(quaternions)):
+    found = untouched((3, len(quaternions)))
+    for s in stretches(len(quaternions)):
         x, y, z, w = _normalized(quaternions[s])
         found[0, s], found[1, s], found[2, s] = 2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)
     return found
-
-
-def _stretches(n: int) -> list[slice]:
-    """Of ``n`` instants, so that what is only used for a moment stays in the cache: fresh memory takes longer than the sums."""
-    return [slice(k, k + STRETCH) for k in range(0, n, STRETCH)]
 
 
 def _normalized(quaternions: Floats) -> Floats:
@@ -151,8 +143,8 @@ def homographies(quaternions: Floats, wcs: WCS | TangentWcs) -> Floats:
     Each coefficient lies in one piece (Fortran's order).
     """
     matrix = pixel_matrix(wcs)
-    h = np.empty((9, len(quaternions)))
-    for s in _stretches(len(quaternions)):
+    h = untouched((9, len(quaternions)))
+    for s in stretches(len(quaternions)):
         turn = _rotations(quaternions[s])
         for row in range(3):
             for column, (sign, axis) in enumerate(((-1, 1), (-1, 0), (1, 2))):

@@ -17,7 +17,7 @@ from .forecast import spares
 from .layout import read
 from .operator import Operator
 from .settings import Settings
-from .streams import untouched
+from .stretches import untouched
 
 SHARE = 4
 """Of the memory for streams and blocks, one part in so many may hold what is kept for later runs."""

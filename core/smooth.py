@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import fused
-from .transforms import spline_filter
 
 Floats = NDArray[np.floating]
 
@@ -33,6 +32,9 @@ LINES_KEPT = 1 << 18
 SPLINE_MARGIN = 12
 """Values on either side that `spline_coefficients` uses up: its filter is cut where it has fallen to 1.4e-7."""
 
+REACH = 28
+"""Values on either side beyond which the filter is below rounding: 0.27^28 = 1e-16."""
+
 
 def spline_coefficients(values: Floats, dtype: type = np.float64) -> Floats:
     """Cubic B-spline coefficients of rows of values (n, m + 2 `SPLINE_MARGIN`): (n, m), each from its neighbours alone.
@@ -40,14 +42,22 @@ def spline_coefficients(values: Floats, dtype: type = np.float64) -> Floats:
     A finite filter, normalized to unit sum, so that a coefficient has the same bits wherever the rows begin.
     """
     out: Floats = np.empty((values.shape[0], values.shape[1] - 2 * SPLINE_MARGIN), dtype)
-    _prefilter(np.ascontiguousarray(values, np.float64), _inverse_taps(), out)
+    _prefilter(np.ascontiguousarray(values, np.float64), _inverse_taps(SPLINE_MARGIN), out)
     return out
 
 
-@lru_cache(maxsize=1)
-def _inverse_taps() -> NDArray[np.float64]:
-    """One-sided inverse of (1, 4, 1) / 6, (`SPLINE_MARGIN` + 1,)."""
-    taps = np.sqrt(3.0) * (np.sqrt(3.0) - 2.0) ** np.arange(SPLINE_MARGIN + 1)
+def interpolating(values: Floats) -> NDArray[np.float64]:
+    """Cubic B-spline coefficients (n, m) of rows of values (n, m), mirrored about their first and their last: exact."""
+    out = np.empty(values.shape)
+    rows = np.pad(np.ascontiguousarray(values, np.float64), ((0, 0), (REACH, REACH)), mode="reflect")
+    _prefilter(rows, _inverse_taps(REACH), out)
+    return out
+
+
+@lru_cache(maxsize=2)
+def _inverse_taps(reach: int) -> NDArray[np.float64]:
+    """One-sided inverse of (1, 4, 1) / 6, (``reach`` + 1,)."""
+    taps = np.sqrt(3.0) * (np.sqrt(3.0) - 2.0) ** np.arange(reach + 1)
     return np.asarray(taps / (taps[0] + 2 * taps[1:].sum()), np.float64)
 
 
@@ -110,8 +120,7 @@ class SmoothField:
         margin, odd = divmod(values.shape[1] - wanted, 2)
         if margin < 0 or odd:
             raise ValueError(f"values must have {wanted} + 2 * margin columns, got {values.shape[1]}")
-        filtered = spline_filter(values)
-        kept = np.ascontiguousarray(filtered[:, margin : margin + wanted])
+        kept = np.ascontiguousarray(interpolating(values)[:, margin : margin + wanted])
         return cls(np.ascontiguousarray(weights, dtype), kept.astype(dtype), step, n_samples)
 
     @classmethod

@@ -21,7 +21,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -30,6 +29,7 @@ import numpy as np
 from .data import Floats, Observation, Stream
 from .errors import OutputError, PipelineError
 from .smooth import SmoothField
+from .stretches import untouched
 
 if TYPE_CHECKING:
     from .blocks import Segment
@@ -167,19 +167,6 @@ class StreamMadeAgain(Stream):
     def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
         """See `Stream.sweep`."""
         return self._sweeper(work)
-
-
-def untouched(shape: tuple[int, int], dtype: Any) -> NDArray[Any]:
-    """An array of zeros, in pages of ordinary size.
-
-    numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
-    """
-    size = shape[0] * shape[1] * np.dtype(dtype).itemsize
-    if size and hasattr(mmap, "MAP_ANONYMOUS"):
-        with suppress(OSError):  # refused: numpy's MemoryError says so
-            pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-            return np.frombuffer(pages, dtype).reshape(shape)
-    return np.zeros(shape, dtype)
 
 
 class Store:

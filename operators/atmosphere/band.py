@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.radiation import T_CMB, rayleigh_jeans
+from zonda.core.stretches import stretches
 
 from .absorption import AbsorptionTable, CrossSections
 from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission
@@ -172,19 +173,22 @@ class BandAtmosphere:
         if pwv.ndim:
             pwv, elevation = np.broadcast_arrays(pwv, elevation)
         basis = _chebyshev(self._x(pwv).ravel(), self._coefficients.shape[1])
-        return self._contract(which, basis, elevation).reshape(elevation.shape)
+        return self._contract(which, basis, elevation)
 
     def _difference(self, which: int, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Array:
         pwv, dpwv, elevation = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (pwv, dpwv, elevation)))
         start, stop = self._x(pwv).ravel(), self._x(pwv + dpwv).ravel()
         step = (2 * np.log1p(dpwv / (self._scale + pwv)) / self._u_max).ravel()
         basis = _chebyshev_difference(start, stop, step, self._coefficients.shape[1])
-        return self._contract(which, basis, elevation).reshape(pwv.shape)
+        return self._contract(which, basis, elevation)
 
     def _contract(self, which: int, basis: Array, elevation: Array) -> Array:
         """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the number of threads."""
-        other = _chebyshev(self._y(elevation).ravel(), self._coefficients.shape[2])
-        return np.asarray(np.sum(np.einsum("ij,in->jn", self._coefficients[which], basis) * other, axis=0))
+        y, found, along = self._y(elevation).ravel(), np.empty(elevation.size), self._coefficients[which]
+        for some in stretches(len(y)):
+            one, other = basis[:, some] if basis.shape[1] > 1 else basis, _chebyshev(y[some], along.shape[1])
+            found[some] = np.sum(np.einsum("ij,in->jn", along, one) * other, axis=0)
+        return found.reshape(elevation.shape)
 
 
 class _BandTransfer:

@@ -27,6 +27,7 @@ from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.smooth import SmoothField
+from zonda.core.stretches import stretches
 
 from . import weather
 from .absorption import AbsorptionTable
@@ -467,16 +468,18 @@ def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
 
 
 def _check_pointing(observation: Observation) -> None:
-    quaternions = observation.boresight_azel
-    if not np.isfinite(quaternions.sum()):
-        bad = np.flatnonzero(~np.isfinite(quaternions).all(axis=1))
-        raise PointingError(
-            f"the boresight of sample {bad[0]} is not a number ({len(bad)} of {observation.n_samples} samples)",
-            place=observation.name,
-            cure="repair the pointing, or leave these samples out",
-        )
-    x, y = quaternions[:, 0], quaternions[:, 1]
-    if 1 - 2 * (x * x + y * y).max() > math.sin(ELEVATION_MIN) + 1e-9:
+    quaternions, lowest = observation.boresight_azel, 1.0
+    for some in stretches(observation.n_samples):
+        x, y, *_ = part = quaternions[some].T
+        if not np.isfinite(part).all():
+            bad = np.flatnonzero(~np.isfinite(quaternions).all(axis=1))
+            raise PointingError(
+                f"the boresight of sample {bad[0]} is not a number ({len(bad)} of {observation.n_samples} samples)",
+                place=observation.name,
+                cure="repair the pointing, or leave these samples out",
+            )
+        lowest = min(lowest, 1 - 2 * float((x * x + y * y).max()))
+    if lowest > math.sin(ELEVATION_MIN) + 1e-9:
         return
     elevation = observation.elevation
     if 0 <= elevation.min() < ELEVATION_MIN:

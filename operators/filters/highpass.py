@@ -33,6 +33,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.smooth import product
+from zonda.core.stretches import stretches, untouched
 from zonda.core.tiles import TILE_DETECTORS
 from zonda.core.transforms import cosine_transform, fast_length
 
@@ -124,8 +125,8 @@ class HighpassFilter(Operator):
         return plan, np.flatnonzero(bad)
 
     def memory(self, observation: Observation) -> int:
-        """Spline weights in both precisions, and what they are made from."""
-        return 200 * observation.n_samples
+        """Spline weights; where the full DCT is used, the polynomials and what they are made from."""
+        return 120 * observation.n_samples
 
     def traits(self, observation: Observation) -> Traits:
         """What passes."""
@@ -175,8 +176,8 @@ class HighpassPlan:
         M; 0: use the full DCT.
     first
         (n_group,): column of s and c, m + 1, of the first knot that the `GROUP` samples from GROUP g on reach.
-    weights
-        (n_group, 5 or 6, GROUP): B at that knot and those after it; 0 past the end.
+    taps
+        Knots from there on that the samples of a group reach, 5 or 6.
     modes
         (degree + 1, M + 3): coarse coefficients of orthonormal polynomials; `spread_modes`, the same shape, their s.
     polynomials
@@ -191,7 +192,7 @@ class HighpassPlan:
     cut: int
     knots: int
     first: NDArray[np.int64]
-    weights: Floats
+    taps: int
     modes: Floats
     spread_modes: Floats
     polynomials: Floats
@@ -232,23 +233,24 @@ class HighpassPlan:
         for start in range(0, len(rows), ABREAST):
             some = rows[start : start + ABREAST]
             sums = np.zeros((self._columns, ABREAST))
-            _spread(some, self.first, self._weights_as(rows.dtype), sums)
+            _spread(some, self.first, self.weights(rows.dtype), sums)
             s[start : start + ABREAST] = sums[: s.shape[1], : len(some)].T
         return s
 
     def _subtract(self, rows: Floats, coarse: Floats) -> None:
         c = np.zeros((len(rows), self._columns), rows.dtype)
         c[:, : coarse.shape[1]] = self._low(coarse)
-        _subtract(rows, self.first, self._weights_as(rows.dtype), c)
+        _subtract(rows, self.first, self.weights(rows.dtype), c)
 
     @property
     def _columns(self) -> int:
         """Of s and c, with those that weigh nothing."""
-        return self.knots - 1 + int(self.weights.shape[1])
+        return self.knots - 1 + self.taps
 
-    def _weights_as(self, kind: np.dtype[Any]) -> Floats:
+    def weights(self, kind: np.dtype[Any]) -> Floats:
+        """(n_group, taps, `GROUP`) of type ``kind``: B at the groups' knots at their samples; 0 past the end."""
         if kind not in self._weights:
-            self._weights[kind] = self.weights.astype(kind)
+            self._weights[kind] = _weights(self.n, self.knots, self.first, self.taps, kind)
         return self._weights[kind]
 
     def _low(self, s: Floats) -> Floats:
@@ -304,29 +306,29 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     knots = fast_length(max(16, math.ceil(oversampling * cut / 2)), (2, 3, 5, 7, 11))
     if not cut or n < SHORTEST_STEP * knots:
         knots = 0
-    position = (np.arange(n) + 0.5) * (knots / n)
-    cell = position.astype(np.int64)
-    u = position - cell
-    v = 1.0 - u
-    weights = np.array([v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6])
     if not knots:
         powers = np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree)
         basis, none = np.linalg.qr(powers)[0].T.copy(), np.zeros((0, 0))
-        return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), np.zeros((0, 5, GROUP)), none, none, basis, np.zeros(0))
+        return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), 5, none, none, basis, np.zeros(0))
     # polynomials through their B-spline coefficients: B * (t^2) = t^2 + 1/3, B * (t^3) = t^3 + t
     t = (np.arange(knots + 3) - 1) * (2 / knots) - 1
     third = (2 / knots) ** 2 / 3
     raw = np.array([np.ones_like(t), t, t * t - third, t**3 - 3 * third * t])[: degree + 1]
     spread = np.zeros_like(raw)
-    for c, s in zip(raw, spread, strict=True):
-        sampled = sum(weights[j] * c[cell + j] for j in range(4))
-        s += sum(np.bincount(cell + j, weights[j] * sampled, knots + 3) for j in range(4))
+    for some in stretches(n):
+        cell, weights = _around(some, n, knots)
+        time = (np.arange(some.start, some.stop) + 0.5) * (2 / n) - 1
+        edges = np.flatnonzero(np.diff(cell, prepend=-1))  # of the knots' intervals
+        for j, weight in enumerate(weights):
+            for s in spread:
+                s[cell[edges] + j] += np.add.reduceat(weight, edges)
+                weight *= time
     norm = np.linalg.inv(np.linalg.cholesky(raw @ spread.T))
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
     modes, spread = norm @ raw, norm @ spread
     sums = _sums(modes, spread, response) if 0 < cut <= FEW else ()
-    return HighpassPlan(n, cut, knots, *_grouped(cell, weights), modes, spread, np.zeros((0, n)), response, sums)
+    return HighpassPlan(n, cut, knots, *_groups(n, knots), modes, spread, np.zeros((0, n)), response, sums)
 
 
 def _sums(modes: Floats, spread: Floats, response: Floats) -> tuple[tuple[Floats, Floats], ...]:
@@ -349,15 +351,33 @@ def _sums(modes: Floats, spread: Floats, response: Floats) -> tuple[tuple[Floats
     return tuple(found)
 
 
-def _grouped(cell: NDArray[np.int64], weights: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """`HighpassPlan.first` and ``weights`` from each sample's interval (N,) and B at the four knots around it (4, N)."""
-    first = cell[::GROUP].copy()
-    group, place = np.divmod(np.arange(cell.size), GROUP)
-    later = cell - first[group]
-    grouped = np.zeros((first.size, 4 + int(later.max()), GROUP))
-    for j in range(4):
-        grouped[group, later + j, place] = weights[j]
-    return first, grouped if grouped.shape[1] > 4 else np.pad(grouped, ((0, 0), (0, 1), (0, 0)))
+def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], Floats]:
+    """Each sample's interval (m,), counted from the first knot, and B at the four knots around it (4, m)."""
+    position = (np.arange(samples.start, samples.stop) + 0.5) * (knots / n)
+    cell = position.astype(np.int64)
+    u = position - cell
+    v = 1.0 - u
+    return cell, np.array([v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6])
+
+
+def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
+    """`HighpassPlan.first` and ``taps``."""
+    begin = np.arange(0, n, GROUP)
+    first, last = (((at + 0.5) * (knots / n)).astype(np.int64) for at in (begin, np.minimum(begin + GROUP, n) - 1))
+    return first, max(5, 4 + int((last - first).max()))
+
+
+def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]) -> Floats:
+    """See `HighpassPlan.weights`."""
+    found: Floats = untouched((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
+    for some in stretches(first.size * GROUP):
+        cell, weights = _around(some, n, knots)
+        weights[:, max(n - some.start, 0) :] = 0.0
+        part = slice(some.start // GROUP, some.stop // GROUP)
+        later, each = cell.reshape(-1, GROUP) - first[part, None], weights.reshape(4, -1, GROUP)
+        for k in range(taps):
+            found[part, k] = sum(np.where(later == k - j, each[j], 0.0) for j in range(max(0, k + 4 - taps), min(4, k + 1)))
+    return found
 
 
 def bridge(row: Floats, gaps: NDArray[np.intp]) -> None:

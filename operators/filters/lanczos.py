@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.stretches import stretches, untouched
+
 from .gram import Gram, directions, near_the_mean
 
 Floats = NDArray[np.float64]
@@ -111,13 +113,13 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
         if exhausted or closed or (enough and converged):
             k = min(wanted, m)
             detectors = np.array(vectors[:, :k].T @ space)
-            series = np.array(vectors[:, :k].T @ np.array(times))
+            series = _combined(vectors[:, :k].T, times)
             rank = int(np.count_nonzero(values > floor))
             if not exhausted:
                 rank += 1
             elif rank < n:  # G squares what is small: look at the remainder itself
                 seen = vectors[:, :rank].T
-                rank += gram.left(seen @ space, seen @ np.array(times)) > NOTHING * gram.energy
+                rank += gram.left(seen @ space, _combined(seen, times)) > NOTHING * gram.energy
             return Ritz(values, detectors, series, residuals[:k], rank, m)
         if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
             rest = gram.use * directions(m, gram.use.size)
@@ -125,3 +127,11 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
                 rest = rest - (space @ rest) @ space
             beta = float(np.linalg.norm(rest))
         basis.append(rest / beta)
+
+
+def _combined(shares: Floats, times: list[Floats]) -> Floats:
+    """Sums (k, n_samp) of series with their ``shares`` (k, m)."""
+    found = untouched((len(shares), times[0].size))
+    for some in stretches(times[0].size):
+        found[:, some] = shares @ np.array([series[some] for series in times])
+    return found

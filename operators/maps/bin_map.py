@@ -21,7 +21,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
-from zonda.core.streams import untouched
+from zonda.core.stretches import untouched
 from zonda.core.tiles import TILE_SAMPLES
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
+from zonda.core.stretches import stretches
 from zonda.core.tangent import TangentWcs
 
 if TYPE_CHECKING:
@@ -108,24 +109,30 @@ def covering_extent(observations: Sequence[Observation], centre: tuple[float, fl
     matrix = pixel_matrix(tangent_wcs(centre, 1.0, (1, 1), frame))
     half = np.zeros(2)
     for observation in observations:
-        x, y, ahead = matrix @ boresights(observation.boresight_radec)
-        if (ahead < math.cos(math.radians(75.0))).any():
-            raise InputError(
-                f"{observation.name} reaches more than 75 deg from the map centre, too far for a tangent plane",
-                place="map grid",
-                cure="give width and height, or nside for a HEALPix map",
-            )
-        offset = np.stack([x, y]) / ahead
-        reach = observation.focalplane.radius
-        far = np.hypot(*offset) * reach
-        # a circle of radius r around a point at tangent distance s appears at most r (1 + s^2) / (1 - r s) wide
-        if (far > 0.5).any():
-            raise InputError(
-                "the field of view is too wide for a tangent plane", place="map grid", cure="give nside for a HEALPix map"
-            )
-        grown = reach * (1 + (offset**2).sum(axis=0)) / (1 - far)
-        half = np.maximum(half, (np.abs(offset) + grown).max(axis=1))
+        for some in stretches(observation.n_samples):
+            half = np.maximum(half, _extent(observation, some, matrix))
     return float(half[0]), float(half[1])
+
+
+def _extent(observation: Observation, samples: slice, matrix: Floats) -> Floats:
+    """(2,) how far from the centre some samples reach; ``matrix`` turns ICRS directions towards it."""
+    x, y, ahead = matrix @ boresights(observation.boresight_radec[samples])
+    if (ahead < math.cos(math.radians(75.0))).any():
+        raise InputError(
+            f"{observation.name} reaches more than 75 deg from the map centre, too far for a tangent plane",
+            place="map grid",
+            cure="give width and height, or nside for a HEALPix map",
+        )
+    offset = np.stack([x, y]) / ahead
+    reach = observation.focalplane.radius
+    far = np.hypot(*offset) * reach
+    # a circle of radius r around a point at tangent distance s appears at most r (1 + s^2) / (1 - r s) wide
+    if (far > 0.5).any():
+        raise InputError(
+            "the field of view is too wide for a tangent plane", place="map grid", cure="give nside for a HEALPix map"
+        )
+    grown = reach * (1 + (offset**2).sum(axis=0)) / (1 - far)
+    return np.asarray((np.abs(offset) + grown).max(axis=1))
 
 
 def covered_healpix(observations: Sequence[Observation], nside: int, nest: bool, frame: str) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from zonda.core.columns import prefetch
 from zonda.core.errors import PipelineError
-from zonda.core.streams import untouched
+from zonda.core.stretches import untouched
 
 from .grid import Grid, TangentGrid
 

@@ -12,8 +12,10 @@ M, tens of kelvin, stays beside the stream as a float64 `SmoothField`; everythin
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -25,7 +27,7 @@ from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
 from zonda.core.operator import Operator
 from zonda.core.random import normals
-from zonda.core.smooth import Series, SmoothField, series_into
+from zonda.core.smooth import Series, SmoothField, interpolating, series_into
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -206,7 +208,7 @@ def _normals(observation: Observation, *names: str) -> Floats:
 
 def _flag_opaque(label: str, observation: Observation, transmission: SmoothField) -> None:
     """Flag detectors that are opaque most of the time, and the samples at which one of the others is."""
-    knots = _knots(transmission, transmission.step)[0]
+    knots = _knots(transmission, transmission.step)
     dead, cell = np.zeros(len(transmission.weights), bool), np.zeros(knots.shape[1], bool)
     for rows in _some(len(dead)):
         opaque = ~(transmission.weights[rows] @ knots >= OPAQUE)
@@ -264,20 +266,19 @@ def _few(weights: NDArray[np.floating], use: NDArray[np.intp]) -> NDArray[np.int
 
 def _ratio(above: SmoothField, below: SmoothField, step: int, rows: NDArray[np.intp]) -> Floats:
     """above / max(below, `OPAQUE`) of the detectors ``rows`` at the coarse times; before and behind, its slopes at the ends."""
-    (high, high_slope), (low, low_slope) = _knots(above, step), _knots(below, step)
-    one, other = above.weights[rows], below.weights[rows]
-    top, bottom = one @ high, other @ low
-    clear = bottom > OPAQUE
-    bottom = np.maximum(bottom, OPAQUE)
-    ratio = top / bottom
-    ends = [0, -1]
-    slope = one @ high_slope[:, ends] - ratio[:, ends] * (other @ low_slope[:, ends]) * clear[:, ends]
-    return np.hstack([slope[:, :1] / bottom[:, :1], ratio, slope[:, 1:] / bottom[:, -1:]])
+    one, other, ends = above.weights[rows], below.weights[rows], [0, -1]
+    bottom = other @ _knots(below, step)
+    clear = bottom[:, ends] > OPAQUE
+    np.maximum(bottom, OPAQUE, out=bottom)
+    ratio = one @ _knots(above, step) / bottom
+    slope = one @ _end_slopes(above, step) - ratio[:, ends] * (other @ _end_slopes(below, step)) * clear
+    slope /= bottom[:, ends]
+    return np.hstack([slope[:, :1], ratio, slope[:, 1:]])
 
 
 def _error(field: SmoothField, above: SmoothField, below: SmoothField, step: int, use: NDArray[np.intp]) -> float:
     """Largest difference between ``field`` and above / below at the cells' midpoints, over the detectors ``use``."""
-    middle, top, bottom = (_knots(f, step, 0.5)[0] for f in (field, above, below))
+    middle, top, bottom = (_knots(f, step, 0.5) for f in (field, above, below))
     worst = 0.0
     for part in _some(len(use)):
         rows = use[part]
@@ -291,44 +292,47 @@ def _some(n: int) -> list[slice]:
     return [slice(k, min(k + AT_ONCE, n)) for k in range(0, n, AT_ONCE)]
 
 
-def _knots(field: SmoothField, step: int, offset: float = 0.0) -> tuple[Floats, Floats]:
-    """Node values and their derivatives per ``step``, at samples (j + offset) * step. Each (n_node, n_cell + 1 or n_cell).
+def _knots(field: SmoothField, step: int, offset: float = 0.0) -> Floats:
+    """Node values at samples (j + offset) * step: (n_node, n_cell + 1 or n_cell).
 
     ``step`` divides the field's own; all cells' edges (offset 0), or one point inside each (0 < offset < 1).
     """
     cells = -(-field.n_samples // step)
-    position = (np.arange(cells + (offset == 0)) + offset) * step / field.step
-    m = np.minimum(position.astype(np.int64), field.coefficients.shape[1] - 4)
-    u = position - m
-    v = 1.0 - u
-    value = (v**3 / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u**3 / 6)
+    m, u, v = _cells(field, (np.arange(cells + (offset == 0), dtype=np.float64) + offset) * step)
+    value = (v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6)
+    return _sum(field, m, value)
+
+
+def _end_slopes(field: SmoothField, step: int) -> Floats:
+    """Derivatives of the node values per ``step`` at the first and at the last of `_knots`: (n_node, 2)."""
+    m, u, v = _cells(field, np.array([0.0, -(-field.n_samples // step) * step]))
     slope = (-v * v / 2, u * (3 * u - 4) / 2, -v * (3 * v - 4) / 2, u * u / 2)
-    c = field.coefficients.astype(np.float64)
-    values: Any = sum(w * c[:, m + j] for j, w in enumerate(value))
-    slopes: Any = sum(w * c[:, m + j] for j, w in enumerate(slope))
-    return values, slopes * (step / field.step)
+    return _sum(field, m, slope) * (step / field.step)
+
+
+def _cells(field: SmoothField, sample: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """The cells that samples lie in, the way into them and what is left of it."""
+    position = sample / field.step
+    m = np.minimum(position.astype(np.int64), field.coefficients.shape[1] - 4)
+    return m, position - m, 1.0 - (position - m)
+
+
+def _sum(field: SmoothField, m: NDArray[np.int64], weights: Sequence[Floats]) -> Floats:
+    c = field.coefficients.astype(np.float64, copy=False)
+    return np.asarray(sum(w * c[:, m + j] for j, w in enumerate(weights)))
 
 
 def _spline(known: Floats) -> Floats:
     """B-spline coefficients (n_node, k) from (first slope, k - 2 values, last slope) per node: the complete cubic spline.
 
-    With c_0 and c_(k-1) taken from the slopes, (c_2 - c_0) / 2, what is left of (c_(j-1) + 4 c_j + c_(j+1)) / 6 = v_j is
-    tridiagonal: Gaussian elimination, all nodes at once.
+    The spline of the mirrored values has no slope at its ends. What gives it one is zero at all knots:
+    c_j = A z^j + B z^(m - j), z = sqrt(3) - 2, solves c_(j-1) + 4 c_j + c_(j+1) = 0 for knots 0 .. m, with
+    (c_1 - c_-1) / 2 = sqrt(3) (A - z^m B).
     """
-    slopes = known[:, [0, -1]]
-    c = np.array(known.T, np.float64)
-    c[1:-1] *= 6
-    c[1], c[-2] = c[1] + 2 * slopes[:, 0], c[-2] - 2 * slopes[:, 1]
-    upper = np.ones(len(c))
-    upper[1] = 2.0  # of the first equation; the last has it below its diagonal
-    pivot = 4.0
-    c[1] /= pivot
-    for j in range(2, len(c) - 1):
-        below = 2.0 if j == len(c) - 2 else 1.0
-        upper[j - 1] /= pivot
-        pivot = 4.0 - below * upper[j - 1]
-        c[j] = (c[j] - below * c[j - 1]) / pivot
-    for j in range(len(c) - 3, 0, -1):
-        c[j] -= upper[j] * c[j + 1]
-    c[0], c[-1] = c[2] - 2 * slopes[:, 0], c[-3] + 2 * slopes[:, 1]
-    return np.ascontiguousarray(c.T)
+    first, last, m = known[:, :1], known[:, -1:], known.shape[1] - 3
+    z = math.sqrt(3) - 2
+    far = z**m
+    a, b = ((one - far * other) / (math.sqrt(3) * (1 - far * far)) for one, other in ((first, last), (-last, -first)))
+    falling = z ** np.arange(-1.0, m + 2)
+    mirrored = np.pad(interpolating(known[:, 1:-1]), ((0, 0), (1, 1)), mode="reflect")
+    return np.asarray(mirrored + a * falling + b * falling[::-1])

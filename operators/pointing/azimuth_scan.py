@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
 from zonda.core.errors import PointingError
+from zonda.core.stretches import stretches
 
 from .base import Pointing
-from .transform import CelestialTransform, unit_vectors
+from .transform import CelestialTransform, series, unit_vectors
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
@@ -81,8 +82,11 @@ class PointingBackAndForth(Pointing):
                 place=self.label,
                 cure="lower throw, or choose a lower elevation",
             )
-        x, _ = self.path(seconds)
-        return unit_vectors(longitude - (x + offset[0]) / math.cos(elevation), np.full(len(seconds), elevation))
+        found = series(3, len(seconds))
+        for some in stretches(len(seconds)):
+            x, _ = self.path(seconds[some])
+            found[some] = unit_vectors(longitude - (x + offset[0]) / math.cos(elevation), np.full(len(x), elevation))
+        return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
         if not self.flag_turnarounds:

@@ -19,12 +19,13 @@ from zonda.core.errors import PointingError
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.random import normals, stream_key
+from zonda.core.stretches import stretches
 
 from .limits import Moved, check_elevation, excess, lower_elevation
 from .motion import POINTS, Peak, Quantity, motion, rate_text
 from .observed import centre_of, observed, state_times
 from .samples_per_beam import Sampled
-from .transform import CelestialTransform, Track, unit_vectors
+from .transform import CelestialTransform, Track, series, unit_vectors
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -102,15 +103,22 @@ class Pointing(Operator):
     # -- what a subclass gives --
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
-        """Offsets (x, y) [rad] from the scan's centre on its tangent plane, each (n,)."""
+        """Offsets (x, y) [rad] from the scan's centre on its tangent plane, each (n,).
+
+        Every instant by itself: of a long scan ``seconds`` are some.
+        """
         raise NotImplementedError
 
     def directions(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
         """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the scan."""
-        if target.frame == "horizontal":
-            x, y = self.path(seconds)
-            return _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])
-        return transform.horizontal(self._on_the_sky(target, offset, seconds), seconds)
+        found = series(3, len(seconds))
+        for some in stretches(len(seconds)):
+            if target.frame == "horizontal":
+                x, y = self.path(seconds[some])
+                found[some] = _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])
+            else:
+                found[some] = transform.horizontal(self._on_the_sky(target, offset, seconds[some]), seconds[some])
+        return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
         """Sample flags (n,); nonzero means: do not use."""
@@ -132,7 +140,7 @@ class Pointing(Operator):
 
     def _track(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Track:
         if type(self).directions is Pointing.directions and target.frame != "horizontal":
-            return transform.track(self._on_the_sky(target, offset, seconds), seconds)
+            return transform.track(lambda some: self._on_the_sky(target, offset, some), seconds)
         horizontal = self.directions(transform, target, offset, seconds)
         return Track(horizontal, *transform.boresight(horizontal, seconds))
 

@@ -1,9 +1,11 @@
 """How fast a scan moves: speed, acceleration and jerk of the axes, and of the beam on the sky, from its track.
 
 Finite differences of the track over a step h are means of the derivatives over at most k h: they never exceed the largest
-derivative (mean value theorem), and fall short of it by O(h^2). What is missing is estimated from steps h and 2 h (Richardson):
+derivative (mean value theorem), and fall short of it by O(h^2). What is missing is estimated from steps h and 2 h (Richardson),
+and from the second difference c of D_h at its largest, a mean over k h that may stand half a step beside the peak (h may be such
+a part of a period that neither step meets one):
 
-    error = |max D_h - max D_2h| / 3                                                                        (1)
+    error = max(|max D_h - max D_2h| / 3, c / 8 + k c / 24)                                                 (1)
 
 The step is halved until the error is below `ACCURACY` for every figure that has a limit.
 """
@@ -87,7 +89,9 @@ def _peaks(track: Floats, step: float) -> dict[Quantity, Peak]:
     for (axis, order), rates in fine.items():
         k = int(rates.argmax())
         largest = float(rates[k])
-        error = abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3
+        around = rates[max(k - 1, 0) : k + 2]
+        bend = 2 * largest - float(around[0] + around[-1]) if len(around) == 3 else 0.0
+        error = max(abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3, bend * (3 + order) / 24)
         there = float(elevation[min(k + order // 2, len(elevation) - 1)])
         found[axis, order] = Peak(largest, (k + order / 2) * step, there, error)
     return found

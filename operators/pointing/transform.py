@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import PointingError
+from zonda.core.stretches import stretches, untouched
 
 from .earth_orientation import orientation
 
@@ -43,8 +45,6 @@ SIDEREAL_RATE = 2 * np.pi * 1.00273781191135448 / 86400
 """Rate of the Earth rotation angle, rad/s of UT1."""
 NODE_SPACING = 600.0
 """First spacing of the nodes, s: leaves some 1e-12 rad."""
-CHUNK = 16384
-"""Samples transformed at once: temporaries stay in the cache."""
 CONVERGED = 5e-11
 """Last step [rad] of an inversion: what it leaves is 1e-4 of that."""
 
@@ -120,7 +120,7 @@ class CelestialTransform:
     def horizontal(self, icrs: Floats, seconds: Floats) -> Floats:
         """Directions (n, 3) north, west, up of ICRS unit vectors (n, 3) or (3,) at ``seconds`` (n,)."""
         out = np.empty((len(seconds), 3))
-        for part in _chunks(len(seconds)):
+        for part in stretches(len(seconds)):
             now = self._interpolated(seconds[part])
             observed = _observed(icrs if icrs.ndim == 1 else icrs[part], now)
             out[part] = rotate(self._rotation(now, seconds[part]), observed)
@@ -129,7 +129,7 @@ class CelestialTransform:
     def icrs(self, horizontal: Floats, seconds: Floats) -> Floats:
         """ICRS unit vectors (n, 3) of horizontal directions (n, 3) or (3,) at ``seconds`` (n,)."""
         out = np.empty((len(seconds), 3))
-        for part in _chunks(len(seconds)):
+        for part in stretches(len(seconds)):
             now = self._interpolated(seconds[part])
             turn = conjugate(self._rotation(now, seconds[part]))
             out[part] = _natural(rotate(turn, horizontal if horizontal.ndim == 1 else horizontal[part]), now)
@@ -140,27 +140,31 @@ class CelestialTransform:
 
         Signs are such that neighbouring samples have neighbouring quaternions.
         """
-        azel, radec = upright(horizontal), np.empty((4, len(seconds))).T
-        for part in _chunks(len(seconds)):
+        n, upright = len(seconds), Upright()
+        azel, radec = series(4, n), series(4, n)
+        for part in stretches(n):
             now = self._interpolated(seconds[part])
             turn = conjugate(self._rotation(now, seconds[part]))
             observed = rotate(turn, horizontal[part])
+            azel[part] = upright(horizontal[part])
             radec[part] = _carried(turn, observed, _natural(observed, now), azel[part])
         return azel, radec
 
-    def track(self, icrs: Floats, seconds: Floats) -> Track:
-        """`horizontal` of ICRS unit vectors (n, 3) and `boresight` of that, at half the cost: nothing is inverted."""
-        n = len(seconds)
-        horizontal, turns, observed, radec = (np.empty((k, n)).T for k in (3, 4, 3, 4))
-        for part in _chunks(n):
+    def track(self, icrs: Callable[[Floats], Floats], seconds: Floats) -> Track:
+        """`horizontal` and `boresight` of that, at half the cost: nothing is inverted.
+
+        ``icrs``: the unit vectors (m, 3) at some of the ``seconds`` (n,).
+        """
+        n, upright = len(seconds), Upright()
+        horizontal, azel, radec = (series(k, n) for k in (3, 4, 4))
+        for part in stretches(n):
             now = self._interpolated(seconds[part])
             turn = self._rotation(now, seconds[part])
-            observed[part] = _observed(icrs[part], now)
-            turns[part] = conjugate(turn)
-            horizontal[part] = rotate(turn, observed[part])
-        azel = upright(horizontal)
-        for part in _chunks(n):
-            radec[part] = _carried(turns[part], observed[part], icrs[part], azel[part])
+            natural = icrs(seconds[part])
+            observed = _observed(natural, now)
+            horizontal[part] = rotate(turn, observed)
+            azel[part] = upright(horizontal[part])
+            radec[part] = _carried(conjugate(turn), observed, natural, azel[part])
         return Track(horizontal, azel, radec)
 
     def _exact(self, seconds: Floats) -> _Nodes:
@@ -242,10 +246,6 @@ class CelestialTransform:
         return float((turn + velocity + sun).max())
 
 
-def _chunks(n: int) -> list[slice]:
-    return [slice(k, min(k + CHUNK, n)) for k in range(0, n, CHUNK)]
-
-
 def _carried(turn: Floats, observed: Floats, natural: Floats, azel: Floats) -> Floats:
     """ICRS quaternions (n, 4): ``turn`` from the horizon to the observed direction, then along a great circle to the natural."""
     return multiply(shortest_rotation(observed, natural), multiply(turn, azel))
@@ -296,6 +296,11 @@ def _near_identity(matrix: Floats) -> Floats:
 
 
 # -- quaternions (..., 4) in the order x, y, z, w, unit length; of many, each component lies in one piece (Fortran's order) --
+
+
+def series(components: int, n: int) -> Floats:
+    """Room for vectors or quaternions (n, components)."""
+    return untouched((components, n)).T
 
 
 def multiply(a: Floats, b: Floats) -> Floats:
@@ -349,36 +354,45 @@ def from_angles(longitude: Any, latitude: Any) -> Floats:
     return quaternions
 
 
-def upright(directions: Floats) -> Floats:
-    """`from_angles` of unit vectors (n, 3), (n, 4), neighbours with neighbouring signs.
+class Upright:
+    """`from_angles` of unit vectors (n, 3), stretch by stretch: (n, 4), neighbours with neighbouring signs.
 
     By half angles: with z = cos(b) and r = sin(b) for the distance b from the pole,
 
         cos(b / 2) = sqrt((1 + z) / 2),   sin(b / 2) = r / (2 cos(b / 2)),                                   (3)
 
-    and so for the longitude counted from the first direction's, where that stays below `_FAR`.
+    and so for the longitude counted from the very first direction's, in stretches in which that stays below `_FAR`.
     """
-    x, y, z = directions.T
-    r = np.sqrt(x * x + y * y)
-    if not len(r) or r.min() == 0.0 or z.min() < -0.9:
-        return _by_angles(x, y, z, r)
-    first = math.atan2(y[0], x[0])
-    cosine = (x * math.cos(first) + y * math.sin(first)) / r
-    if cosine.min() < _FAR:
-        return _by_angles(x, y, z, r)
-    cl, cb = np.sqrt((1 + cosine) / 2), np.sqrt((1 + z) / 2)
-    sl, sb = (y * math.cos(first) - x * math.sin(first)) / (2 * r * cl), r / (2 * cb)
-    c, s = math.cos(first / 2), math.sin(first / 2)
-    ca, sa = c * cl - s * sl, s * cl + c * sl
-    quaternions: Floats = np.stack([-sa * sb, ca * sb, sa * cb, ca * cb]).T
-    return quaternions
+
+    def __init__(self) -> None:
+        self._first = self._last = math.nan  # longitudes, without jumps
+
+    def __call__(self, directions: Floats) -> Floats:
+        x, y, z = directions.T
+        if not len(x):
+            return np.empty((0, 4))
+        if math.isnan(self._first):
+            self._first = self._last = math.atan2(y[0], x[0])
+        r = np.sqrt(x * x + y * y)
+        if r.min() > 0.0 and z.min() >= -0.9 and abs(self._last - self._first) < math.pi:
+            cosine = (x * math.cos(self._first) + y * math.sin(self._first)) / r
+            if cosine.min() >= _FAR:
+                return self._by_half_angles(x, y, z, r, cosine)
+        longitude = np.unwrap(np.concatenate([[self._last], np.arctan2(y, x)]))[1:]
+        self._last = float(longitude[-1])
+        return from_angles(longitude, np.arctan2(z, r))
+
+    def _by_half_angles(self, x: Floats, y: Floats, z: Floats, r: Floats, cosine: Floats) -> Floats:
+        sine = y * math.cos(self._first) - x * math.sin(self._first)  # times r
+        self._last = self._first + math.atan2(sine[-1], r[-1] * cosine[-1])
+        cl, cb = np.sqrt((1 + cosine) / 2), np.sqrt((1 + z) / 2)
+        sl, sb = sine / (2 * r * cl), r / (2 * cb)
+        c, s = math.cos(self._first / 2), math.sin(self._first / 2)
+        ca, sa = c * cl - s * sl, s * cl + c * sl
+        return np.stack([-sa * sb, ca * sb, sa * cb, ca * cb]).T
 
 
 _FAR = math.cos(math.radians(150))
-
-
-def _by_angles(x: Floats, y: Floats, z: Floats, r: Floats) -> Floats:
-    return from_angles(np.unwrap(np.arctan2(y, x)), np.arctan2(z, r))
 
 
 def unit_vectors(longitude: Any, latitude: Any) -> Floats:

@@ -21,7 +21,8 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.fits_image import Cards
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
-from zonda.core.projection import pixel_matrix, rotation_matrices
+from zonda.core.projection import boresights, pixel_matrix, rotation_matrices
+from zonda.core.stretches import stretches
 
 from ..maps.image import Image
 from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct
@@ -419,9 +420,16 @@ def _reaches(observation: Observation, sky: Sky, widest: float) -> bool:
         return True
     *rim, centre = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]).T
     radius = max(float(np.arccos(np.clip(r @ centre, -1, 1))) for r in rim)
-    cosine = float((rotation_matrices(observation.boresight_radec)[:, :, 2] @ centre).max())
+    _, cosine = _cosines(observation, centre)
     nearest = float(np.arccos(np.clip(cosine, -1, 1))) - float(np.arctan(observation.focalplane.radius))
     return bool(nearest <= radius + REACH * SIGMA * widest)
+
+
+def _cosines(observation: Observation, centre: Floats) -> tuple[float, float]:
+    """The least and the largest cosine between the boresight and a direction (3,)."""
+    boresight, n = observation.boresight_radec, observation.n_samples
+    parts = [centre @ boresights(boresight[some]) for some in stretches(n)]
+    return min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)
 
 
 def _behind(sky: Sky, quaternions: Floats, xi: Floats, eta: Floats) -> int:
@@ -436,7 +444,7 @@ def _reach(observation: Observation) -> float:
     """Largest distance [rad] of a detector's direction from the observation's centre."""
     ra, dec = observation.centre
     centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    cosine = float((rotation_matrices(observation.boresight_radec)[:, :, 2] @ centre).min())
+    cosine, _ = _cosines(observation, centre)
     return float(np.arccos(np.clip(cosine, -1, 1)) + np.arctan(observation.focalplane.radius))
 
 

@@ -10,7 +10,7 @@ import zonda
 from tests.core.test_derived import BOTH, FILTERS, MAP, SKY, Several, observed, steps
 from tests.core.test_execution import CHAIN, Demean, Level, Sink, Source, observation
 from tests.core.test_forecast import labelled
-from zonda.core import repeated, streams
+from zonda.core import repeated, stretches
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.forecast import forecast, spares
@@ -148,10 +148,10 @@ def test_memory_that_the_system_refuses_is_a_memory_error(monkeypatch):
     def refused(*given, **named):
         raise OSError(errno.ENOMEM, "Cannot allocate memory")
 
-    monkeypatch.setattr(streams.mmap, "mmap", refused)
-    assert streams.untouched((2, 3), np.float32).shape == (2, 3)
+    monkeypatch.setattr(stretches.mmap, "mmap", refused)
+    assert stretches.untouched((2, stretches.LARGE), np.float32).shape == (2, stretches.LARGE)
     with pytest.raises(MemoryError):
-        streams.untouched((1 << 31, 1 << 26), np.float32)
+        stretches.untouched((1 << 31, 1 << 26), np.float32)
 
 
 def test_a_plan_counts_the_copied_step_once_and_the_memory(monkeypatch):

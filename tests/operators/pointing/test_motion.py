@@ -9,7 +9,7 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from zonda.core.data import Data
@@ -35,6 +35,7 @@ def wave(amplitude: float, omega: float, elevation: float) -> Callable[[np.ndarr
 
 
 @settings(max_examples=40, deadline=None)
+@example(0.25, 1.5703125, 1.0, 5.0)  # 20 samples in a period, none at a peak
 @given(st.floats(1e-4, 0.3), st.floats(0.05, 20.0), st.floats(0.2, 1.3), st.sampled_from([5.0, 30.0, 100.0, 400.0, 3000.0]))
 def test_figures_are_those_of_the_closed_form(amplitude: float, omega: float, elevation: float, rate: float) -> None:
     track, length = wave(amplitude, omega, elevation), 20.0 / min(omega, 1.0)

@@ -10,15 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zonda.core import stretches
+from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.projection import rotation_matrices
 from zonda.core.site import Site
+from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.stare import PointingStare
-from zonda.operators.pointing.transform import CelestialTransform, from_angles, unit_vectors, upright
+from zonda.operators.pointing.transform import CelestialTransform, Upright, from_angles, unit_vectors
 
 GREEN_BANK = Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m")
 POLE = Site(name="South Pole", latitude="-90 deg", longitude="0 deg", altitude="2835 m")
@@ -83,7 +86,7 @@ def test_a_track_is_there_and_back_at_once(frame: str) -> None:
         if frame == "field"
         else random_directions(40000)
     )
-    track = transform.track(sky, seconds)
+    track = transform.track(lambda some: sky[np.searchsorted(seconds, some)], seconds)
     assert np.array_equal(track.horizontal, transform.horizontal(sky, seconds))
     azel, radec = transform.boresight(track.horizontal, seconds)
     assert np.array_equal(track.azel, azel)
@@ -98,7 +101,7 @@ def test_upright_is_from_angles(sweep: float, start: float) -> None:
     """Within 150 deg of the first direction by half angles, else by angles; through south, round the sky, up to the zenith."""
     way = np.linspace(0, 1, 4001)
     longitude, latitude = start + sweep * way, 1.57 * np.sin(7 * way)
-    found = upright(unit_vectors(longitude, latitude))
+    found = Upright()(unit_vectors(longitude, latitude))
     expected = from_angles(longitude, latitude)
     expected *= np.sign((found[0] * expected[0]).sum())  # the first longitude is counted from -pi to pi
     assert np.abs(found - expected).max() < 3e-13  # near the zenith a direction's rounding turns it: 1e-16 / cos(1.57)
@@ -106,11 +109,36 @@ def test_upright_is_from_angles(sweep: float, start: float) -> None:
     assert np.abs(np.linalg.norm(found, axis=1) - 1).max() < 1e-15
 
 
+@pytest.mark.parametrize("sweep", [0.1, 2.7, 3.2, 40.0, -40.0])
+def test_upright_goes_on_from_stretch_to_stretch(sweep: float) -> None:
+    """There and back again: signs are those of the whole, whichever way a stretch is worked out."""
+    longitude = 1.0 + sweep * np.sin(np.linspace(0, 3, 5001)) ** 2
+    directions = unit_vectors(longitude, 0.9 * np.cos(7 * longitude))
+    upright = Upright()
+    found = np.concatenate([upright(part) for part in np.array_split(directions, 23)])
+    assert np.abs(found - from_angles(longitude, 0.9 * np.cos(7 * longitude))).max() < 2e-14  # of angles of 40 rad
+    assert sweep > 0.1 or sweep < 0 or np.array_equal(found, Upright()(directions))
+
+
+@pytest.mark.parametrize("scan", [PointingDaisy(), PointingBackAndForth()])
+@pytest.mark.parametrize("target", ["05h +20d", "az 180d el 45d"])
+def test_bits_do_not_depend_on_the_stretch(scan: Any, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed, seconds = Target.parse(target), np.arange(5000) / 20.0
+    transform = CelestialTransform(GREEN_BANK, START, 250.0)
+    whole = scan._track(transform, parsed, (1e-4, 2e-4), seconds)
+    monkeypatch.setattr(stretches, "STRETCH", 777)
+    parts = scan._track(transform, parsed, (1e-4, 2e-4), seconds)
+    assert np.array_equal(whole.horizontal, parts.horizontal)
+    assert np.array_equal(whole.azel, parts.azel)
+    # bent light is inverted by steps that begin at the mean of a stretch
+    assert np.abs(whole.radec - parts.radec).max() <= (0.0 if isinstance(scan, PointingDaisy) and "az" not in target else 1e-15)
+
+
 def test_upright_where_there_is_no_longitude() -> None:
-    found = upright(np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]))
+    found = Upright()(np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]))
     assert np.isfinite(found).all()
     assert np.abs(rotation_matrices(found)[:, :, 2] - [[0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]]).max() < 1e-15
-    assert upright(np.empty((0, 3))).shape == (0, 4)
+    assert Upright()(np.empty((0, 3))).shape == (0, 4)
 
 
 def test_near_the_sun(reference: Any) -> None:
@@ -315,6 +343,8 @@ def test_offline_with_every_socket_blocked() -> None:
 import socket, sys
 def refuse(*a, **k): raise SystemExit("network used")
 socket.socket.connect = socket.getaddrinfo = socket.create_connection = refuse
+from zonda.core import stretches
+from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.site import Site
 from zonda.operators.pointing.transform import CelestialTransform
