@@ -101,9 +101,11 @@ class Derivation:
             return
         found = {}
         for operator in self._selection.steps(run):
-            if type(operator).subtract is not Operator.subtract and (packed := operator.pack(data, True)) is not None:
-                operator.merge(data, packed)
-                found[operator.label] = packed
+            if type(operator).subtract is not Operator.subtract:
+                before = dict(data.products)
+                if (packed := operator.pack(data, True)) is not None:
+                    found[operator.label] = packed
+                data.products.update((name, product) for name, product in before.items() if name not in data.products)
         self._kept[run] = found
 
     def derive(self, run: str, data: Data, kept_out: frozenset[str]) -> bool:

@@ -209,6 +209,8 @@ class Operator(Parameters):
     def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
         """Take the partial products of the run in progress out of ``data.products``: plain values and arrays; None: nothing.
 
+        Where there is `subtract`, it makes copies: what was taken out may be put back, and go on.
+
         ``first``: the part begins with the very first observation; what is of that one alone need not be in the others.
         """
         return None

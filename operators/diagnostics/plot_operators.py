@@ -109,6 +109,8 @@ class Plots(Operator):
                     written.append(pool.submit(_write, product_path(folder, picture.name, ".png"), picture.png))
 
                 made = pictures(data, self.style(), self._begun, self._artist, write)
+                if self._artist is not None:
+                    pool.submit(self._artist.close)  # it takes as long to end as a file to be written
         finally:
             self._begun = {}
             if self._artist is not None:

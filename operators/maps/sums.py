@@ -174,7 +174,7 @@ class Halves:
         used = [np.flatnonzero(half[:, HITS]) for half in self.sums]
         found: dict[str, Any] = {"scans": list(self.scans), "largest": self._largest}
         for k, pixels in enumerate(used):
-            found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k][pixels]}
+            found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k].take(pixels, axis=0)}
         return found
 
     def merge(self, part: Mapping[str, Any], label: str) -> None:
@@ -182,8 +182,9 @@ class Halves:
         shift = len(self.scans) % 2
         for k in range(2):
             half, pixels = (k + shift) % 2, part[f"pixels_{k}"]
-            self.sums[half][pixels] += part[f"sums_{k}"]
-            self._note(half, int(self.sums[half][pixels, HITS].max(initial=0)), part["largest"])
+            merged = part[f"sums_{k}"] + (self.sums[half].take(pixels, axis=0) if self.scans else 0)
+            self.sums[half][pixels] = merged
+            self._note(half, int(merged[:, HITS].max(initial=0)), part["largest"])
         self.scans += part["scans"]
         self._check(label)
 

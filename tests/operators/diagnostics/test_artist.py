@@ -46,6 +46,45 @@ def test_a_dead_process_is_none(artist):
     assert artist.submit(math.sqrt, 4.0).result() is None
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="no twin elsewhere")
+def test_two_draw_at_a_time(artist):
+    first = artist._process.pid
+    (twin,) = _twins(artist) - {first}
+    assert os.getpgid(twin) == first
+    artist.close()
+    assert _gone({first, twin})
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no twin elsewhere")
+@pytest.mark.parametrize("which", ["first", "twin"])
+def test_where_one_of_them_is_killed_the_other_goes_on(artist, which):
+    first = artist._process.pid
+    (twin,) = _twins(artist) - {first}
+    victim, other = (first, twin) if which == "first" else (twin, first)
+    os.kill(victim, signal.SIGKILL)
+    answers = [artist.submit(os.getpid).result(30) for _ in range(6)]
+    assert set(answers) <= {None, other}
+    assert answers.count(None) <= 1
+    artist.close()
+    assert _gone({first, twin})
+
+
+def _twins(artist):
+    """Their numbers: two tasks at a time, until both have answered."""
+    patience, found = time.monotonic() + 30, set()
+    while time.monotonic() < patience and len(found) < 2:
+        both = [artist.submit(subprocess.check_output, ["sh", "-c", "sleep 0.2; echo $PPID"]) for _ in range(2)]
+        found |= {int(answer.result(30)) for answer in both}
+    return found
+
+
+def _gone(pids):
+    patience = time.monotonic() + 30
+    while time.monotonic() < patience and any(_alive(pid) for pid in pids):
+        time.sleep(0.02)
+    return not any(_alive(pid) for pid in pids)
+
+
 def test_it_ends_with_its_owner():
     made = Artist()
     process = made._process
@@ -56,21 +95,21 @@ def test_it_ends_with_its_owner():
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 @pytest.mark.parametrize("wait", [0.0, 0.3])
 def test_it_ends_with_an_owner_that_is_killed(wait):
-    """Also while it is importing."""
+    """Also while it is importing, and with its twin, where that has drawn already."""
     source = f"""
 import os, signal, time
 from zonda.operators.diagnostics.artist import Artist
 artist = Artist()
-print(artist._process.pid, flush=True)
+pids = {{artist._process.pid}}
+if {wait}:
+    pids |= {{artist.submit(os.getpid).result() for _ in range(8)}}
+print(*pids, flush=True)
 time.sleep({wait})
 os.kill(os.getpid(), signal.SIGKILL)
 """
     run = subprocess.run([sys.executable, "-c", source], stdout=subprocess.PIPE, text=True)
     assert run.returncode == -signal.SIGKILL
-    pid, patience = int(run.stdout), time.monotonic() + 30
-    while time.monotonic() < patience and _alive(pid):
-        time.sleep(0.02)
-    assert not _alive(pid)
+    assert _gone({int(pid) for pid in run.stdout.split()})
 
 
 def _alive(pid):
