@@ -28,6 +28,7 @@ from zonda.core.data import Block, Observation
 from zonda.core.operator import Operator
 from zonda.core.random import normals
 from zonda.core.smooth import Series, SmoothField, interpolating, series_into
+from zonda.core.stretches import stretches, untouched
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -230,17 +231,17 @@ def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> t
     until the error at the cells' midpoints is below `MEAN_ERROR`.
     """
     n_samples, step, n_det = above.n_samples, min(above.step, below.step), len(above.weights)
-    fitted = _few(above.weights, use)
+    fitted, used = _few(above.weights, use), set(use.tolist())
     while True:
         known = _ratio(above, below, step, fitted)
-        at_knots = known[:, 1:-1]
-        largest = float(np.abs(at_knots[np.isin(fitted, use)]).max(initial=0.0))
+        largest = max((float(np.abs(row[1:-1]).max()) for row, d in zip(known, fitted, strict=True) if d in used), default=0.0)
         tolerance = MEAN_ERROR * max(largest, 1e-30)
         error = np.inf
         for nodes in (above.weights.astype(np.float64), None):
             if nodes is not None:
                 basis = nodes
-                fit = np.linalg.lstsq(basis[fitted], known, rcond=1e-12)[0]
+                parts = [np.linalg.lstsq(basis[fitted], known[:, some], rcond=1e-12)[0] for some in stretches(known.shape[1])]
+                fit = np.concatenate(parts, axis=1)
             else:
                 _, size, fit = np.linalg.svd(known, full_matrices=False)
                 fit = fit[: max(1, int(np.count_nonzero(size > 1e-13 * size[0])))]
@@ -266,14 +267,15 @@ def _few(weights: NDArray[np.floating], use: NDArray[np.intp]) -> NDArray[np.int
 
 def _ratio(above: SmoothField, below: SmoothField, step: int, rows: NDArray[np.intp]) -> Floats:
     """above / max(below, `OPAQUE`) of the detectors ``rows`` at the coarse times; before and behind, its slopes at the ends."""
-    one, other, ends = above.weights[rows], below.weights[rows], [0, -1]
-    bottom = other @ _knots(below, step)
-    clear = bottom[:, ends] > OPAQUE
-    np.maximum(bottom, OPAQUE, out=bottom)
-    ratio = one @ _knots(above, step) / bottom
-    slope = one @ _end_slopes(above, step) - ratio[:, ends] * (other @ _end_slopes(below, step)) * clear
-    slope /= bottom[:, ends]
-    return np.hstack([slope[:, :1], ratio, slope[:, 1:]])
+    one, other, high, low = above.weights[rows], below.weights[rows], _knots(above, step), _knots(below, step)
+    found = untouched((len(rows), low.shape[1] + 2))
+    ratio, ends = found[:, 1:-1], [0, -1]
+    for some in stretches(low.shape[1]):
+        np.divide(one @ high[:, some], np.maximum(other @ low[:, some], OPAQUE), out=ratio[:, some])
+    bottom = other @ low[:, ends]
+    slope = one @ _end_slopes(above, step) - ratio[:, ends] * (other @ _end_slopes(below, step)) * (bottom > OPAQUE)
+    found[:, ends] = slope / np.maximum(bottom, OPAQUE)
+    return found
 
 
 def _error(field: SmoothField, above: SmoothField, below: SmoothField, step: int, use: NDArray[np.intp]) -> float:
@@ -281,9 +283,10 @@ def _error(field: SmoothField, above: SmoothField, below: SmoothField, step: int
     middle, top, bottom = (_knots(f, step, 0.5) for f in (field, above, below))
     worst = 0.0
     for part in _some(len(use)):
-        rows = use[part]
-        exact = (above.weights[rows] @ top) / np.maximum(below.weights[rows] @ bottom, OPAQUE)
-        worst = max(worst, float(np.abs(field.weights[rows] @ middle - exact).max(initial=0.0)))
+        one, other, fitted = (f.weights[use[part]] for f in (above, below, field))
+        for some in stretches(middle.shape[1]):
+            exact = (one @ top[:, some]) / np.maximum(other @ bottom[:, some], OPAQUE)
+            worst = max(worst, float(np.abs(fitted @ middle[:, some] - exact).max(initial=0.0)))
     return worst
 
 
