@@ -85,8 +85,8 @@ def scene(instrument):
 def one(name, budget, threads):
     """Predicted and actual memory of one case, as JSON."""
     from zonda.core.errors import PipelineError
-    from zonda.core.forecast import forecast, room
-    from zonda.core.settings import Settings
+    from zonda.core.run.forecast import forecast, room
+    from zonda.core.run.settings import Settings
 
     case = dict(SCENES[name])
     where = scene(case.pop("instrument"))
@@ -100,9 +100,9 @@ def one(name, budget, threads):
         told["elsewhere"] = ", ".join(blocks.elsewhere)
         return left, products
 
-    import zonda.core.memory_budget
+    import zonda.core.run.memory_budget
 
-    zonda.core.memory_budget.room = listen
+    zonda.core.run.memory_budget.room = listen
     try:
         data = pipeline.run(where, threads=threads, ceiling=int(budget * 1e9))
     except PipelineError as error:

@@ -31,7 +31,7 @@ SCENES = {
 
 def one(scene, folder, prune):
     """Run one scene in this process; figures as JSON."""
-    from zonda.core.compiled import ensure_cache, one_blas_thread
+    from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
 
     one_blas_thread()
     ensure_cache()

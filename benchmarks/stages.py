@@ -23,7 +23,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from zonda.core.compiled import one_blas_thread
+from zonda.core.compilation.compiled import one_blas_thread
 
 one_blas_thread()  # as `zonda run` does: idle threads of BLAS take CPU time
 

@@ -2,7 +2,7 @@
 
 python benchmarks/startup.py             first run with empty caches, then the best of three further runs, and of
                                          three that have the compiled kernels but plan anew
-python benchmarks/startup.py --kernels   write core/kernels.py, the list of what a first run compiles in two processes
+python benchmarks/startup.py --kernels   write core/compilation/kernels.py, the list of what a first run compiles in two processes
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
     after(cli, "_load", "read the pipeline file")
     mark("Python and the command line")
     import zonda.core.plan.remembered as remembered
-    from zonda.core.execution import Execution
     from zonda.core.pipeline import Pipeline
+    from zonda.core.run.execution import Execution
 
     mark("import zonda, numpy, numba, pydantic")
     after(remembered, "outcome", "plan")
@@ -84,7 +84,7 @@ def listen(compiled: list[Any]) -> None:
     """Note every kernel of zonda that is compiled: module, name, types, CPU seconds (own, all), whether within another."""
     import numba.core.event as events
 
-    from zonda.core.compile_ahead import text_of
+    from zonda.core.compilation.compile_ahead import text_of
 
     class Listener(events.Listener):  # type: ignore[misc]
         def __init__(self) -> None:
@@ -123,8 +123,8 @@ def child(folder: Path, caches: Path, pipeline: str, kernels: bool = False, know
 
 
 def write(rows: list[list[str]]) -> None:
-    """core/kernels.py: its docstring, and ``rows`` (seconds, module, name, types)."""
-    path = Path(__file__).parents[1] / "core" / "kernels.py"
+    """core/compilation/kernels.py: its docstring, and ``rows`` (seconds, module, name, types)."""
+    path = Path(__file__).parents[1] / "core" / "compilation" / "kernels.py"
     head = path.read_text().partition("KERNELS")[0]
     lines = dict.fromkeys(f'    "{" ".join(row)}",' for row in rows)
     path.write_text(f"{head}KERNELS = (\n" + "\n".join(lines) + "\n)\n")
@@ -144,7 +144,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pipeline", default=PIPELINE)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--kernels", action="store_true", help="write core/kernels.py")
+    parser.add_argument("--kernels", action="store_true", help="write core/compilation/kernels.py")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     parser.add_argument("--listen", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()

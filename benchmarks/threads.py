@@ -59,7 +59,7 @@ def chain_seconds(name: str, threads: int) -> float:
 
 def profile(name: str) -> None:
     """Print where one run with two threads uses one alone."""
-    from zonda.core.execution import Execution
+    from zonda.core.run.execution import Execution
 
     rows: list[tuple[str, float, float]] = []
 

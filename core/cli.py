@@ -217,8 +217,8 @@ def run(
     (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
     """
     from . import early
-    from .compile_ahead import Helper
-    from .compiled import ensure_cache, one_blas_thread
+    from .compilation.compile_ahead import Helper
+    from .compilation.compiled import ensure_cache, one_blas_thread
     from .machine import available_threads
 
     one_blas_thread()
@@ -249,10 +249,10 @@ def run(
             command=_command(pipelines, settings, keep, drop, no_prune),
         )  # fmt: skip
         return
-    from .files import check_output_folder, write_text
-    from .lock import lock
     from .plan.outcome import line
     from .plan.remembered import outcome
+    from .storage.files import check_output_folder, write_text
+    from .storage.lock import lock
 
     if only and verify:
         raise click.UsageError("--verify measures the whole pipeline: leave --only out")

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .focalplane import Focalplane
-from .random import stream_key
-from .smooth import SmoothField
-from .tiles import TILE_DETECTORS, TILE_SAMPLES
+from .numerics.random import stream_key
+from .numerics.smooth import SmoothField
+from .numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 
 if TYPE_CHECKING:
     from .configuration.time import Instant
@@ -289,7 +289,7 @@ class Stream:
     ----------
     array
         (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file. A stream that is made again
-        when it is read (`core.streams`) has none: it is read by `sweep`.
+        when it is read (`core.run.streams`) has none: it is read by `sweep`.
     means
         What must be added in float64 to have all of it, see `Block.means`.
     threads
@@ -320,9 +320,9 @@ class Stream:
 
         ``work`` is called from several threads and must not change or keep the part. Results come in an order in which no
         detector's samples and no sample's detectors are ever out of order, whatever the blocks and threads: what is added up
-        tile by tile (`core.tiles`) has the same bits.
+        tile by tile (`core.numerics.tiles`) has the same bits.
         """
-        from .streams import forget_pages
+        from .run.streams import forget_pages
 
         n_det, n_samp = self.shape
         blocks = [

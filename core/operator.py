@@ -11,10 +11,10 @@ from .configuration.parameters import Parameters
 from .knobs import Knob
 
 if TYPE_CHECKING:
-    from .companion import Companion
     from .data import Block, Data, Observation, Stream
     from .plan.context import Context
     from .plan.estimate import Estimate, Traits
+    from .run.companion import Companion
 
 API_VERSION = 1
 """Version of the contract below; a plugin written for another one is refused with a message that says so."""
@@ -65,12 +65,13 @@ class Operator(Parameters):
         True for operators that only act in `finalize` (plots, reports): they run once, after all companion runs.
     linear
         True where what `exec` makes of the components, or of ``signal``, is linear in them, with the same transmission of the air
-        and, for ``couples = "all"``, with what `freeze` kept. A run may then be derived from others (`core.derived`).
+        and, for ``couples = "all"``, with what `freeze` kept. A run may then be derived from others (`core.run.derived`).
     same_in_all_runs
         True where the streams that `exec` makes are the same in all runs of a pipeline: they follow from the pointing and from
         this step alone, never from other streams, flags, noise levels or the air. It adds no mean, and tells the tally in
-        `prepare` and `collect` only, which ``only_tells``. Runs after the main run may then copy its streams (`core.repeated`):
-        `exec` and `collect` are not called. A class that overrides `configure`, `prepare`, `exec` or `collect` must say so anew.
+        `prepare` and `collect` only, which ``only_tells``. Runs after the main run may then copy its streams
+        (`core.run.repeated`): `exec` and `collect` are not called. A class that overrides `configure`, `prepare`, `exec` or
+        `collect` must say so anew.
     only_tells
         True where `collect` puts nothing into ``data.products`` that differs from run to run: it only tells the tally.
     product_only
@@ -220,7 +221,7 @@ class Operator(Parameters):
 
     def subtract(self, whole: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
         """What `pack` would give of a run of all components but those of ``parts``: ``whole`` (the main run) minus these, all as
-        `pack` made them; None where it cannot be told, and must be simulated (`core.derived`)."""
+        `pack` made them; None where it cannot be told, and must be simulated (`core.run.derived`)."""
         return None
 
     @property

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from .ahead import Ahead
-from .companion import Companion
 from .data import Data, html_table
-from .derived import Derivation, derivable, parts_of
 from .errors import PipelineError
 from .machine import available_memory, available_threads
-from .memory_budget import divide
 from .operator import Operator
-from .order import check_order
-from .selection import Selection
-from .settings import Settings, Timer
-from .simulation import Simulation
+from .run.ahead import Ahead
+from .run.companion import Companion
+from .run.derived import Derivation, derivable, parts_of
+from .run.memory_budget import divide
+from .run.order import check_order
+from .run.selection import Selection
+from .run.settings import Settings, Timer
+from .run.simulation import Simulation
 from .versions import versions
 
 if TYPE_CHECKING:
@@ -143,8 +143,8 @@ class Pipeline:
         part
             Run some of the scans only and pack their products instead of finishing them; nothing acts at the end.
         """
-        from .files import check_output_folder
         from .hooks import manager
+        from .storage.files import check_output_folder
 
         hooks = manager().hook
         data = Data(scene=scene, output=None if output is None else Path(output))

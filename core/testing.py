@@ -23,12 +23,12 @@ from .configuration.parameters import described
 from .configuration.time import Instant
 from .data import Block, Data, Observation
 from .instrument import Band, Instrument, Telescope
+from .numerics.random import normals
+from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
 from .pipeline import Pipeline
-from .random import normals
 from .scene import Scene
 from .site import Site
-from .tiles import TILE_SAMPLES
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
 """Streams that the kit can provide."""

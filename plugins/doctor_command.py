@@ -22,7 +22,7 @@ def doctor(everything: bool, as_json: bool) -> None:
     Prints the figures of docs/stability.md as measured here. Exit status 1 where one is beyond its limit. The first run after
     installation also compiles, which takes a minute.
     """
-    from zonda.core.compiled import ensure_cache, one_blas_thread
+    from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
 
     one_blas_thread()
     ensure_cache()

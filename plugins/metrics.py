@@ -45,10 +45,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.accuracy.metrics import Metric
-from zonda.core.companion import Companion
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.operator import Operator
+from zonda.core.run.companion import Companion
 from zonda.operators.diagnostics.series import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare

@@ -67,7 +67,7 @@ def show(
     """Print the profile, the water by month and hour, and what bands see; draw them (also as PDF or SVG)."""
     from zonda.core import registry, weather
     from zonda.core.configuration.units import Unit
-    from zonda.core.files import atomic_path, product_path
+    from zonda.core.storage.files import atomic_path, product_path
     from zonda.operators.atmosphere import weather_summary as summary
     from zonda.operators.atmosphere.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
     from zonda.operators.atmosphere.weather_sources import air_of
@@ -110,7 +110,7 @@ def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
 
     Needs a (free) key and the package cdsapi: pip install 'zonda[weather]', then https://cds.climate.copernicus.eu/how-to-api.
     """
-    from zonda.core.files import atomic_path
+    from zonda.core.storage.files import atomic_path
     from zonda.operators.atmosphere.era5_fetch import retrieve
 
     place, when = _place(site), _instant(time)

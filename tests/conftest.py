@@ -1,13 +1,17 @@
 """For all tests: nothing is read from or left in the user's cache folder (compiled kernels aside); what a test registers goes
-with it."""
+with it; hypothesis draws the same examples each time (`pytest --hypothesis-profile=default` draws others)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
 
 from zonda.core.registry import registries
+
+settings.register_profile("the same each time", derandomize=True)
+settings.load_profile("the same each time")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,7 +6,7 @@ import pytest
 import zonda
 from zonda.core.configuration.pipeline_file import load
 from zonda.core.errors import PipelineError
-from zonda.core.forecast import room
+from zonda.core.run.forecast import room
 
 DETECTORS, SECONDS = 400, 4
 
@@ -47,7 +47,7 @@ def test_made_again_is_the_same_map():
 
 def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_way_out(monkeypatch):
     pipeline, scene = slice_of(method="svd")
-    monkeypatch.setattr("zonda.core.streams.free_disk", lambda: 1000)
+    monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 1000)
     with pytest.raises(PipelineError, match=r"(?s)neither in memory nor on the disk.*CommonModeFilter.*--memory"):
         pipeline.run(scene, threads=2, memory=int(1.7 * 4 * DETECTORS * SECONDS * 900))
 
@@ -55,8 +55,8 @@ def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_wa
 def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     """By the forecast, without running: 372 GB of streams are kept nowhere."""
     from zonda.core.data import Data
-    from zonda.core.forecast import forecast
-    from zonda.core.settings import Settings
+    from zonda.core.run.forecast import forecast
+    from zonda.core.run.settings import Settings
 
     file = load("atlast_full", ())
     pipeline, scene = file.pipeline(), file.scene()

@@ -21,7 +21,7 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.errors import InputError, OutputError
-from zonda.core.files import own_data
+from zonda.core.storage.files import own_data
 
 PIPELINE = """\
 site: green_bank
@@ -153,7 +153,7 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(monkeypatch: pyt
     """Refused when they are begun: a mapping of a file that cannot grow later kills the process (SIGBUS)."""
     import errno
 
-    from zonda.core.streams import Ledger, Store
+    from zonda.core.run.streams import Ledger, Store
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -171,7 +171,7 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(monkeypatch: pyt
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="this system does not reserve blocks")
 def test_spilled_streams_have_their_blocks_from_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from zonda.core.streams import Ledger, Store
+    from zonda.core.run.streams import Ledger, Store
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     store = Store(1000, np.float32, [], Ledger())
@@ -188,7 +188,7 @@ def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A system maps 64 kB around every page that is touched: short pieces of many rows would map the whole stream."""
-    from zonda.core.streams import Ledger, Store, columns, forget_pages
+    from zonda.core.run.streams import Ledger, Store, columns, forget_pages
 
     def mapped() -> int:
         return int(Path("/proc/self/statm").read_text().split()[2]) * os.sysconf("SC_PAGE_SIZE")
@@ -283,7 +283,7 @@ def test_an_input_removed_between_two_scans(here: Path, threads: int, last: int)
 
 HOLD = """
 import sys
-from zonda.core.lock import lock
+from zonda.core.storage.lock import lock
 with lock("out"):
     print("held", flush=True)
     sys.stdin.read()

@@ -19,7 +19,7 @@ import zonda
 from zonda.core import cli
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import InputError, OutputError, ZondaError
-from zonda.core.files import product_path, write_text
+from zonda.core.storage.files import product_path, write_text
 
 ROOT = Path(__file__).parents[1]
 PRODUCT = sorted(p for f in ("core", "operators", "plugins", "pipelines", "zonda") for p in (ROOT / f).rglob("*.py"))
@@ -36,12 +36,12 @@ ALLOWED = {
     ("core/accuracy/measure.py", "subprocess.run"): "zonda itself, as a child; no shell; arguments are zonda's own",
     ("core/accuracy/measure.py", "pickle.load"): "the child's answer, in a folder that only this user can read, made for it",
     ("core/cli.py", "import_module"): "names from a table in the same file",
-    ("core/compile_ahead.py", "import_module"): "modules named in core/kernels.py",
-    ("core/compile_ahead.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
-    ("core/kernel_cache.py", "pickle.loads"): "machine code that this user compiled; numba's own cache does the same",
+    ("core/compilation/compile_ahead.py", "import_module"): "modules named in core/compilation/kernels.py",
+    ("core/compilation/compile_ahead.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
+    ("core/compilation/kernel_cache.py", "pickle.loads"): "machine code that this user compiled; numba's own cache does the same",
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
-    ("core/fits_files.py", "import_module"): "gzip, bz2, lzma, from a table in the same file",
-    ("core/hdf5_files.py", "subprocess.run"): "zonda itself, as a child; no shell; the file's path is one argument",
+    ("core/storage/fits_files.py", "import_module"): "gzip, bz2, lzma, from a table in the same file",
+    ("core/storage/hdf5_files.py", "subprocess.run"): "zonda itself, as a child; no shell; the file's path is one argument",
     ("operators/atmosphere/era5_fetch.py", "import_module"): "cdsapi, by its name, when the user asks to fetch",
     ("operators/diagnostics/artist.py", "import_module"): "names from a table in the same file",
     ("operators/diagnostics/artist.py", "pickle.load"): "between parent and child, through pipes that nobody else has",

@@ -5,7 +5,7 @@ import pytest
 
 import zonda
 from zonda.core import cli
-from zonda.core.projection import rotation_matrices
+from zonda.core.numerics.projection import rotation_matrices
 from zonda.operators.diagnostics.transfer_function import ARCSEC, compare, window_of
 
 CUT = 0.08  # Hz

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..compiled import ensure_cache, one_blas_thread
+from ..compilation.compiled import ensure_cache, one_blas_thread
 from ..errors import ZondaError
 
 if TYPE_CHECKING:

@@ -75,7 +75,7 @@ def accuracy(
     setup = setup_for(
         file, pipeline, settings, metric, wanted, duration=duration, quick=quick, repeats=repeats, seeds=seeds, threads=threads
     )
-    from ..files import check_output_folder, product_path, write_text
+    from ..storage.files import check_output_folder, product_path, write_text
 
     folder = product_path("out/accuracy", f"{file.header.name}.{metric}") if output is None else output
     check_output_folder(folder)

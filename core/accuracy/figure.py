@@ -48,7 +48,7 @@ def draw(study: Study, ax: Any = None) -> Any:
 
 def save(study: Study, path: Any) -> None:
     """Draw to a file (PNG, PDF, SVG by its suffix)."""
-    from ..files import atomic_path
+    from ..storage.files import atomic_path
 
     with atomic_path(path) as temporary:
         draw(study).figure.savefig(temporary)

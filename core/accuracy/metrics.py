@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from .. import registry
 
 if TYPE_CHECKING:
-    from ..companion import Companion
     from ..data import Data
     from ..operator import Operator
+    from ..run.companion import Companion
 
 Floats = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..files import write_text
+from ..storage.files import write_text
 from .front import Point, cheapest
 from .metrics import get
 from .settings import LENGTH, Setting, knobs_of, overrides

@@ -41,8 +41,8 @@ def run(
     command: str,
 ) -> None:
     """``zonda run`` of pipeline files as a campaign."""
-    from ..files import check_output_folder
-    from ..lock import lock
+    from ..storage.files import check_output_folder
+    from ..storage.lock import lock
     from . import run as campaign
     from .engines import engine as opened
 
@@ -91,12 +91,12 @@ def resume(
     is combined. The maps are the same bits as those of an undisturbed campaign.
     """
     from ..cli import Bytes
-    from ..compiled import ensure_cache, one_blas_thread
+    from ..compilation.compiled import ensure_cache, one_blas_thread
 
     one_blas_thread()
     ensure_cache()
-    from ..files import check_output_folder
-    from ..lock import lock
+    from ..storage.files import check_output_folder
+    from ..storage.lock import lock
     from . import run as campaign
     from .engines import engine as opened
     from .job import Job

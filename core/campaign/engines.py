@@ -163,7 +163,7 @@ def _ctrl_c_held_back() -> Iterator[None]:
 
 def begin_worker() -> None:
     """In a new worker process: leave Ctrl-C to the main process, and end when that is gone, however it went."""
-    from ..compiled import ensure_cache, one_blas_thread
+    from ..compilation.compiled import ensure_cache, one_blas_thread
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):

@@ -89,11 +89,11 @@ def entries(campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], 
 def separate(seed: int, number: int) -> int:
     """Seed of the ``number``-th of those that are co-added and have the same ``seed``: its own is the first one's.
 
-    The others have 63 bits of a hash of both (`core.random.stream_key`): seed + 1 would be another user's seed.
+    The others have 63 bits of a hash of both (`core.numerics.random.stream_key`): seed + 1 would be another user's seed.
     """
     if not number:
         return seed
-    from ..random import stream_key
+    from ..numerics.random import stream_key
 
     low, high = (int(word) for word in stream_key(seed, "campaign", number))
     return (high << 32 | low) & (2**63 - 1)

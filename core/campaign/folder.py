@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import InputError, OutputError, ZondaError
-from ..files import discard, temporary_sibling, write_text
+from ..storage.files import discard, temporary_sibling, write_text
 from . import log as joblog
 from . import parts
 from .job import FILE, LOG, TASKS, Job, Task

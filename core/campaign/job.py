@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ..errors import InputError
-from ..files import write_text
+from ..storage.files import write_text
 
 FORMAT = 1
 FILE = "campaign.json"

@@ -14,7 +14,7 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 
 from ..errors import InputError
-from ..files import output_error, writing
+from ..storage.files import output_error, writing
 
 DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """What reading a damaged file may raise; the second from the text of the first."""

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..files import atomic_path
+from ..storage.files import atomic_path
 
 VALUES = "values.json"
 

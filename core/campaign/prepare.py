@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, ZondaError
-from ..files import product_path
+from ..storage.files import product_path
 from . import parts
 from .entries import Entry, entries
 from .job import TASKS, Combination, Job, Task, digest_of_text, key_of

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..data import Data, Observation
 from ..errors import ZondaError
-from ..files import check_output_folder
+from ..storage.files import check_output_folder
 from . import parts
 from .job import TASKS, Job, Task, plural
 from .prepare import scene_of

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, OutputError, PipelineError, ZondaError
-from ..files import check_output_folder, discard
+from ..storage.files import check_output_folder, discard
 from . import parts
 from .engines import Pool, engine_failed
 from .folder import RESOLVED, Say, check_free, clean, make_way, open_log, opened, publish, sources_of, verify, write_sources

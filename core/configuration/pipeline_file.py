@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .. import registry
-from ..companion import Companion
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
-from ..order import check_order
 from ..pipeline import Pipeline
 from ..plan.budget import Limits
+from ..run.companion import Companion
+from ..run.order import check_order
 from ..scene import Scene
 from ..weather import WeatherSource, resolve
 from . import overrides as settings

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..companion import Companion
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
 from ..focalplane import Focalplane
 from ..operator import Operator
+from ..run.companion import Companion
 from .context import Context
 from .cost import calibrate
 from .estimate import Choice, Cost

@@ -34,7 +34,7 @@ def plan(
     coarsened, the cheapest first, while the bounds add up to no more than the budget: a tenth of the noise, or the file's
     `budget:`.
     """
-    from ..compiled import ensure_cache, one_blas_thread
+    from ..compilation.compiled import ensure_cache, one_blas_thread
 
     one_blas_thread()
     ensure_cache()

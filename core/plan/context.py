@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import Data, Observation
+from ..numerics.projection import rotation_matrices
 from ..operator import Operator
 from ..pipeline import Pipeline
-from ..projection import rotation_matrices
 from ..scene import Scene
 from .estimate import Traits
 from .structure import STREAMS, Structure, selected

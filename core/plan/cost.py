@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from .. import user_cache
-from ..forecast import BASE, forecast
-from ..repeated import affordable, alike
-from ..settings import Settings
+from ..run.forecast import BASE, forecast
+from ..run.repeated import affordable, alike
+from ..run.settings import Settings
+from ..storage import user_cache
 from .context import Context
 from .estimate import Cost
 from .outcome import Prediction
@@ -54,7 +54,7 @@ def measure_speed(budget: float = 0.3) -> dict[str, float]:
 
     The least of several runs: what other programs take does not count as this machine's speed.
     """
-    from ..random import normals, stream_key
+    from ..numerics.random import normals, stream_key
 
     key, array = stream_key(1, "calibration"), np.linspace(0.0, 1.0, 1 << 16, dtype=np.float32)
     other, small = np.empty_like(array), np.arange(64.0)

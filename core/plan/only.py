@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from ..companion import Companion
 from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..errors import ZondaError
+from ..run.companion import Companion
 from .outcome import same_labels
 
 

@@ -23,7 +23,7 @@ class Prediction:
     unknown: tuple[str, ...] = ()
     startup: float = 0.0
     runs: Mapping[str, float] = field(default_factory=dict)
-    """Runs in which each operator is carried out; of one whose streams later runs copy (`core.repeated`), only the first."""
+    """Runs in which each operator is carried out; of one whose streams later runs copy (`core.run.repeated`), only the first."""
     factors: Mapping[str, float] = field(default_factory=dict)
 
     @property

@@ -13,10 +13,10 @@ from typing import Any
 from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile
 from ..data import Data
-from ..derived import derivation
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
 from ..pipeline import Pipeline
+from ..run.derived import derivation
 from .budget import limits
 from .context import Context, look
 from .cost import predict

@@ -15,11 +15,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from .. import user_cache
 from ..configuration.pipeline_file import PipelineFile
 from ..discovery import HOST, discover, normalized
 from ..machine import available_memory, available_threads
 from ..program import fingerprint
+from ..storage import user_cache
 from ..versions import versions
 from .outcome import Outcome, Prediction
 

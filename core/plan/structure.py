@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ..companion import Companion
-from ..derived import derivable, derivation
 from ..operator import Operator
 from ..pipeline import Pipeline
+from ..run.companion import Companion
+from ..run.derived import derivable, derivation
 
 STREAMS = frozenset({"sky", "atmosphere", "transmission", "white", "pink", "signal"})
 """Names whose only use is to be read by a later operator of the same run."""
@@ -45,7 +45,7 @@ class Structure:
     instead
         The companion run that takes the main run's place, its name no longer needed; empty: none.
     derived
-        Companion runs that cost nothing, and how they are derived (`core.derived`).
+        Companion runs that cost nothing, and how they are derived (`core.run.derived`).
     """
 
     operators: tuple[str, ...]

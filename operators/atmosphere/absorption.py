@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.files import own_data
+from zonda.core.storage.files import own_data
 
 Array = NDArray[np.float64]
 

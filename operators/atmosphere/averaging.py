@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.projection import rotation_matrices
+from zonda.core.numerics.projection import rotation_matrices
 
 from .geometry import axes, crossing, rays, tracks
 

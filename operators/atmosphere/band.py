@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.radiation import T_CMB, rayleigh_jeans
-from zonda.core.stretches import stretches
+from zonda.core.numerics.radiation import T_CMB, rayleigh_jeans
+from zonda.core.numerics.stretches import stretches
 
 from .absorption import AbsorptionTable, CrossSections
 from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission

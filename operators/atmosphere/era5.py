@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core import hdf5_files
 from zonda.core.errors import InputError
-from zonda.core.files import reading
+from zonda.core.storage import hdf5_files
+from zonda.core.storage.files import reading
 from zonda.core.weather import Column
 
 from .humidity import from_relative, from_specific, ozone_from_mass

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, Floats, SmoothField, spline_coefficients
+from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, Floats, SmoothField, spline_coefficients
 
 from .nodes import Nodes
 from .response import Response

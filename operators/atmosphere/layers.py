@@ -25,9 +25,9 @@ from zonda.core.data import Block, Data, Observation, Tally
 from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.knobs import Knob
+from zonda.core.numerics.smooth import SmoothField
+from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
-from zonda.core.smooth import SmoothField
-from zonda.core.stretches import stretches
 
 from . import weather
 from .absorption import AbsorptionTable

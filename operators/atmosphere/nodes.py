@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.smooth import PAD, SPLINE_MARGIN
+from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN
 
 from .beams import Aperture
 from .covariance import mixture
@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 SPLINE_TABLE = Path(__file__).parent / "data" / "spline_error.npz"
 
 LARGEST_STEP = 2048
-"""Samples; see `core.tiles`."""
+"""Samples; see `core.numerics.tiles`."""
 
 GRIDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 32, 40, 48, 64)
 _TRIED = 64

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.smooth import SmoothField
 
 from .band import BandAtmosphere
 from .geometry import Track, axes, axes_at, crossing, rays

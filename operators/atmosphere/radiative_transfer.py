@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.radiation import BOLTZMANN, T_CMB, rayleigh_jeans
+from zonda.core.numerics.radiation import BOLTZMANN, T_CMB, rayleigh_jeans
 
 from .absorption import OZONE_PARTS, AbsorptionTable, CrossSections, absorption_table
 

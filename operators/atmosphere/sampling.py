@@ -17,10 +17,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.columns import four_columns_at
+from zonda.core.compilation.columns import four_columns_at
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
-from zonda.core.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
+from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
 
 from .geometry import Track, rim
 from .lines_of_sight import LinesOfSight

@@ -35,9 +35,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.columns import fused
+from zonda.core.compilation.columns import fused
 from zonda.core.errors import InputError
-from zonda.core.random import lattice_normals, stream_key
+from zonda.core.numerics.random import lattice_normals, stream_key
 
 from .beams import Aperture
 from .covariance import NU, beam_correlation, mixture_between, spectrum_between
@@ -102,8 +102,8 @@ class Turbulence:
     Parameters
     ----------
     seed, names
-        What the random stream belongs to (`core.random.stream_key`). Lattices are powers of two metres whatever the beam,
-        so two beams that look through the same stream see the same air.
+        What the random stream belongs to (`core.numerics.random.stream_key`). Lattices are powers of two metres whatever the
+        beam, so two beams that look through the same stream see the same air.
     outer_scale, sigma
         r0 and the Gaussian beam's standard deviation, m.
     aperture

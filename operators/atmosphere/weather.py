@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.files import own_data
+from zonda.core.storage.files import own_data
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from zonda.core.configuration.files import InputPath
 from zonda.core.errors import InputError
-from zonda.core.random import normals, stream_key, uniforms
+from zonda.core.numerics.random import normals, stream_key, uniforms
 from zonda.core.weather import Column, WeatherSource
 
 from .era5 import read_era5

@@ -17,8 +17,8 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.early import take
-from zonda.core.files import atomic_path, product_path
 from zonda.core.operator import Operator
+from zonda.core.storage.files import atomic_path, product_path
 from zonda.operators.io.map_view import MapView, maps_of, noise_sources
 from zonda.operators.io.save_map import MOST_AT_ONCE, output_folder
 from zonda.operators.maps.image import Image

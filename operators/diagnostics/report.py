@@ -18,9 +18,9 @@ from zonda.core.configuration.parameters import described, quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data, Observation
 from zonda.core.errors import ZondaError
-from zonda.core.files import write_text
+from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.operator import Operator
-from zonda.core.radiation import to_kelvin_rj
+from zonda.core.storage.files import write_text
 from zonda.operators.io.map_view import maps_of, noise_figures
 from zonda.operators.io.save_map import output_folder
 

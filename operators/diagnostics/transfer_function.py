@@ -28,12 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from zonda.core.companion import Companion
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data, html_table
 from zonda.core.errors import PipelineError
-from zonda.core.files import product_path
 from zonda.core.operator import Operator
+from zonda.core.run.companion import Companion
+from zonda.core.storage.files import product_path
 from zonda.operators.io.ecsv import Column, write_ecsv
 from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 

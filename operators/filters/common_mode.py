@@ -34,8 +34,8 @@ from pydantic import Field, model_validator
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
+from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
-from zonda.core.tiles import TILE_SAMPLES
 
 from . import focal_plane_mean
 from .gram import MOST_COPIED, Gram, Usable

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Stream
-from zonda.core.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

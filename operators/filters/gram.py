@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Stream
-from zonda.core.random import normals, stream_key
-from zonda.core.streams import columns
-from zonda.core.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.run.streams import columns
 
 Floats = NDArray[np.float64]
 

@@ -31,11 +31,11 @@ from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.knobs import Knob
+from zonda.core.numerics.smooth import product
+from zonda.core.numerics.stretches import stretches, untouched
+from zonda.core.numerics.tiles import TILE_DETECTORS
+from zonda.core.numerics.transforms import cosine_transform, fast_length
 from zonda.core.operator import Operator
-from zonda.core.smooth import product
-from zonda.core.stretches import stretches, untouched
-from zonda.core.tiles import TILE_DETECTORS
-from zonda.core.transforms import cosine_transform, fast_length
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context

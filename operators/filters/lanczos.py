@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.stretches import stretches, untouched
+from zonda.core.numerics.stretches import stretches, untouched
 
 from .gram import Gram, directions, near_the_mean
 

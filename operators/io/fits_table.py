@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from zonda.core.files import writing
-from zonda.core.fits_files import check_size, opened
+from zonda.core.storage.files import writing
+from zonda.core.storage.fits_files import check_size, opened
 
 from .map_file import ascii_text
 from .time_ordered_data import UNITS, Floats, TimeOrderedData

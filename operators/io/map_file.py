@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core import tangent
 from zonda.core.data import Data
-from zonda.core.files import atomic_path
-from zonda.core.fits_image import BLOCK, Cards, image_pieces
+from zonda.core.numerics import tangent
+from zonda.core.storage.files import atomic_path
+from zonda.core.storage.fits_image import BLOCK, Cards, image_pieces
 
 from .map_view import MapView
 
@@ -173,7 +173,7 @@ def _tables(data: Data) -> Iterable[bytes]:
 
 
 def _text_table(name: str, columns: dict[str, list[str]]) -> bytes:
-    """FITS 4.0, section 7.3; see `core.fits_image` for why not astropy."""
+    """FITS 4.0, section 7.3; see `core.storage.fits_image` for why not astropy."""
     plain = {title: [ascii_text(t) for t in texts] for title, texts in columns.items()}
     widths = {title: max([1, *map(len, texts)]) for title, texts in plain.items()}
     rows = list(zip(*([t.ljust(widths[title], "\0") for t in texts] for title, texts in plain.items()), strict=True))

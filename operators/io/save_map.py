@@ -13,9 +13,9 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
-from zonda.core.files import check_output_folder, product_path
-from zonda.core.fits_image import Cards
 from zonda.core.operator import Operator
+from zonda.core.storage.files import check_output_folder, product_path
+from zonda.core.storage.fits_image import Cards
 
 from .map_file import Provenance, write_map
 from .map_view import MapView, NoiseFigure, maps_of, noise_figures, noise_sources

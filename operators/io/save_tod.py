@@ -14,8 +14,8 @@ from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import OutputError
-from zonda.core.files import atomic_path, check_output_folder, discard, product_path, publish, temporary_sibling
 from zonda.core.operator import Operator
+from zonda.core.storage.files import atomic_path, check_output_folder, discard, product_path, publish, temporary_sibling
 
 from . import fits_table, toast_hdf5
 from .save_map import no_output_folder, output_folder

@@ -11,7 +11,7 @@ COMPONENTS = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
 class StreamsAsked:
     """The ``optional`` of an operator with a parameter ``streams``: all components for the class, those asked for in an object.
 
-    So the executor keeps no stream that nobody reads, see `core.execution`.
+    So the executor keeps no stream that nobody reads, see `core.run.execution`.
     """
 
     def __get__(self, operator: Any, owner: type) -> frozenset[str]:

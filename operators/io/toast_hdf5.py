@@ -17,8 +17,8 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.files import writing
-from zonda.core.hdf5_files import Disk, check_size, opened
+from zonda.core.storage.files import writing
+from zonda.core.storage.hdf5_files import Disk, check_size, opened
 
 from .time_ordered_data import UNITS, Floats, TimeOrderedData
 

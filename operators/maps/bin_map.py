@@ -20,9 +20,9 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.numerics.stretches import untouched
+from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
-from zonda.core.stretches import untouched
-from zonda.core.tiles import TILE_SAMPLES
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
 from .map_product import MapProduct

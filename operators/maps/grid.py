@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
-from zonda.core.stretches import stretches
-from zonda.core.tangent import TangentWcs
+from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
+from zonda.core.numerics.stretches import stretches
+from zonda.core.numerics.tangent import TangentWcs
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -44,7 +44,7 @@ class TangentGrid:
         return tangent_wcs(self.centre, self.pixel, self.shape, self.frame)
 
     def pointing(self, observation: Observation) -> Floats:
-        """Homographies (9, n_samp), see `core.projection`."""
+        """Homographies (9, n_samp), see `core.numerics.projection`."""
         return np.ascontiguousarray(homographies(observation.boresight_radec, self.wcs).T)
 
     def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
-    from zonda.core.fits_image import Cards
+    from zonda.core.storage.fits_image import Cards
 
 
 @dataclass

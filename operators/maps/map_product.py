@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core import tangent
 from zonda.core.data import html_table
 from zonda.core.errors import InputError
+from zonda.core.numerics import tangent
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
-    from zonda.core.fits_image import Cards
-    from zonda.core.tangent import TangentWcs
+    from zonda.core.numerics.tangent import TangentWcs
+    from zonda.core.storage.fits_image import Cards
 
 Floats = NDArray[np.float64]
 

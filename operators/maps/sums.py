@@ -21,9 +21,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.columns import prefetch
+from zonda.core.compilation.columns import prefetch
 from zonda.core.errors import PipelineError
-from zonda.core.stretches import untouched
+from zonda.core.numerics.stretches import untouched
 
 from .grid import Grid, TangentGrid
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.random import normals, stream_key
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.smooth import SmoothField
 
 from .models import FixedNet, NoiseModel, time_mean
 

@@ -14,13 +14,13 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Fraction, Kelvin, KelvinRootSecond
 from zonda.core.errors import ZondaError
-from zonda.core.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
+from zonda.core.numerics.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
 from zonda.core.registry import noise_models
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
     from zonda.core.instrument import Band
-    from zonda.core.smooth import SmoothField
+    from zonda.core.numerics.smooth import SmoothField
 
 Array = NDArray[np.float64]
 

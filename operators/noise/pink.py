@@ -16,10 +16,10 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
 from zonda.core.errors import InputError
 from zonda.core.knobs import Knob
+from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, normal_tile, normals
+from zonda.core.numerics.smooth import Series, SmoothField, series_into
+from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.operator import Operator
-from zonda.core.random import TILE, fill_normals, normal_scratch, normal_tile, normals
-from zonda.core.smooth import Series, SmoothField, series_into
-from zonda.core.tiles import TILE_DETECTORS
 
 from .level import NoiseLevel, announced
 from .models import FixedNet, time_mean

@@ -12,9 +12,9 @@ from numba import uint64
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
+from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
+from zonda.core.numerics.smooth import SmoothField, series_into
 from zonda.core.operator import Operator
-from zonda.core.random import TILE, normal_scratch, normal_tile
-from zonda.core.smooth import SmoothField, series_into
 
 from .level import NoiseLevel, announce, scatter_factors
 from .models import FixedNet, NoiseModel, noise_model

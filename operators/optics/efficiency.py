@@ -25,10 +25,10 @@ from pydantic import Field
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
+from zonda.core.numerics.random import normals
+from zonda.core.numerics.smooth import Series, SmoothField, interpolating, series_into
+from zonda.core.numerics.stretches import stretches, untouched
 from zonda.core.operator import Operator
-from zonda.core.random import normals
-from zonda.core.smooth import Series, SmoothField, interpolating, series_into
-from zonda.core.stretches import stretches, untouched
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context

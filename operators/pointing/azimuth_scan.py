@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
 from zonda.core.errors import PointingError
-from zonda.core.stretches import stretches
+from zonda.core.numerics.stretches import stretches
 
 from .base import Pointing
 from .transform import CelestialTransform, series, unit_vectors

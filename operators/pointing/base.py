@@ -17,9 +17,9 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
 from zonda.core.errors import PointingError
 from zonda.core.knobs import Knob
+from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
-from zonda.core.random import normals, stream_key
-from zonda.core.stretches import stretches
 
 from .limits import Moved, check_elevation, excess, lower_elevation
 from .motion import POINTS, Peak, Quantity, motion, rate_text

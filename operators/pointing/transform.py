@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import PointingError
-from zonda.core.stretches import stretches, untouched
+from zonda.core.numerics.stretches import stretches, untouched
 
 from .earth_orientation import orientation
 
@@ -325,7 +325,7 @@ def conjugate(a: Floats) -> Floats:
 
 def matrices(a: Floats) -> Floats:
     """Rotation matrices (n, 3, 3)."""
-    from zonda.core.projection import rotation_matrices
+    from zonda.core.numerics.projection import rotation_matrices
 
     return rotation_matrices(a)
 

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.transforms import fast_length, spline_filter, spline_response
+from zonda.core.numerics.transforms import fast_length, spline_filter, spline_response
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ of an ideal gas (5/3) at Mach number M, which relaxes over the length w behind t
     P -> P [1 + (J - 1) exp(-(R - r) / w) C(theta)],   r < R,   J = (5 M^2 - 1) / 4                             (3)
 
 with C(theta) a raised cosine that is zero beyond the cap's half angle. The Compton parameter is the numerical line-of-sight
-integral y = sigma_T / (m_e c^2) int P dl, which `core.radiation.thermal_sz` turns into K_RJ at one frequency.
+integral y = sigma_T / (m_e c^2) int P dl, which `core.numerics.radiation.thermal_sz` turns into K_RJ at one frequency.
 
 Cosmology: astropy's Planck18. The figures of the shipped map are the defaults below; they describe no real cluster.
 """
@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.files import atomic_path
-from zonda.core.radiation import thermal_sz
+from zonda.core.numerics.radiation import thermal_sz
+from zonda.core.storage.files import atomic_path
 
 Floats = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.projection import pixel_matrix
-from zonda.core.radiation import to_kelvin_rj
+from zonda.core.numerics.projection import pixel_matrix
+from zonda.core.numerics.radiation import to_kelvin_rj
 
 from .read import HealpixMap, WcsMap, is_plain_tan, linear
 from .resample import pixel_areas
@@ -72,7 +72,7 @@ def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: 
     ``wcs``: the TAN WCS, None where resampled.
 
     Jy/pixel is divided by each pixel's own solid angle; one beyond the projection has none, and its flux is
-    lost. Raises InputError as `core.radiation.to_kelvin_rj`.
+    lost. Raises InputError as `core.numerics.radiation.to_kelvin_rj`.
     """
     beam = source.beam_solid_angle if isinstance(source, WcsMap) else None
     factor = to_kelvin_rj(source.unit, band, 1.0, spectral_index, beam)

@@ -14,11 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core import tangent
 from zonda.core.errors import InputError
-from zonda.core.files import check_memory, first_line, reading
-from zonda.core.fits_files import check_size, opened
-from zonda.core.fits_image import read_image
+from zonda.core.numerics import tangent
+from zonda.core.storage.files import check_memory, first_line, reading
+from zonda.core.storage.fits_files import check_size, opened
+from zonda.core.storage.fits_image import read_image
 
 Floats = NDArray[np.float64]
 
@@ -366,7 +366,7 @@ def _plain_scale(place: str, header: Any, scaled: bool, pixel_size: float | None
 
 def is_plain_tan(wcs: Any) -> bool:
     """True for a gnomonic projection without distortions, which needs no resampling; in a frame that is a rotation of ICRS."""
-    from zonda.core.projection import wcs_frame_rotation
+    from zonda.core.numerics.projection import wcs_frame_rotation
 
     if not all(str(c).endswith("-TAN") for c in wcs.wcs.ctype) or wcs.has_distortion or len(wcs.wcs.get_pv()):
         return False

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.projection import pixel_matrix
+from zonda.core.numerics.projection import pixel_matrix
 
 from .read import HealpixMap, WcsMap
 
@@ -145,7 +145,7 @@ def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.b
     import healpy
     from scipy.spatial import cKDTree
 
-    from zonda.core.projection import frame_rotation
+    from zonda.core.numerics.projection import frame_rotation
 
     to_frame = frame_rotation(sky.frame)
     nx, ny = target.pixel_shape

@@ -1,6 +1,6 @@
 """Sampling a convolved map at every detector and instant by cubic B-splines.
 
-A direction d has the working-grid pixel p = A d, x = p0 / p2, y = p1 / p2 (`core.projection`), a detector looks at
+A direction d has the working-grid pixel p = A d, x = p0 / p2, y = p1 / p2 (`core.numerics.projection`), a detector looks at
 R(t) (-eta, -xi, 1), so that one 3 x 3 matrix per instant, H = A R(t) with its columns sorted, takes (xi, eta, 1) to
 pixels: exact for a gnomonic grid.
 
@@ -18,7 +18,7 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from zonda.core.columns import spline_of_four
+from zonda.core.compilation.columns import spline_of_four
 
 Floats = NDArray[np.floating]
 

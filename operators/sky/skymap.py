@@ -18,11 +18,11 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Kelvin
 from zonda.core.data import Block, Data, Observation
-from zonda.core.fits_image import Cards
 from zonda.core.knobs import Knob
+from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_matrices
+from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
-from zonda.core.projection import boresights, pixel_matrix, rotation_matrices
-from zonda.core.stretches import stretches
+from zonda.core.storage.fits_image import Cards
 
 from ..maps.image import Image
 from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct

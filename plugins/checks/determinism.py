@@ -14,9 +14,9 @@ import numpy as np
 
 from zonda.core.checks import Family, Measured
 from zonda.core.data import Block, Data
+from zonda.core.numerics.random import normals, stream_key
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.core.random import normals, stream_key
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter

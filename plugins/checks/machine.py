@@ -68,7 +68,7 @@ def denormals() -> Measured:
 
     A library built with -ffast-math switches them off for the whole process.
     """
-    from zonda.core.random import normals, stream_key
+    from zonda.core.numerics.random import normals, stream_key
 
     def flushed(_: int) -> int:
         normals(stream_key(1, "doctor"), 0, 10)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from zonda.core.checks import Family, Measured
-from zonda.core.random import normals, stream_key
+from zonda.core.numerics.random import normals, stream_key
 from zonda.operators.noise.one_over_f import PowerLawFilter, power_law_filter
 from zonda.operators.noise.pink import Streams
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from zonda.core.checks import Family, Measured
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
-from zonda.core.projection import rotation_matrices
+from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.site import Site
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.daisy import PointingDaisy

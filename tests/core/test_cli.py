@@ -23,7 +23,7 @@ TOYS = '''
 import errno, os, time
 import numpy as np
 from zonda.core.data import Observation
-from zonda.core.files import atomic_path, write_text
+from zonda.core.storage.files import atomic_path, write_text
 from zonda.core.hooks import hookimpl
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.operator import Operator

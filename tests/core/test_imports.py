@@ -17,7 +17,7 @@ HEAVY = {
 RUN = """
 import os, sys
 from zonda.core import cli
-from zonda.core.block_maker import BlockMaker
+from zonda.core.run.block_maker import BlockMaker
 
 def first_block(*arguments, **named):
     print(*sorted(sys.modules))

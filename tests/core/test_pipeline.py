@@ -9,11 +9,11 @@ from pydantic import PrivateAttr
 import zonda
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
+from zonda.core.numerics.random import normals
+from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
-from zonda.core.order import check_order, makers
 from zonda.core.pipeline import Pipeline
-from zonda.core.random import normals
-from zonda.core.smooth import SmoothField
+from zonda.core.run.order import check_order, makers
 
 
 class Point(Operator):

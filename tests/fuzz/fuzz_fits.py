@@ -10,13 +10,19 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import fuzz, guided_by, scratch, told
 
-with guided_by("zonda.operators.sky", "zonda.operators.io", "zonda.core.projection", "zonda.core.fits_image", "astropy.io.fits"):
+with guided_by(
+    "zonda.operators.sky",
+    "zonda.operators.io",
+    "zonda.core.numerics.projection",
+    "zonda.core.storage.fits_image",
+    "astropy.io.fits",
+):
     import numpy as np
     from astropy.io import fits
     from fuzz_hdf5 import tiny_scan, whole
 
     from zonda.core.errors import ZondaError
-    from zonda.core.fits_image import read_image
+    from zonda.core.storage.fits_image import read_image
     from zonda.operators.io import fits_table
     from zonda.operators.io.save_tod import save_tod
     from zonda.operators.sky.read import HealpixMap, read_map

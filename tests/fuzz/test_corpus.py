@@ -40,7 +40,8 @@ def whole(name: str) -> list[bytes]:
 
 @pytest.fixture(autouse=True)
 def _limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    from zonda.core import hdf5_files, machine
+    from zonda.core import machine
+    from zonda.core.storage import hdf5_files
 
     monkeypatch.setattr(hdf5_files, "PATIENCE", 4.0)
     monkeypatch.setattr(machine, "available_memory", lambda: 256 << 20)
@@ -108,8 +109,8 @@ def test_an_input_on_which_libhdf5_hangs(tmp_path: Path) -> None:
     """The process that looks first is ended, and the file refused."""
     import time
 
-    from zonda.core import hdf5_files
     from zonda.core.errors import InputError
+    from zonda.core.storage import hdf5_files
 
     (tmp_path / "x.h5").write_bytes(b"")
     slow = tmp_path / "python"

@@ -13,11 +13,11 @@ from pydantic import PrivateAttr
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
 from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-from zonda.core.smooth import SmoothField
 
 ARCSEC = np.radians(1 / 3600)
 CENTRE = (np.radians(75.0), np.radians(20.0))

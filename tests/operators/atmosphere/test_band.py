@@ -7,7 +7,7 @@ import pytest
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
-from zonda.core.radiation import rayleigh_jeans
+from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.site import Site
 from zonda.operators.atmosphere.absorption import absorption_table
 from zonda.operators.atmosphere.band import BandAtmosphere, _cell_weights, _chebyshev

@@ -17,7 +17,7 @@ from scipy.special import j0, j1
 import zonda
 from zonda.core.data import Observation
 from zonda.core.instrument import Band
-from zonda.core.random import lattice_normals, stream_key
+from zonda.core.numerics.random import lattice_normals, stream_key
 from zonda.operators.atmosphere.turbulence import Turbulence
 
 from .test_layers import PWV, instrument, observe, quaternions

@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from zonda.core.blocks import cut
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import ZondaError
 from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.run.blocks import cut
 from zonda.core.scene import Scene
 from zonda.core.site import Site
 from zonda.operators.atmosphere import fluctuations, plan, sampling

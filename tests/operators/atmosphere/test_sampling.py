@@ -14,8 +14,8 @@ from zonda.core.configuration.time import Instant
 from zonda.core.data import Observation
 from zonda.core.errors import ZondaError
 from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.numerics.smooth import SPLINE_MARGIN, spline_coefficients
 from zonda.core.site import Site
-from zonda.core.smooth import SPLINE_MARGIN, spline_coefficients
 from zonda.operators.atmosphere.band import BandAtmosphere
 from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
 from zonda.operators.atmosphere.lines_of_sight import LinesOfSight

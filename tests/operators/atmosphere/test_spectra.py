@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
-from zonda.core.radiation import rayleigh_jeans
+from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.site import Site
 from zonda.operators.atmosphere.absorption import TABLE, AbsorptionTable, CrossSections, absorption_table
 from zonda.operators.atmosphere.band import _BandTransfer

@@ -10,7 +10,7 @@ from scipy.ndimage import spline_filter
 from scipy.signal import fftconvolve
 
 from zonda.core.errors import InputError
-from zonda.core.random import lattice_normals
+from zonda.core.numerics.random import lattice_normals
 from zonda.operators.atmosphere import turbulence
 from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
 from zonda.operators.atmosphere.turbulence import FIDELITIES, Turbulence

@@ -441,7 +441,7 @@ def test_a_large_input_keeps_its_place_when_thinned(data, wcs):
 
 def test_time_streams_are_kept_whole(make_observation, data):
     from zonda.core.data import Block
-    from zonda.core.smooth import SmoothField
+    from zonda.core.numerics.smooth import SmoothField
 
     observation, operator = make_observation(5000), TimeStreams(streams=["signal", "pink"], detectors=3)
     mean = SmoothField.constant(np.arange(19.0), 5000)

@@ -8,7 +8,7 @@ import scipy.signal
 
 from zonda.core.data import Block
 from zonda.core.errors import PipelineError
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.diagnostics.power_spectrum import PowerSpectrum, Spectrum, Welch, _quick
 
 

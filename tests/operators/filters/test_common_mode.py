@@ -9,9 +9,9 @@ import pytest
 from pydantic import PrivateAttr
 
 from zonda.core.errors import PipelineError
+from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.core.smooth import SmoothField
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap

@@ -12,7 +12,7 @@ from scipy.fft import dct, idct
 
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.highpass import ONLY_A_LINE, HighpassFilter, plan_highpass
 
 RATE, CUT = 100.0, 0.08

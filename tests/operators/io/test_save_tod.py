@@ -14,8 +14,8 @@ from astropy.table import Table
 
 from zonda.core.data import Block
 from zonda.core.errors import InputError, OutputError
+from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
-from zonda.core.smooth import SmoothField
 from zonda.operators.io import fits_table, toast_hdf5
 from zonda.operators.io.save_tod import SaveTOD, load_tod, save_tod
 from zonda.operators.io.time_ordered_data import detector_quaternions

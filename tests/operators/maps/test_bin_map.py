@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import zonda
 from zonda.core.errors import InputError, PipelineError
-from zonda.core.projection import directions, frame_rotation
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.projection import directions, frame_rotation
+from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.map_product import ARCMIN

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from zonda.core.instrument import Band
-from zonda.core.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
+from zonda.core.numerics.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
+from zonda.core.numerics.smooth import SmoothField
 from zonda.core.registry import noise_models
-from zonda.core.smooth import SmoothField
 from zonda.operators.noise.models import BackgroundLimited, FixedNet, NoiseModel, noise_model
 from zonda.operators.noise.white import WhiteNoise
 

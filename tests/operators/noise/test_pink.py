@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from zonda.core.errors import InputError
-from zonda.core.random import normals, stream_key
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.operators.noise.pink import CHECKPOINT, PinkNoise, Streams
 from zonda.operators.noise.white import WhiteNoise

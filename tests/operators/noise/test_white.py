@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.noise.models import BackgroundLimited, FixedNet, NoiseModel
 from zonda.operators.noise.white import WhiteNoise
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from zonda.core.smooth import SmoothField
+from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.optics.efficiency import OPAQUE, Efficiency, _spline, quotient
 
 N_DET, N = 19, 5000

@@ -55,6 +55,7 @@ def test_figures_are_those_of_the_closed_form(amplitude: float, omega: float, el
 
 
 @settings(max_examples=8, deadline=None, phases=[Phase.explicit, Phase.generate])
+@example("throw", 0.0625, 2.0, 20.0, 1.0)  # no turnaround in 30 s
 @given(st.sampled_from(["daisy", "throw"]), st.floats(0.05, 1.0), st.floats(0.2, 2.0), st.floats(20.0, 85.0), st.floats(0.0, 6.0))
 def test_figures_equal_a_brute_force_derivative(which: str, speed: float, size: float, elevation: float, azimuth: float) -> None:
     """Against central differences of the path in 30 digits, every 4 ms near where the figure is reached."""
@@ -96,7 +97,7 @@ def test_figures_equal_a_brute_force_derivative(which: str, speed: float, size: 
             minus, here, plus = (angles(t + s * h)[k] for s in (-1, 0, 1))
             value = (plus - minus) / (2 * h) if order == 1 else (plus - 2 * here + minus) / h**2
             largest = max(largest, abs(value))
-        assert peak.figure == pytest.approx(float(largest), rel=0.02)
+        assert peak.figure == pytest.approx(float(largest), rel=0.02, abs=2**order * 8.9e-16 / 1e-3**order)  # an ulp of 4 to 8 rad
 
 
 def test_a_coarse_sampling_does_not_hide_an_acceleration(observe: Callable[..., Data]) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PointingError, ZondaError
-from zonda.core.projection import rotation_matrices
+from zonda.core.numerics.projection import rotation_matrices
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.recorded import PointingRecorded
 from zonda.operators.pointing.recording import FLAGGED, NOT_RECORDED, Recording, comb, longest_rising, read

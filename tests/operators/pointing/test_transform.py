@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zonda.core import stretches
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
-from zonda.core.projection import rotation_matrices
+from zonda.core.numerics import stretches
+from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.site import Site
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.daisy import PointingDaisy

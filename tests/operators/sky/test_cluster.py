@@ -6,7 +6,7 @@ from astropy.cosmology import Planck18
 from astropy.io import fits
 from scipy.integrate import quad
 
-from zonda.core.radiation import thermal_sz
+from zonda.core.numerics.radiation import thermal_sz
 from zonda.operators.sky import cluster
 
 SHIPPED = Path(cluster.__file__).parents[2] / "pipelines" / "data" / "merging_cluster.fits"

@@ -6,7 +6,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
-from zonda.core.projection import pixel_matrix
+from zonda.core.numerics.projection import pixel_matrix
 from zonda.operators.sky.placement import placed
 from zonda.operators.sky.read import HealpixMap, WcsMap, parse_unit, read_map
 

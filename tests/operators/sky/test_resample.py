@@ -8,7 +8,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
-from zonda.core.radiation import to_kelvin_rj
+from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.operators.sky.placement import tangent_areas
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.resample import pixel_areas, resample_healpix, tangent_wcs
@@ -110,7 +110,7 @@ def test_pixel_areas(made, kind):
     if kind == "ZEA":  # equal-area by name
         np.testing.assert_allclose(areas, (600 * ARCMIN / 60) ** 2, rtol=1e-5)
     if kind == "TAN":
-        from zonda.core.projection import pixel_matrix
+        from zonda.core.numerics.projection import pixel_matrix
 
         np.testing.assert_allclose(areas, tangent_areas(pixel_matrix(WCS(header)), (60, 70)), rtol=1e-5)
     if kind == "SIN":  # dOmega = dx dy / cos(theta)

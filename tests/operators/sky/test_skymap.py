@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from zonda.core.data import Data
 from zonda.core.errors import InputError
-from zonda.core.radiation import to_kelvin_rj
+from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.operators.sky.skymap import SkyMap
 
 ARCSEC = np.pi / 648000

@@ -1,0 +1,1 @@
+"""Arithmetic that operators share: random numbers, tiles, smooth fields, projections, transforms, brightness."""

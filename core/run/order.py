@@ -1,0 +1,76 @@
+"""The order of a pipeline's steps, checked before anything runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+from ..operator import Operator
+from ..sky_signal import place_of_signal
+
+
+@dataclass(frozen=True)
+class OrderProblem:
+    """A step that does not fit where it stands."""
+
+    index: int
+    message: str
+    label: str
+    cure: str = ""
+
+
+def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
+    """Every step whose inputs are not there yet, or whose output comes too late to be used."""
+    problems = []
+    have: set[str] = set()
+    sky_is_signal = place_of_signal(operators)
+    for index, operator in enumerate(operators):
+        if index == sky_is_signal:
+            have.add("signal")
+        name = type(operator).__name__
+        later = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides}
+        for what in sorted(operator.requires - have):
+            if what in later:
+                problems.append(
+                    OrderProblem(
+                        index, f"{name} needs {what}, which {later[what]} provides only later", f"move it below {later[what]}"
+                    )
+                )
+            else:
+                found = makers(what)
+                cure = f"{' or '.join(found)} would" if found else ""
+                message = f"{name} needs {what}, which no step provides"
+                problems.append(OrderProblem(index, message, f"add a step that provides {what} above", cure))
+        for what in sorted((operator.optional - operator.requires) & set(later)):
+            if not operator.at_end:
+                problems.append(
+                    OrderProblem(
+                        index, f"{later[what]} provides {what} only after {name} has used it", f"move {name} below {later[what]}"
+                    )
+                )
+        if operator.couples == "all" and len(operator.requires - {"boresight"}) != 1:
+            problems.append(
+                OrderProblem(
+                    index,
+                    f"{name} couples all samples but requires {len(operator.requires)} streams",
+                    "it must require exactly one",
+                )
+            )
+        have |= operator.provides
+    if operators and not any("boresight" in o.provides | o.requires for o in operators):
+        problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step, e.g. PointingDaisy"))
+    return problems
+
+
+def makers(what: str) -> list[str]:
+    """Installed operators that provide ``what`` and do not need it themselves. Imports them all: for messages only."""
+    from ..registry import RegistryError, steps
+
+    found = []
+    for name in steps:
+        with suppress(RegistryError):  # a broken plugin is another message's
+            operator = steps.get(name)
+            if what in operator.provides - operator.requires:
+                found.append(name)
+    return found

@@ -1,0 +1,65 @@
+"""How observations are executed, and what that took."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..data import Floats
+from .streams import Held
+
+
+@dataclass
+class Settings:
+    """How to execute.
+
+    Attributes
+    ----------
+    threads
+        Threads that work on blocks.
+    memory
+        Bytes for streams and blocks.
+    ceiling
+        Bytes that the whole process may hold; None: only ``memory`` counts.
+    dtype
+        Type of the streams.
+    prefer
+        What is done with streams that do not fit in memory where there is a choice; None: what is quicker.
+    progress
+        Whom to tell.
+    spare
+        Memory to use again.
+    kept
+        Memory of streams kept for later runs (`core.run.repeated`), which neither ``memory`` nor ``ceiling`` count.
+    """
+
+    threads: int = 1
+    memory: int = 2 << 30
+    dtype: type[np.floating[Any]] = np.float32
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None
+    spare: list[Floats] = field(default_factory=list)
+    kept: list[Floats] = field(default_factory=list)
+    ceiling: int | None = None
+    prefer: Held | None = None
+
+
+@dataclass
+class Timer:
+    """CPU seconds by (operator label, stage), added up over threads."""
+
+    seconds: dict[tuple[str, str], float] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, label: str, stage: str, seconds: float) -> None:
+        """Add to a stage."""
+        with self._lock:
+            self.seconds[label, stage] = self.seconds.get((label, stage), 0.0) + seconds
+
+    def rows(self) -> list[tuple[str, str, float]]:
+        """(label, stage, seconds) in the order in which they first took time."""
+        with self._lock:
+            return [(*key, seconds) for key, seconds in self.seconds.items()]

@@ -1,0 +1,357 @@
+"""Where the streams between two segments stay: in memory, in a temporary file, or nowhere, to be made again block by block.
+
+Making again needs no room and no disk: operators depend on absolute detectors and samples only, random numbers are counted, so
+the segments before can run once more for any block that a later segment or an `Operator.measure` reads. It costs their time
+once more for each reading. What is done follows from sizes, free disk and that cost:
+
+    kept      while all streams of an observation that are held at once take at most half of the budget, and leave
+              room for blocks;
+    spilled   where the disk has room and 2 N b / D <= k N c / threads;                                      (1)
+    again     otherwise,
+
+N samples of b bytes, D [B/s] the disk's rate, k the number of readings beyond the first, c [CPU s] what a sample costs.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from ..data import Floats, Observation, Stream
+from ..errors import OutputError, PipelineError
+from ..numerics.smooth import SmoothField
+from ..numerics.stretches import untouched
+
+if TYPE_CHECKING:
+    from .blocks import Segment
+
+Held = Literal["kept", "spilled", "again"]
+
+DISK_RATE = 4e8
+"""Bytes per second to and from the temporary folder where it is not measured."""
+
+WORTH_MEASURING = 1 << 30
+"""Bytes from which the disk's rate and the cost of a sample are measured before anything is decided."""
+
+SAMPLE_COST = 25e-9
+"""CPU seconds to make a sample, where it is not measured."""
+
+DISK_SHARE = 0.9
+"""Of the free disk that streams may take."""
+
+
+class Ledger:
+    """Bytes held for streams and blocks, by owner, and the most at any time. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: dict[Any, int] = {}
+        self.peak = 0
+
+    def note(self, owner: Any, size: int) -> None:
+        """``owner`` now holds ``size`` bytes."""
+        with self._lock:
+            self._held[owner] = size
+            self.peak = max(self.peak, sum(self._held.values()))
+
+    def drop(self, kind: str) -> None:
+        """Owners (kind, ...) hold nothing any more: their threads have ended."""
+        with self._lock:
+            self._held = {owner: size for owner, size in self._held.items() if owner[0] != kind}
+
+
+@dataclass
+class Stage:
+    """A segment whose streams are made again whenever they are read.
+
+    Attributes
+    ----------
+    source
+        What the segment reads.
+    wanted
+        Names of the streams that it passes on.
+    swept
+        It has worked on every sample once: what comes now comes again.
+    """
+
+    segment: Segment
+    source: Source
+    wanted: frozenset[str]
+    swept: bool = False
+
+    @property
+    def span(self) -> str:
+        """What its blocks must hold whole: ``time``, ``detectors``, or ``sample``, nothing."""
+        return self.source.span if self.segment.span == "sample" else self.segment.span
+
+    @property
+    def depth(self) -> int:
+        """Number of stages before it."""
+        return self.source.stage.depth + 1 if self.source.stage else 0
+
+    @property
+    def in_time_order(self) -> bool:
+        """Whether it is much cheaper in order of time."""
+        return self.segment.in_time_order or bool(self.source.stage and self.source.stage.in_time_order)
+
+    def has_been_swept(self) -> None:
+        """Every sample was worked on."""
+        stage: Stage | None = self
+        while stage is not None:
+            stage.swept, stage = True, stage.source.stage
+
+
+@dataclass
+class Source:
+    """What a segment reads: streams that are held, or a stage that makes them; the mean emission that belongs to them."""
+
+    streams: dict[str, Stream] = field(default_factory=dict)
+    stage: Stage | None = None
+    names: frozenset[str] = frozenset()
+    means: dict[str, SmoothField] = field(default_factory=dict)
+
+    @property
+    def span(self) -> str:
+        """See `Stage.span`."""
+        return self.stage.span if self.stage else "sample"
+
+    @classmethod
+    def of(cls, streams: dict[str, Stream], means: dict[str, SmoothField]) -> Source:
+        """Of streams that are held."""
+        return cls(streams, None, frozenset(streams), means)
+
+
+class StreamMadeAgain(Stream):
+    """A stream that is held nowhere: `sweep` makes it. ``sweeper`` is given what `sweep` is given."""
+
+    def __init__(
+        self,
+        name: str,
+        observation: Observation,
+        means: dict[str, SmoothField],
+        threads: int,
+        dtype: type[np.floating[Any]],
+        sweeper: Callable[[Callable[[slice, slice, Floats], Any]], Iterator[tuple[slice, slice, Any]]],
+    ) -> None:
+        self.name, self.observation, self.means, self.threads = name, observation, means, threads
+        self._dtype, self._sweeper = np.dtype(dtype), sweeper
+
+    @property
+    def array(self) -> Floats:  # type: ignore[override]
+        """Refused: there is no such array."""
+        raise PipelineError(
+            f"the stream {self.name} is made again when it is read and is nowhere held as a whole",
+            place=self.observation.name,
+            cure="an operator whose `sweeps` is not 0 reads it with `Stream.sweep`",
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n_det, n_samp)."""
+        return self.observation.n_detectors, self.observation.n_samples
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of its parts."""
+        return self._dtype
+
+    def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+        """See `Stream.sweep`."""
+        return self._sweeper(work)
+
+
+class Store:
+    """Arrays for whole streams: in memory up to half of the budget, or in a temporary folder, removed at the end."""
+
+    def __init__(self, memory: int, dtype: type[np.floating[Any]], spare: list[Floats], ledger: Ledger) -> None:
+        self._room, self._dtype, self._spare, self._ledger = memory // 2, np.dtype(dtype), spare, ledger
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._live: dict[int, Floats] = {}
+
+    @property
+    def held(self) -> int:
+        """Bytes in memory, those that wait for the next stream included."""
+        return self._in_use + sum(a.nbytes for a in self._spare)
+
+    @property
+    def _in_use(self) -> int:
+        return sum(a.nbytes for a in self._live.values() if not isinstance(a, np.memmap))
+
+    def fits(self, size: int) -> bool:
+        """Whether ``size`` more bytes stay within the streams' share of the budget."""
+        return self._in_use + size <= self._room
+
+    def allocate(self, name: str, shape: tuple[int, int], in_memory: bool = True) -> Floats:
+        """An array of anything; a memory map of a file where it does not fit or is not wanted in memory."""
+        size = shape[0] * shape[1] * self._dtype.itemsize
+        if in_memory and self.fits(size):
+            alike = [a for a in self._spare if a.shape == shape and a.dtype == self._dtype]
+            self._spare[:] = alike[1:]
+            if not alike:
+                self._spare.clear()
+            array = alike[0] if alike else untouched(shape, self._dtype)
+        else:
+            array = self._file(name, shape)
+        self._live[id(array)] = array
+        self._note()
+        return array
+
+    def release(self, arrays: list[Floats]) -> None:
+        """Keep memory that is no longer used for the next stream: touching fresh memory costs as much as the physics."""
+        for array in {id(a): a for a in arrays}.values():
+            self._live.pop(id(array), None)
+            if not isinstance(array, np.memmap) and self.fits(array.nbytes + sum(a.nbytes for a in self._spare)):
+                self._spare.append(array)
+        self._note()
+
+    def clear_spare(self) -> None:
+        """Give back memory that waits for the next stream."""
+        self._spare.clear()
+        self._note()
+
+    def close(self) -> None:
+        """Remove the temporary folder."""
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def _note(self) -> None:
+        self._ledger.note(("streams",), self.held)
+
+    def _file(self, name: str, shape: tuple[int, int]) -> Floats:
+        size = shape[0] * shape[1] * self._dtype.itemsize
+        try:
+            if self._folder is None:
+                self._folder = tempfile.TemporaryDirectory(prefix="zonda-")
+            handle, path = tempfile.mkstemp(".stream", name, self._folder.name)  # a new file: the old one may still be read
+            try:
+                _reserve(handle, size)
+            finally:
+                os.close(handle)
+        except OSError as error:
+            raise OutputError(
+                f"a stream of {size / 1e9:.3g} GB cannot be put there: {error.strerror or error}",
+                place=tempfile.gettempdir(),
+                cure="raise --memory, or point TMPDIR to a larger disk",
+            ) from error
+        return np.memmap(path, self._dtype, "r+", shape=shape)
+
+
+def _reserve(handle: int, size: int) -> None:
+    """Give a file its size, and blocks on the disk: where the disk fills up later, writing to a mapping kills the process."""
+    if size and hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(handle, 0, size)
+    else:
+        os.ftruncate(handle, size)
+
+
+def forget_pages(array: Floats) -> None:
+    """Take the pages of a spilled stream out of this process's memory; the file keeps them."""
+    pages = getattr(array, "_mmap", None)
+    if pages is not None and hasattr(mmap, "MADV_DONTNEED"):
+        pages.madvise(mmap.MADV_DONTNEED)
+
+
+def columns(array: Floats, samples: slice) -> Floats:
+    """(n_det, n) samples of all detectors as an array of its own.
+
+    A spilled stream's are read from its file: around each page that is touched in a mapping the system maps up to 64 kB, which is
+    most of a stream whose rows are that short.
+    """
+    if not isinstance(array, np.memmap):
+        return np.array(array[:, samples], order="C")
+    found = np.empty((array.shape[0], samples.stop - samples.start), array.dtype)
+    whole, size = found.data.cast("B"), found.strides[0]
+    with open(str(array.filename), "rb", buffering=0) as file:
+        for row in range(array.shape[0]):
+            place, left = row * array.strides[0] + samples.start * array.itemsize, whole[row * size : (row + 1) * size]
+            while left:
+                read = _read_at(file, left, place)
+                if not read:
+                    raise OutputError("was cut short", place=str(array.filename), cure="leave the temporary folder alone")
+                place, left = place + read, left[read:]
+    return found
+
+
+def _read_at(file: Any, into: memoryview, place: int) -> int:
+    """Bytes read into ``into`` from ``place`` on, in one call of the system where there is one."""
+    if hasattr(os, "preadv"):
+        return os.preadv(file.fileno(), [into], place)
+    file.seek(place)
+    return int(file.readinto(into))
+
+
+def free_disk() -> int:
+    """Bytes that streams may take in the temporary folder."""
+    return int(DISK_SHARE * shutil.disk_usage(tempfile.gettempdir()).free)
+
+
+def disk_rate(size: int = 64 << 20) -> float:
+    """Bytes per second that reach the disk of the temporary folder, from writing ``size`` bytes."""
+    data = os.urandom(1 << 20)
+    with tempfile.TemporaryFile() as file:
+        begin = time.perf_counter()
+        for _ in range(size >> 20):
+            file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+        return size / max(time.perf_counter() - begin, 1e-3)
+
+
+def choose(
+    what: str,
+    size: int,
+    samples: int,
+    *,
+    readings: int,
+    hindrance: str,
+    threads: int,
+    prefer: Held | None,
+    rate: float,
+    cost: float,
+    place: str,
+    ceiling: str,
+) -> tuple[Held, str]:
+    """Spill or make again, equation (1), and why.
+
+    Parameters
+    ----------
+    what, size, samples
+        Streams in words; their bytes and samples.
+    readings
+        k of equation (1).
+    hindrance
+        Why they cannot be made again; empty: they can.
+    rate, cost
+        D and c of equation (1).
+    ceiling
+        What ``--memory`` would have to be for all streams to be kept.
+
+    Raises
+    ------
+    PipelineError
+        Where neither is possible.
+    """
+    disk = free_disk()
+    spill, again = 2 * size / rate, readings * samples * cost / threads
+    if hindrance and size > disk:
+        raise PipelineError(
+            f"{what} takes {size / 1e9:.3g} GB, which fit neither in memory nor on the disk ({disk / 1e9:.3g} GB free in "
+            f"{tempfile.gettempdir()}), and cannot be made again when it is read: {hindrance}",
+            place=place,
+            cure=f"use --memory {ceiling}, or point TMPDIR to a larger disk, or split into shorter scans",
+        )
+    if size > disk:
+        return "again", f"{size / 1e9:.3g} GB; the disk has room for {disk / 1e9:.3g} GB"
+    if hindrance:
+        return "spilled", f"{size / 1e9:.2f} GB: {hindrance}"
+    costs = f"{size / 1e9:.3g} GB: about {spill:.2g} s by disk, {again:.2g} s to make {readings} times more"
+    return (prefer or ("spilled" if spill <= again else "again")), costs

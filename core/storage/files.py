@@ -1,0 +1,212 @@
+"""Reading and writing files: a product is there whole or not at all, and a failure says what to do about it."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError, OutputError, ZondaError
+
+_CURES = {
+    errno.ENOSPC: ("no space left on the disk", "free some space or choose another output folder"),
+    errno.EDQUOT: ("the disk quota is used up", "free some space or choose another output folder"),
+    errno.EFBIG: ("the file grew beyond what this file system allows", "choose another output folder or write fewer streams"),
+    errno.EACCES: ("permission denied", "choose an output folder that you may write to"),
+    errno.EPERM: ("permission denied", "choose an output folder that you may write to"),
+    errno.EROFS: ("the file system is read-only", "choose another output folder"),
+    errno.EISDIR: ("there is a folder of that name", "remove it or choose another output folder"),
+    errno.ENOTDIR: ("a part of the path is a file, not a folder", "remove that file or choose another output folder"),
+    errno.EEXIST: ("there is a file of that name", "remove it or choose another output folder"),
+    errno.ENOENT: ("the folder does not exist", "it may have been removed during the run: make it again or choose another one"),
+    errno.ENAMETOOLONG: ("the name is too long", "choose a shorter name"),
+}
+
+
+def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:
+    """The `OutputError` that tells the user what an operating-system error on ``path`` means and how to mend it.
+
+    HDF5 reports a full disk without an error number: its message text is read instead.
+    """
+    number = error.errno
+    if number is None and (match := re.search(r"errno = (\d+)", str(error))):
+        number = int(match.group(1))
+    if number is None and "no space left" in str(error).lower():
+        number = errno.ENOSPC
+    fallback = (str(error).splitlines()[0] if str(error) else type(error).__name__, "choose another output folder")
+    cause, cure = _CURES.get(number or 0, fallback)
+    return OutputError(f"cannot be written: {cause}", place=str(path), cure=cure)
+
+
+@contextlib.contextmanager
+def writing(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Raise an `OutputError` about ``path`` for every operating-system error in the body."""
+    try:
+        yield
+    except OSError as error:
+        raise output_error(error, path) from error
+
+
+@contextlib.contextmanager
+def reading(place: str, kind: str, cure: str) -> Iterator[None]:
+    """Raise an `InputError` for whatever reading a file of foreign bytes raises in the body.
+
+    Libraries meet corrupt bytes with nearly every exception there is, so all are caught: keep only the reading in the body.
+
+    Parameters
+    ----------
+    place
+        The file, as messages call it.
+    kind
+        What it should be: ``FITS``.
+    cure
+        What to do where it is something else.
+    """
+    try:
+        yield
+    except ZondaError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError("no such file", place=place, cure="check the path; it may have been removed during the run") from error
+    except IsADirectoryError as error:
+        raise InputError("is a folder, not a file", place=place, cure="give the file's path") from error
+    except PermissionError as error:
+        raise InputError("permission denied", place=place, cure="make the file readable") from error
+    except KeyError as error:
+        raise InputError(f"is incomplete or corrupt: {error.args[0] if error.args else ''}", place=place, cure=cure) from error
+    except MemoryError as error:
+        raise InputError("needs more memory than there is", place=place, cure=cure) from error
+    except Exception as error:
+        raise InputError(f"cannot be read as {kind}: {first_line(error)}", place=place, cure=cure) from error
+
+
+@contextlib.contextmanager
+def own_data(path: Path) -> Iterator[Any]:
+    """A numpy archive that comes with zonda. Raises `InputError` where it is missing or damaged (its checksums are tested)."""
+    import numpy as np
+
+    cure = "the installation is damaged: pip install --force-reinstall zonda"
+    try:
+        with reading(f"data file {path}", "a numpy archive", cure), np.load(path, allow_pickle=False) as archive:
+            yield archive
+    except InputError as error:
+        raise InputError(error.message, place=error.place, cure=cure) from error
+
+
+def first_line(error: Exception) -> str:
+    """The line of an error's text that says why: wcslib begins with the line of its own source code."""
+    lines = [line for line in str(error).splitlines() if line.strip() and not line.startswith("ERROR ")]
+    return (lines or [type(error).__name__])[0].strip().rstrip(".")[:300]
+
+
+def check_memory(size: int, what: str, place: str) -> None:
+    """Refuse to read ``what`` of ``size`` bytes where that is more than the machine has free (`InputError`)."""
+    from ..machine import available_memory
+
+    free = available_memory()
+    if size > free:
+        raise InputError(
+            f"{what} needs {size / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are free",
+            place=place,
+            cure="if the file should be smaller it is corrupt: copy it again; else give a smaller one or a larger machine",
+        )
+
+
+def temporary_sibling(path: str | os.PathLike[str]) -> Path:
+    """A hidden name beside ``path``, with its suffix (writers choose the format by it), that no other run uses."""
+    path = Path(path)
+    return path.with_name(f".{path.stem[:100]}.{os.getpid()}-{secrets.token_hex(4)}.part{path.suffix}")
+
+
+def publish(temporary: Path, path: str | os.PathLike[str]) -> None:
+    """Move a finished temporary file to its name in one step. Raises `OutputError`; the temporary file is gone either way."""
+    try:
+        with writing(path):
+            _synchronize(temporary)
+            os.replace(temporary, path)
+    except BaseException:
+        discard(temporary)
+        raise
+
+
+def discard(temporary: Path) -> None:
+    """Remove a temporary file; not an error where there is none."""
+    with contextlib.suppress(OSError):
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary sibling of ``path`` to write to: renamed to ``path`` on success, removed on any failure or Ctrl-C.
+
+    Raises
+    ------
+    OutputError
+        For every operating-system error in the body (disk full, not writable, a folder in the way), with place and cure.
+    """
+    path = Path(path)
+    temporary = temporary_sibling(path)
+    try:
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+            yield temporary
+        publish(temporary, path)
+    except BaseException:
+        discard(temporary)
+        raise
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> Path:
+    """Write a UTF-8 text file atomically; its path."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def product_path(folder: str | os.PathLike[str], name: str, suffix: str = "") -> Path:
+    """Path of a product called ``name`` in ``folder``: it never leaves the folder and is a legal file name everywhere.
+
+    Slashes become underscores, other unusual characters dashes; ``../../etc/passwd`` becomes ``etc_passwd``.
+    """
+    stem = re.sub(r"[^\w.+=@-]+", "-", name.replace("\\", "/").replace("/", "_")).strip("._- ")
+    if not stem:
+        raise OutputError(f"{name!r} cannot name a file", place=str(folder), cure="use letters, digits, '-' and '_'")
+    return Path(folder) / f"{stem[:180]}{suffix}"
+
+
+def check_output_folder(path: str | os.PathLike[str]) -> Path:
+    """Create an output folder and prove that it takes files, before a long run starts; its path.
+
+    Raises
+    ------
+    OutputError
+        Not creatable, not writable, a file in its place, or no space for even a small file.
+    """
+    folder = Path(path)
+    probe = folder / f".zonda-probe-{os.getpid()}-{secrets.token_hex(4)}"
+    try:
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            probe.write_bytes(b"zonda")
+    finally:
+        discard(probe)
+    return folder
+
+
+def _synchronize(path: Path) -> None:
+    """Ask the disk to hold the file: some file systems report a full disk only now."""
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EROFS):
+            raise
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,160 @@
+"""HDF5 files from elsewhere: opened for reading, whole in themselves, and no larger in memory than what they can hold."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from ..errors import InputError
+from .files import check_memory, reading
+
+COMPRESSION_MAX = 1100
+"""Bytes in memory per byte of the file: deflate, the densest filter in use, reaches 1032."""
+
+PATIENCE = 60.0
+"""Seconds for the first look at a file."""
+
+
+@contextlib.contextmanager
+def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> Iterator[Any]:
+    """An `h5py.File` to read from; whatever goes wrong in the body is an `InputError` about ``place``.
+
+    External links, data kept in other files and virtual data sets are refused: a file must not make zonda open others.
+    """
+    import h5py
+
+    with reading(place, kind, cure):
+        survey(path, place, cure)
+    with reading(place, kind, cure), h5py.File(path, "r") as file:
+        _refuse_other_files(file, place)
+        yield file
+
+
+def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
+    """Let a process of its own look at the file first (`hdf5_survey`). `InputError` where libhdf5 hangs or crashes."""
+    with open(path, "rb"):  # not there, not readable: told as it is
+        pass
+    command = [sys.executable, "-m", "zonda.core.storage.hdf5_survey", os.fspath(path)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE, env=_environment())
+    except subprocess.TimeoutExpired:
+        raise InputError("is corrupt: the HDF5 library does not come to an end with it", place=place, cure=cure) from None
+    if done.returncode < 0:
+        raise InputError(f"is corrupt: the HDF5 library crashes on it (signal {-done.returncode})", place=place, cure=cure)
+
+
+def _environment() -> dict[str, str]:
+    """For a child that finds the same packages."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+
+
+def check_size(dataset: Any, place: str) -> None:
+    """Refuse a data set that claims more than its file can hold, or than memory is free, before it is read (`InputError`)."""
+    size = int(dataset.size or 0) * int(dataset.dtype.itemsize)
+    if size > COMPRESSION_MAX * os.path.getsize(dataset.file.filename):
+        raise InputError(
+            f"{dataset.name} claims {size / 1e9:.3g} GB, more than a file of this size can hold",
+            place=place,
+            cure="the file is corrupt or was never filled: copy or make it again",
+        )
+    check_memory(size, str(dataset.name), place)
+
+
+class Disk:
+    """A file for h5py to write to. libhdf5 crashes when it closes a file that it could not write: it is never told of a failure.
+
+    Raises OSError at the next `check` or `close`; whatever is written after a failure is dropped.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115
+        self._error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of it where the last `seek` led."""
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while self._error is None and len(rest):
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            self._error = error
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what was written; zeros beyond the end."""
+        view = memoryview(buffer).cast("B")
+        have = 0
+        while have < len(view) and (more := self._file.readinto(view[have:])):
+            have += more
+        view[have:] = bytes(len(view) - have)
+        return len(view)
+
+    def read(self, size: int) -> bytes:
+        """As `readinto`, in bytes of its own."""
+        found = bytearray(size)
+        self.readinto(found)
+        return bytes(found)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """As any file's."""
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """As any file's."""
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        """Cut the file, or make it longer."""
+        try:
+            if self._error is None:
+                return self._file.truncate(size)
+        except OSError as error:
+            self._error = error
+        return size or 0
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def check(self) -> None:
+        """Raise the first failure."""
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Close the file, then raise the first failure."""
+        if not self._file.closed:
+            self._file.close()
+            self.check()
+
+
+def _refuse_other_files(file: Any, place: str) -> None:
+    import h5py
+
+    seen: set[Any] = set()
+    groups = [file]
+    while groups:
+        group = groups.pop()
+        for name in group:
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                raise _leaves(f"{group.name}/{name} lies in another file, {link.filename!r}", place)
+            if isinstance(link, h5py.SoftLink):
+                continue  # leads elsewhere in this file, which is visited anyway
+            item = group[name]
+            info = h5py.h5o.get_info(item.id)
+            if (info.fileno, info.addr) in seen:
+                continue
+            seen.add((info.fileno, info.addr))
+            if isinstance(item, h5py.Group):
+                groups.append(item)
+            elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+                raise _leaves(f"the values of {item.name} lie in another file", place)
+
+
+def _leaves(message: str, place: str) -> InputError:
+    return InputError(message, place=place, cure="give a file that holds everything itself, e.g. made by h5repack")

@@ -1,0 +1,32 @@
+"""Stretches of long scans, and memory for what lasts."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import spline_filter1d
+
+from zonda.core.numerics.smooth import REACH, interpolating
+from zonda.core.numerics.stretches import LARGE, STRETCH, stretches, untouched
+
+
+@pytest.mark.parametrize("n", [0, 1, STRETCH - 1, STRETCH, STRETCH + 1, 5 * STRETCH + 7])
+def test_stretches_are_all_instants_in_order(n: int) -> None:
+    parts = stretches(n)
+    assert [k for part in parts for k in (part.start, part.stop)] == sorted([0, n] + 2 * [*range(STRETCH, n, STRETCH)]) * (n > 0)
+
+
+@pytest.mark.parametrize("bytes_", [0, 48, LARGE, LARGE + 24])
+def test_untouched_is_an_array_like_any_other(bytes_: int) -> None:
+    found = untouched((3, bytes_ // 24))
+    found[...] = 7.0
+    assert found.shape == (3, bytes_ // 24)
+    assert found.flags.c_contiguous
+    assert (found == 7.0).all()
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, REACH, REACH + 1, 300])
+def test_interpolating_is_the_filter_that_mirrors_its_rows(m: int) -> None:
+    """To rounding: the filter's absolute values add up to 3 (1.1e-16 each way), and what is cut off is 0.27^29 = 3e-17."""
+    values = np.random.default_rng(m).uniform(-1, 1, (2, m))
+    expected = spline_filter1d(values, 3, axis=1, mode="mirror") if m > 1 else values
+    np.testing.assert_allclose(interpolating(values), expected, rtol=0, atol=3e-15)
+    np.testing.assert_array_equal(interpolating(np.asfortranarray(values)), interpolating(values))

@@ -1,0 +1,435 @@
+"""Blocks, segments, halos and spilling never change a bit."""
+
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import PipelineError
+from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.numerics.smooth import SmoothField
+from zonda.core.numerics.tiles import TILE_SAMPLES
+from zonda.core.operator import Operator
+from zonda.core.run.blocks import PIECE, cut
+from zonda.core.run.execution import Execution
+from zonda.core.run.settings import Settings, Timer
+
+
+def observation(n_det=101, n_samp=9 * TILE_SAMPLES + 123):
+    instrument = Instrument(
+        name="test",
+        telescope=Telescope(name="t", diameter="6 m"),
+        band=Band(name="b", low="140 GHz", high="160 GHz"),
+        detectors=n_det,
+        field_of_view="1 deg",
+        main_beam_efficiency=1,
+        illumination_efficiency=1,
+        net="1 mK s(1/2)",
+        sample_rate="100 Hz",
+    )
+    pointing = np.tile([0.0, 0, 0, 1], (n_samp, 1))
+    return Observation(
+        "scan",
+        0,
+        None,
+        instrument,
+        instrument.focalplane(),
+        None,
+        np.arange(n_samp) / 100.0,
+        100.0,
+        pointing,
+        pointing,
+        (0, 0),
+        1,
+    )
+
+
+class Source(Operator):
+    """A value that depends on the absolute detector and sample only."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        d = np.arange(block.detectors.start, block.detectors.stop)[:, None]
+        t = np.arange(block.samples.start, block.samples.stop)
+        block.new("signal")[...] += np.sin(0.37 * d + 0.01 * t) + np.cos(1.3 * d * t)
+        block.means["signal"] = SmoothField.constant(np.full(block.observation.n_detectors, 5.0), block.observation.n_samples)
+
+
+class Smooth(Operator):
+    """The mean of the samples at t - width, t and t + width (those that exist)."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    width: int = 5
+
+    def halo(self, observation):
+        return self.width
+
+    def exec(self, block, state):
+        signal = block.detdata["signal"].astype(np.float64)
+        out, hits = np.zeros_like(signal), np.zeros(signal.shape[1])
+        n = signal.shape[1]
+        for k in (-self.width, 0, self.width):
+            to, of = slice(max(0, -k), max(0, min(n, n - k))), slice(max(0, k), max(0, min(n, n + k)))
+            out[:, to] += signal[:, of]
+            hits[to] += 1
+        block.detdata["signal"][...] = out / hits
+
+
+class Demean(Operator):
+    """Subtract each detector's mean over the scan."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "time"
+
+    def exec(self, block, state):
+        assert block.shape[1] == block.observation.n_samples
+        for row in block.detdata["signal"]:
+            row -= row.mean(dtype=np.float64)
+
+
+class FocalPlaneMean(Operator):
+    """Subtract the focal-plane mean at each sample."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "detectors"
+
+    def exec(self, block, state):
+        assert block.shape[0] == block.observation.n_detectors
+        signal = block.detdata["signal"]
+        total = np.zeros(signal.shape[1])
+        for row in signal:
+            total += row
+        signal -= total / len(signal)
+
+
+class Scale(Operator):
+    """Divide by the rms of the whole stream."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "all"
+
+    def prepare(self, observation):
+        return {}
+
+    def measure(self, stream, state):
+        assert stream.means["signal"].weights[0, 0] == 5.0
+        state["rms"] = np.sqrt(sum(float(np.sum(row.astype(float) ** 2)) for row in stream.array) / stream.array.size)
+
+    def exec(self, block, state):
+        block.detdata["signal"] /= block.dtype(state["rms"])
+
+
+class Sink(Operator):
+    """Count every sample once."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def prepare(self, observation):
+        return np.zeros((observation.n_detectors, observation.n_samples), int)
+
+    def exec(self, block, state):
+        state[block.detectors, block.samples] += 1
+
+    def collect(self, data, observation, state):
+        data.products["seen"] = state
+
+
+CHAIN = [Source(), Smooth(width=3), Demean(), Smooth(width=700), FocalPlaneMean(), Smooth(width=2500), Scale(), Sink()]
+
+
+def execute(operators, obs, room=None, **settings):
+    """The execution, the signal it keeps, the products. ``room``: bytes that streams may take, where not half of the memory."""
+    operators = [o.model_copy() for o in operators]
+    for i, o in enumerate(operators):
+        o._label = f"{type(o).__name__}.{i}"
+    data = Data(scene=None)
+    nothing = lambda **k: None  # noqa: E731
+    execution = Execution(operators, obs, Settings(**settings), Timer(), ["signal"])
+    if room is not None:
+        execution._store._room, execution.layout.keeps = room, lambda stage, size, held, later: held + size <= room
+    execution.run(data, nothing, nothing)
+    return execution, obs.detdata["signal"], data
+
+
+def run(operators, obs, **settings):
+    return execute(operators, obs, **settings)[1:]
+
+
+def reference(obs, chain=CHAIN):
+    block = Block(obs, slice(0, obs.n_detectors), slice(0, obs.n_samples))
+    state = {}
+    for operator in chain[:-1]:
+        if operator.couples == "all":
+            operator.measure(type("S", (), {"array": block.detdata["signal"], "means": block.means})(), state)
+        operator.exec(block, state)
+    return block.total("signal")
+
+
+def test_blocks_halos_threads_and_spilling_change_no_bit():
+    want = reference(observation())
+    size = want.size * 4
+    for memory, threads in ((1 << 30, 1), (3 * size, 3), (int(1.9 * size), 1), (int(1.9 * size), 3)):
+        for prefer in ("spilled", "again"):
+            obs = observation()
+            got, data = run(CHAIN, obs, memory=memory * threads, threads=threads, prefer=prefer)
+            assert np.array_equal(got, want)
+            assert (data.products["seen"] == 1).all()
+
+
+class Peek(Operator):
+    """Make no stream: count how often each sample is seen, and tell the tally."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"seen"})
+
+    def prepare(self, observation):
+        return np.zeros((observation.n_detectors, observation.n_samples), int)
+
+    def exec(self, block, state):
+        state[block.detectors, block.samples] += 1
+        assert not block.again
+
+    def collect(self, data, observation, state):
+        data.products[self.label] = state
+
+
+class Tell(Source):
+    """A source that counts its samples."""
+
+    def exec(self, block, state):
+        super().exec(block, state)
+        block.observation.tally.count(self.label, "samples made", block.shape[0] * block.shape[1])
+
+
+class Level(Operator):
+    """Subtract the mean of the whole stream, found by sweeps."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    couples: ClassVar = "all"
+
+    def prepare(self, observation):
+        return {}
+
+    def sweeps(self, observation):
+        return 2
+
+    def measure(self, stream, state):
+        for _ in range(2):
+            seen = np.zeros(stream.shape, int)
+            total = np.zeros(stream.shape[0])
+
+            def tiles(detectors, samples, part):
+                return [part[:, k : k + TILE_SAMPLES].sum(axis=1, dtype=float) for k in range(0, part.shape[1], TILE_SAMPLES)]
+
+            for detectors, samples, parts in stream.sweep(tiles):
+                seen[detectors, samples] += 1
+                for part in parts:
+                    total[detectors] += part
+            assert (seen == 1).all()
+        state["mean"] = total.sum() / seen.size
+
+    def exec(self, block, state):
+        block.detdata["signal"] -= block.dtype(state["mean"])
+
+
+class Square(Operator):
+    """Add the square of the signal, kept beside it, so that a second stream comes into being piece by piece."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"square", "signal"})
+    optional: ClassVar[frozenset[str]] = frozenset({"square"})
+
+    def exec(self, block, state):
+        block.new("square")[...] += block.detdata["signal"] ** 2
+        block.detdata["signal"] += block.detdata["square"]
+
+
+@pytest.mark.parametrize("coupled", [Demean(), FocalPlaneMean()])
+def test_pieces_of_a_block_change_no_bit(coupled):
+    """Operators without coupling that share a segment with a coupled one, before and after the stream was stored whole."""
+    chain = [Source(), Square(), coupled, Scale(), Square(), coupled, Sink()]
+    assert observation().n_samples > 2 * PIECE
+    assert [len(s.split()[0]) for s in cut(chain, observation())] == [2, 2]
+    want = reference(observation(), chain)
+    for memory, threads in ((1 << 30, 1), (16 * want.size, 2)):
+        got, data = run(chain, observation(), memory=memory, threads=threads)
+        assert np.array_equal(got, want)
+        assert (data.products["seen"] == 1).all()
+
+
+CHAINS_MADE_AGAIN = {
+    "whole scans": [Tell(), Peek(), Demean(), Peek(), Level(), Sink()],
+    "margins": [Tell(), Smooth(width=40), Peek(), Level(), Smooth(width=4000), Level(), Peek(), Sink()],
+    "focal plane": [Tell(), Square(), Peek(), Level(), FocalPlaneMean(), Square(), Peek(), Level(), Sink()],
+}
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("name", CHAINS_MADE_AGAIN)
+def test_streams_made_again_change_no_bit_and_are_counted_once(name, threads):
+    """Steps that make no stream see every sample once, in whichever reading comes first; so does the tally."""
+    chain = CHAINS_MADE_AGAIN[name]
+    want, _ = run(chain, observation(), memory=1 << 30)
+    size = 4 * want.size
+    for prefer, said in (("again", "made again"), ("spilled", "spilled")):
+        obs = observation()
+        memory = threads * int(1.9 * size)
+        execution, got, data = execute(chain, obs, memory=memory, threads=threads, prefer=prefer, room=size // 2)
+        assert np.array_equal(got, want)
+        assert any(said in what for _, what, _ in obs.tally)
+        assert all((seen == 1).all() for seen in data.products.values())
+        assert obs.tally.get("Tell.0", "samples made") == want.size
+        assert 0 < execution.ledger.peak <= memory
+
+
+def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
+    chain = [Source(), Demean(), Scale(), Sink()]
+    obs = observation()
+    size = 4 * obs.n_detectors * obs.n_samples
+    run(chain, obs, memory=int(1.9 * size), prefer="again")
+    assert any("spilled" in what for _, what, _ in obs.tally)
+    monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 1000)
+    with pytest.raises(PipelineError, match=r"(?s)neither in memory nor on the disk.*Scale.2 reads it as a whole.*--memory 15MB"):
+        run(chain, observation(), memory=int(1.9 * size))
+    level = [Source(), Demean(), Level(), Sink()]
+    run(level, observation(), memory=int(1.9 * size), prefer="spilled")  # the disk has no room: made again
+
+
+def test_the_quicker_way_is_taken(monkeypatch):
+    """Equation (1) of `core.run.streams`: 2 N b / D against k N c / threads."""
+    from zonda.core.run.streams import choose
+
+    said = {
+        "samples": 1000, "readings": 2, "hindrance": "", "threads": 1, "prefer": None, "place": "", "ceiling": ""
+    }  # fmt: skip
+    # by disk 2 x 4000 B / 4 kB/s = 2 s
+    assert choose("s", 4000, rate=4e3, cost=0.9e-3, **said)[0] == "again"
+    assert choose("s", 4000, rate=4e3, cost=1.1e-3, **said)[0] == "spilled"
+    assert choose("s", 4000, rate=4e3, cost=1.1e-3, **{**said, "threads": 2})[0] == "again"
+
+
+def test_the_ceiling_of_the_process_leaves_what_is_not_held_already():
+    from zonda.core.machine import resident_memory
+
+    obs = observation()
+    size = 4 * obs.n_detectors * obs.n_samples
+    chain = [Source(), Demean(), Level(), Sink()]
+    execution, got, _ = execute(chain, obs, memory=1 << 30, ceiling=resident_memory() + 3 * size // 2)
+    assert execution.settings.memory <= 2 * size
+    assert np.array_equal(got, run(chain, observation())[0])
+    with pytest.raises(PipelineError, match="raise --memory to"):
+        run(chain, observation(), memory=1 << 30, ceiling=1000)
+
+
+def test_a_stream_made_again_has_no_array():
+    class Greedy(Level):
+        """Reads the array after all."""
+
+        def measure(self, stream, state):
+            stream.array  # noqa: B018
+
+    obs = observation()
+    with pytest.raises(PipelineError, match="nowhere held as a whole"):
+        run([Source(), Greedy(), Sink()], obs, memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples), prefer="again")
+
+
+def test_margins_that_reach_the_ends_leave_the_source_alone():
+    """A block with margins can be the whole scan: it must not be filtered where other blocks read it."""
+    chain = [Source(), Smooth(width=20)]
+    want, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=1 << 30)
+    got, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=2 * 4 * 4 * 16 * 3 * TILE_SAMPLES + 1000)
+    assert np.array_equal(got, want)
+
+
+def test_spilling_is_stated():
+    obs = observation()
+    got, _ = run(CHAIN, obs, memory=int(1.9 * obs.n_detectors * obs.n_samples * 4))
+    assert any("spilled" in what for _, what, _ in obs.tally)
+    assert np.array_equal(got, reference(observation()))
+
+
+def test_budget_too_small_says_what_is_needed():
+    with pytest.raises(PipelineError, match=r"(?s)one block of 16 detectors needs .* raise --memory"):
+        run(CHAIN, observation(), memory=100_000)
+
+
+def test_one_detector_one_sample():
+    got, data = run(CHAIN[:1] + CHAIN[-1:], observation(1, 1))
+    assert got.shape == (1, 1)
+    assert data.products["seen"].sum() == 1
+
+
+def test_segments():
+    spans = [(len(s.operators), s.span, s.halo) for s in cut(CHAIN, observation())]
+    assert spans == [
+        (1, "sample", 0),
+        (1, "sample", 3),
+        (2, "time", 0),
+        (1, "detectors", 0),
+        (1, "sample", 2500),
+        (2, "sample", 0),
+    ]
+    assert [s.operators[0].couples for s in cut([Source(), Demean(), Scale(), Sink()], observation())] == ["sample", "all"]
+    assert [len(s.operators) for s in cut([Source(), Demean(), Smooth(), Sink()], observation())] == [
+        4
+    ]  # whole scans need no halo
+
+
+def test_failure_discards_what_was_begun():
+    gone = []
+
+    class Fails(Operator):
+        """Fails in the second block."""
+
+        def exec(self, block, state):
+            if block.detectors.start:
+                raise ValueError("no")
+
+    class Begun(Operator):
+        """Has something to undo."""
+
+        def discard(self, observation, state):
+            gone.append(True)
+
+    for threads in (1, 2):
+        with pytest.raises(ValueError, match="no"):
+            run([Source(), Begun(), Fails()], observation(), threads=threads)
+    assert gone == [True, True]
+
+
+def test_kept_stream_must_exist():
+    class Nothing(Operator):
+        """Makes nothing."""
+
+    with pytest.raises(PipelineError, match="'signal' was asked to be kept"):
+        run([Nothing()], observation())
+
+
+def test_smooth_field_matches_spline_and_any_cut():
+    rng = np.random.default_rng(1)
+    n, step = 5000, 64
+    weights = rng.standard_normal((5, 3))
+    k = np.arange(-(-n // step) + 3 + 24) - 13
+    values = np.array([np.sin(0.01 * step * k), np.cos(0.004 * step * k), 0.1 + 0 * k])
+    field = SmoothField.from_values(weights, values, step, n)
+    t = np.arange(n)
+    exact = weights @ np.array([np.sin(0.01 * t), np.cos(0.004 * t), 0.1 + 0 * t])
+    got = field.evaluate(slice(0, 5), slice(0, n))
+    # cubic splines err by (omega * step)^4 / 384 = 4e-4 of the fastest sine
+    assert np.abs(got - exact).max() < 5e-4 * np.abs(weights).max() * 2
+    part = field.evaluate(slice(2, 4), slice(2048, 4000))
+    assert np.array_equal(part, got[2:4, 2048:4000])
+
+
+@pytest.mark.parametrize("samples", [slice(-1, 5), slice(0, 5001)])
+def test_smooth_field_refuses_samples_outside(samples):
+    field = SmoothField.constant(np.ones(2), 5000)
+    with pytest.raises(ValueError, match="outside"):
+        field.evaluate(slice(0, 2), samples)
