@@ -330,7 +330,8 @@ from numba.core import environment
 {change}
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
-    from zonda.core import keep_kernels, random
+    from zonda.core.compilation import keep_kernels
+    from zonda.core.numerics import random
     for name in ("toy_inner", "toy_outer"):
         spec = importlib.util.spec_from_file_location(f"zonda.{{name}}", f"{{sys.argv[1]}}/{{name}}.py")
         module = sys.modules[f"zonda.{{name}}"] = importlib.util.module_from_spec(spec)
