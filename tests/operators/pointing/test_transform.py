@@ -343,7 +343,6 @@ def test_offline_with_every_socket_blocked() -> None:
 import socket, sys
 def refuse(*a, **k): raise SystemExit("network used")
 socket.socket.connect = socket.getaddrinfo = socket.create_connection = refuse
-from zonda.core.numerics import stretches
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.site import Site
