@@ -14,7 +14,7 @@ import pytest
 
 from zonda.core.data import Block, Observation
 from zonda.operators.atmosphere import band, covariance, turbulence
-from zonda.operators.filters import common_mode, highpass
+from zonda.operators.filters import brick_wall, common_mode
 from zonda.operators.maps import bin_map
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
@@ -76,16 +76,16 @@ def differences_by_subtraction(patch: Patch) -> None:
 
 
 def highpass_without_detrending(patch: Patch) -> None:
-    low = highpass.HighpassPlan._low
+    low = brick_wall.HighpassPlan._low
 
     def without(self: Any, s: Any) -> Any:
         return low(replace(self, modes=0 * self.modes, spread_modes=0 * self.spread_modes, sums=()), s)
 
-    patch.setattr(highpass.HighpassPlan, "_low", without)
+    patch.setattr(brick_wall.HighpassPlan, "_low", without)
 
 
 def gaps_that_ring(patch: Patch) -> None:
-    patch.setattr(highpass, "bridge", lambda row, gaps: row.__setitem__(gaps, np.nan_to_num(row[gaps], posinf=0.0, neginf=0.0)))
+    patch.setattr(brick_wall, "bridge", lambda row, gaps: row.__setitem__(gaps, np.nan_to_num(row[gaps], posinf=0.0, neginf=0.0)))
 
 
 def modes_beyond_the_rank(patch: Patch) -> None:

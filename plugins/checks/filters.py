@@ -9,8 +9,9 @@ from pydantic import ValidationError
 from zonda.core.checks import Family, Measured
 from zonda.core.errors import PipelineError
 from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.common_mode import CommonModeFilter
-from zonda.operators.filters.highpass import HighpassFilter, plan_highpass
+from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing.stare import PointingStare

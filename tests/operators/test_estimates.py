@@ -11,7 +11,7 @@ from zonda.core.instrument import Band
 from zonda.core.plan.context import Context, Coverage
 from zonda.operators.atmosphere.band import BandAtmosphere, _BandTransfer
 from zonda.operators.atmosphere.estimate import _slope, air
-from zonda.operators.filters.highpass import plan_highpass
+from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.noise.estimate import difference, psd_error
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.operators.pointing.estimate import STEEPEST, pointing_estimate

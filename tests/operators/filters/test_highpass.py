@@ -13,7 +13,8 @@ from scipy.fft import dct, idct
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.smooth import SmoothField
-from zonda.operators.filters.highpass import ONLY_A_LINE, HighpassFilter, plan_highpass
+from zonda.operators.filters.brick_wall import plan_highpass
+from zonda.operators.filters.highpass import ONLY_A_LINE, HighpassFilter
 
 RATE, CUT = 100.0, 0.08
 WHITE = 1.7e-3 * np.sqrt(RATE)

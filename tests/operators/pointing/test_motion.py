@@ -97,7 +97,9 @@ def test_figures_equal_a_brute_force_derivative(which: str, speed: float, size: 
             minus, here, plus = (angles(t + s * h)[k] for s in (-1, 0, 1))
             value = (plus - minus) / (2 * h) if order == 1 else (plus - 2 * here + minus) / h**2
             largest = max(largest, abs(value))
-        assert peak.figure == pytest.approx(float(largest), rel=0.02, abs=2**order * 8.9e-16 / 1e-3**order)  # an ulp of 4 to 8 rad
+        assert peak.figure == pytest.approx(
+            float(largest), rel=0.02, abs=2**order * 8.9e-16 / 1e-3**order
+        )  # an ulp of 4 to 8 rad
 
 
 def test_a_coarse_sampling_does_not_hide_an_acceleration(observe: Callable[..., Data]) -> None:
