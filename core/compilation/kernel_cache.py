@@ -176,6 +176,9 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
             with self._guard_against_spurious_io_errors():
                 return self._load_overload(sig, target_context)
             return None
+        except CHANGED as error:  # the file is whole: its hash was right
+            left_to_numba(error)
+            return None
         except Exception:  # what unpickling and linking of damaged code may raise has no end
             self._cache_file.give_up()
             return None

@@ -71,6 +71,7 @@ def makers(what: str) -> list[str]:
     for name in steps:
         with suppress(RegistryError):  # a broken plugin is another message's
             operator = steps.get(name)
-            if what in operator.provides - operator.requires:
+            provides, requires = (n if isinstance(n, frozenset) else frozenset() for n in (operator.provides, operator.requires))
+            if what in provides - requires:  # a property says nothing before there is an operator
                 found.append(name)
     return found

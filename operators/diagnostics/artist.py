@@ -78,9 +78,10 @@ class Artist:
         self._closed = True
         for _ in range(2):
             self._tasks.put(None)
-        if self._process.poll() is None:
+        if self._process.returncode is None:  # nobody has waited for it: dead or not, the group's number is still its own
             if hasattr(os, "killpg"):
-                os.killpg(self._process.pid, signal.SIGKILL)
+                with suppress(OSError):
+                    os.killpg(self._process.pid, signal.SIGKILL)
             else:
                 self._process.kill()
             self._process.wait()

@@ -17,6 +17,7 @@ error of the low part is (K / 2M)^4 at the cut, less below it; the polynomial is
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -38,8 +39,8 @@ SHORTEST_STEP = 8
 GROUP = 16
 """Samples that are taken together: their low part comes from the same five knots, or six where knots lie closer."""
 
-FEW = 128
-"""Cosines up to which sums over them are quicker than transforms."""
+FEW, CLOSE = 128, 1 << 12
+"""Cosines, and knots, up to which sums over them are quicker than transforms, and their matrices (4 MB) small."""
 
 ABREAST = TILE_DETECTORS
 """Rows whose sums are formed side by side."""
@@ -82,6 +83,7 @@ class HighpassPlan:
     response: Floats
     sums: tuple[tuple[Floats, Floats], ...] = ()
     _weights: dict[np.dtype[Any], Floats] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     def apply(self, rows: Floats, bad: NDArray[np.intp] = NONE) -> int:
         """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite; they stay as they were.
@@ -132,8 +134,9 @@ class HighpassPlan:
 
     def weights(self, kind: np.dtype[Any]) -> Floats:
         """(n_group, taps, `GROUP`) of type ``kind``: B at the groups' knots at their samples; 0 past the end."""
-        if kind not in self._weights:
-            self._weights[kind] = _weights(self.n, self.knots, self.first, self.taps, kind)
+        with self._lock:  # threads that begin together make them once
+            if kind not in self._weights:
+                self._weights[kind] = _weights(self.n, self.knots, self.first, self.taps, kind)
         return self._weights[kind]
 
     def _low(self, s: Floats) -> Floats:
@@ -210,7 +213,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
     modes, spread = norm @ raw, norm @ spread
-    sums = _sums(modes, spread, response) if 0 < cut <= FEW else ()
+    sums = _sums(modes, spread, response) if 0 < cut <= FEW and knots <= CLOSE else ()
     return HighpassPlan(n, cut, knots, *_groups(n, knots), modes, spread, np.zeros((0, n)), response, sums)
 
 

@@ -50,8 +50,8 @@ Floats = NDArray[np.float64]
 FLAG_DEAD = 8
 """Bit set in ``detector_flags`` of detectors whose signal is constant or not finite."""
 
-OF_THE_SKY = frozenset({"sky", "atmosphere", "transmission", "pwv", "opacity", "path_delay"})
-"""Streams of which a detector in order may see nothing, or nothing that changes."""
+OF_THE_SKY = frozenset({"sky", "transmission"})
+"""Streams of which a detector in order may see nothing. All see the air."""
 
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
@@ -142,7 +142,8 @@ class CommonModeFilter(Operator):
             observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
             observation.detector_flags[dead] |= FLAG_DEAD
         if not _noiseless(observation):
-            observation.resolved[f"{self.label}: dead"] = found.not_finite | found.constant
+            # the main run comes first; of companion runs with noise none says which are dead in it
+            observation.resolved.setdefault(f"{self.label}: dead", found.not_finite | found.constant)
 
     def _same_as_main(self, observation: Observation) -> bool:
         """Whether the run has no noise; detectors that were dead in a main run that has it are then flagged."""
@@ -248,7 +249,7 @@ class CommonModeFilter(Operator):
 
 
 def _noiseless(observation: Observation) -> bool:
-    """Whether all that the run in progress simulates is what the sky and the air emit."""
+    """Whether all that the run in progress simulates is the sky."""
     return bool(observation.components) and observation.components <= OF_THE_SKY
 
 

@@ -29,7 +29,7 @@ FLAG_TRIM = 2
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
 
-ONLY_A_LINE = "only the mean and a line are removed"
+ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
 
 
 class HighpassFilter(Operator):
@@ -62,7 +62,7 @@ class HighpassFilter(Operator):
         if not short:
             return []
         return [
-            f"{short} of {len(data.observations)} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {ONLY_A_LINE}"
+            f"{short} of {len(data.observations)} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {self._left()}"
         ]
 
     def prepare(self, observation: Observation) -> tuple[HighpassPlan, NDArray[np.intp]]:
@@ -91,7 +91,7 @@ class HighpassFilter(Operator):
             tally.state(self.label, "smooth mean emission", "removed analytically")
         plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)
         if plan.cut == 0:
-            text = ONLY_A_LINE if n > 1 + min(self.degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+            text = self._left() if n > 1 + min(self.degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
             tally.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
         elif plan.cut >= n:
             raise PipelineError(
@@ -100,6 +100,10 @@ class HighpassFilter(Operator):
                 cure=f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan",
             )
         return plan, np.flatnonzero(bad)
+
+    def _left(self) -> str:
+        """What is removed from a short scan."""
+        return ONLY_A_LINE if self.degree else ONLY_THE_MEAN
 
     def memory(self, observation: Observation) -> int:
         """Spline weights; where the full DCT is used, the polynomials and what they are made from."""

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+INSTRUMENTS = "NET of the instrument"
+"""Where `Observation.resolved` has it, if a step has stated another to map makers."""
+
 
 class NoiseModel(Parameters):
     """Base class of noise models."""
@@ -61,7 +64,7 @@ class FixedNet(NoiseModel):
     def net(self, observation: Observation) -> Array:
         """See `NoiseModel.net`."""
         if self.level is None:
-            return observation.focalplane.net.copy()
+            return np.array(observation.resolved.get(INSTRUMENTS, observation.focalplane.net), np.float64)
         return np.full(observation.n_detectors, self.level)
 
 

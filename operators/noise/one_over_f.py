@@ -24,7 +24,7 @@ poles  f_min / f_s = 1e-5       f_min / f_s = 1e-7
 =====  =======================  =======================
 
 (the rms error is a third of that; the fit in use states its own). Largest over slopes and f_min / f_s up to 0.45, with 16 poles:
-0.2 % for slopes to 2 and f_min / f_s >= 1e-6, 0.45 % down to 1e-8, 1 % for slopes to 3; the last is at f_min itself.
+0.25 % for slopes to 2 and f_min / f_s >= 1e-6, 0.45 % down to 1e-8, 1 % for slopes to 3; the last is at f_min itself.
 
 Below f_min the response levels off, at `plateau` times its value at f_min: a sharp corner is beyond real poles.
 """

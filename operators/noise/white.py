@@ -17,7 +17,7 @@ from zonda.core.numerics.smooth import SmoothField, series_into
 from zonda.core.operator import Operator
 
 from .level import NoiseLevel, announce, scatter_factors
-from .models import FixedNet, NoiseModel, noise_model
+from .models import INSTRUMENTS, FixedNet, NoiseModel, noise_model
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,6 +70,7 @@ class WhiteNoise(Operator):
         """Tell map makers a stated level, for which they lay out their sums; what it becomes for each detector follows."""
         if self.net is not None and self.model is None and self.reference == "sky":
             for observation in data.observations:
+                observation.resolved.setdefault(INSTRUMENTS, observation.focalplane.net)
                 observation.focalplane.net = np.full(observation.n_detectors, self.net)
         return None
 

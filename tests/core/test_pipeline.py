@@ -13,6 +13,7 @@ from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
+from zonda.core.registry import operators
 from zonda.core.run.order import check_order, makers
 
 
@@ -235,7 +236,18 @@ def test_misordered_steps(steps, words):
     assert any(words == p.message for p in check_order(steps))
 
 
+class Varies(Component):
+    """What it provides hangs on a parameter."""
+
+    dust: bool = False
+
+    @property
+    def provides(self):
+        return frozenset({"sky", "dust"} if self.dust else {"sky"})
+
+
 def test_the_cure_names_the_operators_that_would_do():
+    operators.register(Varies, name="Varies")
     assert "PointingDaisy" in makers("boresight")
     assert "Efficiency" in makers("signal")
     assert "HighpassFilter" not in makers("signal")  # it needs one itself

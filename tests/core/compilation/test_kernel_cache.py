@@ -357,19 +357,36 @@ def test_a_numba_with_another_inside_keeps_kernels_itself(tmp_path, change, own)
     if own and not hasattr(numba.config, "CACHE_LOCATOR_CLASSES"):
         pytest.skip("this numba has no other list of locators")
     write(tmp_path)
-    env = {**os.environ, "NUMBA_CACHE_LOCATOR_CLASSES": "InTreeCacheLocator,UserWideCacheLocator" if own else ""}
-    env |= {"XDG_CACHE_HOME": str(tmp_path / "caches"), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    env.pop("NUMBA_CACHE_DIR", None)
-    command = [sys.executable, "-c", CHANGED_NUMBA.format(change=change), str(tmp_path)]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    first, second, count, *told = done.stdout.strip().split("|")
+    first, second, count, *told = run_with_numba(tmp_path, change, "InTreeCacheLocator,UserWideCacheLocator" if own else "")
     assert (first, second) == ("7.0", "7.0")
     assert bool(kept(tmp_path)) == own
     if own:
         assert count == "0"
     else:
         assert (count, told) == ("1", [f"zonda cannot keep compiled code itself with numba {numba.__version__}"])
+
+
+def test_a_numba_that_cannot_load_what_is_kept_says_so_once(tmp_path):
+    """Not that the files are damaged: their hashes are right."""
+    import numba
+
+    write(tmp_path)
+    assert run_with_numba(tmp_path, "")[2] == "0"
+    assert len(kept(tmp_path)) >= 3
+    first, second, count, *told = run_with_numba(tmp_path, "del caching.CompileResultCacheImpl.rebuild")
+    assert (first, second) == ("7.0", "7.0")
+    assert (count, told) == ("1", [f"zonda cannot keep compiled code itself with numba {numba.__version__}"])
+
+
+def run_with_numba(folder, change, locators=""):
+    """What `CHANGED_NUMBA` prints, in parts."""
+    env = {**os.environ, "NUMBA_CACHE_LOCATOR_CLASSES": locators}
+    env |= {"XDG_CACHE_HOME": str(folder / "caches"), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    env.pop("NUMBA_CACHE_DIR", None)
+    command = [sys.executable, "-c", CHANGED_NUMBA.format(change=change), str(folder)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip().split("|")
 
 
 def test_meaning_covers_options_and_constants(folder, monkeypatch):

@@ -17,6 +17,7 @@ def test_stretches_are_all_instants_in_order(n: int) -> None:
 @pytest.mark.parametrize("bytes_", [0, 48, LARGE, LARGE + 24])
 def test_untouched_is_an_array_like_any_other(bytes_: int) -> None:
     found = untouched((3, bytes_ // 24))
+    assert not found.any()
     found[...] = 7.0
     assert found.shape == (3, bytes_ // 24)
     assert found.flags.c_contiguous

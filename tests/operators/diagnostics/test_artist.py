@@ -69,6 +69,23 @@ def test_where_one_of_them_is_killed_the_other_goes_on(artist, which):
     assert _gone({first, twin})
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="no twin elsewhere")
+def test_a_twin_at_work_ends_where_the_first_is_dead(artist):
+    first = artist._process.pid
+    (twin,) = _twins(artist) - {first}
+    answers = [artist.submit(time.sleep, 600.0) for _ in range(2)]
+    os.kill(first, signal.SIGKILL)
+    while not _zombie(first):
+        time.sleep(0.01)
+    artist.close()
+    assert _gone({twin})
+    assert [answer.result(30) for answer in answers] == [None, None]
+
+
+def _zombie(pid):
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
 def _twins(artist):
     """Their numbers: two tasks at a time, until both have answered."""
     patience, found = time.monotonic() + 30, set()

@@ -188,12 +188,19 @@ class Noise(Given):
     provides: ClassVar[frozenset[str]] = frozenset({"white"})
 
 
+class Air(Given):
+    provides: ClassVar[frozenset[str]] = frozenset({"atmosphere"})
+
+
+PARTS = ("sky", "atmosphere", "white")
+
+
 class Sum(Operator):
-    optional: ClassVar[frozenset[str]] = frozenset({"sky", "white"})
+    optional: ClassVar[frozenset[str]] = frozenset(PARTS)
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
 
     def exec(self, block, state):
-        block.new("signal")[...] = sum(block.detdata[n] for n in ("sky", "white") if n in block.detdata)
+        block.new("signal")[...] = sum(block.detdata[n] for n in PARTS if n in block.detdata)
 
 
 SEEN = 5
@@ -241,6 +248,39 @@ def test_a_detector_that_is_dead_in_the_main_run_is_none_in_that_of_the_sky(meth
     assert counted(data, "detectors flagged: dead in the main run", "alone/") == 1
     assert counted(data, "detectors flagged: signal constant", "alone/") == 0
     np.testing.assert_array_equal(companion.hits, main.hits)
+
+
+@pytest.mark.parametrize("method", ["svd", "mean"])
+def test_a_detector_that_is_dead_in_the_main_run_is_told_by_no_other_run(method):
+    """It is dead in the air, which a companion run with noise leaves out before that of the sky."""
+    n_det, n = 6, 2000
+    parts, points = [Sky(), Air(), Noise()], scenes.Points()
+    parts[0]._values, parts[1]._values = np.ones((n_det, 1)) * np.sin(np.arange(n) / 70), np.zeros((n_det, n))
+    parts[2]._values = np.random.default_rng(6).standard_normal((n_det, n))
+    parts[1]._values[3] = np.nan
+    points._observation = scenes.scan(n_det, n)
+    runs = {"airless": {"without": ["atmosphere"]}, "alone": {"only": ["sky"]}}
+    steps = [points, *parts, Sum(), CommonModeFilter(method=method), BinMap(pixel="10 arcsec")]
+    data = Pipeline(steps, runs=runs, precision="float64").run(scenes.scene(), threads=1)
+    main, airless, alone = (data.products[name].hits for name in ("map", "airless/map", "alone/map"))
+    assert airless.sum() == n_det * n
+    assert main.sum() == (n_det - 1) * n
+    np.testing.assert_array_equal(alone, main)
+
+
+@pytest.mark.parametrize("method", ["svd", "mean"])
+def test_a_detector_that_does_not_see_the_air_is_dead(method):
+    """Also in a main run without noise: a dead one must not dilute the mode, nor write it into the map."""
+    n_det, n, points, air, rng = 6, 2000, scenes.Points(), Air(), np.random.default_rng(6)
+    air._values = np.cumsum(rng.standard_normal(n)) + 1e-3 * rng.standard_normal((n_det, n))
+    air._values[3] = 0.0
+    points._observation = scenes.scan(n_det, n)
+    steps = [points, air, Sum(), CommonModeFilter(method=method), BinMap(pixel="10 arcsec")]
+    data = Pipeline(steps, precision="float64").run(scenes.scene(), threads=1, keep=["signal"])
+    assert counted(data, "detectors flagged: signal constant") == 1
+    assert data.products["map"].hits.sum() == (n_det - 1) * n
+    left = np.delete(data.observations[0].detdata["signal"], 3, axis=0)
+    assert left.std() == pytest.approx(1e-3 * np.sqrt(4 / 5), rel=0.05)  # 10 000 numbers: 0.8 %; six times that
 
 
 @pytest.mark.parametrize("method", ["svd", "mean"])
