@@ -3,7 +3,8 @@
 A layer's spline coefficients are made in tiles that overlap by the three cells a cubic spline needs, so that every point is
 interpolated from one tile. Tiles are kept while there is room; any tile has the same bits whenever it is made, and a point
 the same bits in whatever company it is asked for. Where a scan sweeps over few cells they are made as one piece; where it sweeps
-over a strip along the wind, in slabs as wide as that, since what squares would hold beside it is made for nothing.
+over a strip along the wind, in slabs as wide as that, since what squares would hold beside it is made for nothing; along a narrow
+path that turns, in strips.
 """
 
 from __future__ import annotations
@@ -29,8 +30,11 @@ from .turbulence import Field, Turbulence
 Floats = NDArray[np.float64]
 _Key = tuple[int, tuple[int, int, int, int]]
 
-SQUARE = (8, 8)
-"""Sides of a tile, as powers of two of cells (across, along the wind)."""
+SQUARE, STRIP = (8, 8), (5, 10)
+"""Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the path is narrow."""
+
+NARROW = 96
+"""Cells: a path that is narrower than this across the wind, and has no slabs, is tiled by strips."""
 
 SLAB, WIDEST, LONGEST = 1 << 16, 1024, 1 << 10
 """Cells of a slab, about; cells across the wind up to which there are slabs; most cells along it."""
@@ -167,6 +171,7 @@ class Layers:
         self._places = [_place(track, d, self.paths[d.step].seconds) for d in self._drifting]
         swept = self._swept(*rim(xi, eta))
         self._slabs = [_slab(box, cells) for box, cells in swept]
+        self._sides = [STRIP if box[1] - box[0] < NARROW else SQUARE for box, _ in swept]
         self._pieces = [_widened(box) for box, _ in swept]
         self.cells = sum(cells for _, cells in swept)
         """Lattice points swept over, about."""
@@ -207,7 +212,7 @@ class Layers:
 
     def _add(self, n: int, x: Floats, y: Floats, boxes: Floats, start: int, out: Floats) -> None:
         """out += layer ``n`` at the positions (x, y) per metre of height, at times from number ``start`` of its path."""
-        layer, sides, (matrix, i, j) = self._drifting[n], SQUARE, self._places[n]
+        layer, sides, (matrix, i, j) = self._drifting[n], self._sides[n], self._places[n]
         i, j = i[start : start + x.shape[1]], j[start : start + x.shape[1]]
         low_i, high_i, low_j, high_j = _extent(matrix, boxes, i, j)
         piece = self._pieces[n]

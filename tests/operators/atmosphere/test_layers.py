@@ -280,11 +280,13 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
     series()
     assert len(made) > 4 * once
     monkeypatch.setattr(sampling, "WIDEST", 0)
-    for square in ((3, 4), (5, 5)):
-        monkeypatch.setattr(sampling, "SQUARE", square)
-        made.clear()
-        np.testing.assert_array_equal(series(), expected)
-        assert set(made) == {((1 << square[0]) + 3, (1 << square[1]) + 3)}
+    for name, narrow in (("STRIP", 1 << 20), ("SQUARE", 0)):
+        monkeypatch.setattr(sampling, "NARROW", narrow)
+        for sides in ((3, 4), (5, 5)):
+            monkeypatch.setattr(sampling, name, sides)
+            made.clear()
+            np.testing.assert_array_equal(series(), expected)
+            assert set(made) == {((1 << sides[0]) + 3, (1 << sides[1]) + 3)}
     monkeypatch.setattr(sampling, "CELLS_IN_ALL", 300)
     with pytest.raises(ZondaError, match="lattice points of the turbulence"):
         series()
