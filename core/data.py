@@ -174,6 +174,13 @@ class Observation:
         """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""
         return stream_key(self.seed, "observation", self.index, *names)
 
+    def detector_key(self, *names: str | int) -> NDArray[np.uint32]:
+        """As `key`, for what belongs to the detectors: noise, gains. Another instrument or another band has numbers of its own.
+
+        The atmosphere is keyed without them: all bands of one seed look through the same.
+        """
+        return self.key(*self.instrument.identity, *names)
+
     def derotate(self, which: str) -> tuple[Floats, Floats, Floats]:
         """(lon, lat, psi) of ``boresight_azel`` or ``boresight_radec`` [rad]; for azel lon = -azimuth."""
         x, y, z, w = getattr(self, which).T

@@ -64,6 +64,14 @@ class Band(Parameters):
         return self._table[1]
 
     @property
+    def identity(self) -> tuple[str, ...]:
+        """Name and passband, as text that is the same on every machine: two bands of one name are two bands."""
+        if self.file is None:
+            return self.name, f"{self.low:.9g}", f"{self.high:.9g}"
+        table = ",".join(f"{nu:.9g} {t:.9g}" for nu, t in zip(*self._table, strict=True))
+        return self.name, table
+
+    @property
     def centre(self) -> float:
         """Transmission-weighted mean frequency, Hz."""
         nu, t = self._table
@@ -172,6 +180,11 @@ class Instrument(Parameters):
 
             return bands.create(value)
         return value
+
+    @property
+    def identity(self) -> tuple[str, ...]:
+        """What tells its detectors' random numbers from those of another instrument or band: names and passband."""
+        return "instrument", self.name, "band", *self.band.identity
 
     @property
     def beam_fwhm(self) -> float:

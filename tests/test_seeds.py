@@ -1,4 +1,6 @@
-"""The same seed gives the same bits, two seeds have nothing in common: noise, air and maps of a whole run."""
+"""The same seed gives the same bits, two seeds have nothing in common: noise, atmosphere and maps of a whole run.
+
+Two bands, or two instruments, of one seed have noise of their own and see one atmosphere."""
 
 import numpy as np
 import pytest
@@ -8,13 +10,13 @@ import zonda
 NOISE = ("white", "pink", "atmosphere")
 
 
-def run(seed, scans=1, duration="82 s", **more):
+def run(seed, scans=1, duration="82 s", camera=(), **more):
     scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=seed)
-    camera = scene.instrument.model_copy(update={"detectors": 37})
+    camera = scene.instrument.model_copy(update={"detectors": 37, **dict(camera)})
     steps = [
         zonda.PointingDaisy(scan_duration=duration, radius="1 arcmin", sample_rate="50 Hz", scans=scans),
         zonda.AtmosphereLayers(pwv="7.7 mm"),
-        zonda.WhiteNoise(),
+        zonda.WhiteNoise(scatter="5 %"),
         zonda.PinkNoise(**more),
         zonda.Efficiency(scatter="5 %", calibration_error="1 %"),
         zonda.HighpassFilter(frequency="0.08 Hz"),
@@ -84,3 +86,40 @@ def test_maps_of_two_seeds_are_incoherent_and_of_one_the_same(runs):
     halves = [p.half_difference[use] * np.sqrt(p.hits[use]) for p in (one, other)]
     both = np.isfinite(halves).all(axis=0)
     assert abs(np.corrcoef(halves[0][both], halves[1][both])[0, 1]) < 6 / np.sqrt(both.sum())
+
+
+BAND = zonda.Band(name="mustang2_90ghz", low="75 GHz", high="105 GHz")
+OTHERS = {
+    "band": {"band": BAND.model_copy(update={"name": "other"})},
+    "passband": {"band": zonda.Band(name=BAND.name, low="75 GHz", high="106 GHz")},
+    "instrument": {"name": "other", "band": BAND},
+}
+
+
+@pytest.fixture(scope="module")
+def one_band():
+    return run(1, camera={"band": BAND}, shared=0.8).observations[0]
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_two_bands_have_noise_of_their_own_and_one_atmosphere(one_band, other):
+    two = run(1, camera=OTHERS[other], shared=0.8).observations[0]
+    whole = [{name: o.detdata[name] for name in ("white", "pink")} for o in (one_band, two)]
+    common = [streams["pink"].mean(axis=0, keepdims=True) for streams in whole]
+    assert correlation(*(whitened(streams["white"]) for streams in whole)) < 5
+    assert correlation(*(whitened(mean) for mean in common)) < 5  # mostly what detectors share
+    assert correlation(*(whitened(streams["pink"] - mean) for streams, mean in zip(whole, common, strict=True))) < 5
+    n = one_band.n_detectors
+    for drawn in ("net", "main_beam_efficiency"):  # scattered: correlations of n pairs have a standard error of n^-1/2
+        assert abs(np.corrcoef(getattr(one_band.focalplane, drawn), getattr(two.focalplane, drawn))[0, 1]) < 4 / np.sqrt(n)
+    air = [o.detdata["atmosphere"].astype(np.float64) for o in (one_band, two)]
+    # one turbulence, seen through opacities that differ by the passband alone
+    assert np.corrcoef(*(a.ravel() - a.mean() for a in air))[0, 1] > 0.9999
+
+
+def test_a_band_has_its_noise_whatever_else_is_changed(one_band):
+    """Where one setting is compared with another, the random numbers stay: detectors, NET and beams do not draw anew."""
+    changed = run(1, camera={"band": BAND, "detectors": 20, "fwhm": 1e-4, "description": "other"}, shared=0.8).observations[0]
+    for stream in ("white", "pink"):
+        a, b = (whitened(o.detdata[stream]) for o in (one_band, changed))
+        assert np.corrcoef(a[:20].ravel(), b.ravel())[0, 1] > 0.9999

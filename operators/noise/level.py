@@ -58,12 +58,14 @@ class NoiseLevel:
         return SmoothField.constant(sigma, observation.n_samples)
 
 
-def scatter_factors(scatter: float, seed: int, label: str, n_detectors: int) -> Array:
-    """Log-normal factors (n_det,) of mean 1 and relative standard deviation ``scatter``; the same in every observation."""
+def scatter_factors(scatter: float, observation: Observation, label: str) -> Array:
+    """Log-normal factors (n_det,) of mean 1 and relative standard deviation ``scatter``; the same in every observation with this
+    seed, instrument and band."""
     if scatter == 0:
-        return np.ones(n_detectors)
+        return np.ones(observation.n_detectors)
     width = np.sqrt(np.log1p(scatter**2))
-    deviates = normals(stream_key(seed, "noise scatter", label), 0, n_detectors).astype(np.float64)
+    key = stream_key(observation.seed, "noise scatter", *observation.instrument.identity, label)
+    deviates = normals(key, 0, observation.n_detectors).astype(np.float64)
     return np.asarray(np.exp(width * deviates - width**2 / 2))
 
 

@@ -105,10 +105,11 @@ class PinkNoise(Operator):
         level = None
         if self.net is not None:
             level = NoiseLevel(FixedNet.of(self.net, self.reference), np.ones(observation.n_detectors))
-        streams = Streams(law, observation.key(self.label), observation.key(self.label, "start"))
+        streams = Streams(law, observation.detector_key(self.label), observation.detector_key(self.label, "start"))
         state = _State(factor, level, streams, self.shared)
         if self.shared > 0:
-            common = Streams(law, observation.key(self.label, "shared"), observation.key(self.label, "shared", "start"))
+            keys = (observation.detector_key(self.label, "shared", *more) for more in ((), ("start",)))
+            common = Streams(law, *keys)
             state.common = np.zeros((1, observation.n_samples), np.float32)
             common.add(0, 0, state.common)
         return state

@@ -79,7 +79,7 @@ class WhiteNoise(Operator):
         model = self.model or FixedNet.of(self.net, self.reference)
         held: dict[str, NoiseLevel] = observation.resolved.setdefault("noise levels", {})
         if self.label not in held:  # a companion run keeps the main run's level
-            factors = scatter_factors(self.scatter, observation.seed, self.label, observation.n_detectors)
+            factors = scatter_factors(self.scatter, observation, self.label)
             held[self.label] = NoiseLevel(model, factors)
         announce(observation, held[self.label])
         if isinstance(model, FixedNet) and model.reference == "sky":
@@ -88,7 +88,7 @@ class WhiteNoise(Operator):
     def prepare(self, observation: Observation) -> _State:
         """Stream key; the amplitude follows with the first block."""
         level: NoiseLevel = observation.resolved["noise levels"][self.label]
-        return _State(level, observation.key(self.label))
+        return _State(level, observation.detector_key(self.label))
 
     def memory(self, observation: Observation) -> int:
         """Amplitudes at the nodes of the mean emission."""

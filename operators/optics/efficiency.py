@@ -203,8 +203,8 @@ def _calibrate(sky, wet, air, white, pink, first, divisor, inside, mean, mean_in
 
 
 def _normals(observation: Observation, *names: str) -> Floats:
-    """(n_det,) standard normals that belong to this observation and ``names``."""
-    return normals(observation.key(*names), 0, observation.n_detectors).astype(np.float64)
+    """(n_det,) standard normals that belong to this observation, instrument, band and ``names``."""
+    return normals(observation.detector_key(*names), 0, observation.n_detectors).astype(np.float64)
 
 
 def _flag_opaque(label: str, observation: Observation, transmission: SmoothField) -> None:
