@@ -13,6 +13,9 @@ from .yaml_places import Span
 WIDTH = 140
 """Longer source lines are cut around the caret."""
 
+_CONTROL = dict.fromkeys([*range(9), *range(10, 32), 127], "\N{REPLACEMENT CHARACTER}")
+"""What a terminal would obey is shown as a sign of its own."""
+
 
 @dataclass(frozen=True)
 class Diagnostic:
@@ -58,7 +61,7 @@ class Diagnostic:
             f"{red}error{off}{bold}: {self.message}{off}",
             f"{gutter}{blue}-->{off} {self.place}",
             f"{gutter} {blue}|{off}",
-            f"{blue}{row + 1} |{off} {shown}",
+            f"{blue}{row + 1} |{off} {shown.translate(_CONTROL)}",
             f"{gutter} {blue}|{off} {indent}{red}{caret}{' ' + self.label if self.label else ''}{off}",
         ]
         if self.help:

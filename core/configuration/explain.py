@@ -30,6 +30,7 @@ _WANTED = {
     "list": "a list",
     "dict": "a mapping of keys",
     "model": "a mapping of keys",
+    "path": "the path of a file or folder",
 }
 """What pydantic's errors of type (or parsing) want, by the first word of their kind."""
 
@@ -74,7 +75,7 @@ def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str,
         owner, _ = _field(model, loc[:-1])
         options = list(keys if keys and len(loc) == 1 else (owner or model).model_fields)
         inside = who if len(loc) == 1 else f"{who}, {'.'.join(map(str, loc[:-1]))}"
-        hint = nearest(e["loc"][-1], options, "not a known key")
+        hint = glued(e["loc"][-1], options) or nearest(e["loc"][-1], options, "not a known key")
         return Diagnostic(f"unknown key '{e['loc'][-1]}' for {inside}", mark.start, hint, f"{inside} takes: {', '.join(options)}")
     if kind == "missing":
         name = str(e["loc"][-1])
@@ -91,13 +92,23 @@ def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str,
     if kind in _LIMITS:
         message = _limit(e, _unit(field), document, path)
     elif kind == "literal_error":
+        message = f"must be {context.get('expected', '')}, got {e['input']!r:.60}"
         label = nearest(e["input"], re.findall(r"'([^']*)'", context.get("expected", "")))
-    elif kind.endswith(("_parsing", "_type", "_from_float")) and kind.split("_")[0] in _WANTED and "error" not in context:
+    elif kind == "string_pattern_mismatch":
+        message = f"{e['input']!r:.60} has a character that is not allowed here"
+        label = "use letters, digits and '_'" + (", '.', '+', '-' and spaces within" if " " in context.get("pattern", "") else "")
+    elif kind.endswith(("_parsing", "_type", "_from_float")) and kind.split("_")[0] in _WANTED and e["msg"].startswith("Input"):
         message = f"expected {_WANTED[kind.split('_')[0]]}, got {e['input']!r:.60}"
     message = message[:1].lower() + message[1:] if not message[:2].isupper() else message
     where = f"{who}, {'.'.join(map(str, loc))}" if loc else who
     text = "\n".join(filter(None, (context.get("help"), _description(field))))
     return Diagnostic(f"{where}: {message}", span, label, text)
+
+
+def glued(key: object, options: Iterable[str]) -> str:
+    """What to write where a key and its value are one text: {pixel:2 arcsec}."""
+    name, colon, value = str(key).partition(":")
+    return f"write a space after the colon: {name}: {value}" if colon and name in options else ""
 
 
 def _limit(e: Any, unit: Unit | None, document: Document, path: Path) -> str:

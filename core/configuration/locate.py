@@ -47,6 +47,7 @@ def read(path: Path) -> str:
         raise InputError(f"cannot be read: {err.strerror}", place=str(path), cure="check its permissions") from None
     if len(content) > MAXIMUM_BYTES:
         raise InputError("is too large for a pipeline file", place=str(path), cure="give the path of a YAML file")
+    _check_kind(path, content)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as err:
@@ -54,3 +55,39 @@ def read(path: Path) -> str:
         column = err.start - (content.rfind(b"\n", 0, err.start) + 1) + 1
         message = f"is not UTF-8 text (byte 0x{content[err.start]:02x})"
         raise InputError(message, place=f"{path}:{line}:{column}", cure="save it as UTF-8") from None
+
+
+_IMAGE = "to observe it, name it in a pipeline: - SkyMap: {file: %s}"
+_DATA = "give the path of a YAML file; `zonda pipelines` lists examples"
+_KINDS = (
+    (b"SIMPLE  =", "a FITS file", _IMAGE),
+    (b"\x89HDF\r\n", "an HDF5 file", "to observe with its pointing, name it in a pipeline: - PointingRecorded: {file: %s}"),
+    (b"\x93NUMPY", "a NumPy array", _DATA),
+    (b"CDF\x01", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: %s}"),
+    (b"CDF\x02", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: %s}"),
+    (b"\x1f\x8b", "compressed (gzip)", "unpack it; an image is named in a pipeline: - SkyMap: {file: %s}"),
+    (b"BZh", "compressed (bzip2)", "unpack it"),
+    (b"\xfd7zXZ", "compressed (xz)", "unpack it"),
+    (b"PK\x03\x04", "a ZIP archive", "unpack it"),
+    (b"\x89PNG", "a picture (PNG)", _DATA),
+    (b"\xff\xd8\xff", "a picture (JPEG)", _DATA),
+    (b"%PDF", "a PDF document", _DATA),
+    (b"\xff\xfe", "UTF-16 text", "save it as UTF-8"),
+    (b"\xfe\xff", "UTF-16 text", "save it as UTF-8"),
+    (b"<!doctype", "a web page", "download the file itself, not the page that shows it"),
+    (b"<html", "a web page", "download the file itself, not the page that shows it"),
+    (b"<?xml", "an XML file", _DATA),
+)
+"""How files begin that are no pipeline files, what they are, and what to do with them."""
+
+
+def _check_kind(path: Path, content: bytes) -> None:
+    """Raise InputError for a file of another kind, by its name."""
+    start = content.lstrip()[:20]
+    for begins, kind, cure in _KINDS:
+        if start.startswith(begins) or start.lower().startswith(begins):
+            raise InputError(f"is {kind}, not a pipeline file", place=str(path), cure=cure.replace("%s", path.name))
+    if b"\0" in content:
+        raise InputError("is a binary file, not a pipeline file", place=str(path), cure=_DATA)
+    if path.suffix == ".py":
+        raise InputError("is a Python script, not a pipeline file", place=str(path), cure=f"run it: python {path}")

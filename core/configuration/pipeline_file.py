@@ -22,7 +22,7 @@ from ..weather import WeatherSource, resolve
 from . import overrides as settings
 from . import yaml_places
 from .diagnostics import ConfigurationError, Diagnostic, nearest
-from .explain import explain
+from .explain import explain, glued
 from .locate import locate, read
 from .parameters import Parameters, quantity
 from .units import Fraction
@@ -392,15 +392,18 @@ class _Check:
         try:
             operator = registry.steps.get(name)
         except ZondaError as err:
-            first = re.split(r"[\s{]", name)[0]
+            first = re.split(r"[\s{:]", name)[0]
             if first != name and first in registry.steps:
-                self.wrong(f"cannot read the step '{name}'", span, "a colon is missing", f"write '- {first}: {{...}}'")
+                missing = "a space is missing behind the colon" if name[len(first)] == ":" else "a colon is missing"
+                self.wrong(f"cannot read the step '{name}'", span, missing, f"write '- {first}: {{...}}'")
             else:
                 self.refused(err, span)
             return None, None
         if not isinstance(parameters, dict):
             message = f"{name} takes a mapping of parameters, not {_noun(parameters)}"
-            self.wrong(message, self.document.mark(inner).value, f"write '- {name}: {{...}}'")
+            known = list(operator.model_fields)
+            label = (isinstance(parameters, str) and glued(parameters, known)) or f"write '- {name}: {{...}}'"
+            self.wrong(message, self.document.mark(inner).value, label, f"{name} takes: {', '.join(known)}")
             return None, operator.model_construct()
         made = self.validate(operator, parameters, inner, name)
         if made is None:

@@ -14,6 +14,8 @@ SECOND = 1_000_000_000
 """Nanoseconds in a second."""
 
 _EXAMPLES = ["2024-11-25T07:00:00Z", "2024-11-25T02:00-05:00", "2024-11-25 07:00:00.5"]
+_FARTHEST_ZONE = 14 * 60
+"""min."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _ISO = re.compile(
     r"(?P<date>\d{4}-\d{2}-\d{2})"
@@ -85,6 +87,9 @@ class Instant:
             zone: timezone = UTC
             if part["sign"]:
                 minutes = int(part["zone_hour"]) * 60 + int(part["zone_minute"] or 0)
+                if minutes > _FARTHEST_ZONE or int(part["zone_minute"] or 0) >= 60:
+                    zone_text = part["zone"]
+                    raise ValueError(f"no time zone is {zone_text} from UTC; offsets go from -14:00 to +14:00, e.g. -05:00")
                 zone = timezone(timedelta(minutes=-minutes if part["sign"] == "-" else minutes))
             day = datetime.fromisoformat(part["date"])
             local = day.replace(hour=int(part["hour"] or 0), minute=int(part["minute"] or 0), second=seconds, tzinfo=zone)

@@ -151,14 +151,14 @@ def load(source: Source, *, column: int = 0, text: str | None = None) -> Documen
 
     Never raises for bad text: what is wrong is in `Document.faults`, and what could be read in its value.
     """
-    reader = _Reader(source, column)
+    reader = _Reader(source, column, source.text if text is None else text)
     try:
-        loader = _Loader(source.text if text is None else text)
+        loader = _Loader(reader.text)
     except yaml.YAMLError as err:  # a character that YAML does not allow
         reader.fault(err)
         return reader.document(None)
     try:
-        reader.survey(source.text if text is None else text)
+        reader.survey(reader.text)
         node = loader.get_single_node()
         value = reader.build(loader, node, (), None, ()) if node is not None else None
     except yaml.YAMLError as err:
@@ -189,8 +189,8 @@ _CLOSING = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
 
 
 class _Reader:
-    def __init__(self, source: Source, column: int) -> None:
-        self.source, self.column = source, column
+    def __init__(self, source: Source, column: int, text: str) -> None:
+        self.source, self.column, self.text = source, column, text
         self.marks: dict[Path, Mark] = {}
         self.faults: list[Fault] = []
         self.flat: dict[int, list[tuple[Any, Any]]] = {}
@@ -225,6 +225,15 @@ class _Reader:
             column += self.column if line == 0 else 0
             if line >= len(rows):  # past the end
                 line, column = len(rows) - 1, len(rows[-1])
+            from .yaml_faults import causes
+
+            found = causes(err, self.text)
+            for cause in found:
+                shift = self.column if cause.line == 0 else 0
+                span = Span(self.source, cause.line, cause.column + shift, cause.line, cause.end + shift)
+                self.faults.append(Fault(cause.message, span, cause.label))
+            if found:
+                return
             message = f"not valid YAML: {err.problem or err.context}"
             row = rows[line]
             label = "indent with spaces, not tabs" if "\t" in row[: column + 1] else ""

@@ -270,7 +270,7 @@ def test_errors_survive_pickling(toys: Any) -> None:
         ("# nothing\n", "this pipeline file is empty"),
         ("- a\n", "a mapping of keys, not a list"),
         ("hello\n", "a mapping of keys, not text"),
-        ("a: [1\n", "not valid YAML"),
+        ("a: [1\n", "is not closed"),
     ],
 )
 def test_not_a_pipeline(text: str, words: str) -> None:
@@ -413,6 +413,60 @@ def test_not_utf8(tmp_path: Path) -> None:
     path.write_bytes("a: 1\nname: h\u00e9\n".encode("latin-1"))
     with pytest.raises(InputError, match=r"latin.yaml:2:8: is not UTF-8 text \(byte 0xe9\)"):
         load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("m.fits", b"SIMPLE  =                    T".ljust(2880) + bytes(range(256)), "is a FITS file, not a pipeline file"),
+        ("header.fits", b"SIMPLE  =                    T".ljust(2880), "is a FITS file"),
+        ("m.fits.gz", b"\x1f\x8b\x08\0rest", r"is compressed \(gzip\), not a pipeline file"),
+        ("tod.h5", b"\x89HDF\r\n\x1a\n\0", "is an HDF5 file"),
+        ("a.npy", b"\x93NUMPY\x01\0", "is a NumPy array"),
+        ("p.png", b"\x89PNG\r\n\x1a\n", r"is a picture \(PNG\)"),
+        ("p.zip", b"PK\x03\x04", "is a ZIP archive"),
+        ("era5.nc", b"CDF\x01\0", "is a NetCDF file"),
+        ("page.yaml", b"\n<!DOCTYPE HTML>\n<html>", "is a web page"),
+        ("wide.yaml", "site: x".encode("utf-16"), "is UTF-16 text"),
+        ("any.bin", b"name: a\0b", "is a binary file"),
+        ("run.py", b"import zonda\n", "is a Python script"),
+    ],
+)
+def test_files_of_another_kind_are_called_by_their_names(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        load(tmp_path / name)
+    assert caught.value.cure
+    assert caught.value.place == str(tmp_path / name)
+
+
+def test_json_is_yaml(toys: Any, tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_text('{"site": "toy_site", "instrument": "toy_camera"}')
+    with pytest.raises(ConfigurationError, match="the pipeline needs 'operators'"):
+        load(tmp_path / "p.json")
+
+
+@pytest.mark.parametrize(
+    ("step", "column", "words"),
+    [
+        ("ToyMap:{pixel: 2 arcsec}", 5, "a space is missing behind the colon"),
+        ("ToyMap: {pixel:2 arcsec}", 14, "write a space after the colon: pixel: 2 arcsec"),
+        ("ToyMap: pixel:2 arcsec", 13, "write a space after the colon: pixel: 2 arcsec"),
+    ],
+)
+def test_a_space_missing_in_a_step(toys: Any, step: str, column: int, words: str) -> None:
+    steps = toys.steps.splitlines(keepends=True)
+    (found,) = mistakes(toys.head + "".join(steps[:-1]) + f"  - {step}\n")
+    assert found.span.column + 1 == column
+    assert found.label == words
+
+
+@pytest.mark.parametrize("zone", ["+25:00", "-15:00", "+05:99"])
+def test_a_time_zone_that_is_none(toys: Any, zone: str) -> None:
+    head = "\n".join(f"time: 2024-11-25T07:00{zone}" if r.startswith("time:") else r for r in toys.head.splitlines())
+    (found,) = mistakes(head + "\n" + toys.steps)
+    assert f"no time zone is {zone} from UTC; offsets go from -14:00 to +14:00" in found.message
+    assert "timedelta" not in found.render()
 
 
 def test_too_large(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def test_merged_keys_may_be_overridden() -> None:
 @pytest.mark.parametrize(
     ("text", "message", "line", "column"),
     [
-        ("a: [1, 2\nb: 3\n", "not valid YAML", 1, 1),
+        ("a: [1, 2\nb: 3\n", "this '[' is not closed", 0, 3),
         ("a: 1\n\tb: 2\n", "not valid YAML", 1, 0),
         ("a: !point 3\n", "the tag !point is not known", 0, 3),
         ("a: *nowhere\n", "not valid YAML", 0, 3),
