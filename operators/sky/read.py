@@ -20,6 +20,8 @@ from zonda.core.storage.files import check_memory, first_line, reading
 from zonda.core.storage.fits_files import check_size, opened
 from zonda.core.storage.fits_image import read_image
 
+from . import stokes
+
 Floats = NDArray[np.float64]
 
 KNOWN_UNITS = "Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y)"
@@ -112,7 +114,7 @@ def read_map(
     centred: bool = False,
     missing: Literal["error", "zero"] = "error",
 ) -> WcsMap | HealpixMap:
-    """The first image or HEALPix table of a FITS file.
+    """The first image or HEALPix table of a FITS file; of Stokes parameters I, and a note names those that are not used.
 
     Parameters
     ----------
@@ -128,7 +130,7 @@ def read_map(
     Raises
     ------
     InputError
-        Unreadable file; no map in it; unit, scale or position missing; unknown unit; NaN; a cube.
+        Unreadable file; no map in it; unit, scale or position missing; unknown unit; NaN; a cube without an axis STOKES; no I.
     """
     place = f"sky map {path}"
     cure = "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
@@ -141,12 +143,16 @@ def read_map(
         for hdu in hdus:
             if _is_healpix(hdu):
                 check_size(path, hdu, place)
-                table = _columns(hdu)
-                return _healpix(place, hdu.header, *table, unit, pixel_size, centred, missing)
+                table, notes = _columns(hdu, place)
+                found = _healpix(place, hdu.header, *table, unit, pixel_size, centred, missing)
+                found.notes |= notes
+                return found
             if hdu.is_image and hdu.header.get("NAXIS", 0) > 0:
                 check_size(path, hdu, place)
-                values = np.asarray(hdu.data, np.float64)
-                return _image(place, values, hdu.header, unit, pixel_size, centred, missing)
+                notes = stokes.of_extensions(hdu.name, [other.name for other in hdus if other.is_image], place)
+                image = _image(place, np.asarray(hdu.data, np.float64), hdu.header, unit, pixel_size, centred, missing)
+                image.notes |= notes
+                return image
     raise InputError("holds no image and no HEALPix table", place=place, cure="give a FITS file with a two-dimensional image")
 
 
@@ -232,11 +238,10 @@ def _image(
 ) -> WcsMap:
     if values.ndim < 2:
         raise InputError("the image has one axis", place=place, cure="give a two-dimensional image")
-    if values.size == 0 or any(n > 1 for n in values.shape[:-2]):
-        shape = " x ".join(str(n) for n in reversed(values.shape))
-        raise InputError(f"the image is a cube of {shape} pixels", place=place, cure="extract one two-dimensional plane of it")
-    values = values.reshape(values.shape[-2:]).copy()
-    notes: dict[str, str] = {}
+    if values.size == 0:
+        raise InputError("the image has no pixels", place=place, cure="give a two-dimensional image")
+    plane, notes = stokes.plane_of_cube(header, values.shape, place)
+    values = values[plane].copy()
     unit, factor = _unit(place, header, "BUNIT", given, notes)
     beam = _beam_solid_angle(place, header) if unit == "Jy/beam" else None
     if beam is not None:
@@ -387,11 +392,13 @@ def _is_healpix(hdu: Any) -> bool:
     )
 
 
-def _columns(hdu: Any) -> tuple[Floats, NDArray[np.int64] | None]:
-    """Values of the first map of a table, and the pixels they belong to where the table says."""
-    explicit = hdu.columns.names[0].upper() in ("PIXEL", "PIXELS", "PIX", "INDEX")
+def _columns(hdu: Any, place: str) -> tuple[tuple[Floats, NDArray[np.int64] | None], dict[str, str]]:
+    """Values of the first map of a table, with the pixels they belong to where the table says; the note about other maps."""
+    names = hdu.columns.names
+    explicit = names[0].upper() in ("PIXEL", "PIXELS", "PIX", "INDEX")
+    notes = stokes.of_columns(names, int(explicit), place)
     values = np.asarray(hdu.data.field(int(explicit)), np.float64).ravel()
-    return values, np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else None
+    return (values, np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else None), notes
 
 
 def _healpix(

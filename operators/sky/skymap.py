@@ -31,6 +31,7 @@ from .placement import kelvin, placed
 from .read import HealpixMap, WcsMap, read_map
 from .resample import resample_healpix, resample_image, tangent_wcs
 from .sampling import Chunks, pointing, sample
+from .stokes import STOKES
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -231,9 +232,12 @@ class SkyMap(Operator):
         return cast(Sky, self._memory.get(key, lambda: self._resampled(source, wcs, band, key)))
 
     def _read(self) -> WcsMap | HealpixMap:
-        return read_map(
+        source = read_map(
             self.file, unit=self.unit, pixel_size=self.pixel_size, centred=self.centre is not None, missing=self.missing
         )
+        if STOKES in source.notes:
+            warnings.warn(f"{self.label}: {self.file}: {source.notes[STOKES]}", stacklevel=2)
+        return source
 
     def _centre(self, observation: Observation, source: WcsMap) -> tuple[float, float] | None:
         if isinstance(self.centre, Target):

@@ -1,0 +1,88 @@
+"""Maps of I, Q, U: I is read, and what is not used is said."""
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from zonda.core.errors import InputError
+from zonda.operators.sky.read import read_map
+from zonda.operators.sky.skymap import SkyMap
+from zonda.operators.sky.stokes import STOKES, is_polarized
+
+
+@pytest.mark.parametrize(
+    ("name", "polarized"),
+    [("Q_POLARISATION", True), ("U_STOKES", True), ("STOKES_Q", True), ("V", True), ("q-pol", True)]
+    + [(name, False) for name in ("TEMPERATURE", "I_STOKES", "SIGNAL", "UNITS", "QUALITY", "VALUE", "PRIMARY", "")],
+)
+def test_names(name, polarized):
+    assert is_polarized(name) is polarized
+
+
+def healpix_file(path, **options):
+    i, q, u = np.random.default_rng(1).normal(size=(3, 192))
+    healpy.write_map(path, [i, q, u], coord="C", column_units="K_RJ", dtype=np.float64, **options)
+    return i
+
+
+def test_healpix_iqu(tmp_path):
+    i = healpix_file(tmp_path / "iqu.fits")
+    found = read_map(tmp_path / "iqu.fits")
+    np.testing.assert_array_equal(found.values, i)
+    expected = "column TEMPERATURE is read as I; Q_POLARISATION, U_POLARISATION are not used: detectors measure total intensity"
+    assert found.notes[STOKES] == expected
+
+
+def test_partial_healpix_iqu(tmp_path):
+    healpix_file(tmp_path / "iqu.fits", partial=True)
+    assert "Q_POLARISATION, U_POLARISATION are not used" in read_map(tmp_path / "iqu.fits").notes[STOKES]
+
+
+def test_healpix_of_i_alone_has_no_note(tmp_path):
+    healpy.write_map(tmp_path / "i.fits", np.zeros(192), coord="C", column_units="K_RJ", dtype=np.float64)
+    assert STOKES not in read_map(tmp_path / "i.fits").notes
+
+
+def test_healpix_that_begins_with_q(tmp_path):
+    healpix_file(tmp_path / "q.fits", column_names=["Q_STOKES", "U_STOKES", "I_STOKES"])
+    with pytest.raises(InputError, match="the column Q_STOKES, is no intensity"):
+        read_map(tmp_path / "q.fits")
+
+
+@pytest.mark.parametrize(("first", "step", "plane"), [(1, 1, 0), (3, -1, 2)])
+def test_cube_of_i_q_u(made, save, first, step, plane):
+    values = np.random.default_rng(2).normal(size=(3, 5, 6))
+    header = made.tan_header((5, 6), CTYPE3="STOKES", CRVAL3=float(first), CDELT3=float(step), CRPIX3=1.0)
+    found = read_map(save(values, header))
+    np.testing.assert_array_equal(found.values, values[plane])
+    assert found.notes[STOKES].startswith(f"plane {plane + 1} of 3 is read, I; ")
+    assert "are not used" in found.notes[STOKES]
+
+
+@pytest.mark.parametrize(("length", "found"), [(1, "Q"), (2, "Q, U")])
+def test_cube_without_i(made, save, length, found):
+    header = made.tan_header((5, 6), CTYPE3="STOKES", CRVAL3=2.0, CDELT3=1.0, CRPIX3=1.0)
+    with pytest.raises(InputError, match=f"axis STOKES has {found} and no I") as caught:
+        read_map(save(np.zeros((length, 5, 6)), header))
+    assert "CRVAL3" in caught.value.cure
+
+
+def test_one_plane_of_i_has_no_note(made, save):
+    header = made.tan_header((5, 6), CTYPE3="STOKES", CRVAL3=1.0, CDELT3=1.0, CRPIX3=1.0)
+    assert STOKES not in read_map(save(np.zeros((1, 5, 6)), header)).notes
+
+
+def test_extensions_q_and_u(made, tmp_path):
+    images = [fits.ImageHDU(np.zeros((5, 6)), made.tan_header((5, 6)), name=name) for name in ("I", "Q", "U")]
+    fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "iqu.fits")
+    assert read_map(tmp_path / "iqu.fits").notes[STOKES].startswith("the first image, I, is read as I; Q, U are not used")
+    fits.HDUList([fits.PrimaryHDU(), *images[1:]]).writeto(tmp_path / "qu.fits")
+    with pytest.raises(InputError, match="its first image, Q, is no intensity"):
+        read_map(tmp_path / "qu.fits")
+
+
+def test_skymap_warns(tmp_path):
+    healpix_file(tmp_path / "iqu.fits")
+    with pytest.warns(UserWarning, match=r"SkyMap: .*iqu\.fits: column TEMPERATURE is read as I; .* are not used"):
+        SkyMap(file=str(tmp_path / "iqu.fits"))._read()
