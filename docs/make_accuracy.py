@@ -28,10 +28,11 @@ def lines(front: dict[str, Any]) -> Iterator[str]:
     shorter = ", ".join(f"{k} = {v}" for k, v in front["shorter"].items()) or "none"
     yield from ("", f"## {front['pipeline']}, {front['metric']}", "")
     yield f"Error: {front['says']}. Shortened by: {shorter}. zonda {front['versions']['zonda']}, seed {front['seed']}."
+    staying = " ".join(f"`{k}={v}`" for k, v in front["staying"].items())
     yield (
         f"Instrument noise in units of the error: {percent(front['noise_floor'])}; realization scatter: "
         f"{percent(front['realization_scatter'])}. Reference: {cost(reference)} CPU s, {reference['memory'] / 1e6:.0f} MB; "
-        f"its own error by its last steps: {percent(front['reference_error'])}."
+        f"its own error by its last steps: {percent(front['reference_error'])}, with {staying}."
     )
     picture = PAGE.with_name(f"accuracy_{front['pipeline']}_{front['metric']}.png")
     if picture.exists():

@@ -21,7 +21,12 @@ def test_a_front_is_of_its_pipeline_and_holds(path):
     again = "make it anew: zonda accuracy PIPELINE --metric METRIC --quick --store; python docs/make_accuracy.py"
     assert front.fingerprint == store.fingerprint(file), again
     assert set(front.reference) == {k.key for k in knobs_of(file) if not k.redraws}, again
-    assert store.settings_for(file, 0.01, front.metric).error <= 0.01
+    choice = store.settings_for(file, 0.01, front.metric)
+    if front.metric in ("psd", "structure"):  # of two scans of 30 s four seeds do not resolve what other layers would change
+        assert choice.error is None
+        assert "meets 1 %" in choice.reason
+    else:
+        assert choice.error <= 0.01
     for result in retest(front, file, pipeline, points=1):
         assert result.good, result
 

@@ -57,8 +57,8 @@ def accuracy(
     """Show what accuracy costs in time: error against CPU seconds and memory.
 
     Every knob that the pipeline's operators declare is turned alone and jointly, with the same random numbers, and compared with
-    all knobs at their tightest. Prints the tables, draws the work-precision diagram and writes the cheapest setting that meets
-    the target.
+    all knobs at their tightest. Prints the tables, draws the work-precision diagram and writes the setting that
+    meets the target at least cost.
     """
     from ..configuration.pipeline_file import load
     from ..configuration.units import Unit

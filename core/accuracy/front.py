@@ -133,12 +133,17 @@ def pareto(points: Sequence[Point]) -> list[Point]:
 
 def cheapest(points: Sequence[Point], target: float, left: float = 0.0) -> Point | None:
     """The cheapest point whose error, with what is ``left`` in the reference, meets the target; among those that cost the same
-    within their spread, the most accurate. None where there is none."""
-    good = [p for p in points if p.error + left <= target]
-    if not good:
+    within its spread, the most accurate. None where there is none."""
+    best = least(points, target, left)
+    if best is None:
         return None
-    best = min(good, key=lambda p: p.seconds)
-    return min((p for p in good if p.seconds <= best.seconds + best.spread), key=lambda p: (p.error, p.seconds))
+    good = [p for p in points if p.error + left <= target and p.seconds <= best.seconds + best.spread]
+    return min(good, key=lambda p: (p.error, p.seconds))
+
+
+def least(points: Sequence[Point], target: float, left: float = 0.0) -> Point | None:
+    """The point that was measured to cost least of those that meet the target; None where there is none."""
+    return min((p for p in points if p.error + left <= target), key=lambda p: p.seconds, default=None)
 
 
 def _beats(q: Point, p: Point) -> bool:

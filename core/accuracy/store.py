@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from ..operator import Operator
     from .study import Study
 
-FORMAT = 1
+FORMAT = 2
+"""1: `Front.left` without the knobs that stay as in the file."""
 
 
 @dataclass(frozen=True)
 class Front:
-    """A stored front: its points, what the reference is itself wrong by, and what it was measured on."""
+    """A stored front: its points, what the reference is itself wrong by, and what it was measured on. ``staying``: values of the
+    knobs that redraw, which are those of the file in all points."""
 
     metric: str
     fingerprint: str
@@ -40,6 +42,7 @@ class Front:
     reference: Setting
     seed: int
     version: str
+    staying: Setting
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,7 @@ def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
         "realization_scatter": study.scatter,
         "reference": study.sweep.reference,
         "reference_error": study.sweep.left,
+        "staying": {a.knob.key: a.knob.present for a in study.sweep.alone if a.knob.redraws},
         "first_run_seconds": study.first,
         "alone": [
             {
@@ -141,6 +145,7 @@ def read(path: Path) -> Front:
             values["reference"],
             values["seed"],
             values["versions"].get("zonda", "?"),
+            values["staying"],
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as err:
         cure = "make it anew: zonda accuracy PIPELINE --store"
@@ -163,6 +168,8 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
         front = read(path)
         if front.fingerprint != fingerprint(file) or not front.reference.keys() <= known:
             why = f"the stored front of {metric} ({path}) is of other steps or another scene"
+        elif changed := [f"{k.key}={front.staying[k.key]}" for k in knobs if front.staying.get(k.key, k.present) != k.present]:
+            why = f"the stored front of {metric} ({path}) was made with {' '.join(changed)}"
         elif (point := cheapest(front.points, target, front.left)) is None:
             why = f"no point of the stored front of {metric} meets {100 * target:g} %"
     if point is not None:

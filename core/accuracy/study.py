@@ -67,7 +67,7 @@ class Study:
     points
         Every joint setting that was measured, ``present`` among them.
     chosen
-        The cheapest that meets the target; None where none does.
+        Of those that meet the target, see `front.cheapest`; None where none does.
     floor, scatter
         Instrument noise and realization scatter in units of the error; None where they have no meaning or were not measured.
     first
@@ -115,7 +115,8 @@ def study(
     found = sweep(bench, knobs)
     reference = bench.measure(found.reference)
     present = point(bench, {k.key: k.present for k in knobs if not k.redraws}, found.reference)
-    points = (*search(bench, found, setup.target - found.left), present)
+    allowed = setup.target - found.left
+    points = (*search(bench, found, allowed if allowed > 0 else setup.target), present)
     return Study(
         setup,
         metric.says,

@@ -147,6 +147,15 @@ class Alone:
     def rung(self, value: str) -> Rung:
         return next(r for r in self.rungs if r.value == value)
 
+    @property
+    def stays(self) -> float:
+        """Of a knob that redraws, which stays as in the file: what the file's value is wrong by. Its error against the tightest
+        rung, or twice the standard error of that where it is not resolved, and what the tightest is itself wrong by. A value
+        that is not on the ladder counts as the worst rung."""
+        measured = [r for r in self.rungs if r.error is not None]
+        mine = [r for r in measured if r.value == self.knob.present] or measured
+        return max((r.error or 0.0 if (r.error or 0.0) > 2 * r.resolution else 2 * r.resolution) for r in mine) + self.left
+
 
 @dataclass
 class Sweep:
@@ -157,8 +166,18 @@ class Sweep:
 
     @property
     def left(self) -> float:
-        """What the reference is itself wrong by: the sum over the knobs that take part in joint settings."""
+        """What the reference is itself wrong by, the sum over the knobs: at their tightest, or as in the file (`Alone.stays`)."""
+        return self.left_of_turned + sum(a.stays for a in self.alone if a.knob.redraws)
+
+    @property
+    def left_of_turned(self) -> float:
+        """`left`, of the knobs that take part in joint settings alone."""
         return sum(a.left for a in self.alone if not a.knob.redraws)
+
+    @property
+    def staying(self) -> list[Alone]:
+        """Knobs that stay as in the file and add to `left`."""
+        return [a for a in self.alone if a.knob.redraws and a.stays > 0]
 
 
 def tightest(knobs: Sequence[PipelineKnob]) -> Setting:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from .fragment import arguments
-from .front import Point
+from .front import Point, least
 from .study import Study
 from .sweep import Alone, Rung, differences
 
@@ -45,6 +45,9 @@ def _heading(study: Study) -> Iterator[str]:
         f"{_megabytes(reference.memory)} ({study.first:.1f} s the first time, with imports and caches); "
         f"its own error by its last steps: {percent(study.sweep.left)}"
     )
+    if staying := study.sweep.staying:
+        parts = ", ".join(f"{a.knob.key}={a.knob.present} {percent(a.stays)}" for a in staying)
+        yield f"  of it {percent(study.sweep.left - study.sweep.left_of_turned)} of knobs that stay as in the file: {parts}"
     floor = "none" if study.floor is None else percent(study.floor)
     yield f"instrument noise in units of the error: {floor}; realization scatter: {percent(study.scatter)}"
     if study.sweep.left > setup.target:
@@ -88,12 +91,15 @@ def _recommended(study: Study) -> Iterator[str]:
     if study.chosen is None:
         yield f"no setting is shown to meet {percent(target)}"
         return
-    chosen, reference = study.chosen, study.points[0]
-    ratio = reference.seconds / chosen.seconds if chosen.seconds else float("nan")
-    yield (
-        f"cheapest setting within {percent(target)}: {percent(chosen.error)} (+ {percent(left)} of the reference), "
-        f"{_cost(chosen.seconds, chosen.spread)} CPU s, {ratio:.2g} times cheaper than the tightest"
-    )
+    chosen, reference, best = study.chosen, study.points[0], least(study.points, target, left)
+    words, cost = f"{percent(chosen.error)} (+ {percent(left)} of the reference)", _cost(chosen.seconds, chosen.spread)
+    if best is None or chosen.seconds <= best.seconds:
+        ratio = reference.seconds / chosen.seconds if chosen.seconds else float("nan")
+        than = "; it is the tightest" if chosen.setting == reference.setting else f", {ratio:.2g} times cheaper than the tightest"
+        yield f"cheapest setting within {percent(target)}: {words}, {cost} CPU s{than}"
+    else:
+        yield f"setting within {percent(target)}: {words}, {cost} CPU s, the most accurate of those that cost as much as the"
+        yield f"  cheapest within its spread; that is {percent(best.error)}, {_cost(best.seconds, best.spread)} CPU s"
     yield f"  {arguments(chosen.setting)}"
 
 

@@ -62,7 +62,8 @@ class Efficiency(Operator):
     illumination: Fraction | None = Field(None, gt=0, le=1)
     """epsilon, the share of the atmosphere's emission that reaches a detector; where absent, the instrument's."""
     scatter: Fraction = quantity("0 %", ge=0, le=0.5)
-    """Relative rms of zeta between detectors (normal; known to the calibration, so it changes noise, not gain)."""
+    """Relative rms of zeta between detectors (normal). The calibration knows it: the sky keeps its gain, and so does a NET quoted
+    on the sky. The atmosphere's fluctuation, and noise given at the detector (`reference: detector`), vary as 1 / zeta."""
     calibration: Literal["mean", "instantaneous"] = "mean"
     """Divide by e^-tau at the mean PWV and current elevation, or by the fluctuating e^-tau."""
     calibration_error: Fraction = quantity("0 %", ge=0, le=0.5)

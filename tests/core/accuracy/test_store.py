@@ -123,6 +123,18 @@ def test_a_target_that_no_point_meets(made):
     assert "HighpassFilter.oversampling=48" in choice.overrides
 
 
+def test_a_front_holds_for_its_own_values_of_knobs_that_redraw(tmp_path):
+    """They are those of the file in all its points, and what they are wrong by is in its error."""
+    path = tmp_path / "my.yaml"
+    path.write_text(TEXT)
+    file = zonda.load(path)
+    store.save(study(file, Setup(str(path), (), "map_rms", 0.5, {}, seeds=(5, 6)), knobs_of(file), run=toy_run), file)
+    assert store.settings_for(file, 0.5).error is not None
+    other = store.settings_for(zonda.load(path, overrides=["PinkNoise.poles=4"]), 0.5)
+    assert other.error is None
+    assert "was made with PinkNoise.poles=8" in other.reason
+
+
 def test_what_the_file_states_stays(made):
     path, file, found = made
     store.save(found, file)

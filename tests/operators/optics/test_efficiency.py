@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import zonda
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.optics.efficiency import OPAQUE, Efficiency, _spline, quotient
+
+from ...scenes import camera
 
 N_DET, N = 19, 5000
 
@@ -98,6 +101,26 @@ def test_scatter_changes_noise_and_not_the_sky(bench, streams):
     operator.configure(again)
     operator.configure(again)
     np.testing.assert_array_equal(again.focalplane.main_beam_efficiency, zeta)
+
+
+@pytest.mark.parametrize("reference", ["sky", "detector"])
+def test_scatter_changes_noise_at_the_detector_alone(tmp_path, reference):
+    """A NET on the sky is that of the calibrated stream whatever zeta is; one at the detector is divided by it. 20000 samples
+    show a detector's rms to 0.5 %, of which 5 sigma are allowed; zeta scatters by 20 %."""
+    (tmp_path / "a.yaml").write_text(
+        camera(8)
+        + f"""operators:
+  - PointingStare: {{scan_duration: 400 s}}
+  - WhiteNoise: {{net: 1 mK s(1/2), reference: {reference}}}
+  - Efficiency: {{scatter: 20 %}}
+"""
+    )
+    file = zonda.load(tmp_path / "a.yaml")
+    (o,) = file.pipeline().run(file.scene(), threads=1, keep=["signal"]).observations
+    zeta = o.focalplane.main_beam_efficiency
+    assert zeta.std() > 0.1 * zeta.mean()
+    found = np.asarray(o.detdata["signal"], np.float64).std(axis=1) / (1e-3 * np.sqrt(50.0))
+    np.testing.assert_allclose(found if reference == "sky" else found * zeta, 1.0, rtol=5 * 0.005)
 
 
 def test_calibration_error_scales_each_detector(bench, streams):
