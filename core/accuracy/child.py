@@ -1,4 +1,4 @@
-"""The process that measures one setting: python -m zonda.core.accuracy.child REQUEST.json ANSWER.pickle."""
+"""The process that measures one setting: it calls `main`."""
 
 from __future__ import annotations
 
@@ -118,7 +118,3 @@ def main(ask: str, answer: str) -> int:
     with Path(answer).open("wb") as file:
         pickle.dump(result, file)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))

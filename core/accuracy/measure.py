@@ -10,16 +10,15 @@ cost the same at every setting.
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import statistics
 import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .. import children
 from ..errors import ZondaError
 
 REST = "(rest)"
@@ -98,8 +97,8 @@ def _measure(request: Request) -> Measured:
     with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:
         ask, answer = Path(folder) / "request.json", Path(folder) / "answer.pickle"
         ask.write_text(json.dumps(request.__dict__))
-        command = [sys.executable, "-m", "zonda.core.accuracy.child", str(ask), str(answer)]
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=os.environ.copy())
+        command = children.command("zonda.core.accuracy.child", "main", str(ask), str(answer))
+        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         if done.returncode or not answer.exists():
             place = " ".join(request.overrides) or request.pipeline
             if done.returncode < 0:

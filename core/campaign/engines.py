@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from .. import children
 from ..errors import PipelineError
 from ..machine import available_memory, available_threads
 from .settings import Engine, Tls
@@ -117,7 +118,7 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
 
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
             """See `Executor.submit`."""
-            with _ctrl_c_held_back():
+            with children.safe_path(), _ctrl_c_held_back():
                 return super().submit(fn, *args, **kwargs)
 
     count = workers or available_threads()
@@ -128,7 +129,9 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
     def make() -> Executor:
         for old in made:
             _end(old)
-        pool = Workers(count, mp_context=get_context("spawn"), initializer=begin_worker)
+        safe = os.environ.get(children.SAFE)
+        with children.safe_path():  # its queues start a process that counts them
+            pool = Workers(count, mp_context=get_context("spawn"), initializer=begin_worker, initargs=(safe,))
         made[:] = [pool]
         return pool
 
@@ -161,8 +164,12 @@ def _ctrl_c_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def begin_worker() -> None:
-    """In a new worker process: leave Ctrl-C to the main process, and end when that is gone, however it went."""
+def begin_worker(safe: str | None = None) -> None:
+    """In a new worker process: leave Ctrl-C to the main process, and end when that is gone, however it went.
+
+    ``safe``: ``PYTHONSAFEPATH`` of the main process.
+    """
+    children.restore(safe)
     from ..compilation.compiled import ensure_cache, one_blas_thread
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -21,6 +21,7 @@ from itertools import accumulate
 from threading import Event, Thread
 from typing import Any
 
+from .. import children
 from ..machine import available_threads
 from ..program import fingerprint
 from ..storage import user_cache
@@ -30,7 +31,6 @@ from .compiled import cache_folder
 KIND = "compiled"
 COMPILING = (100_000, 20, 100)
 """Thresholds of garbage collection while kernels are compiled: by Python's own it takes 7 % of the time."""
-_CHILD = "import sys; sys.path[:] = {path!r}; from zonda.core.compilation.compile_ahead import serve; serve()"
 
 
 class Helper:
@@ -60,7 +60,7 @@ class Helper:
         if self._first and not self._alone:
             with suppress(OSError):
                 self._process = subprocess.Popen(
-                    [sys.executable, "-c", _CHILD.format(path=sys.path)],
+                    children.command("zonda.core.compilation.compile_ahead", "serve"),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,

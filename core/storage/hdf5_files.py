@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from .. import children
 from ..errors import InputError
 from .files import check_memory, reading
 
@@ -35,21 +36,23 @@ def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> It
 
 
 def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
-    """Let a process of its own look at the file first (`hdf5_survey`). `InputError` where libhdf5 hangs or crashes."""
+    """Let a process of its own look at the file first (`hdf5_survey`). `InputError` where that hangs, crashes or fails."""
     with open(path, "rb"):  # not there, not readable: told as it is
         pass
-    command = [sys.executable, "-m", "zonda.core.storage.hdf5_survey", os.fspath(path)]
+    command = children.command("zonda.core.storage.hdf5_survey", "main", os.path.abspath(os.fspath(path)))
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE, env=_environment())
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE)
     except subprocess.TimeoutExpired:
         raise InputError("is corrupt: the HDF5 library does not come to an end with it", place=place, cure=cure) from None
     if done.returncode < 0:
         raise InputError(f"is corrupt: the HDF5 library crashes on it (signal {-done.returncode})", place=place, cure=cure)
-
-
-def _environment() -> dict[str, str]:
-    """For a child that finds the same packages."""
-    return os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    if done.returncode:
+        said = (done.stderr.decode(errors="replace").strip().splitlines() or ["nothing"])[-1]
+        raise InputError(
+            f"cannot be checked: the process that opens it first ended with status {done.returncode} and said {said!r}",
+            place=place,
+            cure=f"does `{sys.executable} -c 'import h5py'` work? If so, {cure}",
+        )
 
 
 def check_size(dataset: Any, place: str) -> None:

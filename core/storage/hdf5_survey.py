@@ -1,15 +1,17 @@
-"""A first look at an HDF5 file in a process of its own: python -m zonda.core.storage.hdf5_survey FILE.
+"""A first look at an HDF5 file in a process of its own, which calls `main`.
 
 On some corrupt files libhdf5 itself never returns, or takes the process with it (damaged global heaps, B-trees that lead back to
 themselves). Here that costs nothing but this process. It touches what a reader touches: every object, attribute and small data
-set. Python's own errors are left to the reader, who tells them better.
+set. Python's own errors about the file are left to the reader, who tells them better; whatever else goes wrong ends the process
+with another status than 0.
 """
 
 from __future__ import annotations
 
 import contextlib
-import sys
 from typing import Any
+
+from ..compilation.compiled import one_blas_thread
 
 SMALL = 1 << 20
 """Bytes up to which a data set is read whole; of larger ones the first value."""
@@ -19,11 +21,13 @@ MEMORY = 4 << 30
 
 def main(path: str) -> int:
     """Touch everything in a file; 0, however bad it is, where that comes to an end."""
+    one_blas_thread()  # each thread of BLAS takes address space
+    import h5py
+
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    import h5py
 
     def touch(name: str, item: Any) -> None:
         with contextlib.suppress(Exception):
@@ -37,7 +41,3 @@ def main(path: str) -> int:
         touch("/", file)
         file.visititems(touch)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))

@@ -19,7 +19,7 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any, BinaryIO
 
-_CHILD = "import sys; sys.path[:] = {path!r}; from zonda.operators.diagnostics.artist import serve; serve(*{twin!r})"
+from zonda.core import children
 
 LAID_IN = (1, 2, 1, 2, 2, 1, 2, 4)
 """Numbers of axes of the figures that are made ahead, for the pictures of a run with a noiseless and a source-free one."""
@@ -35,13 +35,11 @@ class Artist:
 
     def __init__(self) -> None:
         self._closed = False
-        if not sys.executable:
-            raise OSError("this is no Python interpreter that could be started again")
         twin = [*os.pipe(), *os.pipe()] if sys.platform == "linux" else []
         theirs, ours = twin[::3], twin[1:3]
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _CHILD.format(path=sys.path, twin=theirs)],
+                children.command("zonda.operators.diagnostics.artist", "serve", *theirs),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
