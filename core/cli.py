@@ -6,6 +6,7 @@ import contextlib
 import errno
 import gc
 import os
+import re
 import signal
 import sys
 import threading
@@ -251,6 +252,7 @@ def run(
         return
     from .plan.outcome import line
     from .plan.remembered import outcome
+    from .run.first_look import first_look
     from .storage.files import check_output_folder, write_text
     from .storage.lock import lock
 
@@ -258,6 +260,7 @@ def run(
         raise click.UsageError("--verify measures the whole pipeline: leave --only out")
     if only:
         file = _load(pipeline, settings, only)
+    first_look(file.pipeline(), file.scene())  # minutes of work must not come before a mistake that is seen at once
     target = file.header.accuracy
     if target is not None:
         from .accuracy.store import settings_for
@@ -326,14 +329,13 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.
 
     Every mistake in the file is shown at once, with its place. The telescope is pointed at some instants of the scans: whether
-    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam. Only
-    `zonda run` reads the input maps.
+    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam; and
+    whether it is on the input maps, of which the headers alone are read. A run begins with the same look.
     """
     file = _load(pipeline, settings)
-    from .data import Data
+    from .run.first_look import first_look
 
-    data = Data(scene=file.scene())
-    found = [operator.check(data) for operator in file.pipeline().operators]
+    found = first_look(file.pipeline(), file.scene())
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
     for step, lines in zip(file.steps, found, strict=True):
         click.echo(f"  {step.key}")
@@ -497,17 +499,30 @@ def _stoppable() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Warnings as one line without the source that raised them."""
-    usual = warnings.formatwarning
+    """Warnings as one line without the source that raised them.
+
+    One that differs in its figures alone from one before is not shown: the first look at a pipeline has told it already.
+    """
+    usual, usual_show = warnings.formatwarning, warnings.showwarning
+    told: set[str] = set()
 
     def one_line(message: Any, category: Any, filename: str, lineno: int, line: str | None = None) -> str:
         return f"warning: {message}\n"
 
-    warnings.formatwarning = one_line
+    def show(message: Any, *place: Any, **more: Any) -> None:
+        text = _FIGURES.sub("#", str(message))
+        if text not in told:
+            told.add(text)
+            usual_show(message, *place, **more)
+
+    warnings.formatwarning, warnings.showwarning = one_line, show
     try:
         yield
     finally:
-        warnings.formatwarning = usual
+        warnings.formatwarning, warnings.showwarning = usual, usual_show
+
+
+_FIGURES = re.compile(r"scan-\d+|(?<![\w.-])[-+]?\d[\d.]*(e[-+]?\d+)?(?!\w)")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,8 @@ class Scene(Parameters):
     time: Instant
     """Start of the first scan, UTC unless it carries an offset, e.g. 2024-11-25T07:00 or 2024-11-25T02:00-05:00."""
     target: Target | None = None
-    """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or {az: 180 deg, el: 60 deg}."""
+    """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or {az: 180 deg, el: 60 deg};
+    in a pipeline file also map, the centre of the input map."""
     weather: Annotated[SerializeAsAny[WeatherSource], BeforeValidator(weather_source)] | None = None
     """The air: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: air.csv}; None: the climatology's median."""
     seed: int = Field(0, ge=0, lt=2**63)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +174,116 @@ def test_a_disk_that_is_full(here, capsys, monkeypatch, step):
     monkeypatch.setattr(os, "replace", full)
     message = refused(capsys)
     assert "no space left on the disk" in message
+
+
+@pytest.fixture
+def warned(monkeypatch):
+    """Warnings go where a user sees them; pytest keeps them for itself."""
+
+    def show(*what):
+        sys.stderr.write(warnings.formatwarning(*what[:4]))
+
+    monkeypatch.setattr(warnings, "showwarning", show)
+
+
+def test_a_run_begins_with_what_check_finds(here, capsys, monkeypatch):
+    """400 h of scan are refused in the words of `zonda check`, and no more instants are pointed than it looks at."""
+    from zonda.operators.pointing import base
+
+    pointed, seconds = [], base.Pointing._seconds
+
+    def counted(self, n, rate, key):
+        pointed.append(n)
+        return seconds(self, n, rate, key)
+
+    monkeypatch.setattr(base.Pointing, "_seconds", counted)
+    (here / "my.yaml").write_text(PIPELINE.replace("2 s}", "400 h}"))
+    for command in ("check", "run", "plan"):
+        pointed.clear()
+        message = refused(capsys, command)
+        assert "goes down to elevation" in message
+        assert "the scans take 400.0 h" in message
+        assert pointed
+        assert max(pointed) <= base.INSTANTS_LOOKED_AT + base.POINTS
+
+
+def test_a_long_scan_is_looked_at_first_from_python_too(here, monkeypatch):
+    from zonda.core.configuration.pipeline_file import parse
+    from zonda.core.errors import PointingError
+    from zonda.operators.pointing import base
+
+    monkeypatch.setattr(base, "LONG", 100)
+    looked = []
+    check = base.Pointing.check
+    monkeypatch.setattr(base.Pointing, "check", lambda self, data: looked.append(len(data.observations)) or check(self, data))
+    file = parse(PIPELINE.replace("2 s}", "30 h, sample_rate: 1 Hz}"), name="p", folder=here)
+    with pytest.raises(PointingError, match="goes down to elevation"):
+        file.pipeline().run(file.scene(), output=here / "out")
+    assert looked == [0]
+
+
+def test_a_warning_of_the_first_look_is_not_repeated(here, capsys, warned):
+    """A scan too fast for the beam: `run` warns once, before it runs, in the words of `check`."""
+    (here / "my.yaml").write_text(PIPELINE.replace("2 s}", "4 s, scans: 2, sample_rate: 8 Hz}"))
+    assert cli.main(["check", "my.yaml"]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "samples per FWHM" in line]
+    assert len(said) == 1
+    assert cli.main(["run", "my.yaml", "--output", "out"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if "samples per FWHM" in line] == said
+    assert lines.index(said[0]) == 0
+
+
+@pytest.mark.parametrize("command", ["check", "run", "plan"])
+def test_a_pipeline_that_writes_nothing_says_so(here, capsys, warned, command):
+    assert cli.main([command, "my.yaml"]) == 0
+    assert "no step writes" not in capsys.readouterr().err
+    (here / "my.yaml").write_text(PIPELINE.replace("  - SaveMap\n", ""))
+    assert cli.main([command, "my.yaml"]) == 0
+    said = capsys.readouterr().err
+    assert "warning: my: no step writes a product, so what is computed is lost; add one that does, e.g. SaveMap" in said
+    if command == "run":
+        assert said.index("no step writes") < said.index("of CPU time")
+
+
+@pytest.mark.parametrize("command", ["check", "run", "plan"])
+def test_a_target_off_the_map_warns_with_its_centre(here, capsys, warned, command):
+    assert cli.main([command, "my.yaml"]) == 0
+    assert "is not on the input map" not in capsys.readouterr().err
+    assert cli.main([command, "my.yaml", "--set", "target=06h +20d"]) == 0
+    said = capsys.readouterr().err
+    assert "the target 90.00000 deg 20.00000 deg is not on the input map, whose centre, 75.00000 deg 20.00000 deg, is" in said
+    assert cli.main([command, "my.yaml", "--set", "target=06h +20d", "--set", "SkyMap.centre=target"]) == 0
+    assert "is not on the input map" not in capsys.readouterr().err
+    assert cli.main([command, "my.yaml", "--set", "target=06h +20d", "--set", "SkyMap.centre=06h +20d"]) == 0
+    assert "is not on the input map" not in capsys.readouterr().err
+
+
+def test_target_map_is_the_centre_of_the_input_map(here, capsys):
+    (here / "my.yaml").write_text(PIPELINE.replace("05h00m00s +20d00m00s", "map"))
+    assert cli.main(["check", "my.yaml"]) == 0
+    assert "centre of the input map: 75.00000 deg 20.00000 deg" in capsys.readouterr().out
+    assert cli.main(["run", "my.yaml", "--output", "by_map"]) == 0
+    (here / "my.yaml").write_text(PIPELINE)
+    assert cli.main(["run", "my.yaml", "--output", "by_hand"]) == 0
+    text = (here / "by_map/resolved.yaml").read_text()
+    assert text.replace("name: by_map", "") == (here / "by_hand/resolved.yaml").read_text().replace("name: by_hand", "")
+    assert (here / "by_map/map.fits").read_bytes()[5760:] == (here / "by_hand/map.fits").read_bytes()[5760:]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("  - SkyMap: {file: map.fits}\n", ""), ["my.yaml:4:9", "no step has one", "add SkyMap"]),
+        (
+            ("map.fits}", "map.fits, centre: target}"),
+            ["my.yaml:4:9", "each refer to the other", "give the target as coordinates"],
+        ),
+        (("map.fits}", "nowhere.fits}"), ["nowhere.fits", "no such file"]),
+        (("{scan_duration: 2 s}", "{scan_duration: 2 s, target: map}"), ["my.yaml:7", "top level of a pipeline file"]),
+    ],
+)
+def test_target_map_without_a_centre(here, capsys, change, words):
+    (here / "my.yaml").write_text(PIPELINE.replace("05h00m00s +20d00m00s", "map").replace(*change))
+    message = refused(capsys, "check")
+    assert all(w in message for w in words), message

@@ -62,12 +62,14 @@ def accuracy(
     """
     from ..configuration.pipeline_file import load
     from ..configuration.units import Unit
+    from ..run.first_look import first_look
     from .metrics import get
     from .settings import knobs_of
     from .study import setup_for, study
 
     file = load(pipeline, settings)
     get(metric)
+    first_look(file.pipeline(), file.scene())
     wanted = _fraction(target, Unit(""))
     if check:
         return _retest(file, pipeline, metric)

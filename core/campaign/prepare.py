@@ -69,6 +69,7 @@ def job(
 
     from ..plan import table
     from ..plan.planner import plan
+    from ..run.first_look import first_look
 
     pipelines: list[str] = []
     plans: list[tuple[tuple[str, ...], ...]] = []
@@ -96,6 +97,7 @@ def job(
                 if (entry.settings, share) not in groups:
                     with _placed(about(entry) or source.file.header.name):
                         file = _with_budget(source.load(entry.settings), share)
+                        first_look(file.pipeline(), scene_of(file, entry.seed, entry.time))
                         made = plan(file, keep=keep, drop=drop, prune_all=prune_all)
                     groups[entry.settings, share] = len(pipelines)
                     planned_files.append(made.apply(file))

@@ -230,6 +230,8 @@ class _Check:
             self.mistakes = [entries.missing_above(m, self.document, header.campaign) for m in self.mistakes]
             if not self.mistakes:
                 self.mistakes += entries.mistakes(self.document, header.campaign, KEYS, self.without_campaign)
+        if scene is not None and not self.mistakes and self.target_of_map:
+            scene = self.targeted(scene, [s.operator for s in steps if s is not None])
         if self.mistakes:
             raise ConfigurationError(self.mistakes, self.name)
         assert header is not None
@@ -239,6 +241,26 @@ class _Check:
         header = header.model_copy(update={"name": name, "outputs": header.outputs or Path("out") / name})
         parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree}
         return PipelineFile(header, parameters, tuple(s for s in steps if s is not None), self.name, scene)
+
+    @property
+    def target_of_map(self) -> bool:
+        """Whether the file says ``target: map``."""
+        return isinstance(text := self.tree.get("target"), str) and text.strip().lower() == "map"
+
+    def targeted(self, scene: Scene, operators: Iterable[Operator]) -> Scene:
+        """The scene with the centre of the first step's input map as its target."""
+        at = self.document.mark(("target",)).value
+        centres = [found for o in operators if (found := getattr(o, "map_centre", None)) is not None]
+        if not centres:
+            self.wrong(
+                "target: map takes the centre of an input map, and no step has one", at, "", "add SkyMap, or give a position"
+            )
+            return scene
+        try:
+            return scene.model_copy(update={"target": centres[0]()})
+        except ZondaError as err:
+            self.refused(err, at)
+            return scene
 
     def kind_of_header(self) -> type[Header]:
         """The class that the header is checked against."""
@@ -300,7 +322,7 @@ class _Check:
 
     def scene(self) -> Scene | None:
         """The scene; names are looked up one by one, so that each is reported at its own place."""
-        given = {key: self.tree[key] for key in SCENE_KEYS if key in self.tree}
+        given = {key: self.tree[key] for key in SCENE_KEYS if key in self.tree and not (key == "target" and self.target_of_map)}
         lost = set()
         for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
             if kind in given and not self.named(given, kind, names, (kind,)):

@@ -97,6 +97,10 @@ class Target:
     @classmethod
     def _from_text(cls, text: str) -> Target:
         match = _PAIR.fullmatch(text.replace("\N{MINUS SIGN}", "-").strip())
+        if match is None and text.strip().lower() == "map":
+            raise PydanticCustomError(
+                "target_map", "'map', the centre of the input map, is for the target at the top level of a pipeline file", {}
+            )
         if match is None:
             raise PydanticCustomError(
                 "target_text",

@@ -39,6 +39,7 @@ def plan(
     one_blas_thread()
     ensure_cache()
     from ..configuration.pipeline_file import load
+    from ..run.first_look import first_look
     from . import table
     from .only import only as alone
     from .planner import plan as make
@@ -52,6 +53,7 @@ def plan(
         click.echo(f"{text}; the plan of the first one:", err=as_json)
     if only:
         file = alone(file, only)
+    first_look(file.pipeline(), file.scene())
     made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)
     if not audit:
         import json

@@ -38,6 +38,9 @@ Floats = NDArray[np.float64]
 SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
 """By `Pointing.check`: scans of a step, and instants of all of them."""
 
+LONG = 3_000_000
+"""Instants of all scans [samples] above which `Pointing.check` comes first: a second of work."""
+
 _OFFSET_SIZE = math.radians(1 / 60)
 _BOX = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
 
@@ -147,7 +150,14 @@ class Pointing(Operator):
     # -- the scans --
 
     def observe(self, data: Data) -> None:
-        self._observe(data, range(self.scans), self.sample_rate or data.scene.instrument.sample_rate)
+        rate = self.sample_rate or data.scene.instrument.sample_rate
+        if self.scans * self.scan_duration * rate > LONG:
+            from zonda.core.data import Data
+
+            with warnings.catch_warnings():  # the scans themselves will tell, with better figures
+                warnings.simplefilter("ignore")
+                self.check(Data(scene=data.scene, observations=list(data.observations)))
+        self._observe(data, range(self.scans), rate)
 
     def check(self, data: Data) -> list[str]:
         """Some of the scans at some instants: elevation, speed and acceleration, samples per beam."""

@@ -18,6 +18,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Kelvin
 from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import InputError
 from zonda.core.knobs import Knob
 from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_matrices
 from zonda.core.numerics.stretches import stretches
@@ -26,6 +27,7 @@ from zonda.core.storage.fits_image import Cards
 
 from ..maps.image import Image
 from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct
+from .footprint import Footprint, footprint, off_the_map, position
 from .linear import sample_linear
 from .placement import kelvin, placed
 from .read import HealpixMap, WcsMap, read_map
@@ -102,6 +104,30 @@ class SkyMap(Operator):
         if isinstance(self.centre, Target) and self.centre.frame == "horizontal":
             raise ValueError("centre must be fixed on the sky (ICRS or galactic), not horizontal")
         return self
+
+    def map_centre(self) -> Target:
+        """The middle of the input map, for ``target: map``. Raises InputError where it has none of its own."""
+        place = f"{self.label}, sky map {self.file}"
+        if self.centre == "target":
+            cure = "give the target as coordinates, or remove centre: target"
+            raise InputError("target: map and centre: target each refer to the other", place=place, cure=cure)
+        found = self.centre if isinstance(self.centre, Target) else getattr(self._footprint(), "target", None)
+        if found is None:
+            cure = "give the target as coordinates"
+            raise InputError("the map has no centre on the sky (HEALPix, or no WCS)", place=place, cure=cure)
+        return found
+
+    def _footprint(self) -> Footprint | None:
+        return footprint(self.file, self.pixel_size, self.centre if isinstance(self.centre, Target) else None)
+
+    def check(self, data: Data) -> list[str]:
+        """Whether the scans are about a point of the map, by its header."""
+        if self.centre == "target" or (found := self._footprint()) is None:
+            return []
+        for text in dict.fromkeys(off_the_map(found, o.centre, self.label) for o in data.observations):
+            if text:
+                warnings.warn(text, stacklevel=2)
+        return [f"centre of the input map: {position(*found.target.icrs())}"]
 
     def prepare(self, observation: Observation) -> State:
         widths, index = self._widths(observation)

@@ -1,0 +1,33 @@
+"""What can be found out about a pipeline before any work: `zonda check` prints it, and every run begins with it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ..data import Data
+from ..operator import Operator
+from ..pipeline import Pipeline
+from ..plan.structure import STREAMS
+
+if TYPE_CHECKING:
+    from ..scene import Scene
+
+
+def first_look(pipeline: Pipeline, scene: Scene) -> list[list[str]]:
+    """What each operator's `check` finds, in the order of the steps: lines to print.
+
+    Warns where no step writes anything. Raises `ZondaError` as the checks do: a target that is not up, a scan that is too fast.
+    """
+    data = Data(scene=scene)
+    found = [operator.check(data) for operator in pipeline.operators]
+    if not writes(pipeline.operators):
+        text = f"{pipeline.name}: no step writes a product, so what is computed is lost"
+        warnings.warn(f"{text}; add one that does, e.g. SaveMap, SaveTOD, Plots or Report", stacklevel=2)
+    return found
+
+
+def writes(operators: Iterable[Operator]) -> bool:
+    """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its products in memory."""
+    return any(not (o.product_only or "boresight" in o.provides or (o.provides and o.provides <= STREAMS)) for o in operators)

@@ -1,0 +1,123 @@
+"""Where an input map lies on the sky, by its header alone: what `zonda check` and ``target: map`` need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.configuration.target import Target
+from zonda.core.errors import InputError
+from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
+from zonda.core.storage.files import reading
+from zonda.core.storage.fits_files import opened
+from zonda.core.storage.fits_image import read_image
+
+from .placement import placed
+from .read import WcsMap, _geometry, _is_healpix, is_plain_tan
+
+Floats = NDArray[np.float64]
+
+LATTICE = 17
+"""Pixels along each side from which the extent of a map is taken."""
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Where a map lies.
+
+    Attributes
+    ----------
+    centre
+        ICRS direction (3,) of the middle of the image.
+    radius
+        Largest distance of its pixels from there, rad.
+    matrix
+        From ICRS directions to pixels (`pixel_matrix`) of a TAN image, else None.
+    shape
+        (ny, nx).
+    """
+
+    centre: Floats
+    radius: float
+    matrix: Floats | None
+    shape: tuple[int, int]
+
+    def holds(self, direction: Floats) -> bool:
+        """Whether an ICRS direction (3,) is on the map; of another projection than TAN: within its `radius`."""
+        if self.matrix is None:
+            return float(direction @ self.centre) >= np.cos(self.radius)
+        x, y, depth = self.matrix @ direction
+        ny, nx = self.shape
+        return bool(depth > 0 and -0.5 <= x / depth <= nx - 0.5 and -0.5 <= y / depth <= ny - 0.5)
+
+    @property
+    def target(self) -> Target:
+        """Its centre, to 1e-9 deg: as somebody would write it."""
+        x, y, z = self.centre
+        ra, dec = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+        return Target.parse(f"{ra:.9f} deg {dec:.9f} deg")
+
+
+def footprint(path: Path, pixel_size: float | None, centre: Target | None) -> Footprint | None:
+    """Of the first image of a FITS file; None where it has no place of its own: HEALPix, or an image without a WCS.
+
+    ``pixel_size`` [rad] and ``centre`` as `SkyMap` has them. Raises `InputError` as `read.read_map`.
+    """
+    place = f"sky map {path}"
+    header, shape = _header(path, place)
+    if header is None:
+        return None
+    wcs, scale = _geometry(place, header, pixel_size, centre is not None, {})
+    if centre is not None:
+        empty = np.broadcast_to(np.float64(0.0), shape)
+        wcs = placed(WcsMap(empty, "K_RJ", wcs, scale), centre.icrs(), place)
+    if wcs is None:
+        return None
+    ny, nx = shape
+    x, y = np.meshgrid(np.linspace(0, nx - 1, LATTICE), np.linspace(0, ny - 1, LATTICE))
+    to_icrs = wcs_frame_rotation(wcs).T
+    with reading(place, "FITS", "check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"):
+        lon, lat = np.radians(wcs.wcs_pix2world([[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0).T)
+    lon, lat = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
+    rays = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1) @ to_icrs.T
+    centred, rest = rays[0], rays[1:][np.isfinite(rays[1:]).all(axis=1)]
+    if not np.isfinite(centred).all():
+        return None
+    radius = float(np.arccos(np.clip(rest @ centred, -1, 1)).max(initial=0.0)) * (1 + 2 / LATTICE)
+    return Footprint(centred, min(radius, np.pi), pixel_matrix(wcs) if is_plain_tan(wcs) else None, shape)
+
+
+def _header(path: Path, place: str) -> tuple[Any, tuple[int, int]]:
+    """Header and (ny, nx) of the first image; (None, (0, 0)): a HEALPix table."""
+    plain = read_image(path)
+    if plain is not None and plain[1].ndim == 2:
+        return plain[0], (plain[1].shape[0], plain[1].shape[1])
+    with opened(path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again") as hdus:
+        for hdu in hdus:
+            if _is_healpix(hdu):
+                return None, (0, 0)
+            if hdu.is_image and hdu.header.get("NAXIS", 0) > 0:
+                return hdu.header.copy(), (int(hdu.header.get("NAXIS2", 1)), int(hdu.header.get("NAXIS1", 1)))
+    raise InputError("holds no image and no HEALPix table", place=place, cure="give a FITS file with a two-dimensional image")
+
+
+def off_the_map(found: Footprint, centre: tuple[float, float], label: str) -> str:
+    """What to say of a scan about ``centre``, ICRS (ra, dec) [rad], that is not on the map; empty where it is."""
+    ra, dec = centre
+    direction = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    if found.holds(direction):
+        return ""
+    away = np.degrees(np.arccos(np.clip(direction @ found.centre, -1, 1)))
+    return (
+        f"{label}: the target {position(ra, dec)} is not on the input map, whose centre, {position(*found.target.icrs())}, is "
+        f"{away:.3g} deg away; `target: map` looks there"
+    )
+
+
+def position(ra: float, dec: float) -> str:
+    """ICRS coordinates as a pipeline file takes them."""
+    return f"{np.degrees(ra):.5f} deg {np.degrees(dec):.5f} deg"
