@@ -116,6 +116,8 @@ class Telescope(Parameters):
     """E.g. GBT."""
     diameter: Metres = Field(gt=0)
     """Primary diameter."""
+    site: str = Field("", exclude=True)
+    """Registered name of the site where it stands; `zonda check` says so where the scene has another."""
     elevation_min: Angle = quantity("5 deg", ge=0)
     """Lowest elevation the mount reaches."""
     elevation_max: Angle = quantity("90 deg", gt=0)

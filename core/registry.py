@@ -11,6 +11,7 @@ another is reported, by the name of its distribution, when it is used; the rest 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any, TypeVar, overload
@@ -19,6 +20,9 @@ from .discovery import Found, discover
 from .errors import ZondaError
 
 T = TypeVar("T")
+
+MANY = 24
+"""A list of more names than these is not printed beside the one that is meant."""
 
 SESSION = "this session"
 """Stands for the distribution of what `Registry.register` was given."""
@@ -49,10 +53,13 @@ class Registry:
         ``module:class`` that what is provided must be: a subclass where ``classes``, else an instance. Empty: anything.
     classes
         Whether the components are classes (operators) or objects (sites).
+    exact
+        Whether a name must be written as it is registered, as that of a class; else capitals, hyphens, underscores and spaces
+        make no difference (GBT, MUSTANG-2, Green Bank).
     """
 
-    def __init__(self, kind: str, group: str, base: str = "", *, classes: bool = False) -> None:
-        self.kind, self.group, self.base, self.classes = kind, group, base, classes
+    def __init__(self, kind: str, group: str, base: str = "", *, classes: bool = False, exact: bool = False) -> None:
+        self.kind, self.group, self.base, self.classes, self.exact = kind, group, base, classes, exact
         self._found: dict[str, list[Found]] | None = None
         self._loaded: dict[Found, Any] = {}
         self._registered: dict[str, Any] = {}
@@ -110,25 +117,35 @@ class Registry:
 
     def suggest(self, name: str) -> str | None:
         """The nearest name on offer."""
-        folded = {known.lower(): known for known in self}
-        near = difflib.get_close_matches(name.rpartition(":")[2].lower(), folded, n=1, cutoff=0.6)
+        folded = {fold(known): known for known in self}
+        near = difflib.get_close_matches(fold(name.rpartition(":")[2]), folded, n=1, cutoff=0.6)
         return folded[near[0]] if near else None
+
+    def registered(self, name: str) -> str:
+        """The registered name that ``name`` means: itself, or the one that differs from it by what `exact` tells; else ``name``.
+
+        Raises `RegistryError` where several do.
+        """
+        if self.exact or not isinstance(name, str) or name in self._local or self._named(name):
+            return name
+        distribution, colon, short = name.rpartition(":")
+        alike = [known for known in self if fold(known) == fold(short)]
+        if len(alike) > 1 and not self._same(alike):
+            named = " and ".join(f"'{known}'" for known in alike)
+            raise RegistryError(f"{self.kind} '{name}' may be {named}", label="write one of them as it is spelled here")
+        return f"{distribution}{colon}{alike[0]}" if alike else name
 
     def get(self, name: str) -> Any:
         """The component called ``name`` or ``distribution:name``, imported now.
 
         Raises `RegistryError` for a name that is unknown, doubly provided, broken or written for another plugin API.
         """
+        name = self.registered(name)
         if name in self._local:
             return self._check(self._local[name], Found(name, _reference(self._local[name]), SESSION, ""))
         found = self._named(name)
         if not found:
-            near = self.suggest(name)
-            raise RegistryError(
-                f"unknown {self.kind} '{name}'",
-                label=f"did you mean '{near}'?" if near else "not installed",
-                cure=f"installed: {', '.join(self) or 'none'}; `zonda plugins` lists where each comes from",
-            )
+            raise self._unknown(name)
         if len(found) > 1:
             raise RegistryError(
                 f"{self.kind} '{name}' is provided by {' and '.join(f.origin for f in found)}",
@@ -142,6 +159,7 @@ class Registry:
 
         Raises `RegistryError` as `get`, and where the call fails or returns another kind of thing.
         """
+        name = self.registered(name)
         component = self.get(name)
         if not callable(component):
             return component
@@ -165,6 +183,26 @@ class Registry:
                 raise _broken(self.kind, found, err) from err
             self._loaded[found] = self._check(component, found)
         return self._loaded[found]
+
+    def _same(self, names: list[str]) -> bool:
+        """Whether all ``names`` stand for equal things, as a site and its alias do."""
+        make = self.get if self.classes else self.create
+        try:
+            first, *others = (make(name) for name in names)
+        except ZondaError:
+            return False
+        return all(type(other) is type(first) and other == first for other in others)
+
+    def _unknown(self, name: str) -> RegistryError:
+        from .hints import known_elsewhere
+
+        label, cure = known_elsewhere(self, name)
+        near = None if label else self.suggest(name)
+        names = f"installed: {', '.join(self) or 'none'}; `zonda plugins` lists where each comes from"
+        if (label or near) and len(self) > MANY:
+            names = f"`zonda plugins` lists all {len(self)} {self.kind}s"
+        label = label or (f"did you mean '{near}'?" if near else "not installed")
+        return RegistryError(f"unknown {self.kind} '{name}'", label=label, cure="\n".join(filter(None, (cure, names))))
 
     def _named(self, name: str) -> list[Found]:
         distribution, _, short = name.rpartition(":")
@@ -195,7 +233,7 @@ class Together(Registry):
     """Several registries of classes seen as one."""
 
     def __init__(self, kind: str, *parts: Registry) -> None:
-        super().__init__(kind, "", parts[0].base, classes=True)
+        super().__init__(kind, "", parts[0].base, classes=True, exact=parts[0].exact)
         self.parts = parts
 
     @property
@@ -212,6 +250,11 @@ class Together(Registry):
 
     def register(self, component: Any = None, *, name: str | None = None) -> Any:
         return self.parts[0].register(component, name=name)
+
+
+def fold(name: str) -> str:
+    """``name`` without capitals, hyphens, underscores and spaces."""
+    return re.sub(r"[\s_-]+", "", name).lower()
 
 
 def _reference(component: Any) -> str:
@@ -237,8 +280,8 @@ def _first_words(err: Exception) -> str:
     return f"{type(err).__name__}: {err}".splitlines()[0]
 
 
-operators = Registry("operator", "zonda.operators", "zonda.core.operator:Operator", classes=True)
-mapmakers = Registry("mapmaker", "zonda.mapmakers", "zonda.core.operator:Operator", classes=True)
+operators = Registry("operator", "zonda.operators", "zonda.core.operator:Operator", classes=True, exact=True)
+mapmakers = Registry("mapmaker", "zonda.mapmakers", "zonda.core.operator:Operator", classes=True, exact=True)
 instruments = Registry("instrument", "zonda.instruments", "zonda.core.instrument:Instrument")
 sites = Registry("site", "zonda.sites", "zonda.core.site:Site")
 bands = Registry("band", "zonda.bands", "zonda.core.instrument:Band")

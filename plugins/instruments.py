@@ -22,6 +22,7 @@ TELESCOPES = {
     "GBT": Telescope(
         name="GBT",
         diameter="100 m",
+        site="green_bank",
         elevation_min="5 deg",
         elevation_max="88 deg",
         azimuth_speed_max="0.6 deg/s",
@@ -29,12 +30,17 @@ TELESCOPES = {
         elevation_speed_max="0.3 deg/s",
         elevation_acceleration_max="0.05 deg/s2",
     ),
-    "AtLAST": Telescope(name="AtLAST", diameter="50 m", speed_max="3 deg/s", acceleration_max="1 deg/s2"),
-    "LMT": Telescope(name="LMT", diameter="50 m", azimuth_speed_max="1 deg/s", elevation_speed_max="1 deg/s"),
-    "ACT": Telescope(name="ACT", diameter="6 m", azimuth_speed_max="2 deg/s"),
+    "AtLAST": Telescope(
+        name="AtLAST", diameter="50 m", site="llano_de_chajnantor", speed_max="3 deg/s", acceleration_max="1 deg/s2"
+    ),
+    "LMT": Telescope(
+        name="LMT", diameter="50 m", site="sierra_negra", azimuth_speed_max="1 deg/s", elevation_speed_max="1 deg/s"
+    ),
+    "ACT": Telescope(name="ACT", diameter="6 m", site="cerro_toco", azimuth_speed_max="2 deg/s"),
     "SO LAT": Telescope(
         name="SO LAT",
         diameter="6 m",
+        site="cerro_toco",
         azimuth_speed_max="3 deg/s",
         azimuth_acceleration_max="6 deg/s2",
         elevation_speed_max="1.5 deg/s",
@@ -42,6 +48,7 @@ TELESCOPES = {
     "SO SAT": Telescope(
         name="SO SAT",
         diameter="0.42 m",
+        site="cerro_toco",
         azimuth_speed_max="3 deg/s",
         azimuth_acceleration_max="3 deg/s2",
         elevation_speed_max="1 deg/s",
@@ -49,6 +56,7 @@ TELESCOPES = {
     "SPT": Telescope(
         name="SPT",
         diameter="10 m",
+        site="amundsen_scott",
         azimuth_speed_max="4 deg/s",
         azimuth_acceleration_max="4 deg/s2",
         elevation_speed_max="2 deg/s",
@@ -56,12 +64,17 @@ TELESCOPES = {
     "FYST": Telescope(
         name="FYST",
         diameter="6 m",
+        site="cerro_chajnantor",
         azimuth_speed_max="3 deg/s",
         azimuth_acceleration_max="6 deg/s2",
         elevation_speed_max="1.5 deg/s",
     ),
-    "CMB-S4 LAT": Telescope(name="CMB-S4 LAT", diameter="6 m", azimuth_speed_max="3 deg/s", azimuth_acceleration_max="3 deg/s2"),
-    "APEX": Telescope(name="APEX", diameter="12 m", azimuth_speed_max="6 deg/s", elevation_speed_max="3 deg/s"),
+    "CMB-S4 LAT": Telescope(
+        name="CMB-S4 LAT", diameter="6 m", site="cerro_toco", azimuth_speed_max="3 deg/s", azimuth_acceleration_max="3 deg/s2"
+    ),
+    "APEX": Telescope(
+        name="APEX", diameter="12 m", site="llano_de_chajnantor", azimuth_speed_max="6 deg/s", elevation_speed_max="3 deg/s"
+    ),
     "generic 6 m": Telescope(name="generic 6 m", diameter="6 m"),
 }
 

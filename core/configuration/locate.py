@@ -23,8 +23,12 @@ def locate(path_or_name: str | Path) -> Path:
     path, name = Path(path_or_name), str(path_or_name)
     with suppress(RuntimeError):  # nobody of that name: take ~ as it stands
         path = path.expanduser()
-    if not path.is_file() and name in shipped():
-        return shipped()[name]
+    if not path.is_file():
+        from ..registry import fold
+
+        for known, file in shipped().items():
+            if name == known or fold(name) == fold(known):
+                return file
     if path.is_dir():
         inside = sorted(p.name for p in path.glob("*.y*ml"))
         cure = f"name a file in it, e.g. {path / inside[0]}" if inside else "give the path of a YAML file"

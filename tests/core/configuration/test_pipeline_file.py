@@ -176,7 +176,7 @@ def test_a_bad_step(toys: Any, step: str, column: int, length: int, words: list[
         (("seed: 3", "seed: -3"), 5, 7, ["must be at least 0, got -3"]),
         (("seed: 3", "seed: 3\nseed: 4"), 6, 1, ["duplicate key 'seed'", "first given on line 5"]),
         (("site: toy_site", "site: toy_sight"), 1, 7, ["unknown site 'toy_sight'", "did you mean 'toy_site'?"]),
-        (("toy_camera", "tolteq"), 2, 13, ["unknown instrument 'tolteq'", "toy_camera"]),
+        (("toy_camera", "tolteq"), 2, 13, ["unknown instrument 'tolteq'", "`zonda plugins` lists all"]),
         (("site: toy_site\n", ""), 1, 1, ["the pipeline needs 'site'"]),
         (("2024-11-25T07:00", "yesterday"), 3, 7, ["cannot read 'yesterday' as a time"]),
         (("05h00m00s +20d00m00s", "M 87"), 4, 9, ["cannot read 'M 87' as a position"]),
