@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .flags import EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
+from .intervals import Intervals, runs
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from .instrument import Instrument
     from .scene import Scene
     from .site import Site
+    from .weather import GroundWeather
 
 Floats = NDArray[np.floating]
 
@@ -97,7 +100,11 @@ class Observation:
     centre
         ICRS (ra, dec) [rad] of the scan's target without its per-scan offset: the default map centre.
     flags, detector_flags
-        (n_samp,) and (n_det,) uint8; nonzero means: do not use.
+        (n_samp,) and (n_det,) uint8, bits of `core.flags`; most of them mean: do not use (`good_samples`, `good_detectors`).
+    intervals
+        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`). Default: all is *scanning*.
+    weather
+        At the telescope; None: the air of this scan is not known.
     smooth
         Slowly varying float64 fields: ``atmosphere`` (mean emission at the detector before efficiency, K_RJ) and
         ``transmission`` (band-mean e^-tau at the mean PWV), each a `SmoothField`. Set by operators in ``prepare``.
@@ -127,6 +134,8 @@ class Observation:
     seed: int
     flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     detector_flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    intervals: Intervals = field(default_factory=dict)
+    weather: GroundWeather | None = None
     smooth: dict[str, SmoothField] = field(default_factory=dict)
     detdata: dict[str, Floats] = field(default_factory=dict)
     resolved: dict[str, Any] = field(default_factory=dict)
@@ -139,6 +148,8 @@ class Observation:
             self.flags = np.zeros(self.n_samples, np.uint8)
         if not self.detector_flags.size:
             self.detector_flags = np.zeros(self.n_detectors, np.uint8)
+        if not self.intervals:
+            self.intervals = {"scanning": runs(np.ones(self.n_samples, bool), self.seconds)}
 
     @property
     def n_samples(self) -> int:
@@ -147,6 +158,16 @@ class Observation:
     @property
     def n_detectors(self) -> int:
         return len(self.focalplane)
+
+    @property
+    def good_samples(self) -> NDArray[np.bool_]:
+        """(n_samp,) True where no flag excludes the sample."""
+        return good(self.flags, EXCLUDE_SAMPLE)
+
+    @property
+    def good_detectors(self) -> NDArray[np.bool_]:
+        """(n_det,) True where no flag excludes the detector."""
+        return good(self.detector_flags, EXCLUDE_DETECTOR)
 
     @property
     def duration(self) -> float:

@@ -75,6 +75,34 @@ class Pwv:
 
 
 @dataclass(frozen=True)
+class GroundWeather:
+    """The weather at the telescope, as observatories log it.
+
+    Attributes
+    ----------
+    time
+        POSIX s that it belongs to.
+    pwv
+        m, of the column above the telescope at zenith.
+    pressure, temperature, ground_temperature
+        Pa on the ground; K, 10 m above the ground and on it.
+    humidity
+        Specific, kg of vapour per kg of moist air, 10 m above the ground.
+    wind_east, wind_north
+        Velocity of the air towards east and north, m/s, 10 m above the ground.
+    """
+
+    time: float
+    pwv: float
+    pressure: float
+    temperature: float
+    ground_temperature: float
+    humidity: float
+    wind_east: float
+    wind_north: float
+
+
+@dataclass(frozen=True)
 class Column:
     """The air above a place on levels, from the lowest up: what a weather source delivers.
 

@@ -191,7 +191,7 @@ def _thinned(observation: Any, number: int, entry: int) -> dict[str, Any]:
         "azel": observation.boresight_azel[some],
         "radec": observation.boresight_radec[some],
         "centre": list(observation.centre),
-        "flagged": [int(np.count_nonzero(observation.flags)), int(np.count_nonzero(observation.detector_flags))],
+        "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],
     }
 
 

@@ -43,7 +43,7 @@ from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 from .response import Response
 from .sampling import Drifting, Layers
 from .turbulence import Turbulence
-from .weather_sources import air_of
+from .weather_sources import air_of, on_the_ground
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -239,6 +239,8 @@ class AtmosphereLayers(Operator):
                 observation.tally.state(self.label, what, text)
         pwv = self.pwv or profile.pwv
         layers = self._layers(profile)
+        wind = None if self.wind == "profile" else layers[0].wind
+        observation.weather = on_the_ground(profile, self._origin or observation.start, wind)
         models = [_model(self, layer, track, observation) for layer in layers]
         beams = [_turbulence(self, observation, n, m) for n, m in enumerate(models)]
         variance = sum(m.amplitude**2 * b.variance for m, b in zip(models, beams, strict=True))

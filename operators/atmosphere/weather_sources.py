@@ -6,21 +6,26 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.configuration.files import InputPath
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import normals, stream_key, uniforms
-from zonda.core.weather import Column, WeatherSource
+from zonda.core.weather import Column, GroundWeather, WeatherSource
 
 from .era5 import read_era5
 from .humidity import saturation_pressure
 from .profile_table import read_table
-from .standard_atmosphere import standard_column
+from .radiative_transfer import VAPOUR_GAS_CONSTANT
+from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, standard_column
 from .weather import Profile, check_pwv, climatology_column, on_heights
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
+
+
+Floats = NDArray[np.floating]
 
 
 class Climatology(WeatherSource):
@@ -113,6 +118,24 @@ def air_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, 
     profile, how = _water(profile, weather, seed, pwv)
     profile, wind = _wind(profile, weather, seed)
     return replace(profile, stated=(*profile.stated, ("water", how), *_supersaturated(profile), ("wind", wind)))
+
+
+def on_the_ground(profile: Profile, time: Instant, wind: Floats | None = None) -> GroundWeather:
+    """What instruments at the telescope read in this air; ``wind`` (east, north) [m/s] where it is not the profile's."""
+    ground, air = profile.at(0.0), profile.at(10.0)
+    vapour, temperature = float(air.vapour_density), float(air.temperature)
+    dry = (float(air.pressure) - vapour * VAPOUR_GAS_CONSTANT * temperature) / (DRY_AIR_GAS_CONSTANT * temperature)
+    east, north = (air.wind_east, air.wind_north) if wind is None else wind
+    return GroundWeather(
+        time=time.posix,
+        pwv=profile.pwv,
+        pressure=float(ground.pressure),
+        temperature=temperature,
+        ground_temperature=float(ground.temperature),
+        humidity=vapour / (vapour + dry),
+        wind_east=float(east),
+        wind_north=float(north),
+    )
 
 
 def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:

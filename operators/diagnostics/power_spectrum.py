@@ -145,11 +145,11 @@ class PowerSpectrum(Operator):
         return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.detectors / context.first.n_detectors) * 14))
 
     def prepare(self, observation: Observation) -> _State:
-        usable = np.flatnonzero(observation.detector_flags == 0)
+        usable = np.flatnonzero(observation.good_detectors)
         count = min(usable.size, self.detectors)
         chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
         length = _quick(min(observation.n_samples, max(2, round(self.segment * observation.sample_rate))))
-        if flagged := int(np.count_nonzero(observation.flags)):
+        if flagged := int(np.count_nonzero(~observation.good_samples)):
             observation.tally.count(self.label, "flagged samples that the power spectra include", flagged)
         return _State(usable[chosen], Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None)
 

@@ -325,7 +325,7 @@ def _scans(data: Data) -> str:
     rows = []
     for o in data.observations:
         azimuth, elevation = _ranges(o)
-        flagged = f"{np.count_nonzero(o.flags)} / {np.count_nonzero(o.detector_flags)}"
+        flagged = f"{np.count_nonzero(~o.good_samples)} / {np.count_nonzero(~o.good_detectors)}"
         centre = _sexagesimal(o.centre[0], o.centre[1])
         rows.append(
             (

@@ -33,6 +33,7 @@ from pydantic import Field, model_validator
 
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
+from zonda.core.flags import DEAD
 from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
@@ -46,9 +47,6 @@ if TYPE_CHECKING:
     from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.float64]
-
-FLAG_DEAD = 8
-"""Bit set in ``detector_flags`` of detectors whose signal is constant or not finite."""
 
 OF_THE_SKY = frozenset({"sky", "transmission"})
 """Streams of which a detector in order may see nothing. All see the air."""
@@ -140,7 +138,7 @@ class CommonModeFilter(Operator):
     def _flag(self, found: Gram | Usable, observation: Observation) -> None:
         for name, dead in (("not finite", found.not_finite), ("constant", found.constant)):
             observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
-            observation.detector_flags[dead] |= FLAG_DEAD
+            observation.detector_flags[dead] |= DEAD
         if not _noiseless(observation):
             # the main run comes first; of companion runs with noise none says which are dead in it
             observation.resolved.setdefault(f"{self.label}: dead", found.not_finite | found.constant)
@@ -152,14 +150,14 @@ class CommonModeFilter(Operator):
         dead = observation.resolved.get(f"{self.label}: dead")
         if dead is not None:
             observation.tally.count(self.label, "detectors flagged: dead in the main run", int(dead.sum()))
-            observation.detector_flags[dead] |= FLAG_DEAD
+            observation.detector_flags[dead] |= DEAD
         return True
 
     def _mean(self, stream: Stream) -> tuple[Usable, Ritz]:
         """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
         observation = stream.observation
-        noiseless, good = self._same_as_main(observation), observation.flags == 0
-        usable = Usable(observation.detector_flags == 0, int(good.sum()))
+        noiseless, good = self._same_as_main(observation), observation.good_samples
+        usable = Usable(observation.good_detectors, int(good.sum()))
         reading = focal_plane_mean.read(stream, usable.use, good)
         if usable.judge(reading.sums, reading.squares, noiseless):
             reading = focal_plane_mean.read(stream, usable.use, good)
@@ -182,7 +180,7 @@ class CommonModeFilter(Operator):
 
     def measure_frozen(self, stream: Stream, state: Modes, frozen: Floats) -> None:
         """Equation (3): v_i = B^T u_i."""
-        use, good = np.asarray(frozen.any(axis=0)), stream.observation.flags == 0
+        use, good = np.asarray(frozen.any(axis=0)), stream.observation.good_samples
         if self.method == "mean":
             total = focal_plane_mean.read(stream, use, good).total
             times = [total * u.max(initial=0.0) for u in frozen]

@@ -91,7 +91,7 @@ class Gram:
         """``use``: the detectors to use, where they are known; they are found otherwise. ``noiseless``: see `Usable.judge`."""
         self.stream, self.pool = stream, pool
         self.n_samples = stream.shape[1]
-        self.good_samples = stream.observation.flags == 0
+        self.good_samples = stream.observation.good_samples
         self.n_used = int(self.good_samples.sum())
         self.length = tile_length(stream.shape[0], stream.dtype.itemsize)
         self.copied = isinstance(stream.array, np.memmap)
@@ -102,7 +102,7 @@ class Gram:
         if use is not None:
             self.usable = Usable(use, self.n_used)
             return
-        use = stream.observation.detector_flags == 0
+        use = stream.observation.good_detectors
         vector = near_the_mean(use)
         total, square, image, times = self._pass(vector, np.flatnonzero(use), moments=True)
         self.usable = Usable(use, self.n_used)

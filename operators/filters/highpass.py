@@ -12,6 +12,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
+from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
     from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.floating]
-
-FLAG_TRIM = 2
-"""Bit set in ``flags`` at the trimmed ends."""
 
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
@@ -74,7 +72,7 @@ class HighpassFilter(Operator):
                 place=self.label,
                 cure=f"choose a frequency well below {rate / 2:g} Hz",
             )
-        bad = (observation.flags & ~np.uint8(FLAG_TRIM)) != 0
+        bad = ~good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
         trimmed = min(round(self.trim * rate), n)
         if 2 * trimmed >= n and trimmed:
             raise PipelineError(
@@ -83,8 +81,8 @@ class HighpassFilter(Operator):
                 cure="shorten trim or lengthen the scan",
             )
         if trimmed:
-            observation.flags[:trimmed] |= FLAG_TRIM
-            observation.flags[n - trimmed :] |= FLAG_TRIM
+            observation.flags[:trimmed] |= PROCESSING
+            observation.flags[n - trimmed :] |= PROCESSING
         tally.count(self.label, "samples trimmed", 2 * trimmed)
         tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()))
         if observation.smooth.get("atmosphere") is not None:

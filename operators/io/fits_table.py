@@ -1,4 +1,5 @@
-"""Time-ordered data as FITS binary tables: ``TOD`` (one row per detector), ``SAMPLES``, ``DETECTORS``, ``PROVENANCE``."""
+"""Time-ordered data as FITS binary tables: ``TOD`` (one row per detector), ``SAMPLES``, ``DETECTORS``, ``PROVENANCE``,
+``INTERVALS``."""
 
 from __future__ import annotations
 
@@ -10,8 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from zonda.core.flags import of_before
+from zonda.core.intervals import Intervals
 from zonda.core.storage.files import writing
 from zonda.core.storage.fits_files import check_size, opened
+from zonda.core.weather import GroundWeather
 
 from .map_file import ascii_text
 from .time_ordered_data import UNITS, Floats, TimeOrderedData
@@ -30,11 +34,23 @@ _DETECTOR_UNITS = {
 }
 
 
+_WEATHER = (  # key, our name, unit, meaning
+    ("WEATHERT", "time", "s", "POSIX time of the weather"),
+    ("PWV", "pwv", "m", "precipitable water vapour at zenith"),
+    ("PRESSURE", "pressure", "Pa", "at the ground"),
+    ("TEMPAIR", "temperature", "K", "10 m above the ground"),
+    ("TEMPGRND", "ground_temperature", "K", "at the ground"),
+    ("HUMIDITY", "humidity", "", "specific, kg / kg, 10 m above the ground"),
+    ("WINDEAST", "wind_east", "m/s", "towards east, 10 m above the ground"),
+    ("WINDNRTH", "wind_north", "m/s", "towards north, 10 m above the ground"),
+)
+
+
 class Writer:
     """Writes one observation, streams in rectangles and in any order; same interface as `toast_hdf5.Writer`.
 
     The table ``TOD`` comes first, at a place known beforehand, so that rectangles go straight to their bytes; the tables
-    ``SAMPLES``, ``DETECTORS`` (with the flags as they are at the end) and ``PROVENANCE`` are appended by `finish`.
+    ``SAMPLES``, ``DETECTORS`` (with the flags as they are at the end), ``PROVENANCE`` and ``INTERVALS`` are appended by `finish`.
     """
 
     def __init__(self, path: Path, tod: TimeOrderedData, streams: list[str], dtype: str) -> None:
@@ -76,8 +92,8 @@ class Writer:
         with writing(self.path):
             try:
                 self._file.seek(0, os.SEEK_END)
-                for table in (_samples_table(self._tod), _detectors_table(self._tod), _provenance_table(self._tod)):
-                    self._file.write(_bytes_of(table))
+                for table in (_samples_table, _detectors_table, _provenance_table, _intervals_table):
+                    self._file.write(_bytes_of(table(self._tod)))
             finally:
                 self._file.close()
 
@@ -121,9 +137,27 @@ def _samples_table(tod: TimeOrderedData) -> Any:
         column("FLAGS", "B", array=tod.flags),
     ]
     table = fits.BinTableHDU.from_columns(columns, name="SAMPLES")
+    table.header["FLAGBITS"] = ("TOAST", "bits of FLAGS")
+    for key, name, unit, meaning in _WEATHER if tod.weather is not None else ():
+        table.header[key] = (getattr(tod.weather, name), f"[{unit}] {meaning}" if unit else meaning)
     table.header.add_comment(
         "SECONDS counts from DATE-OBS of the primary header; TIME is POSIX. Quaternions are x, y, z, w as TOAST's."
     )
+    return table
+
+
+def _intervals_table(tod: TimeOrderedData) -> Any:
+    from astropy.io import fits
+
+    rows = [(name, *span) for name, spans in tod.intervals.items() for span in spans]
+    width = max([len(name) for name in tod.intervals] or [1])
+    columns = [
+        fits.Column("NAME", f"{width}A", array=[row[0] for row in rows]),
+        fits.Column("START", "D", unit="s", array=[row[1] for row in rows]),
+        fits.Column("STOP", "D", unit="s", array=[row[2] for row in rows]),
+    ]
+    table = fits.BinTableHDU.from_columns(columns, name="INTERVALS")
+    table.header.add_comment("TOAST's names; START and STOP count as SECONDS.")
     return table
 
 
@@ -189,6 +223,14 @@ def _read(file: Any) -> TimeOrderedData:
         return array.astype(array.dtype.newbyteorder("="))
 
     shape = len(detectors), len(samples)
+    about = file["SAMPLES"].header
+    flags, detector_flags = native(samples["FLAGS"]), native(detectors["FLAGS"])
+    if "FLAGBITS" not in about:
+        flags, detector_flags = of_before(flags, samples=True), of_before(detector_flags, samples=False)
+    intervals: Intervals = {}
+    for row in file["INTERVALS"].data if "INTERVALS" in file else ():
+        intervals.setdefault(str(row["NAME"]), []).append((float(row["START"]), float(row["STOP"])))
+    weather = GroundWeather(**{name: float(about[key]) for key, name, _, _ in _WEATHER}) if "WEATHERT" in about else None
     return TimeOrderedData(
         name=header["OBJECT"],
         start=header["DATE-OBS"],
@@ -200,11 +242,13 @@ def _read(file: Any) -> TimeOrderedData:
         site=(header["SITE"], float(np.radians(header["SITELAT"])), float(np.radians(header["SITELON"])), header["SITEALT"]),
         boresight_azel=native(samples["BORESIGHT_AZEL"]),
         boresight_radec=native(samples["BORESIGHT_RADEC"]),
-        flags=native(samples["FLAGS"]),
-        detector_flags=native(detectors["FLAGS"]),
+        flags=flags,
+        detector_flags=detector_flags,
         names=[str(d) for d in detectors["NAME"]],
         quats=native(detectors["QUAT"]),
         columns={c.lower(): native(detectors[c]) for c in detectors.names if c not in fixed},
         streams={c.lower(): native(tod.data[c]).reshape(shape) for c in tod.columns.names if c != "DETECTOR"},
+        intervals=intervals,
+        weather=weather,
         metadata={str(key): json.loads(value) for key, value in zip(provenance["KEY"], provenance["VALUE"], strict=True)},
     )

@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
-from zonda.core.errors import OutputError
+from zonda.core.errors import InputError, OutputError
+from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
 from zonda.core.operator import Operator
 from zonda.core.storage.files import atomic_path, check_output_folder, discard, product_path, publish, temporary_sibling
 
@@ -25,6 +26,7 @@ from .time_ordered_data import TimeOrderedData
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
+    from zonda.core.weather import GroundWeather
 
 _FORMATS: dict[str, Any] = {"hdf5": toast_hdf5, "fits": fits_table}
 
@@ -107,13 +109,26 @@ class SaveTOD(Operator):
                 state.writer.write(name, block.detectors, block.samples, values)
 
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
-        state.tod.flags, state.tod.detector_flags = observation.flags, observation.detector_flags
+        state.tod.flags = in_file(observation.flags, SAMPLE_FLAGS)
+        state.tod.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
+        state.tod.weather = observation.weather or self._weather(data, observation)
         if self.dtype == "float32":
             observation.tally.state(self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}")
         state.tod.metadata.update(_provenance(data), tally="\n".join(f"{who}: {what}: {v}" for who, what, v in observation.tally))
         state.writer.finish()
         publish(state.temporary, state.path)
         data.products.setdefault(data.product("tod_file"), []).append(state.path)
+
+    def _weather(self, data: Data, observation: Observation) -> GroundWeather | None:
+        """That of the scene, where no step made an atmosphere of it."""
+        from zonda.operators.atmosphere.weather_sources import air_of, on_the_ground
+
+        scene = data.scene
+        try:
+            return on_the_ground(air_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
+        except InputError as err:
+            observation.tally.state(self.label, "weather is not written", str(err).splitlines()[0])
+            return None
 
     def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
         """The names of the files."""

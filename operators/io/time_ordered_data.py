@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
+from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
+from zonda.core.intervals import Intervals
+from zonda.core.weather import GroundWeather
 
 Floats = NDArray[np.floating]
 
@@ -40,7 +43,8 @@ class TimeOrderedData:
     boresight_azel, boresight_radec
         (n_samp, 4) quaternions (x, y, z, w), see `Observation`.
     flags, detector_flags
-        (n_samp,) and (n_det,) uint8; nonzero: do not use.
+        (n_samp,) and (n_det,) uint8, TOAST's bits (`core.flags`): samples with a bit of 15 and detectors with one of 7 are not
+        to be used.
     names, quats
         Detector names; (n_det, 4) rotations from the boresight's frame to the detectors'.
     columns
@@ -48,6 +52,10 @@ class TimeOrderedData:
         band_centre, band_width [Hz], main_beam_efficiency, illumination_efficiency, polarization_angle [rad].
     streams
         (n_det, n_samp) arrays; K_RJ but for `transmission`, which is relative.
+    intervals
+        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`).
+    weather
+        At the telescope; None: not known.
     metadata
         Text and numbers that say where the data come from.
     """
@@ -68,6 +76,8 @@ class TimeOrderedData:
     quats: NDArray[np.float64]
     columns: dict[str, NDArray[np.float64]]
     streams: dict[str, Floats] = field(default_factory=dict)
+    intervals: Intervals = field(default_factory=dict)
+    weather: GroundWeather | None = None
     metadata: dict[str, str | int | float] = field(default_factory=dict)
 
     @property
@@ -97,13 +107,27 @@ class TimeOrderedData:
 
     @property
     def xi(self) -> NDArray[np.float64]:
-        """(n_det,) gnomonic offset towards increasing azimuth."""
+        """(n_det,) offset towards increasing azimuth: a tangent, on the gnomonic plane about the boresight.
+
+        sotodlib's xi is a sine (`xieta_sotodlib`): the same to 3e-7 rad at 0.5 deg, 35 arcsec less at 4 deg, 46 arcmin at 17 deg.
+        """
         return np.asarray(-self._directions[1] / self._directions[2])
 
     @property
     def eta(self) -> NDArray[np.float64]:
-        """(n_det,) gnomonic offset towards increasing elevation."""
+        """(n_det,) offset towards increasing elevation, as `xi`."""
         return np.asarray(-self._directions[0] / self._directions[2])
+
+    def xieta_sotodlib(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """xi, eta, gamma (n_det,) [rad] as sotodlib and so3g define them: sines, of the same signs as ours; gamma is the angle of
+        the polarization from increasing eta towards increasing xi.
+        """
+        _, _, z, w = self.quats.T
+        return (
+            np.asarray(-self._directions[1]),
+            np.asarray(-self._directions[0]),
+            np.asarray(np.arctan2(2 * w * z, w * w - z * z)),
+        )
 
     @property
     def _directions(self) -> NDArray[np.float64]:
@@ -127,8 +151,8 @@ class TimeOrderedData:
             site=(o.site.name, o.site.latitude, o.site.longitude, o.site.altitude),
             boresight_azel=o.boresight_azel,
             boresight_radec=o.boresight_radec,
-            flags=o.flags,
-            detector_flags=o.detector_flags,
+            flags=in_file(o.flags, SAMPLE_FLAGS),
+            detector_flags=in_file(o.detector_flags, DETECTOR_FLAGS),
             names=list(f.names),
             quats=detector_quaternions(f.xi, f.eta, f.polarization_angle),
             columns={
@@ -143,6 +167,8 @@ class TimeOrderedData:
                 "minimum_frequency": np.full(n, instrument.pink_minimum_frequency),
                 "slope": np.full(n, instrument.slope),
             },
+            intervals=o.intervals,
+            weather=o.weather,
             metadata={"seed": o.seed, "observation_index": o.index, **(metadata or {})},
         )
 

@@ -17,12 +17,18 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
+from zonda.core.flags import of_before
+from zonda.core.intervals import Intervals
 from zonda.core.storage.files import writing
 from zonda.core.storage.hdf5_files import Disk, check_size, opened
+from zonda.core.weather import GroundWeather
 
 from .time_ordered_data import UNITS, Floats, TimeOrderedData
 
 SUFFIX = ".h5"
+
+FLAGS_ARE = "zonda_flags"
+"""Attribute of ``metadata/other`` in files whose flags have TOAST's bits; an earlier zonda wrote none."""
 
 _COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
     "fwhm": ("fwhm", "arcmin", "rad"),
@@ -143,6 +149,8 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
         session_start=float(tod.times[0]),
         session_end=float(tod.times[-1]),
     )
+    if tod.weather is not None:
+        _write_weather(group, tod.weather)
     table = QTable()
     table["name"] = np.array(tod.names).astype("S")
     table["quat"] = tod.quats
@@ -159,11 +167,47 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
     write_table_hdf5(table, group, path="focalplane", serialize_meta=True)
 
 
+_WEATHER = {  # ours: (TOAST's name, unit)
+    "pwv": ("pwv", "m"),
+    "humidity": ("humidity", ""),
+    "pressure": ("surface_pressure", "Pa"),
+    "ground_temperature": ("surface_temperature", "K"),
+    "temperature": ("air_temperature", "K"),
+    "wind_east": ("west_wind", "m / s"),
+    "wind_north": ("south_wind", "m / s"),
+}
+
+
+def _write_weather(group: Any, weather: GroundWeather) -> None:
+    """As `toast.weather.Weather` reads it; its west wind blows towards east, and there are no clouds."""
+    group.attrs["weather_class"] = "toast.weather.Weather"
+    group.attrs["weather_time"] = weather.time
+    for name in ("ice_water", "liquid_water"):
+        group.attrs[f"weather_{name}"] = "0.0 mm"
+    for ours, (theirs, unit) in _WEATHER.items():
+        value, text = (weather.pwv * 1e3, "mm") if ours == "pwv" else (getattr(weather, ours), unit)
+        group.attrs[f"weather_{theirs}"] = f"{value!r} {text}".rstrip()
+
+
+def _read_weather(attributes: Any) -> GroundWeather | None:
+    """None where there is none, or one that states no numbers (TOAST's simulated weather names its distribution alone)."""
+    import astropy.units as u
+
+    if not {"weather_time", *(f"weather_{theirs}" for theirs, _ in _WEATHER.values())} <= set(attributes):
+        return None
+    stated = {
+        ours: float(u.Quantity(str(attributes[f"weather_{theirs}"])).to_value(unit or u.dimensionless_unscaled))
+        for ours, (theirs, unit) in _WEATHER.items()
+    }
+    return GroundWeather(time=float(attributes["weather_time"]), **stated)
+
+
 def _write_metadata(file: Any, tod: TimeOrderedData) -> None:
     metadata = file.create_group("metadata")
     other = metadata.create_group("other")
     other.attrs["python_data_type"] = "dict"
     other.attrs["zonda_start_utc"] = tod.start
+    other.attrs[FLAGS_ARE] = "TOAST's"
     for key, value in tod.metadata.items():
         other.attrs[f"zonda_{key}"] = value
     file.create_group("attr")
@@ -206,8 +250,9 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
         group.create_dataset(name, data=values).attrs["comm_type"] = "column"
     intervals = file.create_group("intervals")
     intervals.attrs["times"] = "times"
-    for name in ("scanning", "throw"):
-        intervals.create_dataset(name, data=np.array([[tod.times[0]], [tod.times[-1]]]))
+    for name, spans in tod.intervals.items():
+        at = np.searchsorted(tod.seconds, np.reshape(spans, (-1, 2)).T)
+        intervals.create_dataset(name, data=tod.times[np.minimum(at, tod.n_samples - 1)])  # to the last bit those of samples
 
 
 def azimuth_elevation(boresight_azel: Floats) -> tuple[Floats, Floats]:
@@ -216,6 +261,14 @@ def azimuth_elevation(boresight_azel: Floats) -> tuple[Floats, Floats]:
     azimuth = -np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
     elevation = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
     return azimuth % (2 * np.pi), elevation
+
+
+def _read_intervals(file: Any, times: Floats, seconds: Floats) -> Intervals:
+    found: Intervals = {}
+    for name, spans in file["intervals"].items() if "intervals" in file else ():
+        start, stop = np.interp(np.asarray(spans[:], np.float64), times, seconds)
+        found[name] = list(zip(start.tolist(), stop.tolist(), strict=True))
+    return found
 
 
 def read(path: str | os.PathLike[str]) -> TimeOrderedData:
@@ -244,7 +297,13 @@ def _read(file: Any, place: str) -> TimeOrderedData:
     from astropy.table import QTable
 
     instrument, shared, detdata = file["instrument"], file["shared"], file["detdata"]
-    for dataset in (*shared.values(), *(detdata[name] for name in detdata if name != "flags"), instrument["focalplane"]):
+    intervals = file["intervals"].values() if "intervals" in file else ()
+    for dataset in (
+        *shared.values(),
+        *intervals,
+        *(detdata[name] for name in detdata if name != "flags"),
+        instrument["focalplane"],
+    ):
         check_size(dataset, place)
     table = QTable(read_table_hdf5(instrument, path="focalplane", character_as_bytes=False))
     order = {name: k for k, name in enumerate(np.asarray(table["name"]).astype(str))}
@@ -262,9 +321,13 @@ def _read(file: Any, place: str) -> TimeOrderedData:
     start = other.get("zonda_start_utc")
     if start is None:
         start = Instant(round(float(times[0]) * 1e9)).isoformat()
-    own = {k.removeprefix("zonda_"): v for k, v in other.items() if k.startswith("zonda_") and k != "zonda_start_utc"}
+    kept = (k for k in other if k.startswith("zonda_") and k not in ("zonda_start_utc", FLAGS_ARE))
+    own = {k.removeprefix("zonda_"): other[k] for k in kept}
+    sample_flags = shared["flags"][:] if "flags" in shared else np.zeros(len(times), np.uint8)
+    detector_flags = np.array([flags[d] for d in names], np.uint8)
+    if "zonda_start_utc" in other and FLAGS_ARE not in other:
+        sample_flags, detector_flags = of_before(sample_flags, samples=True), of_before(detector_flags, samples=False)
     a = instrument.attrs
-    n = len(times)
     return TimeOrderedData(
         name=str(file.attrs["observation_name"]),
         start=str(start),
@@ -281,11 +344,13 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         ),
         boresight_azel=shared["boresight_azel"][:],
         boresight_radec=shared["boresight_radec"][:],
-        flags=shared["flags"][:] if "flags" in shared else np.zeros(n, np.uint8),
-        detector_flags=np.array([flags[d] for d in names], np.uint8),
+        flags=sample_flags,
+        detector_flags=detector_flags,
         names=names,
         quats=np.asarray(table["quat"][rows], np.float64),
         columns=columns,
         streams={name: detdata[name][:] for name in detdata if name != "flags"},
+        intervals=_read_intervals(file, times, seconds),
+        weather=_read_weather(a),
         metadata={k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()},
     )

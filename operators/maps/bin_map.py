@@ -220,7 +220,7 @@ class BinMap(Operator):
             raise PipelineError(much if spread else far, place=self.label, cure="set weights: uniform")
         noise = weight**2 * variance
         alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
-        good = (observation.flags == 0).astype(np.uint8)
+        good = observation.good_samples.astype(np.uint8)
         return Binning(self._grid, self._grid.pointing(observation), good, weight, noise, alike, self._spare)
 
     def memory(self, observation: Observation) -> int:
@@ -252,7 +252,7 @@ class BinMap(Operator):
             signal = state.without_kept_out(signal, block.detectors, block.samples)
         before = int(dropped[NOT_FINITE])
         begin, end, rows = block.samples.start, block.samples.stop, block.detectors
-        xi, eta, use = plane.xi[rows], plane.eta[rows], observation.detector_flags[rows] == 0
+        xi, eta, use = plane.xi[rows], plane.eta[rows], observation.good_detectors[rows]
         how = (
             use, state.good[begin:end], state.weight[rows], state.noise[rows], self.noise == "scatter", 1 / self._variance,
             sums, dropped, largest,

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from zonda.core import flags
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
@@ -38,9 +39,6 @@ Floats = NDArray[np.float64]
 
 OPAQUE = 1e-6
 """Band transmission below which nothing can be calibrated: such samples and detectors are flagged."""
-
-FLAG_OPAQUE = 4
-"""Bit set in ``flags`` and ``detector_flags`` where the band transmission is below `OPAQUE`."""
 
 AT_ONCE = 4096
 """Detectors whose series of the smooth fields are worked on at a time."""
@@ -102,7 +100,7 @@ class Efficiency(Operator):
             share = gain * plane.illumination_efficiency / plane.main_beam_efficiency
             ratio, error = emission, 0.0
             if transmission is not None:
-                ratio, error = quotient(emission, transmission, np.flatnonzero(observation.detector_flags == 0))
+                ratio, error = quotient(emission, transmission, np.flatnonzero(observation.good_detectors))
             mean = ratio.scaled(share)
             tally.state(self.label, "largest error of the smooth mean emission", f"{error * np.abs(share).max():.1e} K_RJ")
         zeta, epsilon = plane.main_beam_efficiency, plane.illumination_efficiency
@@ -216,9 +214,9 @@ def _flag_opaque(label: str, observation: Observation, transmission: SmoothField
         opaque = ~(transmission.weights[rows] @ knots >= OPAQUE)
         dead[rows] = opaque.mean(axis=1) > 0.5
         cell |= opaque[~dead[rows]].any(axis=0)
-    observation.detector_flags[dead] |= FLAG_OPAQUE
+    observation.detector_flags[dead] |= flags.OPAQUE
     bad = np.repeat(cell[:-1] | cell[1:], transmission.step)[: observation.n_samples]
-    observation.flags[bad] |= FLAG_OPAQUE
+    observation.flags[bad] |= flags.OPAQUE
     observation.tally.count(label, f"detectors flagged: band transmission below {OPAQUE:g}", int(dead.sum()))
     observation.tally.count(label, f"samples flagged: band transmission below {OPAQUE:g}", int(bad.sum()))
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
 from zonda.core.errors import PointingError
+from zonda.core.flags import TURNAROUND
+from zonda.core.intervals import Intervals, runs
 from zonda.core.numerics.stretches import stretches
 
 from .base import Pointing
@@ -21,9 +23,6 @@ if TYPE_CHECKING:
     from zonda.core.data import Observation
 
 Floats = NDArray[np.float64]
-
-TURNAROUND = 2
-"""Flag bit of a sample taken in a turnaround."""
 
 
 class PointingBackAndForth(Pointing):
@@ -45,7 +44,7 @@ class PointingBackAndForth(Pointing):
     acceleration: AngularAcceleration = quantity("1 arcmin/s2", gt=0)
     """Largest acceleration on the sky in a turnaround."""
     flag_turnarounds: bool = False
-    """Flag the samples in turnarounds (bit value 2), so that no map uses them; without it they are used like all others."""
+    """Flag the samples in turnarounds (bit value 4), so that no map uses them; without it they are used like all others."""
 
     slows: ClassVar[dict[str, tuple[int, int]]] = {"speed": (-1, 1), "acceleration": (-1, 2)}
 
@@ -92,6 +91,25 @@ class PointingBackAndForth(Pointing):
         if not self.flag_turnarounds:
             return np.zeros(len(seconds), np.uint8)
         return np.where(self.in_turnaround(seconds), TURNAROUND, 0).astype(np.uint8)
+
+    def intervals(self, seconds: Floats) -> Intervals:
+        """As TOAST has them. Left to right is towards larger azimuth; a turnaround has the direction of the scan before it.
+        A throw goes from the middle of a turnaround to that of the next (the parameter `throw` is the length of a *scan*)."""
+        cycle = self.throw / self.speed + self.turnaround
+        turning, first, throw = np.empty((3, len(seconds)), bool)
+        for some in stretches(len(seconds)):
+            t = seconds[some]
+            turning[some] = self.in_turnaround(t)
+            first[some] = np.floor(t / cycle) % 2 == 0
+            throw[some] = np.floor((t + self.turnaround / 2) / cycle) % 2 == 0
+        found: Intervals = {}
+        for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
+            found[f"throw_{way}"] = runs(going, seconds)
+            found[f"scan_{way}"] = runs(~turning & after, seconds)
+            found[f"turn_{way}"] = runs(turning & after, seconds)
+        for name, part in (("throw", "throw"), ("scanning", "scan"), ("turnaround", "turn")):
+            found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
+        return found
 
     def state(self, observation: Observation) -> None:
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")

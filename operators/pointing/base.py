@@ -16,6 +16,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
 from zonda.core.errors import PointingError
+from zonda.core.intervals import Intervals
 from zonda.core.knobs import Knob
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.stretches import stretches
@@ -124,8 +125,12 @@ class Pointing(Operator):
         return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
-        """Sample flags (n,); nonzero means: do not use."""
+        """Sample flags (n,), bits of `core.flags`."""
         return np.zeros(len(seconds), np.uint8)
+
+    def intervals(self, seconds: Floats) -> Intervals:
+        """Parts of a scan whose samples are taken at ``seconds`` (n,), by TOAST's names; by default all is *scanning*."""
+        return {}
 
     def state(self, observation: Observation) -> None:
         """Tell the tally what else should be known of this scan."""
@@ -227,8 +232,8 @@ class Pointing(Operator):
         total = self.scans * self.scan_duration + (self.scans - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)
 
-        flags = self.flag(seconds)
-        observation = observed(self.label, scene, index, start, seconds, rate, transform, track[1:], centre, flags)
+        parts = self.flag(seconds), self.intervals(seconds)
+        observation = observed(self.label, scene, index, start, seconds, rate, transform, track[1:], centre, *parts)
         self._check_motion(observation, transform, target, offset, None if self.jitter else horizontal, place, moved)
         if self.jitter > 0:
             state_times(self.label, observation)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
+from zonda.core.intervals import Intervals
 
 from .transform import unit_vectors
 
@@ -34,6 +35,7 @@ def observed(
     boresight: tuple[Floats, Floats],
     centre: tuple[float, float],
     flags: NDArray[np.uint8],
+    intervals: Intervals | None = None,
 ) -> Observation:
     """The scan whose ``boresight`` is at `Track.azel` and `Track.radec` at ``seconds`` (n,) since ``start``."""
     instrument = scene.instrument
@@ -51,6 +53,7 @@ def observed(
         centre=centre,
         seed=scene.seed,
         flags=flags,
+        intervals=intervals or {},
     )
     beam = float(observation.focalplane.fwhm.min())
     error = f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every {transform.spacing:g} s)"

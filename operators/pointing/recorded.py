@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from zonda.core import flags
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
-from zonda.core.errors import PointingError
+from zonda.core.errors import InputError, PointingError
+from zonda.core.intervals import part
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 
 from .observed import centre_of, observed, state_times
-from .recording import OUT_OF_ORDER, Clock, Comb, Recording, Scan, comb, read
+from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
+from .recording_files import Clock, read
 from .samples_per_beam import Sampled
 from .transform import CelestialTransform, unit_vectors
 
@@ -38,12 +41,17 @@ ANOTHER_DAY = 86400.0
 """s between the record and the scene's time from which a run warns: the weather is the scene's."""
 
 
+FAR = np.radians(0.1)
+"""rad between recorded and recomputed directions on the sky from which a run warns: no convention explains it."""
+
+
 class PointingRecorded(Operator):
     """Simulate on a real scan: times and directions of the boresight, read from a file.
 
     HDF5 in TOAST's layout (what `SaveTOD` writes, too) or with datasets ``time``, ``az`` and ``el`` (or ``ra`` and ``dec``,
     ICRS; attribute ``units``), a FITS table with such columns, or CSV that begins with ``time [s], az [deg], el [deg]``; a
-    column ``flags`` is kept. Azimuth and elevation are where the beam looks: the pointing model is applied.
+    column ``flags`` is kept, and the intervals of TOAST's layout. Azimuth and elevation are where the beam looks: the pointing
+    model is applied.
 
     Times need not be a perfect comb. Pointing and atmosphere follow them as they are; noise and filters count samples. Gaps
     and rows that are not numbers become flagged samples: their noise and atmosphere go on, no map uses them, filters bridge
@@ -64,6 +72,12 @@ class PointingRecorded(Operator):
     """A longer gap ends the scan; what follows is another observation. Shorter ones are flagged samples."""
     target: Target | None = None
     """Centre of the map; the scene's target where absent, or else the middle of the scan."""
+    flag_mask: int | None = Field(None, ge=0, le=255)
+    """Bits of the file's flags that exclude a sample; others do not (those of the Sun are kept). Where absent: 15 in TOAST's
+    layout and `SaveTOD`'s files (invalid, processing, turnaround, irregular); any bit in other files."""
+    celestial: Literal["recorded", "recomputed"] | None = None
+    """Where the boresight is on the sky: as recorded (``boresight_radec`` in TOAST's layout and `SaveTOD`'s files), or recomputed
+    from azimuth, elevation and time. Where absent: as recorded where the file has it."""
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
     """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
 
@@ -74,10 +88,11 @@ class PointingRecorded(Operator):
         for scan in found.scans:
             some = slice(None, None, -(-len(scan.seconds) // MOST_CHECKED))
             ways = {k: getattr(scan, k)[some] for k in ("seconds", "longitude", "latitude", "flags")}
-            coarse = replace(scan, rate=scan.rate / some.step, **ways)
+            radec = None if scan.radec is None else scan.radec[some]
+            coarse = replace(scan, rate=scan.rate / some.step, radec=radec, **ways)
             data.observations.append(self._observation(data, start, coarse, recording, len(data.observations)))
             seconds = scan.seconds[-1] - scan.seconds[0]
-            good = scan.flags == 0
+            good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
             text = f"{len(scan.seconds)} samples at {scan.rate:.6g} Hz, {seconds:.1f} s"
             if recording.frame == "azel" and good.any():
                 low, high = np.degrees([scan.latitude[good].min(), scan.latitude[good].max()])
@@ -117,7 +132,15 @@ class PointingRecorded(Operator):
         return pointing_estimate(self, context)
 
     def _read(self) -> tuple[Recording, Comb]:
-        recording = read(self.file, self.clock)
+        recording = read(self.file, self.clock, self.flag_mask)
+        if self.celestial == "recorded" and recording.frame == "azel" and recording.radec is None:
+            raise InputError(
+                "has azimuth and elevation and no boresight_radec",
+                place=f"{self.label}, {self.file}",
+                cure="set celestial: recomputed, or leave it out",
+            )
+        if self.celestial == "recomputed":
+            recording = replace(recording, radec=None)
         return recording, comb(recording, self.split, f"{self.label}, {self.file}")
 
     def _observation(self, data: Data, begin: Instant, scan: Scan, recording: Recording, index: int) -> Observation:
@@ -131,7 +154,8 @@ class PointingRecorded(Operator):
             horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
         elevation = np.arctan2(horizontal[:, 2], np.hypot(horizontal[:, 0], horizontal[:, 1]))
         outside = (elevation < telescope.elevation_min - 1e-9) | (elevation > telescope.elevation_max + 1e-9)
-        if (wrong := np.flatnonzero(outside & (scan.flags == 0))).size:
+        good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
+        if (wrong := np.flatnonzero(outside & good)).size:
             limits = f"{np.degrees(telescope.elevation_min):g} deg to {np.degrees(telescope.elevation_max):g} deg"
             where = f"elevation {np.degrees(elevation[wrong[0]]):.2f} deg, {seconds[wrong[0]]:.4g} s after {start}"
             raise PointingError(
@@ -140,17 +164,40 @@ class PointingRecorded(Operator):
                 cure="flag these rows, or correct site, clock, units or the telescope's limits",
             )
         target = self.target or scene.target
-        centre = centre_of(transform, target, seconds) if target else _middle(transform, horizontal, seconds, scan.flags == 0)
-        boresight = transform.boresight(horizontal, seconds)
+        azel, computed = transform.boresight(horizontal, seconds)
+        radec = computed if scan.radec is None else scan.radec
+        centre = centre_of(transform, target, seconds) if target else _middle(radec, good)
+        parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
         observation = observed(
-            self.label, scene, index, start, seconds, scan.rate, transform, boresight, centre, scan.flags.copy()
+            self.label, scene, index, start, seconds, scan.rate, transform, (azel, radec), centre, scan.flags.copy(), parts
         )
         state_times(self.label, observation)
+        if recording.frame == "azel":
+            self._state_celestial(observation, computed, good)
         return observation
 
+    def _state_celestial(self, observation: Observation, computed: Floats, good: NDArray[np.bool_]) -> None:
+        """Say which directions on the sky are used, and how far recorded ones are from those that follow from az and el."""
+        text = "recomputed from azimuth, elevation and time"
+        if observation.boresight_radec is not computed:
+            some = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
+            apart = np.linalg.norm(_directions(observation.boresight_radec[some]) - _directions(computed[some]), axis=1)
+            most = 2 * float(np.arcsin(apart.max(initial=0.0) / 2))
+            text = f"as recorded, up to {np.degrees(most) * 3600:.3g} arcsec from those {text}"
+            if most > FAR:
+                cure = "are site and clock right? celestial: recomputed takes azimuth and elevation"
+                warnings.warn(f"{self.label}: {observation.name}: directions on the sky are {text}: {cure}", stacklevel=4)
+        observation.tally.state(self.label, f"{observation.name}: directions on the sky", text)
 
-def _middle(transform: CelestialTransform, horizontal: Floats, seconds: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
+
+def _directions(quaternions: Floats) -> Floats:
+    """Unit vectors (n, 3) of boresights (n, 4)."""
+    x, y, z, w = quaternions.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+
+
+def _middle(radec: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
     """ICRS (ra, dec) of the mean direction."""
     some = np.flatnonzero(good)[:: max(1, int(good.sum()) // 10_000)]
-    x, y, z = transform.icrs(horizontal[some], seconds[some]).mean(axis=0)
+    x, y, z = _directions(radec[some]).mean(axis=0)
     return float(np.arctan2(y, x) % (2 * np.pi)), float(np.arctan2(z, np.hypot(x, y)))

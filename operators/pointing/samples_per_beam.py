@@ -32,7 +32,7 @@ class Sampled:
 
     def add(self, observation: Observation, rate: float) -> None:
         """Take a scan into account, read out at ``rate`` [Hz]."""
-        speed, turn = on_the_sky(observation.boresight_radec, observation.seconds, observation.flags == 0)
+        speed, turn = on_the_sky(observation.boresight_radec, observation.seconds, observation.good_samples)
         total = speed + turn * math.atan(observation.focalplane.radius)
         if len(total) and total.max() > self._fastest:
             self._fastest, self._usual = float(total.max()), float(np.median(total))

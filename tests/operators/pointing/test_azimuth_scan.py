@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
-from zonda.operators.pointing.azimuth_scan import TURNAROUND, PointingBackAndForth
+from zonda.core.flags import TURNAROUND
+from zonda.core.intervals import samples_in
+from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
 
 speeds = st.floats(1e-5, 1.0)
@@ -85,6 +87,29 @@ def test_offsets_shift_azimuth_on_the_sky_and_elevation(observe: Callable[..., D
     shift = moved.azimuth * math.cos(math.radians(62)) - plain.azimuth * math.cos(math.radians(60))
     centre = math.pi / 2 * (math.cos(math.radians(62)) - math.cos(math.radians(60)))
     assert shift - centre == pytest.approx(math.radians(1), abs=1e-13)
+
+
+@pytest.mark.parametrize("jitter", ["0 s", "1 ms"])
+def test_intervals_are_toasts(jitter: str, observe: Callable[..., Data]) -> None:
+    """Scans and turnarounds share the samples; a throw ends where the azimuth turns; left to right is towards larger azimuth."""
+    step = PointingBackAndForth(**SCAN, scan_duration="70.03 s", flag_turnarounds=True, jitter=jitter)
+    (o,) = observe(step).observations
+    inside = {name: samples_in(spans, o.seconds) for name, spans in o.intervals.items()}
+    ways = [f"{kind}_{way}" for kind in ("scan", "turn", "throw") for way in ("leftright", "rightleft")]
+    assert set(inside) == {"scanning", "turnaround", "throw", *ways}
+    np.testing.assert_array_equal(inside["turnaround"], (o.flags & TURNAROUND) != 0)
+    np.testing.assert_array_equal(inside["scanning"], ~inside["turnaround"])
+    assert inside["throw"].all()
+    for whole, kind in (("scanning", "scan"), ("turnaround", "turn"), ("throw", "throw")):
+        assert o.intervals[whole] == sorted(o.intervals[f"{kind}_leftright"] + o.intervals[f"{kind}_rightleft"])
+        assert not (inside[f"{kind}_leftright"] & inside[f"{kind}_rightleft"]).any()
+    up = np.diff(np.unwrap(o.azimuth)) > 0
+    both = inside["throw_leftright"][1:] & inside["throw_leftright"][:-1]
+    assert up[both].all()  # between samples of one throw the azimuth does not turn
+    assert not up[inside["throw_rightleft"][1:] & inside["throw_rightleft"][:-1]].any()
+    assert (inside["scan_leftright"] <= inside["throw_leftright"]).all()
+    first, second = o.intervals["turn_leftright"][0], o.intervals["turn_rightleft"][0]
+    assert o.intervals["scan_leftright"][0][1] == first[0] < second[0]
 
 
 def test_turnarounds_are_counted_and_flagged_on_demand(observe: Callable[..., Data]) -> None:

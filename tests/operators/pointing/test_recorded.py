@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PointingError, ZondaError
+from zonda.core.flags import INVALID, NOT_RECORDED
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.recorded import PointingRecorded
-from zonda.operators.pointing.recording import FLAGGED, NOT_RECORDED, Recording, comb, longest_rising, read
+from zonda.operators.pointing.recording import Recording, comb, longest_rising
+from zonda.operators.pointing.recording_files import read
 from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
 
 UNIX = 1732518000.0  # 2024-11-25T07:00:00Z
@@ -91,7 +93,7 @@ def test_nothing_is_repaired_silently() -> None:
         "samples flagged in the file": 2,
     }
     expected = np.zeros(2000, np.uint8)
-    expected[[10, 11]] = FLAGGED
+    expected[[10, 11]] = INVALID
     expected[[50, 51, 900, 77, 300, 400, 500, *range(1000, 1150)]] = NOT_RECORDED
     assert np.array_equal(scan.flags, expected)
     assert scan.seconds == pytest.approx(t, abs=1e-12)
@@ -328,3 +330,139 @@ def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path):
     path = write_csv(tmp_path / "bom.csv", UNIX + np.arange(20) / 10, np.full(20, 150.0), np.full(20, 45.0))
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert len(read(path, "unix").seconds) == 20
+
+
+# ---- what TOAST's layout has beside times and directions
+
+
+@pytest.fixture
+def saved(observe: Callable[..., Data], tmp_path: Path) -> Callable[[str], Path]:
+    """A scan back and forth in a file of SaveTOD; the format is asked for."""
+    import zonda
+    from zonda.operators.io.save_tod import SaveTOD
+    from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
+
+    scan = {"throw": "1 deg", "speed": "0.5 deg/s", "acceleration": "1 deg/s2", "scan_duration": "21.5 s"}
+
+    def write(form: str) -> Path:
+        step = PointingBackAndForth(**scan, flag_turnarounds=True, check_limits="warn", target="az 200 deg el 50 deg")
+        scene = observe(PointingDaisy(scan_duration="1 s")).scene
+        zonda.Pipeline([step, zonda.WhiteNoise(), zonda.Efficiency(), SaveTOD(format=form)]).run(
+            scene, output=tmp_path / form, threads=1
+        )
+        (path,) = (tmp_path / form).iterdir()
+        return path
+
+    return write
+
+
+def change(path: Path, turn: Any = None, flags: Any = None, drop: str = "") -> None:
+    """Edit a file of SaveTOD: directions on the sky turned by ``turn`` [rad] about the poles, flags, an item left out."""
+    import h5py
+
+    with h5py.File(path, "a") as f:
+        if turn is not None:
+            x, y, z, w = f["shared/boresight_radec"][:].T
+            s, c = np.sin(turn / 2), np.cos(turn / 2)
+            f["shared/boresight_radec"][:] = np.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], 1)
+        if flags is not None:
+            f["shared/flags"][:] = flags
+        if drop:
+            del f[drop]
+
+
+@pytest.mark.filterwarnings("ignore:Pointing")
+@pytest.mark.parametrize("form", ["hdf5", "fits"])
+def test_flags_and_intervals_come_back(form: str, saved: Any, observe: Callable[..., Data]) -> None:
+    from zonda.operators.io.save_tod import load_tod
+
+    path = saved(form)
+    tod, (o,) = load_tod(path), observe(PointingRecorded(file=path)).observations
+    assert (tod.flags == 4).sum() > 500  # of 2150: a turnaround of 2 s follows 2 s of scan
+    assert np.array_equal(o.flags, tod.flags)
+    assert o.intervals == tod.intervals
+    assert len(o.intervals["throw_leftright"]) == 3
+    assert np.array_equal(o.boresight_radec, tod.boresight_radec)
+
+
+@pytest.mark.filterwarnings("ignore:Pointing")
+def test_only_the_mask_excludes(saved: Any, observe: Callable[..., Data]) -> None:
+    path = saved("hdf5")
+    flags = np.zeros(2150, np.uint8)
+    flags[:7] = [1, 2, 4, 8, 16, 32, 64]
+    change(path, flags=flags)
+    (o,) = observe(PointingRecorded(file=path)).observations
+    assert o.flags[:8].tolist() == [1, 2, 4, 8, 16, 32, 0, 0]
+    assert np.flatnonzero(~o.good_samples).tolist() == [0, 1, 2, 3]
+    assert o.tally.get("PointingRecorded", "samples flagged in the file") == 4
+    (o,) = observe(PointingRecorded(file=path, flag_mask=1 | 32 | 64)).observations
+    assert np.flatnonzero(~o.good_samples).tolist() == [0, 5, 6]
+    assert o.flags[4] == 16
+
+
+def test_any_flag_excludes_in_files_of_other_kinds(observe: Callable[..., Data], tmp_path: Path) -> None:
+    t = np.arange(200) / 10
+    table = np.transpose([UNIX + t, 120 + 0.01 * t, 45 + 0.01 * t, (np.arange(200) == 5) * 64 + (np.arange(200) == 9)])
+    path = tmp_path / "flagged.csv"
+    np.savetxt(path, table, fmt="%.9f", delimiter=",", header="time [s], az [deg], el [deg], flags", comments="")
+    for mask, expected in ((None, [5, 9]), (64, [5]), (1, [9])):
+        (o,) = observe(PointingRecorded(file=path, flag_mask=mask)).observations
+        assert np.flatnonzero(~o.good_samples).tolist() == expected
+
+
+@pytest.mark.filterwarnings("ignore:Pointing")
+def test_directions_on_the_sky_are_those_recorded(saved: Any, observe: Callable[..., Data]) -> None:
+    """TOAST's own lie 45 arcsec from astropy's: a file that says so is believed, and the distance is stated."""
+    path, turn = saved("hdf5"), np.radians(45 / 3600)
+    (plain,) = observe(PointingRecorded(file=path)).observations
+    change(path, turn=turn)
+    (o,) = observe(PointingRecorded(file=path)).observations
+    shift = (o.ra - plain.ra + np.pi) % (2 * np.pi) - np.pi
+    assert shift == pytest.approx(turn, abs=1e-12)
+    most = 45 * np.cos(o.dec).max()
+    said = {what: text for _, what, text in o.tally}["scan-000: directions on the sky"]
+    assert said.startswith("as recorded, up to ")
+    assert float(said.split()[4]) == pytest.approx(most, rel=5e-3)  # three digits are stated
+    (again,) = observe(PointingRecorded(file=path, celestial="recomputed")).observations
+    assert np.abs(rotation_matrices(again.boresight_radec) - rotation_matrices(plain.boresight_radec)).max() < 1e-10
+    assert "recomputed from" in {what: text for _, what, text in again.tally}["scan-000: directions on the sky"]
+
+
+@pytest.mark.filterwarnings("ignore:PointingBack")
+def test_directions_far_from_azimuth_and_elevation_warn(saved: Any, observe: Callable[..., Data]) -> None:
+    path = saved("hdf5")
+    change(path, turn=np.radians(1.0))
+    with pytest.warns(UserWarning, match=r"as recorded, up to \d+(e\+03)? ?.*arcsec from .*are site and clock right\?"):
+        observe(PointingRecorded(file=path))
+    change(path, drop="shared/boresight_radec")
+    observe(PointingRecorded(file=path))
+    with pytest.raises(InputError, match="has azimuth and elevation and no boresight_radec"):
+        observe(PointingRecorded(file=path, celestial="recorded"))
+
+
+@pytest.mark.filterwarnings("ignore:Pointing")
+def test_a_gap_parts_the_intervals(saved: Any, observe: Callable[..., Data]) -> None:
+    """Rows between 8 and 10 s are missing: with `split` there are two scans, each with its part; quaternions go on in a gap."""
+    import h5py
+
+    path = saved("hdf5")
+    whole = observe(PointingRecorded(file=path)).observations[0]
+    with h5py.File(path, "a") as f:
+        keep = np.r_[0:800, 1000:2150]
+        for name in list(f["shared"]):
+            rows = f["shared"][name][:][keep]
+            if name == "boresight_radec":
+                rows[900:] *= -1  # the same rotations
+            del f["shared"][name]
+            f["shared"][name] = rows
+    (o,) = observe(PointingRecorded(file=path)).observations
+    assert np.flatnonzero(o.flags & NOT_RECORDED).tolist() == list(range(800, 1000))
+    apart = rotation_matrices(o.boresight_radec) - rotation_matrices(whole.boresight_radec)
+    assert np.abs(apart[o.good_samples]).max() < 1e-14
+    assert np.linalg.norm(o.boresight_radec, axis=1) == pytest.approx(1, abs=1e-14)
+    for name, spans in whole.intervals.items():  # a time within the gap has the resolution of POSIX seconds, 0.24 us
+        np.testing.assert_allclose(o.intervals[name], spans, rtol=0, atol=1e-6)
+    first, second = observe(PointingRecorded(file=path, split="1 s")).observations
+    assert sum(b - a for a, b in first.intervals["throw"]) == pytest.approx(7.99, abs=1e-9)
+    assert sum(b - a for a, b in second.intervals["throw"]) == pytest.approx(11.49, abs=1e-9)
+    assert second.intervals["throw"][0][0] == 0.0

@@ -1,0 +1,105 @@
+"""The flags of samples and of detectors: one table of bits, TOAST's where TOAST has one.
+
+TOAST calls flags of samples *shared*. Its map-making leaves out samples with a bit of 15 and detectors with a bit of 7
+("non-science"). zonda leaves out these and its own, `OPAQUE`, `NOT_RECORDED` and `DEAD`, which become *invalid* in a file. The
+bits of the Sun do not exclude a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Flags = NDArray[np.uint8]
+
+INVALID, PROCESSING = 1, 2
+"""Of samples and of detectors."""
+TURNAROUND, IRREGULAR, SUN_UP, SUN_CLOSE = 4, 8, 16, 32
+"""Of samples."""
+SOLAR_SYSTEM_OBJECT = 4
+"""Of detectors."""
+OPAQUE = 64
+"""Of samples and of detectors; zonda's own."""
+NOT_RECORDED = 128
+"""Of samples; zonda's own."""
+DEAD = 128
+"""Of detectors; zonda's own."""
+
+SAMPLE_MASK, DETECTOR_MASK = 15, 7
+"""Bits that exclude a sample or a detector in TOAST."""
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A bit: its name, what it means, whether what has it is left out, and the bit that it becomes in a file."""
+
+    bit: int
+    name: str
+    meaning: str
+    excludes: bool
+    in_file: int
+
+
+SAMPLE_FLAGS = (
+    Flag(INVALID, "invalid", "do not use", True, INVALID),
+    Flag(PROCESSING, "processing", "left out by a step: ends that a filter trims", True, PROCESSING),
+    Flag(TURNAROUND, "unstable scan rate", "in a turnaround", True, TURNAROUND),
+    Flag(IRREGULAR, "irregular", "no regular scan: an elevation nod", True, IRREGULAR),
+    Flag(SUN_UP, "sun up", "the Sun is above the horizon", False, SUN_UP),
+    Flag(SUN_CLOSE, "sun close", "the Sun is near", False, SUN_CLOSE),
+    Flag(OPAQUE, "opaque", "the air lets nothing through in the band of a detector", True, INVALID),
+    Flag(NOT_RECORDED, "not recorded", "in a gap of a recorded scan, or its row is not a number", True, INVALID),
+)
+"""Of samples (`Observation.flags`)."""
+DETECTOR_FLAGS = (
+    Flag(INVALID, "invalid", "do not use", True, INVALID),
+    Flag(PROCESSING, "processing", "left out by a step", True, PROCESSING),
+    Flag(SOLAR_SYSTEM_OBJECT, "solar-system object", "a planet is in the beam", True, SOLAR_SYSTEM_OBJECT),
+    Flag(OPAQUE, "opaque", "the air lets nothing through in its band most of the time", True, INVALID),
+    Flag(DEAD, "dead", "its signal is constant or not finite", True, INVALID),
+)
+"""Of detectors (`Observation.detector_flags`)."""
+
+EXCLUDE_SAMPLE = sum(flag.bit for flag in SAMPLE_FLAGS if flag.excludes)
+EXCLUDE_DETECTOR = sum(flag.bit for flag in DETECTOR_FLAGS if flag.excludes)
+
+HAS_A_SIGNAL = PROCESSING | TURNAROUND
+"""Bits of samples that no map uses but whose signal is one: filters take it as it is, and bridge the other excluded samples."""
+
+
+def good(flags: Flags, exclude: int) -> NDArray[np.bool_]:
+    """Where none of the bits ``exclude`` is set."""
+    return (flags & np.uint8(exclude)) == 0
+
+
+def in_file(flags: Flags, table: tuple[Flag, ...]) -> Flags:
+    """Flags as files have them: TOAST's bits alone."""
+    found = np.zeros_like(flags)
+    for flag in table:
+        found |= np.where(flags & np.uint8(flag.bit), np.uint8(flag.in_file), np.uint8(0))
+    return found
+
+
+def from_file(flags: Flags, mask: int) -> Flags:
+    """Flags of samples as a file in TOAST's layout has them; only those with a bit of ``mask`` are excluded.
+
+    Bits that do not exclude a sample (the Sun's) are kept. A bit of ``mask`` that is none of ours becomes *invalid*; other bits
+    that are not in ``mask`` are dropped.
+    """
+    passing = np.uint8(SUN_UP | SUN_CLOSE)
+    other = np.uint8(mask & ~SAMPLE_MASK)
+    found = flags & (np.uint8(mask & SAMPLE_MASK) | passing)
+    found[(flags & other) != 0] |= np.uint8(INVALID)
+    return found
+
+
+def of_before(flags: Flags, *, samples: bool) -> Flags:
+    """Flags in a file that an earlier zonda wrote, in today's bits.
+
+    Its bits were 1 invalid, 2 trimmed or in a turnaround (which of the two is not known: both became 2), 4 opaque, 8 dead,
+    16 not recorded; any of them excluded.
+    """
+    processing = np.uint8(PROCESSING if samples else 0)
+    return (flags & processing) | np.where(flags & ~processing, np.uint8(INVALID), np.uint8(0))

@@ -1,0 +1,44 @@
+"""Named intervals of a scan, TOAST's names and TOAST's rule of which samples belong to them.
+
+Names: scanning, turnaround, throw, throw_leftright, throw_rightleft, scan_leftright, scan_rightleft, turn_leftright,
+turn_rightleft, elnod, sun_up, sun_close. Times are seconds since the start of the scan. An interval holds the samples from its
+start up to, but not including, its stop; where it stops at the last sample, or between the last two, it holds the last one too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+Intervals = dict[str, list[tuple[float, float]]]
+"""By name: (start, stop) [s], in order and disjoint."""
+
+
+def runs(inside: NDArray[np.bool_], seconds: Floats) -> list[tuple[float, float]]:
+    """The intervals of those samples (n,) that are ``inside``, taken at ``seconds`` (n,).
+
+    A run of the last sample alone has no length, and is left out: TOAST's rule gives that sample to the interval before.
+    """
+    edges = np.flatnonzero(np.diff(np.r_[False, inside, False]))
+    stops = np.minimum(edges[1::2], len(seconds) - 1)
+    spans = zip(seconds[edges[::2]].tolist(), seconds[stops].tolist(), strict=True)
+    return [(start, stop) for start, stop in spans if stop > start]
+
+
+def samples_in(spans: list[tuple[float, float]], seconds: Floats) -> NDArray[np.bool_]:
+    """(n,) True for the samples in any of the intervals ``spans``."""
+    inside = np.zeros(len(seconds), bool)
+    for first, last in np.searchsorted(seconds, np.reshape(spans, (-1, 2))).tolist():
+        inside[first : last + (last == len(seconds) - 1)] = True
+    return inside
+
+
+def part(intervals: Mapping[str, list[tuple[float, float]]], begin: float, end: float) -> Intervals:
+    """What lies between ``begin`` and ``end`` [s], counted from ``begin``; names of which nothing does are kept."""
+    return {
+        name: [(max(a, begin) - begin, min(b, end) - begin) for a, b in spans if min(b, end) > max(a, begin)]
+        for name, spans in intervals.items()
+    }

@@ -1,0 +1,266 @@
+"""Recorded pointing in files: HDF5 (TOAST's layout and plain datasets), FITS tables and CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core import flags
+from zonda.core.configuration.time import SECOND, Instant
+from zonda.core.configuration.units import read_unit
+from zonda.core.errors import InputError
+from zonda.core.intervals import Intervals
+
+from .recording import Recording, longest_rising
+
+Floats = NDArray[np.float64]
+
+ALIASES = {
+    "time": ("time", "times", "t", "ctime", "timestamp", "mjd"),
+    "seconds": ("seconds",),
+    "az": ("az", "azimuth"),
+    "el": ("el", "elevation", "alt", "altitude"),
+    "ra": ("ra",),
+    "dec": ("dec",),
+    "flags": ("flags", "flag"),
+}
+"""Our name of a column, and names that files have for it, in small letters."""
+
+Clock = Literal["unix", "mjd", "scene"]
+
+Columns = Mapping[str, tuple[Any, str | None]]
+"""By name in small letters: values and unit."""
+
+
+@dataclass
+class Table:
+    """What a file holds.
+
+    Attributes
+    ----------
+    columns
+        Those of one number per row.
+    start
+        What a column ``seconds`` counts from, where the file says it.
+    bits
+        What the column of flags has: TOAST's bits, those of files that an earlier zonda wrote, or anything.
+    radec
+        (n, 4) `Recording.radec`.
+    intervals
+        (2, n) each, as ``times`` count or, ``in_seconds``, as ``seconds`` do.
+    """
+
+    columns: Columns
+    start: Instant | None = None
+    bits: Literal["toast", "before", "any"] = "any"
+    radec: Floats | None = None
+    intervals: dict[str, Floats] = field(default_factory=dict)
+    in_seconds: bool = False
+
+
+def read(path: Path, clock: Clock, mask: int | None = None) -> Recording:
+    """Read a recording.
+
+    Parameters
+    ----------
+    clock
+        What its times count, where the file does not carry its own start.
+    mask
+        Bits of a flag that exclude a sample; None: TOAST's 15 in TOAST's layout, any bit in other files.
+
+    Raises
+    ------
+    InputError
+        Unreadable, without the columns, without units, or with directions that cannot be.
+    """
+    place = f"recorded pointing {path}"
+    try:
+        with path.open("rb") as file:
+            magic = file.read(9)
+        kind = _hdf5 if magic.startswith(b"\x89HDF") else _fits if magic.startswith(b"SIMPLE  =") else _csv
+        return _recording(kind(path, place), clock, mask, place)
+    except OSError as err:
+        raise InputError(f"cannot be read: {err}", place=place, cure="give HDF5, a FITS table or CSV") from None
+
+
+def _csv(path: Path, place: str) -> Table:
+    try:
+        with path.open(encoding="utf-8-sig") as file:  # spreadsheets begin with a byte order mark
+            header = file.readline().lstrip("# ").strip()
+            names = [name.strip() for name in header.split(",")]
+            table = np.genfromtxt(file, delimiter=",", ndmin=2)
+    except (UnicodeDecodeError, ValueError) as err:
+        raise InputError(f"cannot be read as CSV: {err}", place=place, cure="write rows of equally many numbers") from None
+    if table.size == 0 or table.shape[1] != len(names):
+        raise InputError(
+            f"the first line names {len(names)} columns, the rows have {table.shape[1] if table.size else 0}",
+            place=place,
+            cure="begin with a line such as: time [s], az [deg], el [deg]",
+        )
+    columns = {}
+    for k, name in enumerate(names):
+        word, _, unit = name.partition("[")
+        columns[word.strip().lower()] = (table[:, k], unit.rstrip("] ") or None)
+    return Table(columns)
+
+
+def _fits(path: Path, place: str) -> Table:
+    from astropy.io import fits
+
+    with fits.open(path) as file:
+        for table in file:
+            names = (
+                {name.lower() for name in getattr(table.columns, "names", [])} if isinstance(table, fits.BinTableHDU) else set()
+            )
+            if any(names >= {a, b} for a in ALIASES["az"] for b in ALIASES["el"]) or names >= {"ra", "dec"}:
+                columns = {
+                    c.name.lower(): (np.asarray(table.data[c.name], np.float64), c.unit) for c in table.columns if c.dim is None
+                    and np.asarray(table.data[c.name]).ndim == 1 and np.asarray(table.data[c.name]).dtype.kind in "fiub"
+                }  # fmt: skip
+                start = file[0].header.get("DATE-OBS") if "seconds" in columns else None
+                found = Table(columns, Instant.parse(start) if start else None, in_seconds=True)
+                if names >= {"boresight_azel", "boresight_radec"}:  # SaveTOD's
+                    found.bits = "toast" if "FLAGBITS" in table.header else "before"
+                    found.radec = np.asarray(table.data["BORESIGHT_RADEC"], np.float64)
+                    if "INTERVALS" in file:
+                        rows = file["INTERVALS"].data
+                        for name in dict.fromkeys(rows["NAME"]):
+                            its = rows[rows["NAME"] == name]
+                            found.intervals[str(name)] = np.array([its["START"], its["STOP"]], np.float64)
+                return found
+    raise InputError("has no table with az and el, or ra and dec", place=place, cure="name the columns TIME, AZ and EL")
+
+
+def _hdf5(path: Path, place: str) -> Table:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        toast = "shared" in file
+        group = file["shared"] if toast else file.get("pointing", file)
+        columns: dict[str, tuple[Any, str | None]] = {}
+        for name, values in group.items():
+            if not isinstance(values, h5py.Dataset) or values.ndim != 1 or values.dtype.kind not in "fiub":
+                continue
+            unit = values.attrs.get("units", values.attrs.get("unit"))
+            known = next((ours for ours, names in ALIASES.items() if name.lower() in names), None)
+            si = {"time": "s", "seconds": "s", "az": "rad", "el": "rad"}.get(known or "") if toast else None
+            columns[name.lower()] = (values[:], str(unit) if unit is not None else si)
+        found = Table(columns)
+        if toast:
+            other = file["metadata/other"].attrs if "metadata/other" in file else {}
+            start = other.get("zonda_start_utc")
+            found.start = Instant.parse(str(start)) if start is not None else None
+            found.bits = "before" if start is not None and "zonda_flags" not in other else "toast"
+            if "boresight_azel" in group:
+                _check_rotation(group["boresight_azel"], place)
+            if "boresight_radec" in group:
+                found.radec = np.asarray(group["boresight_radec"][:], np.float64)
+            for name, spans in file["intervals"].items() if "intervals" in file else ():
+                found.intervals[name] = np.asarray(spans[:], np.float64)
+        return found
+
+
+def _check_rotation(quaternions: Any, place: str) -> None:
+    """zonda's mount keeps the focal plane upright; a file whose boresight is rotated about itself would not be followed."""
+    x, y, z, w = np.asarray(quaternions[:], np.float64).T
+    psi = np.arctan2(y * z + w * x, -(x * z - w * y))
+    turned = float(np.abs(psi[np.isfinite(psi)]).max(initial=0.0))
+    if turned > 1e-6:
+        raise InputError(
+            f"the boresight is rotated by up to {np.degrees(turned):.3g} deg about itself, which is not simulated",
+            place=place,
+            cure="give azimuth and elevation alone",
+        )
+
+
+def _recording(table: Table, clock: Clock, mask: int | None, place: str) -> Recording:
+    columns, start = table.columns, table.start
+    found = {ours: columns[name] for ours, names in ALIASES.items() for name in names if name in columns}
+    frame: Literal["azel", "icrs"] = "azel" if {"az", "el"} <= set(found) else "icrs"
+    which = ("az", "el") if frame == "azel" else ("ra", "dec")
+    lacks = [name for name in which if name not in found] + ["time"] * (not {"time", "seconds"} & set(found))
+    if lacks:
+        there = ", ".join(columns) or "none"
+        raise InputError(f"has no column {' and '.join(lacks)}; columns: {there}", place=place, cure="name them time, az and el")
+    longitude, latitude = (_in_si(*found[name], "rad", name, place) for name in which)
+    if (worst := np.nanmax(np.abs(latitude), initial=0.0)) > np.pi / 2 + 1e-9:
+        row = int(np.nanargmax(np.abs(latitude)))
+        raise InputError(f"{which[1]} is {np.degrees(worst):.6g} deg in row {row}", place=place, cure="check its unit")
+    if start is not None and "seconds" in found:
+        seconds = _in_si(*found["seconds"], "s", "seconds", place)
+    else:
+        seconds, start = _times(*found["time" if "time" in found else "seconds"], clock, place)
+    bits = _flags(found["flags"][0], table.bits, mask) if "flags" in found else np.zeros(len(seconds), np.uint8)
+    if table.radec is not None and table.radec.shape != (len(seconds), 4):
+        shape = " x ".join(map(str, table.radec.shape))
+        raise InputError(f"boresight_radec is {shape}, not {len(seconds)} x 4", place=place, cure="save the file again")
+    radec = table.radec if frame == "azel" else None
+    times = seconds if table.in_seconds or "time" not in found else np.asarray(found["time"][0], np.float64)
+    parts = _intervals(table.intervals, times, seconds, place)
+    return Recording(start, seconds, longitude, latitude, frame, bits, radec, parts)
+
+
+def _flags(values: Any, bits: Literal["toast", "before", "any"], mask: int | None) -> NDArray[np.uint8]:
+    """In bits of `core.flags`. What is not a number excludes a sample."""
+    number = np.asarray(values, np.float64)
+    whole = np.where(np.isfinite(number), number, 255).astype(np.int64)
+    if bits == "any":
+        excluded = number != 0 if mask is None else (whole & mask) != 0
+        return np.where(excluded, flags.INVALID, 0).astype(np.uint8)
+    byte = (whole & 255).astype(np.uint8)
+    if bits == "before":
+        byte = flags.of_before(byte, samples=True)
+    return flags.from_file(byte, flags.SAMPLE_MASK if mask is None else mask)
+
+
+def _intervals(given: Mapping[str, Floats], times: Floats, seconds: Floats, place: str) -> Intervals:
+    """Intervals that count as ``times`` (n,), in order and in ``seconds``; of times that samples have to the last bit."""
+    finite = np.flatnonzero(np.isfinite(times) & np.isfinite(seconds))
+    rows = finite[longest_rising(times[finite])]
+    found: Intervals = {}
+    for name, spans in given.items():
+        if spans.ndim != 2 or spans.shape[0] != 2 or not np.isfinite(spans).all():
+            raise InputError(f"the intervals {name} are no times of start and stop", place=place, cure="save the file again")
+        if len(rows):
+            begin, end = (np.interp(t, times[rows], seconds[rows]).tolist() for t in spans)
+            found[name] = sorted((a, b) for a, b in zip(begin, end, strict=True) if b > a)
+    return found
+
+
+def _times(values: Any, unit: str | None, clock: Clock, place: str) -> tuple[Floats, Instant | None]:
+    """Seconds, and what they count from: a whole second or day next to the first, so that differences are exact."""
+    days = clock == "mjd"
+    times = np.asarray(values, np.float64) if days else _in_si(values, unit or "s", "s", "time", place)
+    if clock == "scene":
+        return times, None
+    finite = times[np.isfinite(times)]
+    if not len(finite):
+        raise InputError("has no time that is a number", place=place, cure="check the column of times")
+    first = int(np.floor(finite[0]))
+    since = first * SECOND if not days else (first - 40587) * 86400 * SECOND
+    try:
+        start = Instant(since)
+        year = start.datetime.year
+    except (OverflowError, ValueError):
+        year = 0
+    if not 1980 <= year <= 2150:
+        raise InputError(
+            f"the first time, {finite[0]:.10g}, is not of our days as {'an MJD' if days else 'seconds since 1970'}",
+            place=place,
+            cure="set clock: unix (seconds since 1970), mjd, or scene (seconds since the scene's time)",
+        )
+    return (times - first) * (86400.0 if days else 1.0), start
+
+
+def _in_si(values: Any, unit: str | None, si: str, name: str, place: str) -> Floats:
+    if not unit:
+        raise InputError(f"{name} has no unit", place=place, cure=f"write one, e.g. {name} [deg] in the first line of a CSV")
+    measure, own = read_unit(unit), read_unit(si)
+    if measure is None or own is None or measure.powers != own.powers:
+        raise InputError(f"{unit!r} is no unit of {name}", place=place, cure=f"use {'deg or rad' if si == 'rad' else 's'}")
+    return np.asarray(values, np.float64) * measure.factor
