@@ -172,7 +172,7 @@ def _prepare() -> None:
             import_module(name)
     gc.freeze()
     with suppress(Exception):
-        lay_in = import_module("zonda.operators.diagnostics.plots").lay_in
+        lay_in = import_module("zonda.operators.diagnostics.canvas").lay_in
         for count in LAID_IN:
             lay_in(count)
     gc.enable()

@@ -37,6 +37,8 @@ class FlatMap:
         What is known of a plane's rms beforehand (maps that were not flat).
     smooth
         Whether it can be smoothed (maps that were flat).
+    per_beam
+        `MapProduct.seconds_per_beam`.
     """
 
     planes: dict[str, Floats]
@@ -50,6 +52,35 @@ class FlatMap:
     smoothed_by: float = 0.0
     rms: dict[str, float] = field(default_factory=dict)
     smooth: bool = True
+    per_beam: Floats | float | None = None
+
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns where there are samples, with a margin of a hundredth of the longer side; all, if they are most."""
+        edges = []
+        for axis, size in enumerate(self.hits.shape):
+            used = np.flatnonzero((self.hits > 0).any(axis=1 - axis))
+            edges.append((int(used[0]), int(used[-1]) + 1) if used.size else (0, size))
+        spare = math.ceil(0.01 * max(high - low for low, high in edges))
+        y, x = (slice(max(0, a - spare), min(n, b + spare)) for (a, b), n in zip(edges, self.hits.shape, strict=True))
+        whole = (y.stop - y.start) * (x.stop - x.start) >= 0.9 * self.hits.size
+        return (slice(0, self.hits.shape[0]), slice(0, self.hits.shape[1])) if whole else (y, x)
+
+    def cropped(self, window: tuple[slice, slice] | None = None) -> FlatMap:
+        """The rows and columns of `window`."""
+        y, x = window or self.window()
+        header = dict(self.header)
+        for key, shift in (("CRPIX1", x.start), ("CRPIX2", y.start)):
+            header[key] = float(header.get(key, 0.0)) - shift
+        each = isinstance(self.per_beam, np.ndarray) and self.per_beam.ndim
+        return replace(
+            self,
+            planes={name: plane[y, x] for name, plane in self.planes.items()},
+            hits=self.hits[y, x],
+            weights=self.weights[y, x],
+            axes=None if self.axes is None else self.axes.shifted(x.start, y.start),
+            header=header,
+            per_beam=np.asarray(self.per_beam)[y, x] if each else self.per_beam,
+        )
 
     @property
     def sky(self) -> Any:

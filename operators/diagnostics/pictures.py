@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from .canvas import angle_text
 from .flat_map import FlatMap
-from .plots import SHOWN, Track, map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
+from .map_layout import map_axes
+from .map_plots import SHOWN, plot_coverage, plot_map
+from .plots import Track, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .png import png_of
 from .series import Spectrum, TimeStream
 from .sky_axes import SkyAxes
@@ -43,7 +46,7 @@ def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, A
 
 def draw_map(file: str, run: str, key: str, product: FlatMap, style: Style) -> list[Picture]:
     """Plane ``signal`` of a map of run ``run``, called ``key``."""
-    shown, how = _shown(product, style)
+    shown, how = _shown(product.cropped(), style)
     title = {"": "Map", "noiseless": "Map of the noiseless run"}.get(run, f"Map of run {run}")
     title += "" if key == "map" else f" ({key})"
     meaning = {
@@ -59,8 +62,9 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Pic
     """Maps of noise alone: ``half_difference`` (of the map, which comes first) and ``source_free`` (plane ``signal``)."""
     words = {"half_difference": "even minus odd scans", "source_free": "run without the sky"}
     panels, figures, limits, how = [], [], [], ""
+    window = next(iter(sources.values())).window()
     for of, source in sources.items():
-        shown, how = _shown(source, style)
+        shown, how = _shown(source.cropped(window), style)
         plane = next(iter(shown.planes))
         panels.append((shown, _titled(f"Noise: {words[of]}", how)))
         limits.append(shown.limit(plane, panels[0][0].hits, 99.7))
@@ -76,10 +80,14 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Pic
 
 
 def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int) -> list[Picture]:
-    """Samples per pixel; ``samples`` in ``pixels`` in all."""
-    (ax,) = map_axes(product.hits.shape, product.axes, product.header)
-    plot_coverage(product.hits, product.sky, ax=ax)
-    return [Picture(file, "Coverage", f"{samples:,} samples in {pixels:,} pixels.", png_of(ax))]
+    """Samples per pixel and seconds per beam; ``samples`` in ``pixels`` in all."""
+    product = product.cropped()
+    ax = plot_coverage(product.hits, product.sky, per_beam=product.per_beam)
+    text = f"{samples:,} samples in {pixels:,} pixels of {angle_text(product.pixel)}.".replace(",", "\u202f")
+    if product.per_beam is not None:
+        beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
+        text += f" Integration time: of all detectors together, in the area of the telescope's beam {beam}."
+    return [Picture(file, "Coverage", text, png_of(ax))]
 
 
 def draw_scan(tracks: Sequence[Track]) -> list[Picture]:
@@ -129,17 +137,13 @@ def _shown(product: FlatMap, style: Style) -> tuple[FlatMap, str]:
     if not product.smooth:
         return product, "not smoothed"
     if style.smooth == 0 or product.smoothed_by:
-        return product, f"smoothed by {_arcsec(product.smoothed_by)}" if product.smoothed_by else "not smoothed"
+        return product, f"smoothed by {angle_text(product.smoothed_by)}" if product.smoothed_by else "not smoothed"
     fwhm = product.fwhm if style.smooth is None else style.smooth
-    return (product.smoothed(fwhm), f"smoothed by {_arcsec(fwhm)} for this picture") if fwhm > 0 else (product, "not smoothed")
+    return (product.smoothed(fwhm), f"smoothed by {angle_text(fwhm)} for this picture") if fwhm > 0 else (product, "not smoothed")
 
 
 def _titled(title: str, how: str) -> str:
     return f"{title}, {how.removesuffix(' for this picture')}"
-
-
-def _arcsec(angle: float) -> str:
-    return f"{np.degrees(angle) * 3600:.3g}″"
 
 
 def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | None, circle: bool = False) -> bytes:
@@ -147,7 +151,7 @@ def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | 
     whole = panels[0][0]
     covered = whole.covered(style.least_coverage)
     fwhm = math.hypot(whole.fwhm, whole.smoothed_by)
-    axes = map_axes(covered.shape, whole.axes, whole.header, len(panels))
+    axes = map_axes(covered.shape, whole.sky, len(panels))
     for ax, (shown, title) in zip(axes, panels, strict=True):
         values = np.where(covered, next(iter(shown.planes.values())), np.float32(np.nan))
         width = style.central_diameter if circle else None

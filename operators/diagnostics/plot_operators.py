@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.parameters import quantity
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
     from zonda.core.plan.estimate import Estimate
 
 __all__ = ["Picture", "Plots", "pictures"]
+
+Floats = NDArray[np.floating]
 
 LARGEST = 1500
 """Pixels of an image's longer side in a picture; larger images are thinned out."""
@@ -220,8 +223,6 @@ def _plain(header: Any) -> dict[str, Any]:
 def _input(name: str, image: Image) -> tuple[Any, ...]:
     step = -(-max(image.values.shape) // LARGEST)
     values, axes, header = image.values[::step, ::step], SkyAxes.of(image.header), _plain(image.header)
-    if axes is not None and not axes.upright(image.values.shape):
-        axes = None  # drawn on astropy's, from the header
     if step > 1 and axes is not None:
         axes = axes.thinned(step)
     elif step > 1:
@@ -230,8 +231,10 @@ def _input(name: str, image: Image) -> tuple[Any, ...]:
     return product_path("", name).name, np.asarray(values, np.float32), axes, header
 
 
-def _flat(name: str, product: MapProduct, *planes: str, style: Style | None = None) -> FlatMap:
-    """What pictures need of a map; a HEALPix map on the tangent plane at its centre."""
+def _flat(
+    name: str, product: MapProduct, *planes: str, style: Style | None = None, per_beam: Floats | float | None = None
+) -> FlatMap:
+    """What pictures need of a map; a HEALPix map on a plane about its centre."""
     view = MapView.of(name, product)
     view.planes = {plane: np.asarray(getattr(product, plane)) for plane in planes}
     if product.header is not None:
@@ -246,7 +249,7 @@ def _flat(name: str, product: MapProduct, *planes: str, style: Style | None = No
     hits, weights, *rest = (np.asarray(a, np.float32) for a in (*arrays, *(view.planes[p] for p in planes)))
     return FlatMap(
         dict(zip(planes, rest, strict=True)), hits, np.nan_to_num(weights), SkyAxes.of(view.header), _plain(view.header),
-        product.centre, product.pixel, product.fwhm, product.smoothed_by, rms, product.header is not None,
+        product.centre, product.pixel, product.fwhm, product.smoothed_by, rms, product.header is not None, per_beam,
     )  # fmt: skip
 
 
@@ -261,8 +264,9 @@ def _noise(name: str, sources: dict[Any, tuple[MapProduct, Any]], style: Style) 
 
 
 def _coverage(name: str, product: MapProduct) -> tuple[Any, ...]:
-    hits = product.hits
-    return f"coverage{'' if name == 'map' else f'_{name}'}", _flat(name, product), int(hits.sum()), int((hits > 0).sum())
+    hits, per_beam = product.hits, product.seconds_per_beam()
+    flat = _flat(name, product, per_beam=per_beam)
+    return f"coverage{'' if name == 'map' else f'_{name}'}", flat, int(hits.sum()), int((hits > 0).sum())
 
 
 def _streams(file: str, stream: TimeStream, before: dict[str, str]) -> tuple[Any, ...]:

@@ -1,7 +1,7 @@
 """Where the pixels of an image are on the sky, and tick marks in longitude and latitude along its edges.
 
-numpy alone: astropy's world axes take longer to import than a picture takes to draw. Images of other projections, turned
-ones and those with a pole in them have no `SkyAxes`; they are drawn on astropy's.
+numpy alone: astropy takes longer to import than a picture takes to draw. Images of other projections have no `SkyAxes`; they,
+turned ones and those with a pole in them have a `graticule` instead of tick marks.
 """
 
 from __future__ import annotations
@@ -25,6 +25,15 @@ _FROM_CENTRE: dict[str, Callable[[Floats], Floats]] = {
 }
 """Zenithal projections: angle from the reference point [rad] by the distance in the image plane [rad] (Calabretta & Greisen
 2002, section 5.1); NaN beyond the edge of the sky."""
+
+_TO_CENTRE: dict[str, tuple[Callable[[Floats], Floats], float]] = {
+    "TAN": (np.tan, 85.0),
+    "SIN": (np.sin, 90.0),
+    "ARC": (lambda a: a, 180.0),
+    "STG": (lambda a: 2 * np.tan(a / 2), 170.0),
+    "ZEA": (lambda a: 2 * np.sin(a / 2), 180.0),
+}
+"""The reverse, and the largest angle [deg] for which it is used."""
 
 _MOST_TURNED = math.tan(math.radians(30.0))
 _SIXTY = (1, 2, 5, 10, 15, 20, 30)
@@ -105,6 +114,10 @@ class SkyAxes:
         x, y = self.reference
         return replace(self, reference=(x / step, y / step), matrix=self.matrix * step)
 
+    def shifted(self, x: int, y: int) -> SkyAxes:
+        """Of the part of the image that begins at pixel (x, y)."""
+        return replace(self, reference=(self.reference[0] - x, self.reference[1] - y))
+
     def world(self, x: Any, y: Any) -> tuple[Floats, Floats]:
         """Longitude and latitude [deg] of pixel coordinates; NaN off the sky."""
         dx, dy = np.asarray(x, np.float64) - self.reference[0], np.asarray(y, np.float64) - self.reference[1]
@@ -120,6 +133,27 @@ class SkyAxes:
         east, north, ahead = east * ratio, north * ratio, np.cos(angle)
         lon = lon0 + np.arctan2(east, ahead * np.cos(lat0) - north * np.sin(lat0))
         return np.degrees(lon), np.degrees(np.arcsin(np.clip(ahead * np.sin(lat0) + north * np.cos(lat0), -1, 1)))
+
+    def pixel(self, lon: Any, lat: Any) -> tuple[Floats, Floats]:
+        """Pixel coordinates of a longitude and latitude [deg]; NaN where the projection does not show them."""
+        lon, lat = np.asarray(lon, np.float64), np.asarray(lat, np.float64)
+        if self.projection == "CAR":
+            u, v = (lon - self.centre[0] + 180) % 360 - 180, lat + 0 * lon
+        else:
+            turn, lon0, lat0 = np.radians([self.turn, *self.centre])
+            far, up = np.radians(lon) - lon0, np.radians(lat)
+            east = np.cos(up) * np.sin(far)
+            north = np.sin(up) * np.cos(lat0) - np.cos(up) * np.sin(lat0) * np.cos(far)
+            ahead = np.sin(up) * np.sin(lat0) + np.cos(up) * np.cos(lat0) * np.cos(far)
+            beside = np.hypot(east, north)
+            angle = np.arctan2(beside, ahead)
+            project, most = _TO_CENTRE[self.projection]
+            known = np.where(angle <= math.radians(most), angle, np.nan)
+            ratio = np.degrees(np.where(beside > 0, project(known) / np.where(beside > 0, beside, 1.0), 1.0))
+            u, v = (np.cos(turn) * east - np.sin(turn) * north) * ratio, (np.sin(turn) * east + np.cos(turn) * north) * ratio
+        back = np.linalg.inv(self.matrix)
+        x, y = (back[i, 0] * u + back[i, 1] * v + self.reference[i] for i in (0, 1))
+        return x, y
 
     def distance(self, shape: tuple[int, ...], centre: tuple[float, float]) -> Floats:
         """Angle [rad] of every pixel of an image (ny, nx) from ``centre`` (longitude, latitude) [rad]."""
@@ -178,14 +212,14 @@ class SkyAxes:
                 known = value(t, at)
                 low, high = float(known.min()), float(known.max())
                 step = step or _step(low, high, room, value is longitude, hours)
-                wanted = _multiples(low, high, step) * step
+                wanted = multiples(low, high, step) * step
                 order = np.argsort(known)
                 places = np.interp(wanted, known[order], t[order])
                 for _ in range(3):
                     before, after = np.maximum(places - 0.5, -0.5), np.minimum(places + 0.5, along - 0.5)
                     slope = (value(after, at) - value(before, at)) / (after - before)
                     places = np.clip(places - (value(places, at) - wanted) / slope, -0.5, along - 0.5)
-                found[edge] = Ticks(places, [_label(w, step, value is longitude, hours) for w in wanted])
+                found[edge] = Ticks(places, [label_of(w, step, value is longitude, hours) for w in wanted])
         return found
 
 
@@ -201,28 +235,34 @@ def names_of(header: Any) -> tuple[str, str, str]:
     return first.split("-")[0].lower() or "x", second.split("-")[0].lower() or "y", "as in the file"
 
 
-def _multiples(low: float, high: float, step: float) -> Floats:
+def multiples(low: float, high: float, step: float) -> Floats:
+    """Whole numbers whose products with ``step`` lie between ``low`` and ``high``."""
     return np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1, dtype=np.float64)
 
 
-def _step(low: float, high: float, room: float, longitude: bool, hours: bool) -> float:
-    """Smallest round step [deg] whose labels fit into ``room``: characters for longitudes, lines for latitudes."""
+def round_steps(longitude: bool, hours: bool) -> list[float]:
+    """Round steps [deg], ascending: of hours, minutes and seconds, or of degrees."""
     time = longitude and hours
     seconds = [m * 10.0**-k for k in range(5, 0, -1) for m in (1, 2, 5)]
     seconds += [float(m * unit) for unit in (1, 60) for m in _SIXTY]
     seconds += [3600.0 * m for m in ((1, 2, 3, 4, 6, 12) if time else (1, 2, 5, 10, 15, 20, 30, 45, 60, 90))]
-    steps = [s / 3600 * (15 if time else 1) for s in seconds]
+    return [s / 3600 * (15 if time else 1) for s in seconds]
+
+
+def _step(low: float, high: float, room: float, longitude: bool, hours: bool) -> float:
+    """Smallest round step [deg] whose labels fit into ``room``: characters for longitudes, lines for latitudes."""
+    steps = round_steps(longitude, hours)
     last = steps[0]
     for step in steps:
-        count = len(_multiples(low, high, step)) if (high - low) / step < 100 else 100
-        size = len(_label(high, step, longitude, hours)) + 2.5 if longitude else 2.2
+        count = len(multiples(low, high, step)) if (high - low) / step < 100 else 100
+        size = len(label_of(high, step, longitude, hours)) + 2.5 if longitude else 2.2
         if count <= 7 and count * size <= room:
-            return step if count >= 2 or not len(_multiples(low, high, last)) else last
+            return step if count >= 2 or not len(multiples(low, high, last)) else last
         last = step
     return last
 
 
-def _label(value: float, step: float, longitude: bool, hours: bool) -> str:
+def label_of(value: float, step: float, longitude: bool, hours: bool) -> str:
     """A longitude or latitude [deg] to the digits that ``step`` [deg] has."""
     unit, marks, turn = (15.0, "ʰᵐˢ", 24) if longitude and hours else (1.0, "°′″", 360)
     seconds = step / unit * 3600

@@ -84,29 +84,22 @@ class MapView:
         return WCS(self.header, naxis=2)
 
     def flat(self, size: int = 400) -> MapView:
-        """A HEALPix map on ``size`` x ``size`` points of the tangent plane at its centre, for pictures; any other map as it is.
+        """A HEALPix map on a grid of at most ``size`` x ``size`` points of a plane about its centre, for pictures; any other map
+        as it is.
 
-        Each grid point takes the value of the HEALPix pixel it lies in.
+        The plane is the tangent plane, or for maps of more than 60 deg the equal-area one (ZEA); the grid reaches as far as the
+        pixels. Each point takes the value of the HEALPix pixel it lies in.
         """
         if not self.is_healpix:
             return self
         import healpy as hp
-        from astropy.wcs import WCS
 
-        directions = np.array(hp.pix2vec(self.nside, self.pixels, nest=self.nest))
-        lon, lat = np.degrees(self.centre)
-        centre = hp.ang2vec(lon, lat, lonlat=True)
-        reach = np.arccos(np.clip((centre @ directions).min(), 0.1, 1)) + hp.nside2resol(self.nside)
-        wcs = WCS(naxis=2)
-        axes = ("RA", "DEC") if self.frame == "icrs" else ("GLON", "GLAT")
-        wcs.wcs.ctype = [f"{a}{'-' * (8 - len(a) - 3)}TAN" for a in axes]
-        wcs.wcs.crval = [float(lon), float(lat)]
-        wcs.wcs.crpix = [(size + 1) / 2] * 2
-        step = np.degrees(2 * np.tan(reach) / size)
-        wcs.wcs.cdelt = [-step, step]
-        x, y = np.meshgrid(np.arange(size), np.arange(size))
+        wcs, (nx, ny) = self._plane(size)
+        x, y = np.meshgrid(np.arange(nx), np.arange(ny))
         world = wcs.pixel_to_world_values(x, y)
-        wanted = hp.ang2pix(self.nside, world[0], world[1], nest=self.nest, lonlat=True)
+        known = np.isfinite(world[0]) & np.isfinite(world[1])
+        lon, lat = np.where(known, world, 0.0)
+        wanted = np.where(known, hp.ang2pix(self.nside, lon, lat, nest=self.nest, lonlat=True), -1)
         order = np.argsort(self.pixels)
         place = np.clip(np.searchsorted(self.pixels, wanted, sorter=order), 0, len(order) - 1)
         found = order[place]
@@ -115,6 +108,30 @@ class MapView:
         return MapView(
             self.name, planes, self.units, wcs.to_header(relax=True), frame=self.frame, fwhm=self.fwhm, centre=self.centre
         )
+
+    def _plane(self, size: int) -> tuple[Any, tuple[int, int]]:
+        """A WCS about the centre, and the numbers (nx, ny) of points that take in every pixel."""
+        import healpy as hp
+        from astropy.wcs import WCS
+
+        lon, lat = np.degrees(self.centre)
+        directions = np.array(hp.pix2vec(self.nside, self.pixels, nest=self.nest))
+        far = float((hp.ang2vec(lon, lat, lonlat=True) @ directions).min(initial=1.0)) < 0.86
+        wcs = WCS(naxis=2)
+        axes = ("RA", "DEC") if self.frame == "icrs" else ("GLON", "GLAT")
+        wcs.wcs.ctype = [f"{a}{'-' * (8 - len(a) - 3)}{'ZEA' if far else 'TAN'}" for a in axes]
+        wcs.wcs.crval = [float(lon), float(lat)]
+        wcs.wcs.crpix = [1.0, 1.0]
+        wcs.wcs.cdelt = [-1.0, 1.0]
+        x, y = wcs.wcs_world2pix(*hp.pix2ang(self.nside, self.pixels, nest=self.nest, lonlat=True), 0)
+        spare = np.degrees(hp.nside2resol(self.nside))
+        places = np.stack([x, y]) if x.size else np.zeros((2, 1))
+        low, high = places.min(axis=1) - spare, places.max(axis=1) + spare
+        step = float((high - low).max()) / size
+        numbers = np.maximum(1, np.ceil((high - low) / step - 1e-9)).astype(int)
+        wcs.wcs.cdelt = [-step, step]
+        wcs.wcs.crpix = (1 - (low + high) / 2 / step + (numbers - 1) / 2).tolist()
+        return wcs, (int(numbers[0]), int(numbers[1]))
 
 
 def maps_of(products: Mapping[str, Any]) -> dict[str, MapProduct]:

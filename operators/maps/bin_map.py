@@ -395,6 +395,7 @@ class BinMap(Operator):
         common: dict[str, Any] = {
             "frame": self.frame, "weighting": self.weights, "noise_from": self.noise, "fwhm": self._fwhm, "scans": halves.scans,
             "centre": self._middle, "half_difference": arrays[4] if half is not None else None, "contents": self.contents,
+            "sample_rate": min(halves.rates) if len(halves.rates) == 1 else 0.0,
         }  # fmt: skip
         if isinstance(grid, TangentGrid):
             header = grid.wcs.to_header(relax=True)

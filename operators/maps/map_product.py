@@ -57,6 +57,8 @@ class MapProduct:
         Main-beam FWHM of the instrument [rad]. ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
     scans
         Names of the observations in it.
+    sample_rate
+        Of all scans [Hz]; 0 where it is unknown or they differ.
     """
 
     signal: Floats
@@ -77,6 +79,7 @@ class MapProduct:
     fwhm: float = 0.0
     smoothed_by: float = 0.0
     scans: list[str] = field(default_factory=list)
+    sample_rate: float = 0.0
     contents: Literal["all", "hits"] = "all"
     """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
 
@@ -99,6 +102,22 @@ class MapProduct:
 
         colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
         return _angle(phi, np.pi / 2 - colatitude, self.centre)
+
+    def seconds_per_beam(self) -> Floats | float | None:
+        """What one sample in a pixel adds to the integration time of all detectors per beam [s]: times ``hits``, that time.
+
+            1 / sample rate x beam area / pixel area,   pi FWHM^2 / (4 ln 2) / pixel^2 (cos^-3 of the distance, TAN)
+
+        The beam is the telescope's, not what smoothing made of it. One number where pixels are equal to 0.1 %, else an array,
+        shape of ``signal``; None where the rate or the beam is not known.
+        """
+        if not (self.sample_rate > 0 and self.fwhm > 0):
+            return None
+        per_pixel = math.pi / math.log(16) * (self.fwhm / self.pixel) ** 2 / self.sample_rate
+        if self.header is None:
+            return per_pixel
+        larger = np.cos(self.distance()) ** -3
+        return per_pixel if larger.max() < 1.001 else per_pixel * larger
 
     def rms(self, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal") -> float:
         """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre (the central arcmin).
@@ -213,6 +232,7 @@ class MapProduct:
             ("pixel", f"{math.degrees(self.pixel) * 3600:.3g} arcsec"),
             ("pixels hit", int(hit.sum())),
             ("smoothed by", f"{math.degrees(self.smoothed_by) * 3600:.3g} arcsec" if self.smoothed_by else "nothing"),
+            ("resolution (FWHM)", f"{math.degrees(math.hypot(self.fwhm, self.smoothed_by)) * 3600:.3g} arcsec"),
             ("rms in the central arcmin", f"{self.rms():.3g} {self.unit}"),
         ]
         if self.half_difference is not None:

@@ -153,6 +153,8 @@ class Halves:
     def __init__(self, n_pixels: int) -> None:
         self.sums = untouched((2 * n_pixels, 4), np.int64).reshape(2, n_pixels, 4)
         self.scans: list[str] = []
+        self.rates: set[float] = set()
+        """Hz: of the scans."""
         self._largest = np.zeros(4)
         self._deepest = [0, 0]
 
@@ -161,6 +163,7 @@ class Halves:
         k = len(self.scans) % 2
         inside, deepest, dropped, largest = state.fold(self.sums[k])
         self.scans.append(observation.name)
+        self.rates.add(float(observation.sample_rate))
         self._note(k, deepest, largest)
         self._check(f"{label}, {observation.name}")
         return inside, dropped
@@ -172,7 +175,7 @@ class Halves:
     def packed(self) -> dict[str, Any]:
         """As plain values and arrays: numbers of the pixels with hits, and their sums."""
         used = [np.flatnonzero(half[:, HITS]) for half in self.sums]
-        found: dict[str, Any] = {"scans": list(self.scans), "largest": self._largest}
+        found: dict[str, Any] = {"scans": list(self.scans), "rates": sorted(self.rates), "largest": self._largest}
         for k, pixels in enumerate(used):
             found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k].take(pixels, axis=0)}
         return found
@@ -186,6 +189,7 @@ class Halves:
             self.sums[half][pixels] = merged
             self._note(half, int(merged[:, HITS].max(initial=0)), part["largest"])
         self.scans += part["scans"]
+        self.rates |= set(part["rates"])
         self._check(label)
 
     def _note(self, half: int, deepest: int, largest: Floats) -> None:

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from zonda.core.errors import OutputError
-from zonda.operators.diagnostics import pictures, plots
-from zonda.operators.diagnostics.plot_operators import Plots
+from zonda.operators.diagnostics import canvas, pictures
+from zonda.operators.diagnostics.plot_operators import Plots, _flat
 from zonda.operators.diagnostics.plots import map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
 from zonda.operators.diagnostics.png import png_of
 from zonda.operators.diagnostics.power_spectrum import Spectrum
@@ -160,7 +160,25 @@ def test_a_map_with_the_mean_emission_in_it_shows_its_variation(wcs):
     low, high = drawn(plot_map(values, wcs, limit=78.8)).images[0].get_clim()
     assert 78.59 < low < 78.61
     assert 78.79 < high < 78.81
-    assert drawn(plot_map(np.full((50, 60), 78.7), wcs)).images[0].get_clim() == (-78.7, 78.7)  # no variation at all
+    assert drawn(plot_map(np.full((50, 60), 78.7), wcs)).images[0].get_clim() == (0.0, 78.7)  # no variation at all
+
+
+def test_colours_diverge_only_about_zero(wcs):
+    """A sky of one sign has a scale from zero, however small its source; one about zero has white at zero."""
+    y, x = np.indices((50, 60))
+    blob = 1e-3 * np.exp(-((x - 30) ** 2 + (y - 25) ** 2) / 40)
+    noise = 1e-5 * np.random.default_rng(1).normal(size=blob.shape)  # far below a twentieth of the peak
+    for sky in (blob, blob + noise, np.where(blob == blob.max(), 1e-3, 0.0)):
+        image = drawn(plot_map(sky, wcs)).images[0]
+        assert image.cmap.name == "inferno"
+        assert image.get_clim()[0] == pytest.approx(0, abs=50)  # uK: noise alone lies below
+        image = drawn(plot_map(-sky, wcs)).images[0]
+        assert image.cmap.name == "Blues_r"
+        assert image.get_clim()[1] == pytest.approx(0, abs=50)
+        assert image.get_clim()[0] < -900
+    image = drawn(plot_map(blob - 3e-4, wcs)).images[0]
+    assert image.cmap.name == "RdBu_r"
+    assert image.get_clim()[0] == -image.get_clim()[1]
 
 
 def test_a_repeated_track_does_not_hide_the_first(make_observation):
@@ -306,7 +324,20 @@ def test_the_pixels_are_those_of_savefig(values, wcs):
 
 
 @pytest.mark.parametrize(
-    "picture", ["map", "polar map", "wide map", "spectra", "streams", "transfer function", "scan", "coverage"]
+    "picture",
+    [
+        "map",
+        "polar map",
+        "turned map",
+        "all-sky map",
+        "wide map",
+        "strip",
+        "spectra",
+        "streams",
+        "transfer function",
+        "scan",
+        "coverage",
+    ],
 )
 def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observation):
     """Margins are fixed: all that is drawn lies within the picture, and no two tick labels of an axis overlap."""
@@ -316,6 +347,12 @@ def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observa
     if picture == "polar map":
         wcs.wcs.crval = [75.0, -89.99]
         wcs.wcs.set()
+    if picture == "turned map":
+        wcs.wcs.pc = [[0.7, -0.7], [0.7, 0.7]]
+    if picture == "all-sky map":
+        wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crval = ["RA---AIT", "DEC--AIT"], [-5.0, 5.0], [75.0, 0.0]
+    if picture == "strip":
+        values = np.tile(values, (1, 20))
     if picture == "wide map":
         values = np.tile(values, (1, 5)) * 1e6
     edges = 1 / np.geomspace(400, 12, 13) / ARCSEC
@@ -326,11 +363,15 @@ def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observa
         "streams": lambda: plot_tod(replace(stream, streams={"signal": -1e3 + stream.streams["signal"]})),
         "transfer function": lambda: plot_transfer(Transfer(rings, edges, "sky", 9 * ARCSEC, "T", "map"), title="T"),
         "scan": lambda: plot_scan([make_observation(500)]),
-        "coverage": lambda: plot_coverage(hits, wcs),
+        "coverage": lambda: plot_coverage(hits, wcs, per_beam=0.3),
     }.get(picture, lambda: plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC))()
     canvas = FigureCanvasAgg(ax.figure)
     canvas.draw()
     width, height = canvas.get_width_height()
+    everything = [*ax.figure.axes, *(child for axes in ax.figure.axes for child in axes.child_axes)]
+    assert not any(
+        a.title.get_window_extent().overlaps(t.get_window_extent()) for a in everything for t in a.texts if a.get_title()
+    )
     for axes in ax.figure.axes:
         box = axes.get_tightbbox(canvas.get_renderer(), for_layout_only=True)
         assert min(box.x0, box.y0, width - box.x1, height - box.y1) >= 0, axes
@@ -339,14 +380,65 @@ def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observa
                 labels = [t.get_window_extent() for t in axis.get_ticklabels() if t.get_text()]
                 spans = sorted((b.intervalx if side == 0 else b.intervaly).tolist() for b in labels)
                 assert all(first[1] < second[0] for first, second in itertools.pairwise(spans)), axes
+            written = [t.get_window_extent() for t in axes.texts]
+            assert not any(a.overlaps(b) for a, b in itertools.combinations(written, 2)), [t.get_text() for t in axes.texts]
     assert "$" not in " ".join(t.get_text() for t in ax.figure.findobj(Text))
 
 
-def test_a_polar_map_has_astropys_axes(values, wcs):
-    wcs.wcs.crval = [75.0, 89.99]
-    wcs.wcs.set()
-    ax = drawn(plot_map(values, wcs))
-    assert ax.coords[0].get_axislabel() == "RA (ICRS)"
+def test_astropys_own_axes_can_be_drawn_on(values, wcs):
+    ax = Figure().add_subplot(projection=wcs)
+    plot_map(values, wcs, ax=ax)
+    assert drawn(ax).coords[0].get_axislabel() == "RA (ICRS)"
+
+
+@pytest.mark.parametrize(
+    ("shape", "stretched"), [((60, 1500), "Dec stretched 3.1×"), ((600, 40), "stretched 3.7×"), ((50, 200), "")]
+)
+def test_a_strip_fills_its_frame(shape, stretched, wcs):
+    """Its image is at least an inch high and wide, its colour bar beside the longer edge; the axes say if it is stretched."""
+    wcs.wcs.crpix = [shape[1] / 2, shape[0] / 2]
+    ax = drawn(plot_map(np.random.default_rng(1).normal(size=shape), wcs, title="A title that is longer than the strip is wide"))
+    box, whole = ax.get_window_extent(), ax.figure.bbox
+    assert min(box.width, box.height) >= ax.figure.dpi
+    assert max(box.width / whole.width, box.height / whole.height) > 0.75
+    assert stretched in ax.get_xlabel()
+    assert ("stretched" in ax.get_xlabel()) == bool(stretched)
+    bar = ax.bar_axes.get_window_extent()
+    assert (bar.width > bar.height) == (shape[1] > shape[0])
+    title = ax.title.get_window_extent()
+    assert 0 <= title.x0 < title.x1 <= whole.width
+
+
+def test_a_map_is_shown_where_it_has_samples(values, wcs):
+    """Pictures are cut to the samples, and stay in their place."""
+    hits = np.zeros(values.shape, int)
+    hits[30:40, 5:20] = 3
+    product = MapProduct(
+        values, hits, hits * 1.0, values, None, wcs.to_header(), centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=4 * ARCSEC, fwhm=9 * ARCSEC, sample_rate=50.0,
+    )  # fmt: skip
+    whole = _flat("map", product, "signal")
+    cut = whole.cropped()
+    assert cut.hits.shape == (12, 17)  # a hundredth of 15 pixels is one
+    np.testing.assert_array_equal(cut.planes["signal"], values[29:41, 4:21].astype(np.float32))
+    np.testing.assert_allclose(cut.axes.world(1, 1), whole.axes.world(5, 30), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(WCS(cut.header).wcs_pix2world(1, 1, 0), whole.axes.world(5, 30), rtol=0, atol=1e-9)
+
+
+def test_coverage_in_seconds_per_beam(wcs):
+    hits = np.arange(1, 3001).reshape(50, 60)
+    ax = drawn(plot_coverage(hits, wcs, per_beam=0.25))
+    np.testing.assert_allclose(np.ma.getdata(ax.images[0].get_array()), hits / 4)
+    bar = ax.images[0].colorbar.ax
+    assert bar.get_ylabel() == "integration time of all detectors [s per beam]"
+    (samples,) = bar.child_axes
+    FigureCanvasAgg(ax.figure).draw()
+    assert samples.get_ylabel() == "samples per pixel"
+    assert samples.get_ylim() == pytest.approx((0, 3000))
+    each = np.linspace(0.25, 0.3, 3000).reshape(50, 60)  # pixels of different size: no second scale can be true
+    ax = drawn(plot_coverage(hits, wcs, per_beam=each))
+    np.testing.assert_allclose(np.ma.getdata(ax.images[0].get_array()), hits * each, rtol=1e-6)
+    assert not ax.images[0].colorbar.ax.child_axes
 
 
 def test_many_scans_take_few_points(make_observation):
@@ -420,8 +512,23 @@ def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
     np.testing.assert_array_equal(flat.planes["signal"][y, x], hp.ang2pix(nside, lon, lat, lonlat=True))
     assert set(flat.planes["signal"][y, x]) == set(pixels)  # none is lost
     assert np.isnan(flat.planes["signal"][flat.planes["hits"] == 0]).all()
-    np.testing.assert_allclose(flat.wcs.pixel_to_world_values(149.5, 149.5), (266.0, -29.0), atol=1e-9)
+    ny, nx = flat.planes["hits"].shape
+    assert max(nx, ny) == 300
+    np.testing.assert_allclose(flat.wcs.pixel_to_world_values(nx / 2, ny / 2), (266.0, -29.0), atol=0.1)  # a pixel of the map
+    assert all(flat.planes["hits"].any(axis=axis)[[6, -7]].all() for axis in (0, 1))  # it reaches as far as the pixels
     assert flat.wcs.wcs.ctype[0].startswith("GLON")
+
+
+def test_a_healpix_map_of_half_the_sky_is_drawn():
+    import healpy as hp
+
+    from zonda.operators.io.map_view import MapView
+
+    pixels = np.sort(hp.query_disc(32, hp.ang2vec(10.0, -60.0, lonlat=True), np.radians(100.0)))
+    centre = (np.radians(10.0), np.radians(-60.0))
+    flat = MapView("map", {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, nside=32, pixels=pixels, centre=centre).flat(300)
+    assert set(flat.planes["signal"][flat.planes["hits"] > 0]) == set(pixels)
+    assert flat.wcs.wcs.ctype[0] == "RA---ZEA"
 
 
 def test_no_output_folder(data):
@@ -473,7 +580,7 @@ def test_the_legend_touches_no_line(picture, stream, make_observation):
 
 
 def test_maps_side_by_side_have_their_latitudes_written_once(values, wcs):
-    first, second = map_axes(values.shape, SkyAxes.of(wcs), wcs, 2)
+    first, second = map_axes(values.shape, SkyAxes.of(wcs), 2)
     for ax in (first, second):
         plot_map(values, SkyAxes.of(wcs), ax=ax)
     assert first.get_ylabel()
@@ -485,13 +592,13 @@ def test_maps_side_by_side_have_their_latitudes_written_once(values, wcs):
 
 def test_figures_made_ahead_have_the_same_pixels_and_are_used_once(values, wcs, spectrum, stream):
     def every():
-        sides = map_axes(values.shape, SkyAxes.of(wcs), wcs, 2)
+        sides = map_axes(values.shape, SkyAxes.of(wcs), 2)
         made = [plot_map(values, SkyAxes.of(wcs), fwhm=9 * ARCSEC), plot_spectra(spectrum), plot_tod(stream)]
         return [png_of(ax) for ax in [plot_map(values, SkyAxes.of(wcs), ax=sides[1]), *made]]
 
     plain = every()
     for count in (1, 1, 2, 4):
-        plots.lay_in(count)
+        canvas.lay_in(count)
     assert every() == plain
-    assert not any(plots._ready.values())
+    assert not any(canvas._ready.values())
     assert every() == plain

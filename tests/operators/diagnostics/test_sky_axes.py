@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.wcs import WCS
 
-from zonda.operators.diagnostics.sky_axes import SkyAxes, _label
+from zonda.operators.diagnostics.sky_axes import SkyAxes, label_of
 
 
 def made(projection, centre, scale, galactic=False, turned=0.0, pole=None):
@@ -72,13 +72,13 @@ def _degrees(text):
     return sign * unit * sum(float(f) / 60**k for k, f in enumerate(fields))
 
 
-def test_labels_have_the_digits_of_the_step():
-    assert _label(74.9999999999, 15 / 3600, True, True) == "5ʰ00ᵐ00ˢ"
-    assert _label(75.0, 15 * 0.05 / 3600, True, True) == "5ʰ00ᵐ00.00ˢ"
-    assert _label(359.99999999999, 15 * 5 / 60, True, True) == "0ʰ00ᵐ"
-    assert _label(-0.5, 0.25, False, False) == "−0°30′"
-    assert _label(-1e-14, 0.25, False, False) == "0°00′"
-    assert _label(-90.0, 30.0, True, False) == "270°"
+def testlabel_ofs_have_the_digits_of_the_step():
+    assert label_of(74.9999999999, 15 / 3600, True, True) == "5ʰ00ᵐ00ˢ"
+    assert label_of(75.0, 15 * 0.05 / 3600, True, True) == "5ʰ00ᵐ00.00ˢ"
+    assert label_of(359.99999999999, 15 * 5 / 60, True, True) == "0ʰ00ᵐ"
+    assert label_of(-0.5, 0.25, False, False) == "−0°30′"
+    assert label_of(-1e-14, 0.25, False, False) == "0°00′"
+    assert label_of(-90.0, 30.0, True, False) == "270°"
 
 
 def test_what_it_cannot_do_well_is_left_to_astropy():

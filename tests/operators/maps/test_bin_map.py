@@ -424,3 +424,50 @@ def test_noise_far_from_the_instruments(net):
     pixels = np.count_nonzero(seen)
     assert np.sum(found.weights[seen] * found.signal[seen] ** 2) == pytest.approx(pixels, abs=4 * np.sqrt(2 * pixels))
     assert found.weights.sum() * scene.instrument.sample_rate == pytest.approx(found.hits.sum() / steps[1].net ** 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("how", [{"pixel": "2 arcsec"}, {"pixel": "5 arcsec"}, {"nside": 8192}])
+@pytest.mark.parametrize("rate", [100.0, 37.0])
+def test_seconds_per_beam_add_up_to_what_the_detectors_observed(bench, how, rate):
+    """Summed over pixels, seconds per beam times pixels per beam are the detector-seconds of the scans, at the scans' own rate
+    (the camera's is 100 Hz), whatever the pixels."""
+    scans = [bench.observation(7, 1500, rate=rate, index=k) for k in range(2)]
+    scans[0].flags[:100] = 1  # what is not used is no integration time
+    product = bench.run([BinMap(**how)], scans, {"signal": np.zeros((7, 1500))}).map
+    area = healpy.nside2pixarea(how["nside"]) if "nside" in how else float(how["pixel"].split()[0]) ** 2 * ARCSEC**2
+    beam = np.pi / (4 * np.log(2)) * (8.5 * ARCSEC) ** 2
+    seconds = (product.hits * product.seconds_per_beam()).sum() * area / beam
+    assert seconds == pytest.approx(7 * (2 * 1500 - 100) / rate, rel=1e-12)
+
+
+def test_seconds_per_beam_of_smoothed_maps_are_those_of_the_telescopes_beam(bench):
+    plain, smooth = (
+        bench.run([BinMap(**how)], bench.observation(), {"signal": np.zeros((7, 3000))}).map for how in ({}, {"smooth": "beam"})
+    )
+    assert smooth.seconds_per_beam() == plain.seconds_per_beam()
+
+
+def test_seconds_per_beam_are_not_known_where_scans_have_different_rates(bench):
+    scans = [bench.observation(7, 1500, rate=r, index=k) for k, r in enumerate((100.0, 50.0))]
+    assert bench.run([BinMap()], scans, {"signal": np.zeros((7, 1500))}).map.seconds_per_beam() is None
+
+
+def test_pixels_far_from_the_centre_are_smaller_and_hold_less_of_a_beam():
+    """A pixel of a tangent plane at the distance c from the centre covers cos(c)^3 of the middle one's part of the sky."""
+    from astropy.wcs import WCS
+
+    from zonda.operators.maps.map_product import MapProduct
+
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [75.0, 20.0], [21, 21], [-1.0, 1.0]
+    none = np.zeros((41, 41))
+    product = MapProduct(
+        none, none.astype(int), none, none, None, wcs.to_header(), centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=np.radians(1.0), fwhm=np.radians(2.0), sample_rate=10.0,
+    )  # fmt: skip
+    x, y = np.array([[20, 40, 0, 33], [20, 20, 5, 40]], float)
+    corners = [np.radians(wcs.wcs_pix2world(x + a, y + b, 0)) for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+    d = [np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]) for lon, lat in corners]
+    area = np.linalg.norm(np.cross(d[2] - d[0], d[3] - d[1], axis=0), axis=0) / 2  # of the flat quadrilateral: 1e-4 less
+    beam = np.pi / (4 * np.log(2)) * np.radians(2.0) ** 2
+    np.testing.assert_allclose(product.seconds_per_beam()[y.astype(int), x.astype(int)], beam / area / 10.0, rtol=1e-3)
