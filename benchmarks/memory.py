@@ -17,6 +17,7 @@ import subprocess
 import sys
 import threading
 import time
+from importlib.resources import files
 from pathlib import Path
 
 SCENES = {
@@ -60,7 +61,7 @@ def peak_memory():
 def chain(scan_duration, method="mean", pixel="2 arcsec"):
     import zonda
 
-    cluster = Path(zonda.__file__).resolve().parents[1] / "pipelines" / "data" / "merging_cluster.fits"
+    cluster = files("zonda.pipelines") / "data" / "merging_cluster.fits"  # in an installed package and in this tree
     return zonda.Pipeline(
         [
             zonda.PointingDaisy(radius="4 arcmin", speed="50 arcsec/s", scan_duration=scan_duration),

@@ -21,6 +21,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 
 from zonda.core.compilation.compiled import one_blas_thread
@@ -114,7 +115,7 @@ def pipeline_of(name, short=False, **pointing):
     import zonda
 
     case = CASES[name]
-    cluster = Path(zonda.__file__).resolve().parents[1] / "pipelines" / "data" / "merging_cluster.fits"
+    cluster = files("zonda.pipelines") / "data" / "merging_cluster.fits"  # in an installed package and in this tree
     pointing = {**case.pointing, **pointing, **({"scan_duration": "10 s"} if short else {})}
     kinds = ["AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency", "HighpassFilter", "CommonModeFilter", "BinMap"]
     steps = [getattr(zonda, kind)(**case.steps.get(kind, {})) for kind in kinds]

@@ -24,12 +24,17 @@ from .errors import ZondaError
 if TYPE_CHECKING:
     from .configuration.pipeline_file import PipelineFile
 
+    _Integer = click.ParamType[int]
+    _Anything = click.ParamType[Any]
+else:
+    _Integer = _Anything = click.ParamType  # an older click's has no type of its values
+
 USER_ERROR, INTERRUPTED = 2, 130
 
 _UNITS = {"": 1, "B": 1, **{f"{p}{i}B": b ** (k + 1) for k, p in enumerate("KMGT") for i, b in (("", 1000), ("I", 1024))}}
 
 
-class Bytes(click.ParamType[int]):
+class Bytes(_Integer):
     """A size such as 4GB or 500MiB, in bytes."""
 
     name = "SIZE"
@@ -49,7 +54,7 @@ class Bytes(click.ParamType[int]):
         return int(size)
 
 
-class Share(click.ParamType[Any]):
+class Share(_Anything):
     """``3/8``, the third of eight shares, as (3, 8)."""
 
     name = "K/N"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from importlib.resources import files
 from typing import Any
 
 from common import case, cpu, peak, report
 
 import zonda
 
-CLUSTER = Path(zonda.__file__).resolve().parents[1] / "pipelines" / "data" / "merging_cluster.fits"
+CLUSTER = files("zonda.pipelines") / "data" / "merging_cluster.fits"  # in an installed package and in this tree
 
 
 def run(c: dict[str, Any]) -> dict[str, float]:

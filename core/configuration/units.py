@@ -213,7 +213,8 @@ class Unit:
             parsed = u.Unit(unit)
             if isinstance(parsed, u.StructuredUnit):  # "m, s"
                 raise ValueError("several units")
-        except (ValueError, TypeError) as err:
+            parsed.decompose()
+        except (ValueError, TypeError, OverflowError) as err:  # the last: km400, by an astropy before 7
             hint = re.search(r"Did you mean ([^?]*)\?", str(err))
             otherwise = f"did you mean {hint[1]}?" if hint else f"expected {self.kind.noun}, e.g. '{self.example}'"
             own = read_unit(self.unit)

@@ -21,7 +21,11 @@ def remade(tmp_path_factory):
 
 def test_the_shipped_map_is_what_the_module_makes(remade):
     with fits.open(SHIPPED) as old, fits.open(remade) as new:
-        assert old[0].header == new[0].header
+        before, after = dict(old[0].header), dict(new[0].header)
+        assert list(before) == list(after)
+        for key, value in before.items():
+            # a few operations in float64: other CPUs and libraries may round each otherwise
+            assert after[key] == (pytest.approx(value, rel=1e-14) if isinstance(value, float) else value), key
         # float32 of float64 sums: other CPUs may round the last bit or two otherwise
         np.testing.assert_allclose(old[0].data, new[0].data, rtol=1e-6, atol=1e-12)
     assert SHIPPED.stat().st_size < 2e6
