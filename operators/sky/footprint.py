@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.configuration.target import Target
-from zonda.core.errors import InputError
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import opened
 from zonda.core.storage.fits_image import read_image
 
-from .placement import placed
-from .read import WcsMap, _geometry, _is_healpix, is_plain_tan
+from .geometry import geometry, is_plain_tan
+from .healpix import is_healpix
+from .inputs import WcsMap
+from .placement import placed, turned
+from .planes import chosen
 
 Floats = NDArray[np.float64]
 
@@ -62,24 +64,28 @@ class Footprint:
         return Target.parse(f"{ra:.9f} deg {dec:.9f} deg")
 
 
-def footprint(path: Path, pixel_size: float | None, centre: Target | None) -> Footprint | None:
-    """Of the first image of a FITS file; None where it has no place of its own: HEALPix, or an image without a WCS.
+def footprint(path: Path, pixel_size: float | None, centre: Target | None, hdu: int | str | None = None) -> Footprint | None:
+    """Of an image of a FITS file; None where it has no place of its own: HEALPix, or an image without a WCS.
 
-    ``pixel_size`` [rad] and ``centre`` as `SkyMap` has them. Raises `InputError` as `read.read_map`.
+    ``pixel_size`` [rad], ``centre`` and ``hdu`` as `SkyMap` has them. Raises `InputError` as `read.read_map`.
     """
     place = f"sky map {path}"
-    header, shape = _header(path, place)
+    header, shape = _header(path, hdu, place)
     if header is None:
         return None
-    wcs, scale = _geometry(place, header, pixel_size, centre is not None, {})
+    wcs, scale = geometry(place, header, pixel_size, centre is not None, {})
+    turn = None
     if centre is not None:
-        empty = np.broadcast_to(np.float64(0.0), shape)
-        wcs = placed(WcsMap(empty, "K_RJ", wcs, scale), centre.icrs(), place)
+        image = WcsMap(np.broadcast_to(np.float64(0.0), shape), "K_RJ", wcs, scale)
+        if (moved := placed(image, centre.icrs())) is None:
+            turn = turned(image, centre.icrs(), place).turn
+        else:
+            wcs = moved
     if wcs is None:
         return None
     ny, nx = shape
     x, y = np.meshgrid(np.linspace(0, nx - 1, LATTICE), np.linspace(0, ny - 1, LATTICE))
-    to_icrs = wcs_frame_rotation(wcs).T
+    to_icrs = (wcs_frame_rotation(wcs) if turn is None else turn).T
     with reading(place, "FITS", "check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"):
         lon, lat = np.radians(wcs.wcs_pix2world([[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0).T)
     lon, lat = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
@@ -91,18 +97,16 @@ def footprint(path: Path, pixel_size: float | None, centre: Target | None) -> Fo
     return Footprint(centred, min(radius, np.pi), pixel_matrix(wcs) if is_plain_tan(wcs) else None, shape)
 
 
-def _header(path: Path, place: str) -> tuple[Any, tuple[int, int]]:
-    """Header and (ny, nx) of the first image; (None, (0, 0)): a HEALPix table."""
-    plain = read_image(path)
+def _header(path: Path, wanted: int | str | None, place: str) -> tuple[Any, tuple[int, int]]:
+    """Header and (ny, nx) of the first image, or of the extension ``wanted``; (None, (0, 0)): a HEALPix table."""
+    plain = read_image(path) if wanted in (None, 0) else None
     if plain is not None and plain[1].ndim == 2:
         return plain[0], (plain[1].shape[0], plain[1].shape[1])
     with opened(path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again") as hdus:
-        for hdu in hdus:
-            if _is_healpix(hdu):
-                return None, (0, 0)
-            if hdu.is_image and hdu.header.get("NAXIS", 0) > 0:
-                return hdu.header.copy(), (int(hdu.header.get("NAXIS2", 1)), int(hdu.header.get("NAXIS1", 1)))
-    raise InputError("holds no image and no HEALPix table", place=place, cure="give a FITS file with a two-dimensional image")
+        hdu, _ = chosen(hdus, wanted, place)
+        if is_healpix(hdu):
+            return None, (0, 0)
+        return hdu.header.copy(), (int(hdu.header.get("NAXIS2", 1)), int(hdu.header.get("NAXIS1", 1)))
 
 
 def off_the_map(found: Footprint, centre: tuple[float, float], label: str) -> str:

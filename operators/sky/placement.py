@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,16 +12,20 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.radiation import to_kelvin_rj
 
-from .read import HealpixMap, WcsMap, is_plain_tan, linear
-from .resample import pixel_areas
+from .geometry import is_plain_tan, linear
+from .inputs import HealpixMap, WcsMap
+from .resample import from_pixels, pixel_areas
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
 
 Floats = NDArray[np.float64]
 
+BRIGHT = 1e4
+"""K_RJ, averaged over a beam, above which a map's unit is doubted: the Sun has 6000 K."""
 
-def placed(image: WcsMap, centre: tuple[float, float] | None, place: str = "") -> Any:
+
+def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
     """The TAN `WCS` of an image, or None where it must be resampled (another projection, distortions).
 
     Parameters
@@ -29,16 +34,11 @@ def placed(image: WcsMap, centre: tuple[float, float] | None, place: str = "") -
         ICRS (ra, dec) [rad]: the image's centre, pixel ((nx + 1) / 2, (ny + 1) / 2) counted from 1, is put there and becomes
         the tangent point; scale and orientation with respect to north are kept. None: where the header puts it.
 
-    Raises InputError for a ``centre`` with another projection than TAN.
     """
-    if centre is None:
-        return image.wcs if image.wcs is not None and is_plain_tan(image.wcs) else None
     if image.wcs is not None and not is_plain_tan(image.wcs):
-        raise InputError(
-            f"centre cannot move a map in projection {', '.join(image.wcs.wcs.ctype)}",
-            place=place,
-            cure="remove centre, or give a TAN map",
-        )
+        return None
+    if centre is None:
+        return image.wcs
     from astropy.wcs import WCS
 
     rows, columns = image.values.shape
@@ -53,6 +53,31 @@ def placed(image: WcsMap, centre: tuple[float, float] | None, place: str = "") -
     wcs.wcs.crpix = [(columns + 1) / 2, (rows + 1) / 2]
     wcs.wcs.radesys = "ICRS"
     return linear(wcs, matrix)
+
+
+def turned(image: WcsMap, centre: tuple[float, float], place: str = "") -> WcsMap:
+    """An image of any projection with its centre at ``centre``, ICRS (ra, dec) [rad], and its north (of its own coordinates)
+    north there: the sphere is turned, so that the image keeps its shape.
+
+    Raises InputError where the image's centre is beyond its projection.
+    """
+    rows, columns = image.values.shape
+    lon, lat = (float(c) for c in from_pixels(image.wcs, np.array((columns - 1) / 2), np.array((rows - 1) / 2)))
+    if not np.isfinite([lon, lat]).all():
+        raise InputError(
+            f"the middle of the map is beyond its projection {', '.join(image.wcs.wcs.ctype)}",
+            place=place,
+            cure="remove centre, or cut the map",
+        )
+    return replace(image, turn=_axes(np.radians(lon), np.radians(lat)) @ _axes(*centre).T)
+
+
+def _axes(lon: float, lat: float) -> Floats:
+    """(3, 3) columns: the direction at (lon, lat), east and north there."""
+    towards = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+    east = [-np.sin(lon), np.cos(lon), 0.0]
+    north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
+    return np.array([towards, east, north]).T
 
 
 def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
@@ -74,8 +99,7 @@ def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: 
     Jy/pixel is divided by each pixel's own solid angle; one beyond the projection has none, and its flux is
     lost. Raises InputError as `core.numerics.radiation.to_kelvin_rj`.
     """
-    beam = source.beam_solid_angle if isinstance(source, WcsMap) else None
-    factor = to_kelvin_rj(source.unit, band, 1.0, spectral_index, beam)
+    factor = to_kelvin_rj(source.unit, band, 1.0, spectral_index, source.beam_solid_angle)
     if source.unit != "Jy/pixel":
         return source.values * factor, f"{factor:.6g} K_RJ per {source.unit}", 0
     areas: Floats
@@ -93,4 +117,14 @@ def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: 
         values,
         f"{typical:.6g} K_RJ per Jy/pixel at the median pixel, {float(np.nanmedian(areas)):.6g} sr",
         int(np.count_nonzero(source.values[~placed])),
+    )
+
+
+def too_bright(peak: float, conversion: str) -> str:
+    """What to say of a sky whose brightness in the beam is up to ``peak`` [K_RJ]; empty where that is possible."""
+    if peak <= BRIGHT:
+        return ""
+    return (
+        f"in the beam the sky is as bright as {peak:.3g} K_RJ, and the Sun has 6000 K; is the map's unit right ({conversion}), "
+        "or are its pixels counts? `unit` replaces the header's, `scale` multiplies the map"
     )

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.numerics.projection import pixel_matrix
+from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 
-from .read import HealpixMap, WcsMap
+from .inputs import HealpixMap, WcsMap
 
 Floats = NDArray[np.float64]
 
@@ -67,11 +68,9 @@ def resample_image(image: WcsMap, target: Any) -> tuple[Floats, NDArray[np.bool_
 
     A cylindrical map that goes round the sky is joined at its seam.
     """
-    from astropy.coordinates import SkyCoord
-    from astropy.wcs.utils import wcs_to_celestial_frame
     from scipy.ndimage import map_coordinates, spline_filter
 
-    frame = wcs_to_celestial_frame(image.wcs)
+    coordinates = _coordinates(image)
     rows, columns = image.values.shape
     period = _period(image.wcs)
     wrap = 12 if period and abs(columns - period) < 0.5 else 0
@@ -82,8 +81,7 @@ def resample_image(image: WcsMap, target: Any) -> tuple[Floats, NDArray[np.bool_
     for first in range(0, ny, ROWS):
         last = min(first + ROWS, ny)
         d = directions(target, first, last)
-        sky = SkyCoord(*np.moveaxis(d, 2, 0), representation_type="cartesian", frame="icrs").transform_to(frame).spherical
-        x, y = _to_pixels(image.wcs, sky.lon.deg, sky.lat.deg)
+        x, y = _to_pixels(image.wcs, *coordinates(d))
         if period:
             x = (x + 0.5) % period - 0.5
         inside = (x >= -0.5) & (x < columns - 0.5) & (y >= -0.5) & (y < rows - 0.5)
@@ -91,6 +89,31 @@ def resample_image(image: WcsMap, target: Any) -> tuple[Floats, NDArray[np.bool_
         values[first:last] = np.where(inside, map_coordinates(coefficients, at, order=3, prefilter=False, mode="mirror"), 0.0)
         covered[first:last] = inside
     return values, covered
+
+
+def _coordinates(image: WcsMap) -> Callable[[Floats], tuple[Floats, Floats]]:
+    """From ICRS directions (..., 3) to the (lon, lat) [deg] in the frame of the image's WCS at which it is looked up."""
+    turn = image.turn
+    if turn is None:
+        try:
+            turn = wcs_frame_rotation(image.wcs)
+        except InputError:  # FK4 is no rotation of ICRS
+            return lambda d: _by_astropy(image.wcs, d)
+
+    def found(d: Floats) -> tuple[Floats, Floats]:
+        x, y, z = np.moveaxis(d @ turn.T, -1, 0)
+        return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+
+    return found
+
+
+def _by_astropy(wcs: Any, d: Floats) -> tuple[Floats, Floats]:
+    from astropy.coordinates import SkyCoord
+    from astropy.wcs.utils import wcs_to_celestial_frame
+
+    frame = wcs_to_celestial_frame(wcs)
+    sky = SkyCoord(*np.moveaxis(d, -1, 0), representation_type="cartesian", frame="icrs").transform_to(frame).spherical
+    return np.asarray(sky.lon.deg), np.asarray(sky.lat.deg)
 
 
 def _to_pixels(wcs: Any, lon: Floats, lat: Floats) -> tuple[Floats, Floats]:
@@ -120,7 +143,7 @@ def pixel_areas(wcs: Any, shape: tuple[int, int]) -> Floats:
         y, x = np.mgrid[first:last, 0:columns].astype(np.float64)
 
         def ray(dx: float, dy: float, x: Floats = x, y: Floats = y) -> Floats:
-            lon, lat = (np.radians(c) for c in _from_pixels(wcs, x + dx, y + dy))
+            lon, lat = (np.radians(c) for c in from_pixels(wcs, x + dx, y + dy))
             return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=2)
 
         h = 0.25
@@ -129,7 +152,8 @@ def pixel_areas(wcs: Any, shape: tuple[int, int]) -> Floats:
     return areas
 
 
-def _from_pixels(wcs: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+def from_pixels(wcs: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Native (lon, lat) [deg] of 0-based pixels; NaN beyond the projection."""
     pair = wcs.all_pix2world(x, y, 0)
     lon, lat = pair if wcs.wcs.lng == 0 else pair[::-1]
     return np.asarray(lon), np.asarray(lat)
@@ -156,11 +180,12 @@ def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.b
     middle /= np.linalg.norm(middle)
     reach = float(np.arccos(np.clip((corners @ middle).min(), -1, 1))) + 6 * pixel
     near = healpy.query_disc(sky.nside, to_frame @ middle, min(reach, np.pi), nest=sky.nest)
-    slot = np.flatnonzero(np.isin(sky.pixels, near, assume_unique=True))
+    slot = near if sky.pixels is None else np.flatnonzero(np.isin(sky.pixels, near, assume_unique=True))
     values, covered, poor = np.zeros((ny, nx)), np.zeros((ny, nx), bool), 0
     if len(slot) < NEIGHBOURS:
         return values, covered, poor
-    rays = np.stack(healpy.pix2vec(sky.nside, sky.pixels[slot], nest=sky.nest), axis=1) @ to_frame
+    numbers = slot if sky.pixels is None else sky.pixels[slot]
+    rays = np.stack(healpy.pix2vec(sky.nside, numbers, nest=sky.nest), axis=1) @ to_frame
     projected = rays @ matrix.T
     front = projected[:, 2] > 0
     slot, points = slot[front], projected[front, :2] / projected[front, 2:]
@@ -169,8 +194,9 @@ def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.b
         last = min(first + ROWS, ny)
         d = (directions(target, first, last) @ to_frame.T).reshape(-1, 3)
         own = healpy.vec2pix(sky.nside, *d.T, nest=sky.nest)
-        k = np.minimum(np.searchsorted(sky.pixels, own), len(sky.pixels) - 1)
-        seen = sky.pixels[k] == own
+        seen = np.ones(len(own), bool)
+        if sky.pixels is not None:
+            seen = sky.pixels[np.minimum(np.searchsorted(sky.pixels, own), len(sky.pixels) - 1)] == own
         y, x = np.mgrid[first:last, 0:nx].astype(np.float64)
         at = np.stack([x.ravel(), y.ravel()], axis=1)[seen]
         flat = np.zeros(len(seen))

@@ -6,7 +6,7 @@ import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -28,9 +28,10 @@ from zonda.core.storage.fits_image import Cards
 from ..maps.image import Image
 from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct
 from .footprint import Footprint, footprint, off_the_map, position
+from .inputs import HealpixMap, WcsMap
 from .linear import sample_linear
-from .placement import kelvin, placed
-from .read import HealpixMap, WcsMap, read_map
+from .placement import kelvin, placed, too_bright, turned
+from .read import read_map
 from .resample import resample_healpix, resample_image, tangent_wcs
 from .sampling import Chunks, pointing, sample
 from .stokes import STOKES
@@ -76,6 +77,14 @@ class SkyMap(Operator):
     """Side of a pixel; replaces the header's scale (its orientation is kept). Default: the header's."""
     centre: Target | Literal["target"] | None = None
     """Put the map's centre here: a position fixed on the sky, or `target` for the scan's. Default: where its header says."""
+    input_beam: Angle | None = Field(None, gt=0)
+    """Full width at half maximum of the beam that a map in Jy/beam was made with. Default: its header's BMAJ and BMIN."""
+    coordsys: Literal["icrs", "galactic", "ecliptic"] | None = None
+    """Coordinates of a HEALPix map. Default: its header's COORDSYS."""
+    plane: int | tuple[int, ...] | None = None
+    """Plane of a cube, counted from 1; of several further axes a list: [12, 1]. Default: the only one, or Stokes I."""
+    hdu: int | str | None = None
+    """Extension of the file by number (0: the primary one) or name. Default: the first image or HEALPix table."""
     beam: Literal["gaussian", "none"] = "gaussian"
     """Shape of the main beam; `none` for a map that is convolved already."""
     fwhm: Angle | None = Field(None, gt=0)
@@ -118,7 +127,7 @@ class SkyMap(Operator):
         return found
 
     def _footprint(self) -> Footprint | None:
-        return footprint(self.file, self.pixel_size, self.centre if isinstance(self.centre, Target) else None)
+        return footprint(self.file, self.pixel_size, self.centre if isinstance(self.centre, Target) else None, self.hdu)
 
     def check(self, data: Data) -> list[str]:
         """Whether the scans are about a point of the map, by its header."""
@@ -242,10 +251,12 @@ class SkyMap(Operator):
         bandwise = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
         if isinstance(source, WcsMap):
             centre = self._centre(observation, source)
-            wcs = placed(source, centre, place)
+            wcs = placed(source, centre)
             if wcs is not None:
                 there = (*bandwise, "image", tuple(wcs.wcs.crval))
                 return cast(Sky, self._memory.get(there, lambda: self._direct(source, wcs, band, there)))
+            if centre is not None:
+                source, bandwise = turned(source, centre, place), (*bandwise, centre)
         ra, dec = observation.centre
         radius = _reach(observation) + REACH * SIGMA * widest
         pixel = _pixel(source)
@@ -257,10 +268,15 @@ class SkyMap(Operator):
         wcs = tangent_wcs(ra, dec, radius, step, place)
         return cast(Sky, self._memory.get(key, lambda: self._resampled(source, wcs, band, key)))
 
+    @property
+    def wanted(self) -> dict[str, Any]:
+        """Attributes of `inputs.Wanted`."""
+        plane = (self.plane,) if isinstance(self.plane, int) else self.plane
+        names = ("unit", "pixel_size", "missing", "input_beam", "coordsys", "hdu")
+        return {"centred": self.centre is not None, "plane": plane} | {name: getattr(self, name) for name in names}
+
     def _read(self) -> WcsMap | HealpixMap:
-        source = read_map(
-            self.file, unit=self.unit, pixel_size=self.pixel_size, centred=self.centre is not None, missing=self.missing
-        )
+        source = read_map(self.file, **self.wanted)
         if STOKES in source.notes:
             warnings.warn(f"{self.label}: {self.file}: {source.notes[STOKES]}", stacklevel=2)
         return source
@@ -284,11 +300,11 @@ class SkyMap(Operator):
         values, factor, lost = kelvin(source, band, self.spectral_index, None)
         if isinstance(source, HealpixMap):
             kind = f"HEALPix of nside {source.nside}"
-            scaled: WcsMap | HealpixMap = HealpixMap(values, source.pixels, source.nside, source.nest, source.frame, "K_RJ")
+            scaled: WcsMap | HealpixMap = replace(source, values=values, unit="K_RJ")
             grid, covered, poor = resample_healpix(cast(HealpixMap, scaled), wcs)
         else:
             kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
-            grid, covered = resample_image(WcsMap(values, "K_RJ", source.wcs, None), wcs)
+            grid, covered = resample_image(replace(source, values=values, unit="K_RJ"), wcs)
             poor = 0
         step = abs(float(wcs.wcs.cdelt[1])) * 3600
         notes = {
@@ -306,6 +322,8 @@ class SkyMap(Operator):
         jacobian = np.radians(np.asarray(sky.wcs.pixel_scale_matrix, np.float64))
         linear = self.interpolation == "linear"
         convolved = convolve(sky.values, jacobian, fwhm, self.outside, self.pixels_per_fwhm, linear)
+        if text := too_bright(float(np.abs(convolved.coefficients["float64"]).max(initial=0.0)), sky.notes["conversion"]):
+            warnings.warn(f"{self.label}: {self.file}: {text}", stacklevel=2)
         return Beam(convolved, convolved.to_grid @ pixel_matrix(sky.wcs), _on_grid(sky.covered, convolved))
 
 

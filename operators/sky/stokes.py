@@ -41,43 +41,34 @@ def of_columns(names: Sequence[str], read: int, place: str) -> dict[str, str]:
 def of_extensions(read: str, names: Sequence[str], place: str) -> dict[str, str]:
     """The note about a file's image ``read``, beside which there are others called ``names``. Raises as `of_columns`."""
     if is_polarized(read):
-        raise InputError(f"its first image, {read}, is no intensity", place=place, cure="put the image of I first")
+        raise InputError(
+            f"its first image, {read}, is no intensity",
+            place=place,
+            cure="put the image of I first, or name it by the operator's parameter hdu",
+        )
     unused = [name for name in names if is_polarized(name)]
     return {STOKES: f"the first image{f', {read},' if read else ''} is read as I; {_not_used(unused)}"} if unused else {}
 
 
-def plane_of_cube(header: Any, shape: Sequence[int], place: str) -> tuple[tuple[int, ...], dict[str, str]]:
-    """Index of the plane of I among the axes before the last two, and the note about the others.
-
-    Parameters
-    ----------
-    shape
-        Of the image, slowest axis first.
+def plane(header: Any, axis: int, length: int, wanted: int | None, place: str) -> tuple[int, dict[str, str]]:
+    """Number of the plane of I, or of the one that is ``wanted``, along the FITS axis STOKES; the note about the others.
 
     Raises
     ------
     InputError
-        A cube that has no axis STOKES, or no I on it.
+        There is no I on the axis.
     """
-    index, notes = [], {}
-    for k, length in enumerate(shape[:-2]):
-        axis = len(shape) - k  # FITS counts from the fastest
-        if str(header.get(f"CTYPE{axis}", "")).strip().upper() != "STOKES":
-            if length > 1:
-                sides = " x ".join(str(n) for n in reversed(shape))
-                cure = "extract one two-dimensional plane of it, or set CTYPE3 to STOKES if its planes are I, Q, U"
-                raise InputError(f"the image is a cube of {sides} pixels", place=place, cure=cure)
-            index.append(0)
-            continue
-        first, step, pixel = (float(header.get(f"{key}{axis}", 1.0)) for key in ("CRVAL", "CDELT", "CRPIX"))
-        found = [_NAMES.get(round(first + (n + 1 - pixel) * step), "a correlation") for n in range(length)]
-        if "I" not in found:
-            message = f"its axis STOKES has {', '.join(found)} and no I"
-            raise InputError(message, place=place, cure=f"give a map of I, or correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}")
-        index.append(found.index("I"))
-        if unused := [name for name in found if name != "I"]:
-            notes[STOKES] = f"plane {found.index('I') + 1} of {length} is read, I; {_not_used(unused)}"
-    return tuple(index), notes
+    first, step, pixel = (float(header.get(f"{key}{axis}", 1.0)) for key in ("CRVAL", "CDELT", "CRPIX"))
+    found = [_NAMES.get(round(first + (n + 1 - pixel) * step), "a correlation") for n in range(length)]
+    if "I" not in found and wanted is None:
+        message = f"its axis STOKES has {', '.join(found)} and no I"
+        raise InputError(message, place=place, cure=f"give a map of I, or correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}")
+    number = found.index("I") + 1 if wanted is None else wanted
+    unused = [name for k, name in enumerate(found, 1) if k != number]
+    if not unused:
+        return number, {}
+    as_what = found[number - 1] + ("" if found[number - 1] == "I" else " as I")
+    return number, {STOKES: f"plane {number} of {length} is read, {as_what}; {_not_used(unused)}"}
 
 
 def _not_used(names: Sequence[str]) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -71,6 +72,14 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if unit == "K":
             image.header["TEMPSCAL"] = "K_RJ"
         image.writeto(folder / f"{name}.fits")
+    header = fits.getheader(folder / "map.fits")
+    fits.PrimaryHDU(np.array([values, values**2]), header).writeto(folder / "cube.fits")
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(values, header), fits.ImageHDU(values**2, header, "SECOND")]).writeto(
+        folder / "two.fits"
+    )
+    header["BUNIT"] = "Jy/beam"
+    fits.PrimaryHDU(values, header).writeto(folder / "beam.fits")
+    healpy.write_map(folder / "sphere.fits", np.arange(12.0 * 64**2), coord="C", column_units="uK_CMB", dtype=np.float64)
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
     seen = Data(scene())
     operators.get("PointingStare")(scan_duration="1 s").observe(seen)
@@ -180,6 +189,10 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "unit": ({}, {"unit": "mK_CMB"}),
         "pixel_size": ({}, {"pixel_size": "4 arcsec"}),
         "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
+        "input_beam": ({"file": "beam.fits", "input_beam": "9 arcsec"}, {"input_beam": "12 arcsec"}),
+        "coordsys": ({"file": "sphere.fits"}, {"coordsys": "galactic"}),
+        "plane": ({"file": "cube.fits", "plane": 1}, {"plane": 2}),
+        "hdu": ({"file": "two.fits"}, {"hdu": "second"}),
         "beam": ({}, {"beam": "none"}),
         "fwhm": ({}, {"fwhm": "12 arcsec"}),
         "outside": ({"pixel_size": "1 arcsec"}, {"outside": "1 K"}),

@@ -70,3 +70,16 @@ def test_what_has_no_place_of_its_own_has_no_footprint(tmp_path):
     assert footprint(tmp_path / "h.fits", None, None) is None
     fits.PrimaryHDU(np.zeros((3, 3)), fits.Header({"BUNIT": "K_RJ"})).writeto(tmp_path / "p.fits")
     assert footprint(tmp_path / "p.fits", 1e-5, None) is None
+
+
+def test_a_moved_map_of_another_projection_and_an_extension(tmp_path):
+    """The whole footprint moves with its centre; an extension is found by its name."""
+    write(tmp_path / "m.fits", ("RA---SIN", "DEC--SIN"), (30.0, 20.0))
+    with fits.open(tmp_path / "m.fits") as hdus:
+        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.zeros(4)), fits.ImageHDU(hdus[0].data, hdus[0].header, "MAP")]).writeto(
+            tmp_path / "e.fits"
+        )
+    still = footprint(tmp_path / "e.fits", None, None, "MAP")
+    moved = footprint(tmp_path / "e.fits", None, Target.parse("260 deg -10 deg"), "MAP")
+    np.testing.assert_allclose(np.degrees(moved.target.icrs()), [260.0, -10.0], atol=1e-8)
+    np.testing.assert_allclose(moved.radius, still.radius, rtol=1e-6)

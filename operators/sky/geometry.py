@@ -1,0 +1,159 @@
+"""Where the pixels of an image lie, by its header: the WCS, or pixels of a known size."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.numerics import tangent
+from zonda.core.storage.files import first_line
+
+Floats = NDArray[np.float64]
+
+_ANGLES = {
+    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
+    **dict.fromkeys(("arcmin", "arcminute", "arcminutes"), "arcmin"),
+    **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", "asec"), "arcsec"),
+    "mas": "mas",
+}
+_IN_RADIANS = {"deg": np.pi / 180, "rad": 1.0, "arcmin": np.pi / 10800, "arcsec": np.pi / 648000, "mas": np.pi / 648e6}
+
+
+def geometry(
+    place: str, header: Any, pixel_size: float | None, centred: bool, notes: dict[str, str]
+) -> tuple[Any, Floats | None]:
+    """(wcs, scale) of `WcsMap`, or the error that says what is missing."""
+    header = header.copy()
+    for key in ("CUNIT1", "CUNIT2"):
+        text = str(header.get(key, "") or "").strip()
+        if text and text.lower() in _ANGLES:
+            header[key] = _ANGLES[text.lower()]
+        elif text and _celestial(header, key[-1]):
+            raise InputError(f"{key} = '{text}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'")
+    scaled = _has_scale(header)
+    if not scaled and pixel_size is None:
+        raise InputError(
+            "the pixel size is missing",
+            place=place,
+            cure="set the header keys CDELT1, CDELT2 and CUNIT1, CUNIT2 ('deg' or 'rad'), or the operator's parameter "
+            "pixel_size: 1 arcsec",
+        )
+    if not all(_celestial(header, axis) for axis in "12"):
+        if pixel_size is None and not header.get("CUNIT1"):
+            raise InputError(
+                "the unit of the pixel size is missing",
+                place=place,
+                cure="set the header keys CUNIT1 and CUNIT2 ('deg' or 'rad'), or the operator's parameter pixel_size: 1 arcsec",
+            )
+        if pixel_size is None and not centred:
+            raise _no_position(place, "CTYPE1, CTYPE2, CRVAL1, CRVAL2, CRPIX1, CRPIX2")
+        notes["position"] = "the file has no WCS: its centre is put on the target, its first axis runs west, its second north"
+        return None, _plain_scale(place, header, scaled, pixel_size)
+    kinds = {str(header[f"CTYPE{axis}"]).upper()[:4] for axis in "12"}
+    if kinds == {"GLON", "GLAT"}:
+        for key in ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH"):  # they are for equatorial axes; astropy would take ICRS
+            if key in header:
+                del header[key]
+    elif kinds != {"RA--", "DEC-"}:
+        raise InputError(
+            f"the axes {header['CTYPE1']}, {header['CTYPE2']} are neither equatorial nor Galactic",
+            place=place,
+            cure="give a map in ICRS, FK5, FK4 or Galactic coordinates",
+        )
+    absent = [k for k in ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2") if k not in header]
+    if absent and not centred:
+        raise _no_position(place, ", ".join(absent))
+    try:
+        wcs = tangent.plain(header)
+        if wcs is None:
+            from astropy.wcs import WCS
+
+            wcs = WCS(header, naxis=2)
+            wcs.wcs.set()
+        matrix = np.asarray(wcs.pixel_scale_matrix)
+    except Exception as err:  # wcslib has a dozen exception classes of its own
+        raise InputError(
+            f"the WCS is broken: {first_line(err)}", place=place, cure="check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"
+        ) from err
+    if not np.isfinite([*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]).all() or np.linalg.det(matrix) == 0.0:
+        raise InputError("the WCS is singular: its pixels have no area", place=place, cure="check CDELT1, CDELT2, PC and CD")
+    if pixel_size is None:
+        return wcs, None
+    if not is_plain_tan(wcs):
+        raise InputError(
+            f"pixel_size cannot replace the scale of a map in projection {', '.join(wcs.wcs.ctype)}",
+            place=place,
+            cure="remove pixel_size, or give a TAN map",
+        )
+    notes["pixel size"] = f"{np.degrees(pixel_size) * 3600:g} arcsec as given; the header's scale is overridden"
+    cd = matrix if scaled else np.diag([-1.0, 1.0])
+    return linear(wcs, cd / np.linalg.norm(cd, axis=0) * np.degrees(pixel_size)), None
+
+
+def linear(wcs: Any, matrix: Floats) -> Any:
+    """A copy of a plain TAN ``wcs`` with the pixel scale matrix (2, 2) [deg], whether it had CD, PC, CDELT or CROTA."""
+    from astropy.wcs import WCS
+
+    made = WCS(naxis=2)
+    for key in ("ctype", "crval", "crpix", "radesys", "equinox", "lonpole", "latpole"):
+        setattr(made.wcs, key, getattr(wcs.wcs, key))
+    made.wcs.cdelt = [1.0, 1.0]
+    made.wcs.pc = matrix
+    made.wcs.set()
+    return made
+
+
+def is_celestial(ctype: str) -> bool:
+    """Whether an axis of this CTYPE is a longitude or a latitude on the sky."""
+    return re.match(r"(RA--|DEC-|[GESH]L(ON|AT)|HP(LN|LT)|[A-Z]{2}L[NT])", ctype.upper()) is not None
+
+
+def _celestial(header: Any, axis: str) -> bool:
+    return is_celestial(str(header.get(f"CTYPE{axis}", "")))
+
+
+def _has_scale(header: Any) -> bool:
+    cd = any(f"CD{i}_{j}" in header for i in (1, 2) for j in (1, 2))
+    return cd or all(f"CDELT{k}" in header for k in (1, 2))
+
+
+def _no_position(place: str, keys: str) -> InputError:
+    return InputError(
+        "the map has no world coordinates, so its position on the sky is unknown",
+        place=place,
+        cure=f"set the header keys {keys}, or the operator's parameter centre (a position, or 'target')",
+    )
+
+
+def _plain_scale(place: str, header: Any, scaled: bool, pixel_size: float | None) -> Floats:
+    """(2, 2) rad for a map without celestial axes: the first axis runs west whatever the sign of its CDELT."""
+    if pixel_size is not None:
+        return np.diag([-pixel_size, pixel_size])
+    sizes = []
+    for k in (1, 2):
+        unit = _IN_RADIANS[str(header.get(f"CUNIT{k}") or header.get("CUNIT1"))]
+        step = header.get(f"CDELT{k}")
+        if step is None:
+            step = np.hypot(header.get(f"CD1_{k}", 0.0), header.get(f"CD2_{k}", 0.0))
+        sizes.append(abs(float(step)) * unit)
+    if not all(np.isfinite(s) and s > 0 for s in sizes):
+        raise InputError("the pixel size is zero or not finite", place=place, cure="check CDELT1 and CDELT2")
+    return np.diag([-sizes[0], sizes[1]])
+
+
+def is_plain_tan(wcs: Any) -> bool:
+    """True for a gnomonic projection without distortions, which needs no resampling; in a frame that is a rotation of ICRS."""
+    from zonda.core.numerics.projection import wcs_frame_rotation
+
+    if not all(str(c).endswith("-TAN") for c in wcs.wcs.ctype) or wcs.has_distortion or len(wcs.wcs.get_pv()):
+        return False
+    try:
+        wcs_frame_rotation(wcs)
+    except InputError:
+        return False
+    return True

@@ -1,0 +1,119 @@
+"""HEALPix maps in FITS tables, whole or of some pixels only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+
+from . import stokes
+from .inputs import Floats, Frame, HealpixMap, Wanted
+from .units import beam_solid_angle, filled, unit_of
+
+_FRAMES: dict[str, Frame] = {
+    **dict.fromkeys(("C", "Q", "EQ", "ICRS", "CELESTIAL", "EQUATORIAL"), "icrs"),
+    **dict.fromkeys(("G", "GALACTIC"), "galactic"),
+    **dict.fromkeys(("E", "ECLIPTIC"), "barycentricmeanecliptic"),
+}
+
+
+def is_healpix(hdu: Any) -> bool:
+    """Whether an HDU is a table of HEALPix pixels."""
+    header = hdu.header
+    return header.get("XTENSION") == "BINTABLE" and (
+        str(header.get("PIXTYPE", "")).upper() == "HEALPIX" or ("NSIDE" in header and "ORDERING" in header)
+    )
+
+
+def read_healpix(hdu: Any, place: str, wanted: Wanted) -> HealpixMap:
+    """The first map of a table; of Stokes parameters I. Raises InputError as `read.read_map`."""
+    header = hdu.header
+    _check_wanted(place, wanted)
+    nested = _ordering(place, header)
+    notes: dict[str, str] = {}
+    frame = _frame(place, header, wanted, notes)
+    names = hdu.columns.names
+    explicit = names[0].upper() in ("PIXEL", "PIXELS", "PIX", "INDEX")
+    notes |= stokes.of_columns(names, int(explicit), place)
+    unit, factor = unit_of(place, header, f"TUNIT{1 + int(explicit)}", wanted.unit, notes)
+    beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
+    values = np.array(hdu.data.field(int(explicit)), np.float64).ravel()
+    pixels = np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else None
+    nside = _nside(place, header, nested, len(values), pixels)
+    if pixels is not None:
+        order = np.argsort(pixels, kind="stable")
+        pixels, values = pixels[order], values[order]
+        if len(pixels) and (pixels[0] < 0 or pixels[-1] >= 12 * nside * nside or (np.diff(pixels) == 0).any()):
+            raise InputError(
+                "the pixel numbers are out of range or twice there", place=place, cure="check NSIDE and the PIXEL column"
+            )
+    pixels, values = _seen(pixels, values)
+    zeroed = filled(place, values, wanted.missing, "entry {} of those that are seen (counted from 1)")
+    values *= factor
+    return HealpixMap(values, pixels, nside, nested, frame, unit, beam, notes, zeroed)
+
+
+def _check_wanted(place: str, wanted: Wanted) -> None:
+    given = {"centre": wanted.centred, "pixel_size": wanted.pixel_size is not None, "plane": wanted.plane is not None}
+    for name in (n for n, is_given in given.items() if is_given):
+        raise InputError(f"{name} does not apply to a HEALPix map", place=place, cure=f"remove {name}")
+
+
+def _ordering(place: str, header: Any) -> bool:
+    """Whether the pixels are numbered in the nested scheme."""
+    ordering = str(header.get("ORDERING", "")).strip().upper()
+    if ordering == "NUNIQ":
+        raise InputError(
+            "multi-order HEALPix maps (ORDERING = NUNIQ) are not read",
+            place=place,
+            cure="flatten it to one resolution, e.g. with ligo-skymap-flatten",
+        )
+    if not ordering.startswith(("RING", "NEST")):
+        raise InputError(
+            "the ordering of the HEALPix map is missing", place=place, cure="set the header key ORDERING to RING or NESTED"
+        )
+    return ordering.startswith("NEST")
+
+
+def _frame(place: str, header: Any, wanted: Wanted, notes: dict[str, str]) -> Frame:
+    written = str(header.get("COORDSYS", "")).strip().upper()
+    system = written if wanted.coordsys is None else wanted.coordsys.upper()
+    if system not in _FRAMES:
+        raise InputError(
+            f"the coordinate system of the HEALPix map is {f'unknown: COORDSYS = {written!r}' if written else 'missing'}",
+            place=place,
+            cure="set the header key COORDSYS to C (ICRS), G or E, or the operator's parameter coordsys to icrs, galactic or "
+            "ecliptic (WMAP's and Planck's maps are galactic)",
+        )
+    if wanted.coordsys is not None and _FRAMES.get(written, _FRAMES[system]) != _FRAMES[system]:
+        notes["coordinates"] = f"{wanted.coordsys} as given; COORDSYS = '{written}' is overridden"
+    return _FRAMES[system]
+
+
+def _nside(place: str, header: Any, nested: bool, n_values: int, pixels: Any) -> int:
+    import healpy
+
+    if pixels is not None:
+        nside = int(header.get("NSIDE", 0))
+    else:
+        nside = round((n_values / 12) ** 0.5)
+        if 12 * nside * nside != n_values:
+            raise InputError(f"{n_values} values are no HEALPix map", place=place, cure="a full map has 12 nside^2 of them")
+    if nside < 1 or not healpy.isnsideok(nside, nest=nested):
+        raise InputError(f"NSIDE = {nside} is not valid", place=place, cure="set the header key NSIDE")
+    return nside
+
+
+def _seen(pixels: NDArray[np.int64] | None, values: Floats) -> tuple[NDArray[np.int64] | None, Floats]:
+    """The pixels that are not marked as unseen; None as pixels: all."""
+    import healpy
+
+    unseen = healpy.mask_bad(values) if len(values) else np.zeros(0, bool)
+    unseen &= np.isfinite(values)
+    if not unseen.any():
+        return pixels, values
+    seen = ~unseen
+    return (np.flatnonzero(seen) if pixels is None else pixels[seen]), values[seen]

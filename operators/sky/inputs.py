@@ -1,0 +1,108 @@
+"""What is read of a sky map's file: an image or a HEALPix map; and what the user says of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
+"""Names of frames as astropy has them."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user says of a file.
+
+    Attributes
+    ----------
+    unit
+        Unit of the pixels; None: the header's BUNIT (TUNIT1 of a HEALPix table).
+    pixel_size
+        rad; replaces the header's scale, its orientation (signs, rotation) is kept.
+    centred
+        True where the caller says where the map's centre lies: then the header's position is not needed.
+    missing
+        What a NaN or infinite pixel does: an error, or it becomes zero.
+    input_beam
+        FWHM [rad] of the beam of a map in Jy/beam; None: the header's BMAJ and BMIN.
+    coordsys
+        Coordinates of a HEALPix map; None: the header's COORDSYS.
+    plane
+        Of a cube, counted from 1; one number for each axis that is longer than one. None: the only one, or that of Stokes I.
+    hdu
+        Extension by number (0: the primary HDU) or name; None: the first image or HEALPix table.
+    """
+
+    unit: str | None = None
+    pixel_size: float | None = None
+    centred: bool = False
+    missing: Literal["error", "zero"] = "error"
+    input_beam: float | None = None
+    coordsys: Literal["icrs", "galactic", "ecliptic"] | None = None
+    plane: tuple[int, ...] | None = None
+    hdu: int | str | None = None
+
+
+@dataclass
+class WcsMap:
+    """An image as its file has it.
+
+    Attributes
+    ----------
+    values
+        (ny, nx) float64 in `unit`; row 0 is the file's first row.
+    unit
+        ``Jy/pixel``, ``Jy/beam``, ``MJy/sr``, ``K_RJ``, ``K_CMB`` or ``y``.
+    wcs
+        Two-dimensional celestial `astropy.wcs.WCS`; None where the file has none: then `scale` says how large pixels are.
+    scale
+        (2, 2) rad, where there is no WCS: a step of one pixel along (x, y) moves (east, north) by its columns.
+    beam_solid_angle
+        sr, of the beam of a ``Jy/beam`` map.
+    notes
+        What was chosen or changed, for the tally.
+    zeroed
+        Missing pixels set to zero on request.
+    turn
+        (3, 3) a direction on the sky (ICRS) to the one in the frame of `wcs` at which the image is looked up; None: the same one.
+    """
+
+    values: Floats
+    unit: str
+    wcs: Any
+    scale: Floats | None
+    beam_solid_angle: float | None = None
+    notes: dict[str, str] = field(default_factory=dict)
+    zeroed: int = 0
+    turn: Floats | None = None
+
+    @property
+    def nbytes(self) -> int:
+        return self.values.nbytes
+
+
+@dataclass
+class HealpixMap:
+    """A HEALPix map: ``values[k]`` float64 belongs to pixel ``pixels[k]`` (sorted; the others are not covered); None: to pixel k.
+
+    ``pixels`` are numbers in the ordering ``nest``; ``frame`` is an astropy frame name. Other attributes as `WcsMap`.
+    """
+
+    values: Floats
+    pixels: NDArray[np.int64] | None
+    nside: int
+    nest: bool
+    frame: Frame
+    unit: str
+    beam_solid_angle: float | None = None
+    notes: dict[str, str] = field(default_factory=dict)
+    zeroed: int = 0
+
+    @property
+    def nbytes(self) -> int:
+        return self.values.nbytes + (0 if self.pixels is None else self.pixels.nbytes)

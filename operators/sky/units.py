@@ -1,0 +1,111 @@
+"""Units of sky maps as their headers write them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+
+Floats = NDArray[np.float64]
+
+KNOWN_UNITS = "Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y)"
+_PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6}
+_PER = {"pixel": "Jy/pixel", "pix": "Jy/pixel", "px": "Jy/pixel", "beam": "Jy/beam", "bm": "Jy/beam", "sr": "MJy/sr"}
+_SCALES = {
+    "k_rj": "K_RJ",
+    "rj": "K_RJ",
+    "rayleigh-jeans": "K_RJ",
+    "k_cmb": "K_CMB",
+    "cmb": "K_CMB",
+    "thermodynamic": "K_CMB",
+}
+
+
+def parse_unit(text: str, *, place: str, temperature_scale: str | None = None) -> tuple[str, float]:
+    """(unit, factor) with value * factor in ``unit``, one of `KNOWN_UNITS`: ``mK_CMB`` is ("K_CMB", 1e-3).
+
+    ``temperature_scale`` (the header key TEMPSCAL: K_RJ or K_CMB) tells what a plain kelvin is. Raises InputError.
+    """
+    plain = text.strip().replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u")
+    if re.fullmatch(r"(y|y[_ -]?sz|(y[_ -])?compton([_ -]?y)?|compton[_ -]?(y[_ -]?)?parameter)", plain, re.IGNORECASE):
+        return "y", 1.0
+    match = re.fullmatch(r"(?-i:([num]?))(?:K|Kelvin)\s*[_ ]?\s*\(?(RJ|CMB|thermodynamic)?\)?", plain, re.IGNORECASE)
+    if match and match[1] in _PREFIXES:
+        scale = match[2] or temperature_scale
+        if scale is None or not scale.strip():
+            raise InputError(
+                f"the unit '{text}' does not say on which temperature scale",
+                place=place,
+                cure="set the header key TEMPSCAL to 'K_RJ' or 'K_CMB', or the operator's parameter unit: K_RJ",
+            )
+        if scale.strip().lower() not in _SCALES:
+            raise InputError(f"unknown temperature scale TEMPSCAL = '{scale}'", place=place, cure="use K_RJ or K_CMB")
+        return _SCALES[scale.strip().lower()], _PREFIXES[match[1]]
+    match = re.fullmatch(
+        r"(?-i:([numkM]?))Jy\s*(?:/|\s|\*|\.)?\s*(pixel|pix|px|beam|bm|sr)\s*(?:(?:\^|\*\*)?\(?-1\)?)?", plain, re.IGNORECASE
+    )
+    if match and match[1] in _PREFIXES:
+        unit = _PER[match[2].lower()]
+        return unit, _PREFIXES[match[1]] * (1e-6 if unit == "MJy/sr" else 1.0)
+    raise InputError(
+        f"unknown unit '{text}'", place=place, cure=f"set the header key BUNIT or the operator's parameter unit to {KNOWN_UNITS}"
+    )
+
+
+def unit_of(place: str, header: Any, key: str, given: str | None, notes: dict[str, str]) -> tuple[str, float]:
+    """`parse_unit` of the unit ``given``, or of the header's ``key``."""
+    written = str(header.get(key, "") or "").strip()
+    text = given if given is not None else written
+    if not text:
+        raise InputError(
+            "the unit of the map is missing",
+            place=place,
+            cure=f"set the header key {key}, or the operator's parameter unit, to {KNOWN_UNITS}",
+        )
+    if given is not None and written and given != written:
+        notes["unit"] = f"{given} as given; {key} = '{written}' is overridden"
+    return parse_unit(text, place=place, temperature_scale=header.get("TEMPSCAL"))
+
+
+def beam_solid_angle(place: str, header: Any, unit: str, given: float | None, notes: dict[str, str]) -> float | None:
+    """sr, of the beam of a map in Jy/beam: ``given`` as its FWHM [rad], or the header's BMAJ and BMIN; None in other units."""
+    if unit != "Jy/beam":
+        if given is not None:
+            raise InputError(
+                f"input_beam is for maps in Jy/beam, and this one is in {unit}", place=place, cure="remove input_beam"
+            )
+        return None
+    notes["resolution"] = "the map is in Jy/beam, so convolved already; it is convolved with the detector's beam once more"
+    major, minor = header.get("BMAJ"), header.get("BMIN", header.get("BMAJ"))
+    written = all(isinstance(b, int | float) and np.isfinite(b) and b > 0 for b in (major, minor))
+    if given is not None:
+        if written:
+            notes["input beam"] = f"{np.degrees(given) * 3600:g} arcsec as given; BMAJ and BMIN are overridden"
+        return float(np.pi / (4 * np.log(2)) * given**2)
+    if not written:
+        raise InputError(
+            "a map in Jy/beam needs the beam it was made with, and its header has no BMAJ",
+            place=place,
+            cure="set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam: 18 arcsec, the "
+            "FWHM of the map's beam (not fwhm, which is that of the telescope simulated)",
+        )
+    return float(np.pi / (4 * np.log(2)) * np.radians(major) * np.radians(minor))
+
+
+def filled(place: str, values: Floats, missing: str, first: str) -> int:
+    """Zero the non-finite values in place on request; their number. ``first``: how to name the first one, by its indices."""
+    bad = ~np.isfinite(values)
+    count = int(bad.sum())
+    if count and missing == "error":
+        where = np.unravel_index(int(np.flatnonzero(bad)[0]), values.shape)
+        raise InputError(
+            f"{count} of {values.size} pixels are NaN or infinite, the first at {first.format(*(int(k) + 1 for k in where))}",
+            place=place,
+            cure="mend the map, or set the operator's parameter missing: zero to take them as zero (they are counted)",
+        )
+    values[bad] = 0.0
+    return count
