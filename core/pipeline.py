@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from .data import Data, html_table
+from .data import Data, Observation, html_table
 from .errors import PipelineError
 from .machine import available_memory, available_threads
 from .operator import Operator
@@ -40,6 +40,8 @@ class Part:
         By label: what `Operator.agree` found for all scans of all parts.
     first
         Whether the very first scan is among them.
+    prefix
+        Of the names of the scans: what makes them unique among all parts.
     packed
         By run and label: what `Operator.pack` took out. Filled by `Pipeline.run`.
     """
@@ -47,7 +49,13 @@ class Part:
     scans: Sequence[int] | None = None
     layouts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     first: bool = True
+    prefix: str = ""
     packed: dict[str, dict[str, Mapping[str, Any]]] = field(default_factory=dict)
+
+    def name(self, observations: Sequence[Observation]) -> None:
+        """Give scans that a pointing step has just made their unique names, before other steps see them."""
+        for observation in observations:
+            observation.name = self.prefix + observation.name
 
     def take(self, operator: Operator, data: Data) -> None:
         """Pack one operator's products of the run in progress."""
@@ -167,7 +175,10 @@ class Pipeline:
         for operator in sorted(self.operators, key=lambda o: not o.at_end):  # what only acts at the end may refuse at once
             start = time.thread_time()
             if part is None or not (operator.at_end or operator.label in part.layouts):
+                before = len(data.observations)
                 operator.observe(data)  # pointing steps append observations; map makers lay out the grid of all of them
+                if part is not None:
+                    part.name(data.observations[before:])
             elif operator.label in part.layouts:
                 operator.lay_out(part.layouts[operator.label])
             timer.add(operator.label, "observe", time.thread_time() - start)

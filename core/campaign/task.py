@@ -129,7 +129,7 @@ def _run(order: Order) -> str:
     task, folder = order.task, Path(order.folder)
     file = _file(order.pipeline)
     layouts = _layouts(order.layout, order.layout_digest)
-    part = Part(task.scans, layouts, first=task.before == 0)
+    part = Part(task.scans, layouts, first=task.before == 0, prefix=f"{task.entry:06d}-")
     pipeline = file.pipeline()
     data = pipeline.run(
         scene_of(file, task.seed, Instant(task.time)),
@@ -145,13 +145,14 @@ def _run(order: Order) -> str:
             place=file.header.name,
             cure="its operator needs pack() and merge() to take part in a campaign; run the observations one by one",
         )
-    scans = [_thinned(o, k + task.before, task.entry) for k, o in enumerate(data.observations)]
+    scans = [_thinned(o, k + task.before) for k, o in enumerate(data.observations)]
     tally = data.tally
     tree = {
         "packed": part.packed,
         "scans": scans,
         "counts": [list(row) for row in tally.counts()],
-        "figures": [list(row) for row in tally.figures()],
+        # figures of scans of one number share a row, whatever the entry: there may be a million entries
+        "figures": [[who, what.removeprefix(part.prefix), text] for who, what, text in tally.figures()],
     }
     return parts.write(product_path(folder, task), task.key, tree)
 
@@ -173,7 +174,7 @@ def _layouts(path: str, digest: str) -> Mapping[str, Any]:
     return layouts
 
 
-def _thinned(observation: Any, number: int, entry: int) -> dict[str, Any]:
+def _thinned(observation: Any, number: int) -> dict[str, Any]:
     """What a report tells of a scan, with a few of its boresight directions."""
     import numpy as np
 
@@ -182,7 +183,7 @@ def _thinned(observation: Any, number: int, entry: int) -> dict[str, Any]:
     elevation = observation.elevation
     some = np.unique([*some, elevation.argmin(), elevation.argmax()])
     return {
-        "name": f"{entry:06d}/{observation.name}",
+        "name": observation.name,
         "start": observation.start.nanoseconds,
         "n_samples": n,
         "n_detectors": observation.n_detectors,

@@ -9,6 +9,7 @@ import signal
 import threading
 from concurrent.futures import Executor, Future
 
+import h5py
 import pytest
 
 from zonda.core.campaign import run as campaign
@@ -114,10 +115,19 @@ def test_several_files(bench):
 def test_time_streams_spectra_pictures_and_report(bench):
     more = "  - SaveMap\n  - SaveTOD\n  - TimeStreams\n  - Plots\n  - Report\n"
     out = bench.run("{nights: 2}", *SERIAL, changes=(("  - SaveMap\n", more),))
-    assert len(list(out.glob("entries/*/tod_*.h5"))) == 4
+    files = list(out.glob("entries/*/tod_*.h5"))
+    assert len(files) == 4
+    numbers = []
+    for path in files:
+        with h5py.File(path) as f:
+            session = f["instrument"].attrs
+            numbers.append(
+                [f.attrs["observation_name"], f.attrs["observation_uid"], session["session_name"], session["session_uid"]]
+            )
+    assert [len(set(column)) for column in zip(*numbers, strict=True)] == [4, 4, 4, 4]
     assert {"map.png", "power_spectra.png", "tod.png", "scan.png", "report.html"} <= {p.name for p in out.iterdir()}
     report = (out / "report.html").read_text()
-    assert "000001/scan-001" in report
+    assert "000001-scan-001" in report
     assert "this table and the plan are of its first entry" in report
 
 

@@ -419,17 +419,6 @@ def test_one_detector_one_sample(make_observation, data):
         assert load_tod(path).streams["signal"].tolist() == [[1.0]] * 19
 
 
-def test_toast_itself_reads_the_file(make_observation, data, streams, mean):
-    toast = pytest.importorskip("toast", reason="TOAST is not installed")
-    toast_io = pytest.importorskip("toast.io")
-    observation = make_observation()
-    path = write(SaveTOD(), observation, data, streams, mean)
-    found = toast_io.load_hdf5(str(path), toast.Comm())
-    assert found.name == observation.name
-    np.testing.assert_array_equal(found.detdata["signal"].data, load_tod(path).streams["signal"])
-    np.testing.assert_array_equal(found.shared["boresight_radec"].data, observation.boresight_radec)
-
-
 class Fails(Operator):
     """Raises in the middle of the second scan."""
 

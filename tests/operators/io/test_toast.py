@@ -1,0 +1,226 @@
+"""TOAST itself on our files: it bins the samples that zonda bins, its filters find their intervals, its atmosphere the weather.
+
+`.ci/toast` runs these in an environment with TOAST (the extra ``toast``), where none may be skipped (ZONDA_TOAST=required).
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+import zonda
+from zonda.core.flags import DEAD, OPAQUE
+from zonda.core.operator import Operator
+from zonda.operators.io.save_tod import SaveTOD, load_tod
+
+pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
+
+if os.environ.get("ZONDA_TOAST") == "required":
+    import toast
+else:
+    toast = pytest.importorskip("toast", reason="TOAST is not installed: .ci/toast makes an environment with it")
+
+import toast.io
+import toast.ops
+
+NSIDE = 512
+INSTRUMENT = {
+    "name": "camera",
+    "telescope": {"name": "dish", "diameter": "6 m"},
+    "band": {"name": "b", "low": "130 GHz", "high": "170 GHz"},
+    "detectors": 7,
+    "field_of_view": "1 deg",
+    "main_beam_efficiency": 0.7,
+    "illumination_efficiency": 0.9,
+    "net": "300 uK s(1/2)",
+    "sample_rate": "40 Hz",
+}
+SCENE = {"site": "atacama", "instrument": INSTRUMENT, "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
+SCAN = {"throw": "4 deg", "speed": "1 deg/s", "acceleration": "1 deg/s2", "scan_duration": "61.3 s", "check_limits": "warn"}
+
+
+class Marks(Operator):
+    """Flags a dead detector, an opaque one, and opaque samples, as CommonModeFilter and Efficiency do."""
+
+    def prepare(self, observation):
+        observation.detector_flags[[1, 5]] |= np.array([DEAD, OPAQUE], np.uint8)
+        observation.flags[400:437] |= OPAQUE
+
+
+def toast_data(path):
+    data = toast.Data(toast.Comm())
+    data.obs.append(toast.io.load_hdf5(str(path), data.comm))
+    return data
+
+
+def pixels():
+    return toast.ops.PixelsHealpix(nside=NSIDE, nest=False, detector_pointing=toast.ops.PointingDetectorSimple())
+
+
+def full_sky(local):
+    """The first column of a `toast.PixelData`, (12 nside^2,)."""
+    found, size = np.zeros(local.distribution.n_pix), local.distribution.n_pix_submap
+    for k, submap in enumerate(local.distribution.local_submaps):
+        found[submap * size : (submap + 1) * size] = local.data[k, :, 0]
+    return found
+
+
+def toast_maps(path):
+    """Hits and map with TOAST's defaults: all that is asked for is the pixels."""
+    data, where = toast_data(path), pixels()
+    weights = toast.ops.StokesWeights(mode="I", detector_pointing=where.detector_pointing)
+    toast.ops.CovarianceAndHits(
+        pixel_dist="dist", covariance="cov", hits="hits", rcond="rcond", pixel_pointing=where, stokes_weights=weights
+    ).apply(data)
+    toast.ops.BinMap(pixel_dist="dist", covariance="cov", pixel_pointing=where, stokes_weights=weights, binned="map").apply(data)
+    return full_sky(data["hits"]), full_sky(data["map"])
+
+
+def zonda_maps(product):
+    hits, signal = np.zeros((2, 12 * NSIDE**2))
+    hits[product.pixels], signal[product.pixels] = product.hits, product.signal
+    return hits, np.nan_to_num(signal)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """Turnarounds, trimmed ends, dead and opaque detectors, opaque samples."""
+    folder = tmp_path_factory.mktemp("scan")
+    steps = [
+        zonda.PointingBackAndForth(**SCAN, flag_turnarounds=True),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        Marks(),
+        zonda.HighpassFilter(frequency="0.1 Hz", trim="1.5 s"),
+        zonda.BinMap(nside=NSIDE),
+        SaveTOD(),
+    ]
+    data = zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=folder, threads=1)
+    return folder / "tod_scan-000.h5", data
+
+
+@pytest.fixture(scope="module")
+def recorded(scan, tmp_path_factory):
+    """The same scan recorded with a gap, rows that are no numbers, and a clock that jitters."""
+    import h5py
+
+    folder = tmp_path_factory.mktemp("recorded")
+    tod = load_tod(scan[0])
+    keep = np.r_[0:1000, 1100 : tod.n_samples]
+    with h5py.File(folder / "recording.h5", "w") as f:
+        jitter = np.random.default_rng(3).normal(0, 5e-4, len(keep))
+        azimuth = scan[1].observations[0].azimuth[keep]
+        azimuth[1500:1520] = np.nan
+        for name, values, unit in (("time", tod.times[keep] + jitter, "s"), ("az", azimuth, "rad"), ("el", 0 * azimuth, "rad")):
+            f[name] = values if name != "el" else scan[1].observations[0].elevation[keep]
+            f[name].attrs["units"] = unit
+    recording = zonda.PointingRecorded(file=folder / "recording.h5")
+    steps = [recording, zonda.WhiteNoise(), zonda.Efficiency(), Marks(), zonda.BinMap(nside=NSIDE), SaveTOD()]
+    data = zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=folder, threads=1)
+    return folder / "tod_scan-000.h5", data
+
+
+@pytest.mark.parametrize("which", ["scan", "recorded"])
+def test_toast_bins_what_zonda_bins(which, request):
+    path, data = request.getfixturevalue(which)
+    (o,) = data.observations
+    used = int(o.good_samples.sum()) * int(o.good_detectors.sum())
+    assert used < 0.95 * o.n_samples * 5  # of 7 detectors 5 are good, and not all samples
+    hits, signal = toast_maps(path)
+    ours, brightness = zonda_maps(data.products["map"])
+    assert hits.sum() == used
+    np.testing.assert_array_equal(hits, ours)
+    # Both add the same numbers; TOAST's weights come from a noise model in float32 and are equal: they cancel to rounding
+    np.testing.assert_allclose(signal, brightness, rtol=0, atol=1e-6 * np.abs(brightness).max())
+
+
+def test_toasts_intervals_hold_our_samples(scan):
+    path, data = scan
+    kept = toast_data(path)  # TOAST clears its observations with their owner
+    (o,), observation = kept.obs, data.observations[0]
+    turning = np.zeros(o.n_local_samples, bool)
+    for interval in o.intervals["turnaround"]:
+        turning[interval.first : interval.last] = True
+    np.testing.assert_array_equal(turning, (o.shared["flags"].data & 4) != 0)
+    for name, spans in observation.intervals.items():
+        assert len(o.intervals[name]) == len(spans)
+    throws = o.intervals["throw"]
+    assert [int(throws[0].first), int(throws[-1].last)] == [0, o.n_local_samples]
+    assert [int(a.last) for a in throws[:-1]] == [int(b.first) for b in throws[1:]]
+
+
+def test_toasts_filters_run(scan):
+    data = toast_data(scan[0])
+    before = data.obs[0].detdata["signal"].data.copy()
+    good = ~(data.obs[0].shared["flags"].data & 15).astype(bool)
+    toast.ops.PolyFilter(order=3, view="throw").apply(data)
+    after = data.obs[0].detdata["signal"].data.copy()
+    for interval in data.obs[0].intervals["throw"][1:-1]:  # a cubic is gone in each throw by itself
+        t = np.linspace(-1, 1, interval.last - interval.first)
+        inside = good[interval.first : interval.last]
+        left = np.polynomial.legendre.legfit(t[inside], after[0, interval.first : interval.last][inside], 3)
+        assert np.abs(left).max() < 1e-6 * np.abs(before[0][good]).max()
+    toast.ops.GroundFilter(split_template=True, trend_order=2, filter_order=3).apply(data)
+    assert np.isfinite(data.obs[0].detdata["signal"].data).all()
+    assert (data.obs[0].detdata["signal"].data[0] != after[0]).any()
+    assert not any(data.obs[0].local_detector_flags[d] & 2 for d in data.obs[0].local_detectors)
+
+
+def test_toast_finds_the_weather(scan):
+    import astropy.units as u
+
+    tod, data = load_tod(scan[0]), toast_data(scan[0])
+    weather = data.obs[0].telescope.site.weather
+    for theirs, unit, ours in (
+        ("pwv", u.m, tod.weather.pwv),
+        ("surface_pressure", u.Pa, tod.weather.pressure),
+        ("air_temperature", u.K, tod.weather.temperature),
+        ("surface_temperature", u.K, tod.weather.ground_temperature),
+        ("humidity", u.dimensionless_unscaled, tod.weather.humidity),
+        ("west_wind", u.m / u.s, tod.weather.wind_east),
+        ("south_wind", u.m / u.s, tod.weather.wind_north),
+    ):
+        assert getattr(weather, theirs).to_value(unit) == pytest.approx(ours, rel=1e-14)
+    assert weather.time.timestamp() == pytest.approx(tod.times[0], abs=1e-3)
+    azel = toast.ops.PointingDetectorSimple(boresight="boresight_azel", quats="quats_azel")
+    before = data.obs[0].detdata["signal"].data.copy()
+    toast.ops.SimAtmosphere(
+        detector_pointing=azel,
+        field_of_view=2 * u.deg,
+        lmin_center=100 * u.m,
+        lmax_center=300 * u.m,
+        xstep=50 * u.m,
+        ystep=50 * u.m,
+        zstep=50 * u.m,
+        zmax=500 * u.m,
+    ).apply(data)
+    assert (data.obs[0].detdata["signal"].data[0] != before[0]).any()
+
+
+def test_directions_make_the_round_trip(scan, tmp_path):
+    """Through TOAST's own writer, with its directions on the sky in place of ours: zonda simulates on those."""
+    data = toast_data(scan[0])
+    (o,) = data.obs
+    turn = toast.qarray.rotation(np.array([0.0, 0.0, 1.0]), np.radians(45 / 3600))
+    o.shared["boresight_radec"].set(toast.qarray.mult(turn, o.shared["boresight_radec"].data), offset=(0, 0), fromrank=0)
+    path = toast.io.save_hdf5(o, str(tmp_path), detdata=["signal", "flags"])
+    found = zonda.Data(zonda.Scene(**SCENE))
+    zonda.PointingRecorded(file=path).observe(found)
+    (again,) = found.observations
+    np.testing.assert_array_equal(again.boresight_radec, o.shared["boresight_radec"].data)
+    first = scan[1].observations[0]
+    np.testing.assert_array_equal(again.good_samples, first.good_samples)
+    assert {name: len(spans) for name, spans in again.intervals.items()} == {n: len(s) for n, s in first.intervals.items()}
+    tod = load_tod(path)
+    np.testing.assert_array_equal(tod.detector_flags, load_tod(scan[0]).detector_flags)
+    assert tod.weather == load_tod(scan[0]).weather
+
+
+def test_intervals_without_any(scan, tmp_path):
+    """A scan of half a leg has no turnaround: TOAST reads an empty list of that name."""
+    steps = [zonda.PointingBackAndForth(**{**SCAN, "scan_duration": "2 s"}), zonda.WhiteNoise(), zonda.Efficiency(), SaveTOD()]
+    zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=tmp_path, threads=1)
+    kept = toast_data(tmp_path / "tod_scan-000.h5")
+    (o,) = kept.obs
+    assert len(o.intervals["turnaround"]) == 0
+    assert len(o.intervals["throw"]) == 1
