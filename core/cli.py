@@ -298,7 +298,7 @@ def run(
     write_text(folder / "resolved.yaml", resolved)
     counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
     lost = {(who, what) for who, what in counts if what != "samples binned"}
-    for who, what, value in data.tally:
+    for who, what, value in data.tally.told():
         if verbose or (who, what) in lost:
             click.echo(f"{who}: {what}: {value}", err=True)
     if verify:

@@ -41,11 +41,15 @@ class Tally:
         self._lock = threading.Lock()
         self._counts: dict[tuple[str, str], int] = {}
         self._figures: dict[tuple[str, str], str] = {}
+        self._totals: dict[tuple[str, str], int] = {}
 
-    def count(self, who: str, what: str, number: int) -> None:
-        """Add ``number`` to a count (a count of zero is kept: it says that nothing happened)."""
+    def count(self, who: str, what: str, number: int, of: int = 0) -> None:
+        """Add ``number`` to a count (a count of zero is kept: it says that nothing happened); ``of``: among how many, where its
+        share is worth telling."""
         with self._lock:
             self._counts[who, what] = self._counts.get((who, what), 0) + int(number)
+            if of:
+                self._totals[who, what] = self._totals.get((who, what), 0) + int(of)
 
     def state(self, who: str, what: str, text: str) -> None:
         """Record a figure or a choice as text; the last statement wins."""
@@ -55,7 +59,7 @@ class Tally:
     def update(self, other: Tally, prefix: str = "") -> None:
         """Add another tally's counts and statements, ``prefix`` before their operators' labels."""
         for (who, what), number in other._counts.items():
-            self.count(prefix + who, what, number)
+            self.count(prefix + who, what, number, other._totals.get((who, what), 0))
         for (who, what), text in other._figures.items():
             self.state(prefix + who, what, text)
 
@@ -75,9 +79,25 @@ class Tally:
         with self._lock:
             return sorted((*k, v) for k, v in self._figures.items())
 
+    def totals(self) -> list[tuple[str, str, int]]:
+        """Among how many the counts were made that have a share, in a fixed order."""
+        with self._lock:
+            return sorted((*k, v) for k, v in self._totals.items())
+
+    def told(self) -> Iterator[tuple[str, str, str]]:
+        """Rows as `__iter__`, with the share of counts that have one: ``2623184 (20.3 %)``."""
+        for who, what, value in self:
+            whole = self._totals.get((who, what), 0)
+            yield who, what, f"{value} ({percent(self.get(who, what) / whole)})" if whole and self.get(who, what) else value
+
     def get(self, who: str, what: str) -> int:
         """A count, 0 where there is none."""
         return self._counts.get((who, what), 0)
+
+
+def percent(share: float, digits: int = 3) -> str:
+    """``20.3 %``; never 100 for what is less."""
+    return "more than 99.9 %" if 0.9995 < share < 1 else f"{100 * share:.{digits}g} %"
 
 
 @dataclass

@@ -69,7 +69,7 @@ def combine(folder: str, number: int, digests: Mapping[int, str]) -> Combined:
     except ZondaError as err:
         return Combined(error=err)
     counts = {(who, what) for who, what, _ in data.tally.counts()}
-    return Combined(tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally))
+    return Combined(tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told()))
 
 
 def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) -> Data:
@@ -133,14 +133,15 @@ def _empty(data: Data) -> Data:
 
 def _packed(pipeline: Pipeline, data: Data, first: bool) -> dict[str, Any]:
     tally = data.tally
-    counts, figures = [list(row) for row in tally.counts()], [list(row) for row in tally.figures()]
-    return {"packed": pipeline.pack(data, first), "scans": data.observations, "counts": counts, "figures": figures}
+    rows = {name: [list(row) for row in getattr(tally, name)()] for name in ("counts", "totals", "figures")}
+    return {"packed": pipeline.pack(data, first), "scans": data.observations, **rows}
 
 
 def _add(pipeline: Pipeline, data: Data, tree: dict[str, Any]) -> None:
     pipeline.merge(data, tree["packed"])
+    totals = {(who, what): total for who, what, total in tree["totals"]}
     for who, what, count in tree["counts"]:
-        data.tally.count(who, what, count)
+        data.tally.count(who, what, count, totals.get((who, what), 0))
     for who, what, text in tree["figures"]:
         data.tally.state(who, what, text)
     for scan in tree["scans"]:

@@ -151,6 +151,7 @@ def _run(order: Order) -> str:
         "packed": part.packed,
         "scans": scans,
         "counts": [list(row) for row in tally.counts()],
+        "totals": [list(row) for row in tally.totals()],
         # figures of scans of one number share a row, whatever the entry: there may be a million entries
         "figures": [[who, what.removeprefix(part.prefix), text] for who, what, text in tally.figures()],
     }

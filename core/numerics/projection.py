@@ -11,6 +11,7 @@ direction lies in the opposite hemisphere and has no pixel.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -117,6 +118,26 @@ def pixel_matrix(wcs: WCS | TangentWcs) -> Floats:
         raise InputError(f"projection {kinds} is not a plain TAN", place="WCS", cure="reproject to TAN without distortion")
     wcs.wcs.set()
     return central(wcs) @ wcs_frame_rotation(wcs)
+
+
+LOOKED_AT = 256, 37
+"""Instants of a scan and detectors that `share_outside` takes, at most."""
+
+
+def share_outside(scans: Iterable[tuple[Floats, Floats, Floats]], matrix: Floats, shape: tuple[int, int]) -> float:
+    """About what share of all samples lies beyond an image (ny, nx) whose `pixel_matrix` is ``matrix``.
+
+    ``scans``: boresight quaternions (n, 4), ICRS, and offsets of the detectors (n_det,), (n_det,) of each; some of them are used.
+    """
+    ny, nx = shape
+    beyond = looked = 0
+    for quaternions, xi, eta in scans:
+        at, of = (slice(None, None, -(-n // most)) for n, most in zip((len(quaternions), len(xi)), LOOKED_AT, strict=True))
+        x, y, depth = np.moveaxis(directions(quaternions[at], xi[of], eta[of]) @ matrix.T, -1, 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            inside = (depth > 0) & (abs(x / depth - (nx - 1) / 2) <= nx / 2) & (abs(y / depth - (ny - 1) / 2) <= ny / 2)
+        beyond, looked = beyond + int(np.count_nonzero(~inside)), looked + inside.size
+    return beyond / looked if looked else 0.0
 
 
 def central(wcs: WCS | TangentWcs) -> Floats:

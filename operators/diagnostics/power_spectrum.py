@@ -150,7 +150,7 @@ class PowerSpectrum(Operator):
         chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
         length = _quick(min(observation.n_samples, max(2, round(self.segment * observation.sample_rate))))
         if flagged := int(np.count_nonzero(~observation.good_samples)):
-            observation.tally.count(self.label, "flagged samples that the power spectra include", flagged)
+            observation.tally.count(self.label, "flagged samples that the power spectra include", flagged, observation.n_samples)
         return _State(usable[chosen], Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None)
 
     def exec(self, block: Block, state: _State) -> None:

@@ -83,8 +83,8 @@ class HighpassFilter(Operator):
         if trimmed:
             observation.flags[:trimmed] |= PROCESSING
             observation.flags[n - trimmed :] |= PROCESSING
-        tally.count(self.label, "samples trimmed", 2 * trimmed)
-        tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()))
+        tally.count(self.label, "samples trimmed", 2 * trimmed, n)
+        tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()), n)
         if observation.smooth.get("atmosphere") is not None:
             tally.state(self.label, "smooth mean emission", "removed analytically")
         plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)

@@ -18,8 +18,9 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
-from zonda.core.data import Block, Data, Observation
+from zonda.core.data import Block, Data, Observation, percent
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.numerics.projection import pixel_matrix, share_outside
 from zonda.core.numerics.stretches import untouched
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
@@ -134,6 +135,16 @@ class BinMap(Operator):
         if self.nside is None and "ordering" in self.model_fields_set:
             raise ValueError("ordering belongs to a HEALPix map; give nside too")
         return self
+
+    def check(self, data: Data) -> list[str]:
+        """The share of the samples outside a map of a given width."""
+        if self.width is None or not data.observations:
+            return []
+        middle = in_frame(self.centre.icrs() if self.centre else data.observations[0].centre, self.frame)
+        self._middle = (float(middle[0]), float(middle[1]))
+        grid = self._image((0.0, 0.0))
+        scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in data.observations)
+        return [f"samples outside the map: about {percent(share_outside(scans, pixel_matrix(grid.wcs), grid.shape), 2)}"]
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""
@@ -283,10 +294,10 @@ class BinMap(Operator):
             data.products[key] = Halves(self._n_pixels())
         binned, dropped = data.products[key].add(observation, state, self.label)
         tally = observation.tally
-        tally.count(self.label, "samples binned", binned)
-        tally.count(self.label, "samples dropped: outside the map", int(dropped[OUTSIDE]))
-        tally.count(self.label, "samples dropped: flagged", int(dropped[FLAGGED]))
-        tally.count(self.label, "samples dropped: not finite", int(dropped[NOT_FINITE]))
+        every = observation.n_detectors * observation.n_samples
+        tally.count(self.label, "samples binned", binned, every)
+        for what, number in (("outside the map", OUTSIDE), ("flagged", FLAGGED), ("not finite", NOT_FINITE)):
+            tally.count(self.label, f"samples dropped: {what}", int(dropped[number]), every)
         if dropped[TOO_LARGE]:
             raise PipelineError(
                 f"{int(dropped[TOO_LARGE])} samples are too large for the map's fixed-point sums",

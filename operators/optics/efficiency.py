@@ -217,8 +217,10 @@ def _flag_opaque(label: str, observation: Observation, transmission: SmoothField
     observation.detector_flags[dead] |= flags.OPAQUE
     bad = np.repeat(cell[:-1] | cell[1:], transmission.step)[: observation.n_samples]
     observation.flags[bad] |= flags.OPAQUE
-    observation.tally.count(label, f"detectors flagged: band transmission below {OPAQUE:g}", int(dead.sum()))
-    observation.tally.count(label, f"samples flagged: band transmission below {OPAQUE:g}", int(bad.sum()))
+    observation.tally.count(
+        label, f"detectors flagged: band transmission below {OPAQUE:g}", int(dead.sum()), observation.n_detectors
+    )
+    observation.tally.count(label, f"samples flagged: band transmission below {OPAQUE:g}", int(bad.sum()), observation.n_samples)
 
 
 def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> tuple[SmoothField, float]:

@@ -113,4 +113,4 @@ class PointingBackAndForth(Pointing):
 
     def state(self, observation: Observation) -> None:
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
-        observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()))
+        observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()), observation.n_samples)

@@ -17,10 +17,10 @@ from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Kelvin
-from zonda.core.data import Block, Data, Observation
+from zonda.core.data import Block, Data, Observation, percent
 from zonda.core.errors import InputError
 from zonda.core.knobs import Knob
-from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_matrices
+from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_matrices, share_outside
 from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
 from zonda.core.storage.fits_image import Cards
@@ -130,13 +130,17 @@ class SkyMap(Operator):
         return footprint(self.file, self.pixel_size, self.centre if isinstance(self.centre, Target) else None, self.hdu)
 
     def check(self, data: Data) -> list[str]:
-        """Whether the scans are about a point of the map, by its header."""
+        """Whether the scans are about a point of the map, by its header; the share of their samples that is outside."""
         if self.centre == "target" or (found := self._footprint()) is None:
             return []
         for text in dict.fromkeys(off_the_map(found, o.centre, self.label) for o in data.observations):
             if text:
                 warnings.warn(text, stacklevel=2)
-        return [f"centre of the input map: {position(*found.target.icrs())}"]
+        lines = [f"centre of the input map: {position(*found.target.icrs())}"]
+        if found.matrix is not None and data.observations:
+            scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in data.observations)
+            lines.append(f"samples outside the input map: about {percent(share_outside(scans, found.matrix, found.shape), 2)}")
+        return lines
 
     def prepare(self, observation: Observation) -> State:
         widths, index = self._widths(observation)
@@ -180,8 +184,8 @@ class SkyMap(Operator):
 
     def collect(self, data: Data, observation: Observation, state: State) -> None:
         beyond, behind = state.totals()
-        observation.tally.count(self.label, "samples outside the input map", beyond)
         total = observation.n_detectors * observation.n_samples
+        observation.tally.count(self.label, "samples outside the input map", beyond, total)
         if beyond == total:
             ra, dec = np.degrees(observation.centre)
             warnings.warn(
@@ -189,10 +193,8 @@ class SkyMap(Operator):
                 f"{self.file.name}; `centre: target` moves the map there",
                 stacklevel=2,
             )
-        elif beyond:
-            observation.tally.state(self.label, f"{observation.name}: share outside the input map", f"{beyond / total:.1%}")
         if behind:
-            observation.tally.count(self.label, "samples more than 90 deg from the input map's centre", behind)
+            observation.tally.count(self.label, "samples more than 90 deg from the input map's centre", behind, total)
         first = data.products.get("input")  # of the first observation, and of the first SkyMap in the pipeline
         key = "input" if first is None or first.header.get("OPERATOR") == self.label else f"input.{self.label}"
         if key not in data.products:

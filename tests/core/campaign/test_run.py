@@ -82,12 +82,16 @@ def test_a_tree_of_several_levels_gives_the_same_maps(undisturbed, bench, monkey
     assert bench.planes(bench.run(bench.CAMPAIGN, *SERIAL)) == bench.planes(undisturbed)
 
 
-def test_scans_as_tasks_are_the_plain_run(bench):
-    """One entry is an ordinary run: same maps, same mean spectrum, same tally."""
+def test_scans_as_tasks_are_the_plain_run(bench, capsys):
+    """One entry is an ordinary run: same maps, same mean spectrum, same tally, the same told of it with its shares."""
     plain, split = bench.new(), bench.new()
     file = bench.file("null")
-    assert bench.command("run", file, "--output", plain, "--no-prune") == 0
-    assert bench.command("run", file, "--output", split, "--no-prune", *SERIAL) == 0
+    said = []
+    for out, how in ((plain, ()), (split, SERIAL)):
+        assert bench.command("run", file, "--output", out, "--no-prune", "--verbose", *how) == 0
+        said.append([line for line in capsys.readouterr().err.splitlines() if line.endswith("%)")])
+    assert said[0] == said[1]
+    assert any(line.startswith("BinMap: samples binned: ") for line in said[0])
     assert bench.planes(plain) == bench.planes(split)
     from astropy.io import fits
 

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
+from scipy.spatial.transform import Rotation
 
 from zonda.core.errors import InputError
-from zonda.core.numerics.projection import directions, frame_rotation, homographies, pixel_matrix, rotation_matrices
+from zonda.core.numerics.projection import (
+    directions,
+    frame_rotation,
+    homographies,
+    pixel_matrix,
+    rotation_matrices,
+    share_outside,
+)
 
 
 def tan(ctype=("RA---TAN", "DEC--TAN"), crval=(75.0, 20.0), crpix=(17.3, -4.0), lonpole=180.0, cdelt=(-2 / 3600, 3 / 3600)):
@@ -83,3 +91,22 @@ def test_other_images_are_refused(wcs, message):
 def test_unknown_frame_is_refused():
     with pytest.raises(InputError, match="unknown celestial frame"):
         frame_rotation("supergalactical")
+
+
+def test_share_of_the_samples_outside_an_image():
+    """A boresight that crosses an image of half its track, seen by detectors in a row across it; behind it is outside."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [0.0, 0.0], [50.5, 50.5], [-0.01, 0.01]
+    matrix = pixel_matrix(wcs)  # 1 deg x 1 deg about (0, 0)
+    n = 3000
+
+    def along(longitude):
+        return Rotation.from_euler("ZY", np.stack([longitude, np.full(n, np.pi / 2)], axis=1)).as_quat()
+
+    inside = np.radians(np.linspace(-1.0, 1.0, n))  # half of 2 deg
+    one = np.zeros(1)
+    assert share_outside([(along(inside), one, one)], matrix, (100, 100)) == pytest.approx(0.5, abs=2 / 250)
+    across = np.radians(np.linspace(-0.25, 0.75, 400))  # a quarter of the detectors is beyond the edge
+    many = [(along(0 * inside), 0 * across, across), (along(0 * inside + np.pi), one, one)]
+    assert share_outside(many[:1], matrix, (100, 100)) == pytest.approx(0.25, abs=1 / 30)
+    assert share_outside(many[1:], matrix, (100, 100)) == 1.0
