@@ -11,7 +11,7 @@ import numpy as np
 from zonda.operators.atmosphere.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather_summary import HOURS, MONTHS, QUANTILES, WaterByMonth, pwv_steps
 
-from .plots import DPI, SEQUENCE
+from .canvas import DPI, SEQUENCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
