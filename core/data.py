@@ -127,9 +127,15 @@ class Observation:
         At the telescope; None: the air of this scan is not known.
     smooth
         Slowly varying float64 fields: ``atmosphere`` (mean emission at the detector before efficiency, K_RJ) and
-        ``transmission`` (band-mean e^-tau at the mean PWV), each a `SmoothField`. Set by operators in ``prepare``.
+        ``transmission`` (band-mean e^-tau at the mean PWV), each a `SmoothField`. Set by operators in ``configure``, so that the
+        levels which follow from them are known before any step is prepared.
     detdata
         (n_det, n_samp) arrays that an output asked to keep.
+    expected_load
+        Tells the atmosphere's mean emission [K_RJ] and transmission in the middle of the scan, before ``smooth`` is known; None:
+        there is no atmosphere.
+    expected_net
+        Tells what (n_det,) ``focalplane.net`` will be about, before it is resolved; None: what it is now.
     resolved
         What operators resolved for one another (noise levels). It outlives the main run: companion runs use the same.
     components
@@ -161,6 +167,8 @@ class Observation:
     resolved: dict[str, Any] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
     output: Any = None
+    expected_load: Callable[[], tuple[float, float]] | None = None
+    expected_net: Callable[[], Floats] | None = None
     components: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:

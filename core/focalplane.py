@@ -36,6 +36,9 @@ class Focalplane:
         Noise-equivalent temperature on the sky, K_RJ sqrt(s): the rms of one second of integration.
     band
         Name of the band each detector observes in.
+    knee, slope, minimum_frequency
+        Pink noise: frequency at which it equals white noise of ``net`` [Hz], exponent of the fall f^-slope, frequency below which
+        it is flat [Hz]. The knee is 0 where there is none.
     """
 
     names: list[str]
@@ -47,6 +50,9 @@ class Focalplane:
     net: Floats
     polarization_angle: Floats = field(default_factory=lambda: np.zeros(0))
     band: list[str] = field(default_factory=list)
+    knee: Floats = field(default_factory=lambda: np.zeros(0))
+    slope: Floats = field(default_factory=lambda: np.zeros(0))
+    minimum_frequency: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -54,6 +60,9 @@ class Focalplane:
             self.polarization_angle = np.zeros(n)
         if not self.band:
             self.band = [""] * n
+        for name, default in (("knee", 0.0), ("slope", 1.0), ("minimum_frequency", 1e-3)):
+            if not getattr(self, name).size:
+                setattr(self, name, np.full(n, default))
         if len(set(self.names)) != n:
             twice = sorted({d for d in self.names if self.names.count(d) > 1})
             raise InputError(f"detector names must be unique; {twice[0]!r} is there twice", place="focal plane")

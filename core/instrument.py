@@ -212,6 +212,9 @@ class Instrument(Parameters):
             illumination_efficiency=full(n, self.illumination_efficiency),
             net=full(n, self.net),
             band=[self.band.name] * n,
+            knee=full(n, self.knee),
+            slope=full(n, self.slope),
+            minimum_frequency=full(n, self.pink_minimum_frequency),
         )
 
 

@@ -80,12 +80,8 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
     leaves = [(product_path(folder, t), t.key, digests[t.number]) for t in tasks]
     _add(pipeline, data, _tree(pipeline, data, leaves, lambda leaf: parts.read(*leaf)))
     data.output = check_output_folder(folder / combination.folder)
-    first = data.observations[0]
-    for operator in pipeline.operators:
-        if not operator.at_end and "boresight" not in operator.provides:
-            operator.configure(first)
     for observation in data.observations[1:]:
-        observation.focalplane = first.focalplane
+        observation.focalplane = data.observations[0].focalplane
     return pipeline.finish(data)
 
 
@@ -153,7 +149,12 @@ def _thinned(data: Data, scan: dict[str, Any], index: int) -> Thinned:
     from ..configuration.time import Instant
 
     scene = data.scene
-    plane = data.observations[0].focalplane if data.observations else scene.instrument.focalplane()
+    if data.observations:
+        plane = data.observations[0].focalplane
+    else:  # the first scan tells what the steps made of it
+        plane = scene.instrument.focalplane()
+        for name, values in scan["focal_plane"].items():
+            setattr(plane, name, values)
     return Thinned(
         name=scan["name"],
         index=index,

@@ -193,8 +193,14 @@ def _thinned(observation: Any, number: int) -> dict[str, Any]:
         "azel": observation.boresight_azel[some],
         "radec": observation.boresight_radec[some],
         "centre": list(observation.centre),
+        "focal_plane": _levels(observation.focalplane) if number == 0 else {},
         "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],
     }
+
+
+def _levels(plane: Any) -> dict[str, Any]:
+    """What the steps made of the focal plane, for the report: efficiencies and noise as they were resolved."""
+    return {name: getattr(plane, name) for name in ("main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope")}
 
 
 def _peak() -> int:

@@ -112,6 +112,8 @@ class Simulation:
         if not run:
             observation.tally.update(before)  # what pointing steps said belongs to the scan, and to its files
         observation.focalplane, observation.smooth = focalplane.copy(), {}
+        if run:  # the scene's levels, for the weights of a run without noise too
+            observation.focalplane.net = self._main[number]["focalplane"].net.copy()
         observation.output, observation.components = self._data.output, self._selection.streams(run)
         observation.flags, observation.detector_flags = flags.copy(), detector_flags.copy()
         kept = self._frozen[number] if not run or self._selection.runs[run].modes == "full" else None

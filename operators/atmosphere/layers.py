@@ -12,7 +12,9 @@ elevation of the ray (`response`). All of it is smooth, so it is computed at nod
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -94,6 +96,20 @@ class Layer:
     height: float
     amplitude: float
     wind: Floats
+
+
+@dataclass(frozen=True)
+class _Laid:
+    """What `AtmosphereLayers.configure` hands on to `prepare`: weather, layers as one observation sees them, nodes and steps."""
+
+    profile: Profile
+    band: BandAtmosphere
+    pwv: float
+    layers: list[Layer]
+    models: list[LayerModel]
+    beams: list[Turbulence]
+    variance: float
+    plan: Plan
 
 
 @dataclass(frozen=True)
@@ -205,20 +221,36 @@ class AtmosphereLayers(Operator):
 
     def observe(self, data: Data) -> None:
         """Note when the run begins and how its scans follow each other: all of them look through the same drifting air."""
-        self._origin, self._source = data.scene.time, data.scene.weather
+        self.agree(data)
         self._tracks = dict(zip((o.name for o in data.observations), tracks(data.observations), strict=True))
 
+    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
+        """Say what the load will be about: map makers lay out their sums for the noise that follows from it."""
+        self._origin, self._source = data.scene.time, data.scene.weather
+        for observation in data.observations:
+            observation.expected_load = partial(self._expected_load, observation)
+        return None
+
+    def configure(self, observation: Observation) -> None:
+        """Set the smooth means: noise levels that follow from the load need them before any step is prepared."""
+        drawn = self._drawn(observation)
+        if drawn is not None:
+            observation.smooth.update(drawn.means)
+            return
+        laid = observation.resolved[f"{self.label} laid out"] = self._lay_out(observation)
+        _means(observation, laid.plan, laid.band, laid.pwv)
+
     def prepare(self, observation: Observation) -> AtNodes | OfDetectors:
-        """Lay out the turbulence, draw it at the nodes; set the smooth means.
+        """Lay out the turbulence, draw it at the nodes.
 
         What is drawn at nodes is kept for the companion runs, which see the same air, unless it is larger than the pointing.
         """
-        key = f"{self.label} drawn {observation.seed}"
-        drawn: _Drawn | None = observation.resolved.get(key)
-        if drawn is not None and drawn.operator is self:
+        drawn = self._drawn(observation)
+        if drawn is not None:
             observation.smooth.update(drawn.means)
             observation.tally.update(drawn.tally)
             return drawn.state
+        key = f"{self.label} drawn {observation.seed}"
         whole, observation.tally = observation.tally, Tally()
         try:
             state = self._prepare(observation)
@@ -230,13 +262,21 @@ class AtmosphereLayers(Operator):
             observation.tally = whole
         return state
 
-    def _prepare(self, observation: Observation) -> AtNodes | OfDetectors:
-        _check_pointing(observation)
-        track = self._tracks.get(observation.name) or tracks([observation])[0]
+    def _drawn(self, observation: Observation) -> _Drawn | None:
+        """What an earlier run of the same observation drew."""
+        drawn: _Drawn | None = observation.resolved.get(f"{self.label} drawn {observation.seed}")
+        return drawn if drawn is not None and drawn.operator is self else None
+
+    def _expected_load(self, observation: Observation) -> tuple[float, float]:
         profile, band = self._weather(observation)
-        for what, text in profile.stated:
-            if what != "wind" or self.wind == "profile":
-                observation.tally.state(self.label, what, text)
+        elevation = min(max(float(np.median(observation.elevation)), ELEVATION_MIN), ELEVATION_MAX)
+        pwv = self.pwv or profile.pwv
+        return float(band.emission(pwv, elevation)), float(band.transmission(pwv, elevation))
+
+    def _lay_out(self, observation: Observation) -> _Laid:
+        _check_pointing(observation)
+        track = self._track(observation)
+        profile, band = self._weather(observation)
         pwv = self.pwv or profile.pwv
         layers = self._layers(profile)
         wind = None if self.wind == "profile" else layers[0].wind
@@ -244,15 +284,26 @@ class AtmosphereLayers(Operator):
         models = [_model(self, layer, track, observation) for layer in layers]
         beams = [_turbulence(self, observation, n, m) for n, m in enumerate(models)]
         variance = sum(m.amplitude**2 * b.variance for m, b in zip(models, beams, strict=True))
-        scale = self.pwv_rms / math.sqrt(variance) if self.pwv_rms_after_beam else self.pwv_rms
-
         key = f"{self.label} plan"  # kept for the companion runs
         if key not in observation.resolved:
             winds = [layer.wind for layer in layers]
             made = make_plan(observation, track, models, winds, variance, self.tolerance, band, pwv, self.pwv_rms)
             observation.resolved[key] = made
-        plan: Plan = observation.resolved[key]
-        _means(observation, plan, band, pwv)
+        return _Laid(profile, band, pwv, layers, models, beams, variance, observation.resolved[key])
+
+    def _track(self, observation: Observation) -> Track:
+        return self._tracks.get(observation.name) or tracks([observation])[0]
+
+    def _prepare(self, observation: Observation) -> AtNodes | OfDetectors:
+        if f"{self.label} laid out" not in observation.resolved:
+            self.configure(observation)
+        laid: _Laid = observation.resolved.pop(f"{self.label} laid out")
+        profile, band, pwv, layers, models, beams = laid.profile, laid.band, laid.pwv, laid.layers, laid.models, laid.beams
+        variance, plan, track = laid.variance, laid.plan, self._track(observation)
+        for what, text in profile.stated:
+            if what != "wind" or self.wind == "profile":
+                observation.tally.state(self.label, what, text)
+        scale = self.pwv_rms / math.sqrt(variance) if self.pwv_rms_after_beam else self.pwv_rms
         parts = zip(beams, layers, plan.steps, strict=True)
         drifting = [Drifting(beam, layer.height, layer.amplitude, layer.wind, step) for beam, layer, step in parts]
         drifting = [d for k, d in enumerate(drifting) if k not in self.omit]

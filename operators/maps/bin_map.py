@@ -159,7 +159,10 @@ class BinMap(Operator):
         first = data.observations[0]
         instrument = first.instrument
         if before is None:
-            net = float(np.median(first.focalplane.net)) or instrument.net
+            expected = first.expected_net if self.contents == "all" else None
+            levels = expected() if expected else first.focalplane.net
+            # weights about 1 and below: a sample's weight times its value, mean emission included, must fit the sums
+            net = float(max(levels.min(), np.median(levels) / 4)) or instrument.net
             found: dict[str, Any] = {
                 "variance": 2.0 ** round(math.log2(net**2 * first.sample_rate)) if net > 0 else 2.0**-12,
                 "fwhm": instrument.beam_fwhm,
@@ -210,7 +213,8 @@ class BinMap(Operator):
         """Pointing, weights and empty sums for one observation."""
         if self._grid is None:
             raise PipelineError("no grid: observe() was not called", place=self.label, cure="run it in a Pipeline")
-        net = observation.focalplane.net
+        usable, net = observation.good_detectors, observation.focalplane.net.copy()
+        net[~usable] = net[usable][0] if usable.any() else 1.0  # they weigh nothing, whatever their noise
         variance = net**2 * observation.sample_rate / self._variance  # of one sample, in reference units
         weight = np.ones(len(net))
         if self.weights == "inverse_variance" and self.contents == "all":

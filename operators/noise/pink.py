@@ -21,7 +21,7 @@ from zonda.core.numerics.smooth import Series, SmoothField, series_into
 from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.operator import Operator
 
-from .level import NoiseLevel, announced
+from .level import NoiseLevel, announced, resolve
 from .models import FixedNet, time_mean
 from .one_over_f import PowerLawFilter, power_law_filter
 
@@ -93,6 +93,7 @@ class PinkNoise(Operator):
         f_min = self.minimum_frequency or instrument.pink_minimum_frequency
         if knee == 0:
             observation.tally.state(self.label, "pink noise", "none: the knee is at 0 Hz")
+            observation.focalplane.knee = np.zeros(observation.n_detectors)
             return None
         try:
             law = power_law_filter(f_min / rate, slope, self.poles)
@@ -105,6 +106,8 @@ class PinkNoise(Operator):
         level = None
         if self.net is not None:
             level = NoiseLevel(FixedNet.of(self.net, self.reference), np.ones(observation.n_detectors))
+        resolve(observation)
+        _state_law(observation, (level or announced(observation)).sky_net(observation), knee, slope, f_min)
         streams = Streams(law, observation.detector_key(self.label), observation.detector_key(self.label, "start"))
         state = _State(factor, level, streams, self.shared)
         if self.shared > 0:
@@ -150,6 +153,15 @@ class PinkNoise(Operator):
         amplitude = time_mean(state.amplitude(observation), observation.n_detectors, 0.0)
         middle = np.median(amplitude) * np.sqrt(state.streams.law.variance)
         observation.tally.state(self.label, "rms at the detector, median (mK)", f"{1e3 * middle:.4g}")
+
+
+def _state_law(observation: Observation, net: NDArray[np.float64], knee: float, slope: float, f_min: float) -> None:
+    """Write where pink noise equals the white noise of the focal plane: the ``knee`` refers to ``net`` (n_det,)."""
+    plane = observation.focalplane
+    white = np.where(plane.net > 0, plane.net, net)
+    ratio = np.divide(net, white, out=np.ones(len(plane)), where=white > 0)
+    plane.knee = knee * ratio ** (2 / slope)
+    plane.slope, plane.minimum_frequency = np.full(len(plane), slope), np.full(len(plane), f_min)
 
 
 class _State:

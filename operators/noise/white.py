@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numba as nb
@@ -12,15 +14,18 @@ from numba import uint64
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
+from zonda.core.errors import PipelineError
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import SmoothField, series_into
 from zonda.core.operator import Operator
 
-from .level import NoiseLevel, announce, scatter_factors
+from .level import LEVELS, NoiseLevel, announce, resolve, scatter_factors
 from .models import INSTRUMENTS, FixedNet, NoiseModel, noise_model
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
 
     from zonda.core.data import Block, Data, Observation
     from zonda.core.plan.context import Context
@@ -36,8 +41,8 @@ class WhiteNoise(Operator):
     """Independent Gaussian noise in every sample of every detector.
 
     One sample has standard deviation NET sqrt(f_s); the one-sided power spectral density is 2 NET^2. Quoted on the sky, NET
-    enters the stream ``white`` as NET zeta <e^-tau>. The resolved sky NET is written to ``observation.focalplane.net``: at once
-    where it is given, with the first block where it depends on the load.
+    enters the stream ``white`` as NET zeta <e^-tau>. The NET on the sky, whatever it follows from, is written to
+    ``observation.focalplane.net`` in ``prepare``, before later steps are prepared; of several steps with white noise, all of it.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -67,28 +72,23 @@ class WhiteNoise(Operator):
         self.agree(data)
 
     def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
-        """Tell map makers a stated level, for which they lay out their sums; what it becomes for each detector follows."""
-        if self.net is not None and self.model is None and self.reference == "sky":
-            for observation in data.observations:
-                observation.resolved.setdefault(INSTRUMENTS, observation.focalplane.net)
-                observation.focalplane.net = np.full(observation.n_detectors, self.net)
+        """Say what the level will be about: map makers lay out their sums for it."""
+        model = self.model or FixedNet.of(self.net, self.reference)
+        for observation in data.observations:
+            level = NoiseLevel(model, scatter_factors(self.scatter, observation, self.label))
+            observation.expected_net = partial(_expected, level, observation, observation.expected_net)
         return None
 
     def configure(self, observation: Observation) -> None:
-        """Announce the level to `PinkNoise`; set ``focalplane.net`` where it is already known."""
+        """Announce the level to `PinkNoise` and to other white noise."""
+        observation.resolved.setdefault(INSTRUMENTS, observation.focalplane.net.copy())
         model = self.model or FixedNet.of(self.net, self.reference)
-        held: dict[str, NoiseLevel] = observation.resolved.setdefault("noise levels", {})
-        if self.label not in held:  # a companion run keeps the main run's level
-            factors = scatter_factors(self.scatter, observation, self.label)
-            held[self.label] = NoiseLevel(model, factors)
-        announce(observation, held[self.label])
-        if isinstance(model, FixedNet) and model.reference == "sky":
-            observation.focalplane.net = held[self.label].net(observation).copy()
+        announce(observation, self.label, NoiseLevel(model, scatter_factors(self.scatter, observation, self.label)))
 
     def prepare(self, observation: Observation) -> _State:
-        """Stream key; the amplitude follows with the first block."""
-        level: NoiseLevel = observation.resolved["noise levels"][self.label]
-        return _State(level, observation.detector_key(self.label))
+        """Stream key; resolves the level."""
+        resolve(observation)
+        return _State(observation.resolved[LEVELS][self.label], observation.detector_key(self.label), dict(observation.smooth))
 
     def memory(self, observation: Observation) -> int:
         """Amplitudes at the nodes of the mean emission."""
@@ -98,7 +98,7 @@ class WhiteNoise(Operator):
         """White noise of one sample."""
         from .estimate import white_traits
 
-        return white_traits(observation.resolved["noise levels"][self.label], observation)
+        return white_traits(observation.resolved[LEVELS][self.label], observation)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost: there is no coarser form of it."""
@@ -112,31 +112,44 @@ class WhiteNoise(Operator):
         """Add noise to ``white``."""
         add = "white" in block.detdata
         out = block.new("white", zero=False)
-        level = state.amplitude(block.observation).series(block.detectors, block.samples, out.dtype)
+        level = self._amplitude(block.observation, state).series(block.detectors, block.samples, out.dtype)
         _add_normals(state.key, block.detectors.start, block.samples.start, *level, add, out)
 
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """State the level."""
-        state.amplitude(observation)
-        net = 1e3 * observation.focalplane.net
+        net = 1e3 * state.level.sky_net(observation)
         text = f"{np.median(net):.4g}" + (f" ({net.min():.4g} to {net.max():.4g})" if net.max() > net.min() else "")
         observation.tally.state(self.label, "NET on the sky, median (range), mK s^1/2", text)
 
+    def _amplitude(self, observation: Observation, state: _State) -> SmoothField:
+        with state.lock:
+            if state.amplitude is None:
+                changed = [name for name, field in observation.smooth.items() if state.smooth.get(name) is not field]
+                if changed and (self.model is not None or self.reference == "detector"):
+                    raise PipelineError(
+                        f"a step has set the mean {changed[0]} after the noise level that follows from it was resolved",
+                        place=self.label,
+                        cure="set observation.smooth in configure(), or put that step before the noise",
+                    )
+                state.amplitude = state.level.amplitude(observation)
+            return state.amplitude
 
+
+@dataclass
 class _State:
-    """Level, key, and the amplitude once all operators are prepared."""
+    """Level, key, the smooth means that the level was resolved with; its amplitude, made with the first block."""
 
-    def __init__(self, level: NoiseLevel, key: NDArray[np.uint32]) -> None:
-        self.level, self.key = level, key
-        self._lock = threading.Lock()
-        self._amplitude: SmoothField | None = None
+    level: NoiseLevel
+    key: NDArray[np.uint32]
+    smooth: dict[str, SmoothField]
+    amplitude: SmoothField | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def amplitude(self, observation: Observation) -> SmoothField:
-        with self._lock:
-            if self._amplitude is None:
-                observation.focalplane.net = self.level.sky_net(observation).copy()
-                self._amplitude = self.level.amplitude(observation)
-            return self._amplitude
+
+def _expected(level: NoiseLevel, observation: Observation, others: Callable[[], NDArray[np.floating[Any]]] | None) -> Floats:
+    """`NoiseLevel.expected_sky_net` and that of ``others``, in quadrature."""
+    net = level.expected_sky_net(observation)
+    return net if others is None else np.asarray(np.hypot(net, others()), np.float64)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -74,6 +74,8 @@ PARTIAL = Case(
     "one detector dead in one block only; a scan of zero length",
     "clear error or correct result",
 )
+STATED = Case("stated noise", "std(signal / NOISE) of a map of white noise is 1 for every reference and model")
+"""What a map's header promises."""
 MACHINE = Case("this machine", "what the other figures rest on")
 """Differs from machine to machine: shown by `zonda doctor`, not published."""
 

@@ -1,18 +1,24 @@
-"""Pink noise from f_min on, for any length."""
+"""Pink noise from f_min on, for any length; the noise that a map states, for every noise model."""
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
+import zonda
 from zonda.core.checks import Family, Measured
+from zonda.core.errors import ZondaError
 from zonda.core.numerics.random import normals, stream_key
+from zonda.core.registry import noise_models
 from zonda.operators.noise.one_over_f import PowerLawFilter, power_law_filter
 from zonda.operators.noise.pink import Streams
+from zonda.operators.noise.white import WhiteNoise
 
-from .cases import PINK
-from .scenes import largest, unrefused
+from .cases import PINK, STATED
+from .scenes import camera, largest, unrefused
 
 checks = Family("noise")
 
@@ -109,3 +115,45 @@ def refusals() -> Measured:
             (lambda: power_law_filter(1e-7, 1.0, 4), "poles fit"),
         ]
     )
+
+
+def over_stated(*white: WhiteNoise, seed: int = 1, **optics: Any) -> tuple[float, float]:
+    """std(signal / NOISE) of a map of white noise through 1.5 mm of water at 800 to 900 GHz, and its standard error.
+
+    The map less that of the same run without the noise, so that the mean emission is not in it.
+    """
+    instrument = camera(low="800 GHz", high="900 GHz").model_copy(update={"knee": 0.0})
+    scene = zonda.Scene(site="chajnantor", instrument=instrument, time="2024-07-25T03:00", target="17h -20d", seed=seed)
+    steps = [
+        zonda.PointingDaisy(radius="4 arcmin", speed="1 arcmin/s", scan_duration="10 s"),
+        zonda.AtmosphereLayers(pwv="1.5 mm", pwv_rms="0 %"),
+        *white,
+        zonda.Efficiency(**optics),
+        zonda.BinMap(pixel="2 arcsec", half_difference=False),
+    ]
+    pipeline = zonda.Pipeline(steps, runs={"quiet": {"without": ["white"], "modes": "full"}})
+    products = pipeline.run(scene, threads=1).products
+    product, use = products["map"], products["map"].hits > 0
+    ratio = (product.signal[use] - products["quiet/map"].signal[use]) / product.noise[use]
+    return float(np.sqrt(np.mean(ratio**2))), 1 / math.sqrt(2 * ratio.size)
+
+
+def levels() -> dict[str, WhiteNoise]:
+    """White noise of every reference, and of every registered model that needs no parameters."""
+    found = {
+        "the instrument's": WhiteNoise(),
+        "on the sky": WhiteNoise(net="3 mK s(1/2)", scatter="30 %"),
+        "at the detector": WhiteNoise(net="1 mK s(1/2)", reference="detector", scatter="30 %"),
+    }
+    for name in noise_models:
+        with suppress(ZondaError, ValueError):
+            found[name] = WhiteNoise(model=name, scatter="30 %")
+    return found
+
+
+@checks.add(STATED, reference="1", limit=4.5, unit="standard errors")
+def stated() -> Measured:
+    """std(signal / NOISE) of maps of white noise, NET on the sky, at the detector, every noise model, 850 GHz, 1.5 mm of PWV"""
+    found = {name: over_stated(level, scatter="10 %") for name, level in levels().items()}
+    text = ", ".join(f"{name} {ratio:.3f}" for name, (ratio, _) in found.items())
+    return largest(*(abs(ratio - 1) / error for ratio, error in found.values())), text
