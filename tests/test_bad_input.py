@@ -287,3 +287,44 @@ def test_target_map_without_a_centre(here, capsys, change, words):
     (here / "my.yaml").write_text(PIPELINE.replace("05h00m00s +20d00m00s", "map").replace(*change))
     message = refused(capsys, "check")
     assert all(w in message for w in words), message
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(
+    ("cards", "value", "words"),
+    [
+        ({}, 1e297, ["map.fits", "its largest value is 1e+297", "check the map"]),
+        ({}, -1e20, ["map.fits", "its largest value is 1e+20 K_RJ, more than 1e+15", "check its unit"]),
+        ({"CDELT1": 1e-300}, 1.0, ["map.fits", "1e-300 deg is no size of a pixel", "check CDELT1"]),
+        ({"CDELT2": 1e300}, 1.0, ["map.fits", "1e+300 deg is no size of a pixel", "check CDELT1"]),
+        ({"CRPIX2": 1e30}, 1.0, ["map.fits", "the reference point is pixel 6, 1e+30", "CRPIX1 and CRPIX2 may be up to 1e+09"]),
+        ({"RADESYS": "FK5", "EQUINOX": 1e300}, 1.0, ["map.fits", "EQUINOX = 1e+300 is no year", "set EQUINOX"]),
+        ({"BUNIT": "Jy/beam", "BMAJ": 1e-300}, 1.0, ["map.fits", "1e-300 deg is no size of a pixel or beam", "BMAJ and BMIN"]),
+    ],
+)
+def test_numbers_in_a_map_that_no_sky_has(here, capsys, cards, value, words):
+    (here / "map.fits").unlink()
+    write_map(here / "map.fits", np.full((11, 11), value), **cards)
+    message = refused(capsys)
+    assert all(w in message for w in words), message
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("- BinMap", "- BinMap: {pixel: 1e30 arcsec}"), ["my.yaml:11:22", "1e30 arcsec is more than 1e+06 rad"]),
+        (("- BinMap", "- BinMap: {pixel: 1e-300 arcsec}"), ["my.yaml:11:22", "1e-300 arcsec is less than 1e-30 rad"]),
+        (("- BinMap", "- BinMap: {smooth: 1e9 arcsec}"), ["my.yaml:11:23", "at most 0.1 rad"]),
+        (("map.fits}", "map.fits, scale: 1e300}"), ["my.yaml:8:36", "must be at most 1e+30"]),
+        (("map.fits}", "map.fits, outside: 1e300 K}"), ["my.yaml:8:38", "more than 1e+15 K"]),
+        (("map.fits}", "map.fits, pixel_size: 1e-300 arcsec}"), ["my.yaml:8:41", "less than 1e-30 rad"]),
+        (("2 s}", "2 s, sample_rate: 1e-300 Hz}"), ["my.yaml:7:54", "less than 1e-30 Hz"]),
+    ],
+)
+def test_parameters_that_nothing_has(here, capsys, change, words):
+    (here / "my.yaml").write_text(PIPELINE.replace(*change))
+    message = refused(capsys, "check")
+    assert "Traceback" not in message
+    assert words[0].rpartition(":")[0] in message, message  # on that line; where in it is up to the kind of mistake
+    assert all(w in message for w in words[1:]), message

@@ -69,7 +69,7 @@ def accuracy(
 
     file = load(pipeline, settings)
     get(metric)
-    first_look(file.pipeline(), file.scene())
+    first_look(file.pipeline(), file.scene(), saved=False)
     wanted = _fraction(target, Unit(""))
     if check:
         return _retest(file, pipeline, metric)

@@ -25,24 +25,31 @@ from .diagnostics import nearest
 
 
 class Kind(NamedTuple):
-    """One kind of quantity: how messages call it, examples, and the units in which values are written back."""
+    """One kind of quantity: how messages call it, examples, the units in which values are written back, and the largest value
+    (SI) that is computed with."""
 
     noun: str
     examples: tuple[str, ...]
     display: tuple[str, ...]
+    most: float = 1e30
+
+
+LEAST = 1e-30
+"""Smallest value (SI) besides zero that is computed with: squares and products of a few such values, and of `Kind.most`, are
+still numbers."""
 
 
 KINDS = {
-    "rad": Kind("an angle", ("4 arcmin", "11 arcsec", "0.5 deg"), ("deg", "arcmin", "arcsec", "rad")),
-    "rad / s": Kind("an angular speed", ("51 arcsec/s", "0.5 deg/s"), ("deg/s", "arcmin/s", "arcsec/s", "rad/s")),
-    "rad / s2": Kind("an angular acceleration", ("0.05 deg/s2",), ("deg/s2", "arcmin/s2", "arcsec/s2", "rad/s2")),
-    "rad / s3": Kind("an angular jerk", ("0.2 deg/s3",), ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3")),
-    "s": Kind("a time", ("20 min", "600 s"), ("s", "min", "h", "ms")),
-    "Hz": Kind("a frequency", ("90 GHz", "100 Hz"), ("Hz", "mHz", "GHz")),
-    "m": Kind("a length", ("1.8 mm", "1 km"), ("m", "mm", "km")),
-    "m / s": Kind("a speed", ("10 m/s", "36 km/h"), ("m/s",)),
-    "K": Kind("a temperature", ("150 mK", "270 K"), ("K", "mK", "uK")),
-    "K s(1/2)": Kind("a noise level", ("1.7 mK s(1/2)", "400 uK s(1/2)"), ("mK s(1/2)", "uK s(1/2)", "K s(1/2)")),
+    "rad": Kind("an angle", ("4 arcmin", "11 arcsec", "0.5 deg"), ("deg", "arcmin", "arcsec", "rad"), 1e6),
+    "rad / s": Kind("an angular speed", ("51 arcsec/s", "0.5 deg/s"), ("deg/s", "arcmin/s", "arcsec/s", "rad/s"), 1e6),
+    "rad / s2": Kind("an angular acceleration", ("0.05 deg/s2",), ("deg/s2", "arcmin/s2", "arcsec/s2", "rad/s2"), 1e6),
+    "rad / s3": Kind("an angular jerk", ("0.2 deg/s3",), ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3"), 1e6),
+    "s": Kind("a time", ("20 min", "600 s"), ("s", "min", "h", "ms"), 1e15),
+    "Hz": Kind("a frequency", ("90 GHz", "100 Hz"), ("Hz", "mHz", "GHz"), 1e18),
+    "m": Kind("a length", ("1.8 mm", "1 km"), ("m", "mm", "km"), 1e20),
+    "m / s": Kind("a speed", ("10 m/s", "36 km/h"), ("m/s",), 1e15),
+    "K": Kind("a temperature", ("150 mK", "270 K"), ("K", "mK", "uK"), 1e15),
+    "K s(1/2)": Kind("a noise level", ("1.7 mK s(1/2)", "400 uK s(1/2)"), ("mK s(1/2)", "uK s(1/2)", "K s(1/2)"), 1e15),
     "": Kind("a pure number", ("0.3", "30 %"), ("",)),
 }
 """By SI unit."""
@@ -169,6 +176,9 @@ class Unit:
             result = self._from_astropy(value)
         if not math.isfinite(result):
             raise self._error("unit_finite", f"expected a finite number, got {value}")
+        if result and not LEAST <= abs(result) <= self.kind.most:
+            beyond = f"more than {self.kind.most:g}" if abs(result) > 1 else f"less than {LEAST:g}"
+            raise self._error("unit_range", f"{value} is {beyond} {self.unit}".rstrip() + ", beyond what can be computed with")
         return result
 
     def write(self, value: float) -> str:

@@ -15,14 +15,16 @@ if TYPE_CHECKING:
     from ..scene import Scene
 
 
-def first_look(pipeline: Pipeline, scene: Scene) -> list[list[str]]:
+def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[list[str]]:
     """What each operator's `check` finds, in the order of the steps: lines to print.
 
-    Warns where no step writes anything. Raises `ZondaError` as the checks do: a target that is not up, a scan that is too fast.
+    Warns where no step writes anything (unless not ``saved``: products are wanted in memory alone).
+
+    Raises `ZondaError` as the checks do: a target that is not up, a scan that is too fast.
     """
     data = Data(scene=scene)
     found = [operator.check(data) for operator in pipeline.operators]
-    if not writes(pipeline.operators):
+    if saved and not writes(pipeline.operators):
         text = f"{pipeline.name}: no step writes a product, so what is computed is lost"
         warnings.warn(f"{text}; add one that does, e.g. SaveMap, SaveTOD, Plots or Report", stacklevel=2)
     return found

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +70,7 @@ class Plots(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
     at_end: ClassVar[bool] = True
 
-    smooth: Angle | Literal["beam", "none"] = "beam"
+    smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = "beam"
     """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a Gaussian of this FWHM, or not."""
     central_diameter: Angle = quantity("1 arcmin", gt=0)
     """Diameter of the circle that noise maps show, in which their rms is taken."""

@@ -61,6 +61,10 @@ class _Requires:
         return frozenset({"boresight"} if operator is not None and operator.contents == "hits" else {"signal", "boresight"})
 
 
+WIDEST_SMOOTH = 0.1
+"""FWHM of a map's smoothing, rad."""
+
+
 class BinMap(Operator):
     """Average the samples in each pixel, equation (1), into a FITS image (TAN) or a HEALPix map."""
 
@@ -125,6 +129,8 @@ class BinMap(Operator):
     def _positive(cls, value: float | str | None) -> float | str | None:
         if isinstance(value, float) and value <= 0:
             raise ValueError("smooth must be positive; leave it out for no smoothing")
+        if isinstance(value, float) and value > WIDEST_SMOOTH:
+            raise ValueError(f"smooth must be at most {WIDEST_SMOOTH:g} rad (5.7 deg): the kernel would be wider than any map")
         return value
 
     @model_validator(mode="after")

@@ -12,6 +12,8 @@ from zonda.core.errors import InputError
 from zonda.core.numerics import tangent
 from zonda.core.storage.files import first_line
 
+from .limits import check_geometry, check_sides
+
 Floats = NDArray[np.float64]
 
 _ANGLES = {
@@ -80,8 +82,11 @@ def geometry(
         raise InputError(
             f"the WCS is broken: {first_line(err)}", place=place, cure="check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"
         ) from err
-    if not np.isfinite([*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]).all() or np.linalg.det(matrix) == 0.0:
+    with np.errstate(over="ignore"):
+        area = np.linalg.det(matrix)
+    if not np.isfinite([*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]).all() or area == 0.0:
         raise InputError("the WCS is singular: its pixels have no area", place=place, cure="check CDELT1, CDELT2, PC and CD")
+    check_geometry(matrix if pixel_size is None else np.eye(2) / 60, wcs.wcs.crpix, header, place)
     if pixel_size is None:
         return wcs, None
     if not is_plain_tan(wcs):
@@ -143,6 +148,7 @@ def _plain_scale(place: str, header: Any, scaled: bool, pixel_size: float | None
         sizes.append(abs(float(step)) * unit)
     if not all(np.isfinite(s) and s > 0 for s in sizes):
         raise InputError("the pixel size is zero or not finite", place=place, cure="check CDELT1 and CDELT2")
+    check_sides(np.degrees(sizes), place, "check CDELT1 and CDELT2")
     return np.diag([-sizes[0], sizes[1]])
 
 

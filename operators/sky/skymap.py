@@ -29,6 +29,7 @@ from ..maps.image import Image
 from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct
 from .footprint import Footprint, footprint, off_the_map, position
 from .inputs import HealpixMap, WcsMap
+from .limits import check_brightness
 from .linear import sample_linear
 from .placement import kelvin, placed, too_bright, turned
 from .read import read_map
@@ -93,9 +94,9 @@ class SkyMap(Operator):
     """Brightness of the sky beyond the map's edge, K_RJ; samples there are counted."""
     missing: Literal["error", "zero"] = "error"
     """What NaN or infinite pixels do: stop with an error, or count as 0 in the map's unit (and be counted)."""
-    scale: float = 1.0
+    scale: float = Field(1.0, ge=-1e30, le=1e30)
     """Factor on the whole map (not on `outside`)."""
-    spectral_index: float = 0.0
+    spectral_index: float = Field(0.0, ge=-100, le=100)
     """Slope of the flux density, S ~ frequency^index, within the band; for maps in Jy/pixel, Jy/beam and MJy/sr."""
     pixels_per_fwhm: float = Field(PIXELS_PER_FWHM, ge=2, le=16)
     """Fewest points per FWHM between which the convolved map is interpolated; a finer input is used on its own pixels."""
@@ -296,10 +297,12 @@ class SkyMap(Operator):
             "input map": f"TAN, {values.shape[1]} x {values.shape[0]} pixels of {pixel[0]:.6g} x {pixel[1]:.6g} arcsec",
             "conversion": factor,
         }
+        check_brightness(values * self.scale, f"{self.label}, sky map {self.file}")
         return Sky(key, values * self.scale, np.zeros((0, 0), bool), wcs, notes, {ZEROED: source.zeroed, LOST: lost})
 
     def _resampled(self, source: WcsMap | HealpixMap, wcs: Any, band: Any, key: tuple[Hashable, ...]) -> Sky:
         values, factor, lost = kelvin(source, band, self.spectral_index, None)
+        check_brightness(values * self.scale, f"{self.label}, sky map {self.file}")
         if isinstance(source, HealpixMap):
             kind = f"HEALPix of nside {source.nside}"
             scaled: WcsMap | HealpixMap = replace(source, values=values, unit="K_RJ")

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 
+from .limits import LARGEST, check_sides, check_values
+
 Floats = NDArray[np.float64]
 
 KNOWN_UNITS = "Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y)"
@@ -93,6 +95,7 @@ def beam_solid_angle(place: str, header: Any, unit: str, given: float | None, no
             cure="set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam: 18 arcsec, the "
             "FWHM of the map's beam (not fwhm, which is that of the telescope simulated)",
         )
+    check_sides((major, minor), place, "set the header keys BMAJ and BMIN (FWHM in degrees)")
     return float(np.pi / (4 * np.log(2)) * np.radians(major) * np.radians(minor))
 
 
@@ -108,4 +111,5 @@ def filled(place: str, values: Floats, missing: str, first: str) -> int:
             cure="mend the map, or set the operator's parameter missing: zero to take them as zero (they are counted)",
         )
     values[bad] = 0.0
+    check_values(values, place, LARGEST, "in its unit", "check the map, and the header's BSCALE and BZERO")
     return count
