@@ -22,7 +22,7 @@ class ZondaError(Exception):
 
     def __str__(self) -> str:
         text = f"{self.place}: {self.message}" if self.place else self.message
-        return f"{text}\n  = {self.cure}" if self.cure else text
+        return "\n  = ".join([text, *self.cure.splitlines()])
 
 
 class InputError(ZondaError):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from .configuration.files import InputPath
-from .configuration.parameters import Parameters, quantity
+from .configuration.parameters import Parameters, named, quantity
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
 from .errors import InputError
 from .focalplane import Focalplane
@@ -177,11 +177,9 @@ class Instrument(Parameters):
     @field_validator("band", mode="before")
     @classmethod
     def _band_by_name(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            from .registry import bands
+        from .registry import bands
 
-            return bands.create(value)
-        return value
+        return named(bands, value)
 
     @property
     def identity(self) -> tuple[str, ...]:

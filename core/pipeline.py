@@ -14,6 +14,7 @@ from .data import Data, Observation, html_table
 from .errors import PipelineError
 from .machine import available_memory, available_threads
 from .operator import Operator
+from .run import arguments
 from .run.ahead import Ahead
 from .run.companion import Companion
 from .run.derived import Derivation, derivable, parts_of
@@ -94,13 +95,14 @@ class Pipeline:
         description: str = "",
         precision: Literal["float32", "float64"] = "float32",
     ) -> None:
-        self.operators = [o.model_copy() for o in operators]  # labels are this pipeline's own
-        self.runs = {k: v if isinstance(v, Companion) else Companion.model_validate(v) for k, v in (runs or {}).items()}
-        self.name, self.description, self.precision = name, description, precision
+        self.operators = arguments.steps(operators, name)  # copies: labels are this pipeline's own
+        self.runs = arguments.runs(runs, name)
+        self.name, self.description, self.precision = name, description, arguments.precision(precision, name)
         self._name_steps()
         if problems := check_order(self.operators):
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
-            raise PipelineError("\n".join(lines), place=self.name)
+            cures = dict.fromkeys(p.cure for p in problems if p.cure)
+            raise PipelineError("\n".join(lines), place=self.name, cure="\n".join(cures))
         self.selection = Selection(self.operators, self.runs, self.name)
         self.derived = derivable(self.selection, tuple(self.runs))
         """Companion runs that are derived from the main run and these others, if the operators find nothing against it."""
@@ -154,6 +156,8 @@ class Pipeline:
         from .hooks import manager
         from .storage.files import check_output_folder
 
+        numbers = {"threads": threads, "memory": memory, "ceiling": ceiling}
+        threads, memory, ceiling = arguments.check_run(scene, output, numbers, keep, self.name)
         hooks = manager().hook
         data = Data(scene=scene, output=None if output is None else Path(output))
         if data.output is not None and part is None:  # a part makes a folder only when it writes there

@@ -37,7 +37,7 @@ class RegistryError(ZondaError):
 
     def __str__(self) -> str:
         text = f"{self.place}: {self.message}" if self.place else self.message
-        return "\n  = ".join(part for part in (f"{text}; {self.label}" if self.label else text, self.cure) if part)
+        return "\n  = ".join([f"{text}; {self.label}" if self.label else text, *self.cure.splitlines()])
 
 
 class Registry:
@@ -166,9 +166,9 @@ class Registry:
         found = Found(name, _reference(component), SESSION, "") if name in self._local else self._named(name)[0]
         try:
             made = component()
-        except ZondaError:
-            raise
         except Exception as err:
+            if isinstance(err, ZondaError) and not isinstance(err, ValueError):  # a ParameterError is the plugin's fault
+                raise
             raise _broken(self.kind, found, err) from err
         return self._check(made, found, made=True)
 
@@ -275,6 +275,10 @@ def _first_words(err: Exception) -> str:
     """The first line of what an exception says; of pydantic's, which has none to the point, all fields with their mistakes."""
     from pydantic import ValidationError
 
+    from .configuration.diagnostics import ConfigurationError
+
+    if isinstance(err, ConfigurationError):
+        return "; ".join(diagnostic.message for diagnostic in err.diagnostics)
     if isinstance(err, ValidationError):
         return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in err.errors())
     return f"{type(err).__name__}: {err}".splitlines()[0]

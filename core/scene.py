@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, field_validator
 
-from .configuration.parameters import Parameters
+from .configuration.parameters import Parameters, named
 from .configuration.target import Target
 from .configuration.time import Instant
 from .instrument import Instrument
@@ -34,17 +34,13 @@ class Scene(Parameters):
     @field_validator("site", mode="before")
     @classmethod
     def _site_by_name(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            from .registry import sites
+        from .registry import sites
 
-            return sites.create(value)
-        return value
+        return named(sites, value)
 
     @field_validator("instrument", mode="before")
     @classmethod
     def _instrument_by_name(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            from .registry import instruments
+        from .registry import instruments
 
-            return instruments.create(value)
-        return value
+        return named(instruments, value)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic_core import PydanticCustomError, core_schema
 
+from .configuration.diagnostics import refusal
 from .configuration.parameters import Parameters
 from .configuration.units import Unit
 from .errors import InputError, ZondaError
@@ -183,6 +184,8 @@ def resolve(value: Any) -> tuple[type[WeatherSource], dict[str, Any]]:
     named = [key for key in SHORTHAND if key in given]
     if "source" not in given and len(named) > 1:
         raise InputError(f"{' and '.join(named)} are two sources of weather", cure=f"keep one; {example}")
+    if isinstance(value, str) and (value[:1].isdigit() or value.strip().lower() == "random"):
+        raise InputError(f"'{value}' is no source of weather", cure=f"write weather: {{pwv: {value}}}; {example}")
     name = str(given.get("source") or (SHORTHAND[named[0]] if named else "climatology"))
     return weather_sources.get(name), {**given, "source": name}
 
@@ -194,5 +197,5 @@ def weather_source(value: Any, info: ValidationInfo) -> Any:
     try:
         source, given = resolve(value)
     except ZondaError as err:
-        raise ValueError(str(err)) from None
+        raise refusal(err) from None
     return source.model_validate(given, context=info.context)

@@ -10,7 +10,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from .diagnostics import Diagnostic, nearest
+from .diagnostics import ConfigurationError, Diagnostic, nearest
 from .parameters import described
 from .units import Unit
 from .yaml_places import Document, Path, Span
@@ -33,10 +33,18 @@ _WANTED = {
     "path": "the path of a file or folder",
 }
 """What pydantic's errors of type (or parsing) want, by the first word of their kind."""
+_IN_PYTHON = {"a mapping of keys": "a dict", "true or false": "True or False"}
 
 
 def explain(
-    error: ValidationError, model: type[BaseModel], document: Document, at: Path, who: str, keys: Iterable[str] = ()
+    error: ValidationError,
+    model: type[BaseModel],
+    document: Document,
+    at: Path,
+    who: str,
+    keys: Iterable[str] = (),
+    *,
+    python: bool = False,
 ) -> list[Diagnostic]:
     """One diagnostic per mistaken value.
 
@@ -48,11 +56,13 @@ def explain(
         How messages call it.
     keys
         The keys it takes, where they are not just the model's fields.
+    python
+        Whether it was called in Python: cures are then written so.
     """
     found: list[Diagnostic] = []
     branches: dict[Span, int] = {}
     for e in error.errors():
-        new = _one(e, model, document, at, who, keys)
+        new = _one(e, model, document, at, who, keys, python)
         if new.span not in branches or e["type"] in ("missing", "extra_forbidden"):
             branches[new.span] = len(found)
             found.append(new)
@@ -60,10 +70,28 @@ def explain(
             k = branches[new.span]
             other = "or: " + new.message.removeprefix(found[k].message.split(": ")[0] + ": ")
             found[k] = replace(found[k], help="\n".join(filter(None, (other, found[k].help))))
+    return _together(found)
+
+
+def _together(found: list[Diagnostic]) -> list[Diagnostic]:
+    """More than two parameters that are missing at one place as one mistake; none that another name was meant for."""
+    meant = {d.label for d in found if d.message.startswith("unknown ")}
+    found = [d for d in found if not (" needs '" in d.message and f"did you mean {_missing(d)}?" in meant)]
+    for span in dict.fromkeys(d.span for d in found):
+        lacking = [d for d in found if d.span == span and " needs '" in d.message]
+        if len(lacking) > 2:
+            names = ", ".join(_missing(d) for d in lacking)
+            texts = "\n".join(f"{_missing(d)[1:-1]}: {d.help}" for d in lacking)
+            one = Diagnostic(f"{lacking[0].message.split(' needs ')[0]} needs {names}", span, "these are missing", texts)
+            found = [one if d is lacking[0] else d for d in found if d is lacking[0] or d not in lacking]
     return found
 
 
-def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str, keys: Iterable[str]) -> Diagnostic:
+def _missing(diagnostic: Diagnostic) -> str:
+    return diagnostic.message.rpartition(" needs ")[2]
+
+
+def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str, keys: Iterable[str], python: bool) -> Diagnostic:
     path, loc = at, []
     kind, context = e["type"], e.get("ctx", {})
     for part in e["loc"][:-1] if kind == "missing" else e["loc"]:  # leaves out tags of unions
@@ -76,18 +104,27 @@ def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str,
         options = list(keys if keys and len(loc) == 1 else (owner or model).model_fields)
         inside = who if len(loc) == 1 else f"{who}, {'.'.join(map(str, loc[:-1]))}"
         hint = glued(e["loc"][-1], options) or nearest(e["loc"][-1], options, "not a known key")
-        return Diagnostic(f"unknown key '{e['loc'][-1]}' for {inside}", mark.start, hint, f"{inside} takes: {', '.join(options)}")
+        message = f"unknown {'parameter' if python else 'key'} '{e['loc'][-1]}' for {inside}"
+        return Diagnostic(message, mark.start, hint, f"{inside} takes: {', '.join(options)}")
     if kind == "missing":
         name = str(e["loc"][-1])
         _, field = _field(model, [*loc, name])
         unit = _unit(field)
-        label = f"add '{name}: {unit.example}'" if unit else f"add '{name}:'"
+        if python and not loc:
+            label = f"add {name}={unit.example!r}" if unit and unit.unit else f"add {name}={unit.example if unit else '...'}"
+        else:
+            label = f"add '{name}: {unit.example}'" if unit else f"add '{name}:'"
         inside = f"{who}, {'.'.join(map(str, loc))}" if loc else who
         return Diagnostic(f"{inside} needs '{name}'", mark.start, label, _description(field))
     _, field = _field(model, loc)
+    if isinstance(inner := context.get("error"), ConfigurationError) and inner.diagnostics:  # a call within
+        first = inner.diagnostics[0]
+        where = f"{who}, {'.'.join(map(str, loc))}" if loc else who
+        return Diagnostic(f"{where}: {first.message}", mark.value, first.label, first.help)
     span, label = mark.value, context.get("label") or ""
     if caret := context.get("caret"):
-        span = span.part(*caret)
+        offset, length = caret
+        span = span.inner(offset + 1, length) if python and isinstance(e["input"], str) else span.part(offset, length)
     message = str(context.get("error") or e["msg"])
     if kind in _LIMITS:
         message = _limit(e, _unit(field), document, path)
@@ -98,7 +135,8 @@ def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str,
         message = f"{e['input']!r:.60} has a character that is not allowed here"
         label = "use letters, digits and '_'" + (", '.', '+', '-' and spaces within" if " " in context.get("pattern", "") else "")
     elif kind.endswith(("_parsing", "_type", "_from_float")) and kind.split("_")[0] in _WANTED and e["msg"].startswith("Input"):
-        message = f"expected {_WANTED[kind.split('_')[0]]}, got {e['input']!r:.60}"
+        wanted = _WANTED[kind.split("_")[0]]
+        message = f"expected {_IN_PYTHON.get(wanted, wanted) if python else wanted}, got {e['input']!r:.60}"
     message = message[:1].lower() + message[1:] if not message[:2].isupper() else message
     where = f"{who}, {'.'.join(map(str, loc))}" if loc else who
     text = "\n".join(filter(None, (context.get("help"), _description(field))))
@@ -121,7 +159,9 @@ def _limit(e: Any, unit: Unit | None, document: Document, path: Path) -> str:
     except (TypeError, LookupError):  # a key that is there twice: its places are of one, its value of the other
         value = e["input"]
     limit = e["ctx"][key]
-    shown = unit.write_in_unit_of(limit, value) if unit and unit.unit and isinstance(value, str) else f"{limit}"
+    shown = f"{limit}"
+    if unit and unit.unit:
+        shown = unit.write_in_unit_of(limit, value) if isinstance(value, str) else unit.write(limit)
     return f"must be {words} {shown}, got {value}"
 
 

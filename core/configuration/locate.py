@@ -20,6 +20,8 @@ def shipped() -> dict[str, Path]:
 
 def locate(path_or_name: str | Path) -> Path:
     """The file that a path, or a shipped pipeline's name, stands for. Raises InputError where there is none."""
+    if not isinstance(path_or_name, str | Path):
+        raise InputError("is not a path", place=f"{path_or_name!r:.60}", cure=f"give the path of a YAML file; {SHIPPED}")
     path, name = Path(path_or_name), str(path_or_name)
     with suppress(RuntimeError):  # nobody of that name: take ~ as it stands
         path = path.expanduser()
@@ -61,6 +63,7 @@ def read(path: Path) -> str:
         raise InputError(message, place=f"{path}:{line}:{column}", cure="save it as UTF-8") from None
 
 
+SHIPPED = "`zonda pipelines` lists those that have names"
 _IMAGE = "to observe it, name it in a pipeline: - SkyMap: {file: %s}"
 _DATA = "give the path of a YAML file; `zonda pipelines` lists examples"
 _KINDS = (

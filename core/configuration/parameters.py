@@ -10,10 +10,12 @@ import sys
 import textwrap
 import tokenize
 from itertools import pairwise, takewhile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
+
+from ..errors import ZondaError
 
 
 def quantity(default: str, **limits: Any) -> Any:
@@ -24,10 +26,51 @@ def quantity(default: str, **limits: Any) -> Any:
     return Field(default, **limits)
 
 
+def named(names: Any, value: Any) -> Any:
+    """What a registered name stands for (``names``: a `core.registry.Registry`); what is no text is returned as it is.
+
+    Raises PydanticCustomError, which is shown at the value's place.
+    """
+    if not isinstance(value, str):
+        return value
+    try:
+        return names.create(value)
+    except ZondaError as err:
+        from .diagnostics import refusal
+
+        raise refusal(err) from None
+
+
 class Parameters(BaseModel):
     """A frozen, validated parameter set. Attribute docstrings become schema descriptions and error messages."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+    if not TYPE_CHECKING:  # a type checker sees the fields
+
+        def __init__(self, /, *values: Any, **given: Any) -> None:
+            """Raises `ParameterError`, a ZondaError, with every mistake in the parameters."""
+            __tracebackhide__ = True
+            if values:
+                from .calls import positional
+
+                raise positional(type(self), values)
+            try:
+                super().__init__(**given)
+            except ValidationError as err:
+                from .calls import mistakes_of
+
+                raise mistakes_of(err, type(self), given) from None
+
+        __init__.__pydantic_base_init__ = True  # what is validated as a field is not made by it: contexts and places are kept
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            try:
+                super().__setattr__(name, value)
+            except ValidationError:
+                from .calls import changed
+
+                raise changed(type(self), name) from None
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -203,7 +203,7 @@ def parse(text: str, *, name: str = "<text>", folder: str | Path | None = None, 
             message = f"a pipeline file is a mapping of keys, not {_noun(document.value)}"
             mistakes = [Diagnostic(message, Span(source), "", EXAMPLE)]
         raise ConfigurationError(mistakes, name)
-    for setting in overrides:
+    for setting in [overrides] if isinstance(overrides, str) else overrides:
         mistakes += settings.apply(document, setting, KEYS)
     return _Check(document, name, folder, mistakes).run()
 

@@ -122,6 +122,16 @@ class Plan:
         return html_table("Plan", [(f"{r['operator']}.{r['effect']}", f"{r['decision']}: {r['what']}") for r in rows(self)])
 
 
+def _check_arguments(file: Any, keep: Any, drop: Any) -> None:
+    if not isinstance(file, PipelineFile):
+        cure = "write zonda.plan(zonda.load(path_or_name))"
+        raise ZondaError(f"a plan is made of a pipeline file, not of {file!r:.60}", place="zonda plan", cure=cure)
+    for what, names in (("keep", keep), ("drop", drop)):
+        if isinstance(names, str):
+            cure = f"write {what}=[{names!r}]"
+            raise ZondaError(f"{what} is a list of names, not the text {names!r}", place="zonda plan", cure=cure)
+
+
 def plan(
     file: PipelineFile,
     *,
@@ -150,6 +160,7 @@ def plan(
     ZondaError
         For a name that is not in the plan, or a budget that is not a number from 0 to 1.
     """
+    _check_arguments(file, keep, drop)
     begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
     labels = [o.label for o in pipeline.operators]

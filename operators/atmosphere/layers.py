@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
+from zonda.core.configuration.diagnostics import refusal
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSecond
 from zonda.core.data import Block, Data, Observation, Tally
@@ -201,7 +202,7 @@ class AtmosphereLayers(Operator):
         try:
             spectra.get(name)
         except ZondaError as error:
-            raise ValueError(str(error)) from None
+            raise refusal(error) from None
         return name
 
     @model_validator(mode="after")

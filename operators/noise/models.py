@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from zonda.core.configuration.diagnostics import refusal
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Fraction, Kelvin, KelvinRootSecond
 from zonda.core.errors import ZondaError
@@ -149,7 +150,7 @@ def noise_model(value: Any) -> Any:
         elif callable(found):
             found = noise_models.create(name)
     except ZondaError as err:
-        raise ValueError(str(err)) from None
+        raise refusal(err) from None
     if not isinstance(found, NoiseModel):
         raise ValueError(f"noise model {name!r} is no NoiseModel: {found!r:.60}")
     return found

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from zonda.core.checks import Family, Measured
-from zonda.core.errors import PipelineError
+from zonda.core.errors import PipelineError, ZondaError
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.common_mode import CommonModeFilter
@@ -186,7 +185,7 @@ def zero_length() -> int:
     for duration in ("0 s", "-1 s"):
         try:
             PointingStare(scan_duration=duration)
-        except ValidationError:
+        except ZondaError:
             continue
         wrong += 1
     return wrong

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 import zonda
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, ZondaError
 from zonda.core.instrument import hexagonal_packing
 from zonda.core.registry import instruments, sites
 
@@ -70,7 +69,7 @@ def test_bad_passband_files(tmp_path, text, words):
 
 
 def test_missing_passband_file(tmp_path):
-    with pytest.raises(ValidationError, match="no such file"):
+    with pytest.raises(ZondaError, match="no such file"):
         zonda.Band(name="mine", file=tmp_path / "none.txt")
 
 
@@ -78,7 +77,7 @@ def test_missing_passband_file(tmp_path):
     "edges", [{}, {"low": "90 GHz"}, {"low": "90 GHz", "high": "80 GHz"}, {"low": "0 GHz", "high": "80 GHz"}]
 )
 def test_band_edges(edges):
-    with pytest.raises(ValidationError, match="0 < low < high"):
+    with pytest.raises(ZondaError, match="0 < low < high"):
         zonda.Band(name="mine", **edges)
 
 

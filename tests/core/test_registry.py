@@ -75,7 +75,7 @@ def test_every_wrong_field_of_a_factory_is_named(plugin: Plugin) -> None:
     plugin("zonda-bog", "3", {"zonda.sites": {"bog": "zt_bog:bog"}}, zt_bog=source)
     with pytest.raises(RegistryError) as caught:
         registry.sites.create("bog")
-    assert caught.value.label == "longitude: Field required; colour: Extra inputs are not permitted"
+    assert caught.value.label == "Site needs 'longitude'; unknown parameter 'colour' for Site"
 
 
 def test_operator_must_be_a_class_of_operators(plugin: Plugin) -> None:

@@ -17,7 +17,6 @@ import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
-from pydantic import ValidationError
 
 import zonda
 from zonda.core.data import Data
@@ -390,7 +389,7 @@ def test_every_parameter_of_every_operator(name: str, field: str, maps: Path, tm
         known[case] = outcome(chain(name, maps, **needs), where, tmp_path / "before")
     folder = tmp_path / ("before" if field == "overwrite" else "after")
     if (name, field) in REFUSALS:
-        with pytest.raises((ZondaError, ValidationError), match=REFUSALS[name, field]):
+        with pytest.raises(ZondaError, match=REFUSALS[name, field]):
             outcome(chain(name, maps, **(needs | change)), where, folder)
     else:
         assert not same(known[case], outcome(chain(name, maps, **(needs | change)), where, folder))
@@ -439,7 +438,7 @@ def test_the_name_of_a_step_is_its_label(name: str, maps: Path) -> None:
 )
 def test_what_would_be_ignored_is_refused(name: str, parameters: dict[str, Any], maps: Path) -> None:
     values = {"file": maps / "map.fits"} if name == "SkyMap" else {}
-    with pytest.raises(ValidationError):
+    with pytest.raises(ZondaError):
         make(name, **values, **parameters)
 
 
@@ -564,7 +563,7 @@ def test_every_parameter_of_the_scene(what: str, field: str, maps: Path, tmp_pat
         return outcome(whole(noise, maps), where, tmp_path)
 
     if (what, field) in LIMITS:
-        with pytest.raises((ZondaError, ValidationError), match=LIMITS[what, field]):
+        with pytest.raises(ZondaError, match=LIMITS[what, field]):
             run()
     else:
         assert not same(unchanged[what], run())
@@ -577,4 +576,5 @@ def test_no_parameter_of_the_scene_is_left_out() -> None:
     }  # fmt: skip
     assert set(classes) == set(SETTINGS)
     for what, cls in classes.items():
-        assert set(cls.model_fields) - SAID == set(SETTINGS[what]), what
+        said = SAID | ({"site"} if what == "telescope" else set())  # where it stands: `zonda check` compares, nothing is computed
+        assert set(cls.model_fields) - said == set(SETTINGS[what]), what

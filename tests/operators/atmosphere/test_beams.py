@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import ValidationError
 from scipy.interpolate import make_interp_spline
 from scipy.special import j1
 
+from zonda.core.errors import ZondaError
 from zonda.operators.atmosphere.beams import Aperture
 from zonda.operators.atmosphere.covariance import beam_structure, correlation, structure
 from zonda.operators.atmosphere.layers import AtmosphereLayers
@@ -108,7 +108,7 @@ def test_footprints_compared() -> None:
 
 
 def test_edge_taper_is_for_tapered_beams() -> None:
-    with pytest.raises(ValidationError, match="edge_taper is for beam: tapered"):
+    with pytest.raises(ZondaError, match="edge_taper is for beam: tapered"):
         AtmosphereLayers(beam="top_hat", edge_taper=10.0)
     assert AtmosphereLayers(beam="tapered", edge_taper=12.0).edge_taper == 12
 

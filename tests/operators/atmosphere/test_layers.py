@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
@@ -624,7 +623,7 @@ def test_the_beam_is_that_of_the_distance_along_the_line_of_sight() -> None:
     ],
 )
 def test_bad_parameters(parameters: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ZondaError, match=message):
         AtmosphereLayers(**parameters)
 
 
@@ -662,7 +661,7 @@ def test_outputs_are_made_only_where_asked_for() -> None:
     assert operator().provides == AtmosphereLayers.provides == {"atmosphere", "transmission"}
     o = observe(5.0)
     assert set(operator().prepare(o).fields) == {"emission", "transmission"}
-    with pytest.raises(ValidationError, match="outputs"):
+    with pytest.raises(ZondaError, match="outputs"):
         operator(outputs=["ozone"])
 
 

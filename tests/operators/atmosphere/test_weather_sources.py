@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from zonda import Scene
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.configuration.time import Instant
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, ZondaError
 from zonda.core.registry import sites, weather_sources
 from zonda.core.site import Site
 from zonda.core.weather import PWV_MAX, Column, Pwv, WeatherSource
@@ -44,7 +43,7 @@ def here(**changes):
 
 def scene(weather, **changes):
     given = {"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25T07:00", "weather": weather}
-    return Scene.model_validate(given | changes)
+    return Scene(**(given | changes))
 
 
 def air(weather, **changes):
@@ -118,11 +117,11 @@ def test_mistakes_are_reported_at_their_place(weather, words):
 
 
 def test_mistakes_in_python():
-    with pytest.raises(ValidationError, match="500 mm is outside"):
+    with pytest.raises(ZondaError, match="500 mm is outside"):
         scene({"pwv": "500 mm"})
-    with pytest.raises(ValidationError, match="unknown weather source"):
+    with pytest.raises(ZondaError, match="unknown weather source"):
         scene("nowhere")
-    with pytest.raises(ValidationError, match="Extra inputs"):
+    with pytest.raises(ZondaError, match="unknown parameter 'pvw'"):
         scene({"pvw": "1 mm"})
 
 

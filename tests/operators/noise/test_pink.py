@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.noise.one_over_f import power_law_filter
@@ -308,5 +307,5 @@ def test_what_cannot_be_fitted_is_refused(make_observation, simulate):
         {"minimum_frequency": "0 Hz"},
         {"reference": "sky"},
     ):
-        with pytest.raises(ValidationError):
+        with pytest.raises(ZondaError):
             PinkNoise(**bad)

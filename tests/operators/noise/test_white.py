@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 import zonda
+from zonda.core.errors import ZondaError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.noise.models import BackgroundLimited, FixedNet, NoiseModel
 from zonda.operators.noise.white import WhiteNoise
@@ -151,15 +151,15 @@ def test_the_level_is_stated(make_observation, simulate):
         ({"net": "1 mK s(1/2)", "model": FixedNet()}, "either net"),
         ({"reference": "detector", "model": FixedNet()}, "either net"),
         ({"reference": "detector"}, "needs net"),
-        ({"net": "-1 mK s(1/2)"}, "greater than or equal to 0"),
+        ({"net": "-1 mK s(1/2)"}, "at least 0"),
         ({"net": "1 mK"}, "noise level"),
-        ({"scatter": -0.1}, "greater than or equal to 0"),
+        ({"scatter": -0.1}, "at least 0"),
         ({"model": "no_such_model"}, "unknown noise model 'no_such_model'"),
         ({"model": {"level": "1 mK s(1/2)"}}, "name a noise model"),
     ],
 )
 def test_bad_parameters(arguments, message):
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ZondaError, match=message):
         WhiteNoise(**arguments)
 
 

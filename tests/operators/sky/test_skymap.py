@@ -8,10 +8,9 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from zonda.core.data import Data
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.operators.sky.skymap import SkyMap
 
@@ -430,12 +429,12 @@ def test_a_changed_file_is_read_again(made, save):
     ],
 )
 def test_wrong_parameters(made, save, more, message):
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ZondaError, match=message):
         SkyMap(file=save(np.zeros((9, 9)), made.tan_header((9, 9))), **more)
 
 
 def test_missing_file(tmp_path):
-    with pytest.raises(ValidationError, match="no such file"):
+    with pytest.raises(ZondaError, match="no such file"):
         SkyMap(file=tmp_path / "none.fits")
 
 
