@@ -71,7 +71,7 @@ HAS_A_SIGNAL = PROCESSING | TURNAROUND
 
 def good(flags: Flags, exclude: int) -> NDArray[np.bool_]:
     """Where none of the bits ``exclude`` is set."""
-    return (flags & np.uint8(exclude)) == 0
+    return np.asarray((flags & np.uint8(exclude)) == 0, np.bool_)
 
 
 def in_file(flags: Flags, table: tuple[Flag, ...]) -> Flags:

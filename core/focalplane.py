@@ -24,6 +24,7 @@ class Focalplane:
     xi, eta
         Gnomonic tangent-plane offsets from the boresight [tan(rad)], xi towards increasing azimuth, eta towards
         increasing elevation. In TOAST's boresight frame the direction is proportional to (-eta, -xi, 1).
+        Tangents: sotodlib's xi and eta are sines.
     polarization_angle
         rad, COSMO convention, from the focal plane's +X (TOAST) axis.
     fwhm

@@ -244,7 +244,7 @@ def _run(file: PipelineFile, context: Context, threads: int | None) -> _Result:
     main = next((data.products[k] for k in maps if "/" not in k), None)
     sky = next((data.products[k] for k in maps if k.startswith("sky_alone/")), None)
     kept = [o for o in data.observations if "signal" in o.detdata]
-    return _Result([o.detdata["signal"][o.good_detectors][:, o.good_samples] for o in kept], main, sky)
+    return _Result([np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64) for o in kept], main, sky)
 
 
 def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: Context) -> list[Checked]:

@@ -173,7 +173,10 @@ def _detectors_table(tod: TimeOrderedData) -> Any:
         column("FLAGS", "B", array=tod.detector_flags),
     ]
     columns += [column(k.upper(), "D", unit=_DETECTOR_UNITS.get(k), array=v) for k, v in tod.columns.items()]
-    return fits.BinTableHDU.from_columns(columns, name="DETECTORS")
+    table = fits.BinTableHDU.from_columns(columns, name="DETECTORS")
+    table.header["FLAGBITS"] = ("TOAST", "bits of FLAGS")
+    table.header.add_comment("XI and ETA are tangents (a gnomonic plane); sotodlib's are sines.")
+    return table
 
 
 def _provenance_table(tod: TimeOrderedData) -> Any:

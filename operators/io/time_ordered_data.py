@@ -102,6 +102,7 @@ class TimeOrderedData:
         numbers = [name for name, shape in shapes.items() if not np.isfinite(getattr(self, name)).all()]
         if not np.isfinite([self.sample_rate, self.field_of_view, *self.site[1:]]).all() or not self.sample_rate > 0:
             numbers.append("sample rate, field of view or site")
+        numbers += [f"intervals {name}" for name, spans in self.intervals.items() if not np.isfinite(spans).all()]
         if numbers:
             raise InputError(f"has NaN or impossible values in {', '.join(numbers)}", place=place, cure="save it again")
 

@@ -127,11 +127,7 @@ def _fits(path: Path, place: str) -> Table:
                 if names >= {"boresight_azel", "boresight_radec"}:  # SaveTOD's
                     found.bits = "toast" if "FLAGBITS" in table.header else "before"
                     found.radec = np.asarray(table.data["BORESIGHT_RADEC"], np.float64)
-                    if "INTERVALS" in file:
-                        rows = file["INTERVALS"].data
-                        for name in dict.fromkeys(rows["NAME"]):
-                            its = rows[rows["NAME"] == name]
-                            found.intervals[str(name)] = np.array([its["START"], its["STOP"]], np.float64)
+                    found.intervals = _fits_intervals(file["INTERVALS"].data) if "INTERVALS" in file else {}
                 return found
     raise InputError("has no table with az and el, or ra and dec", place=place, cure="name the columns TIME, AZ and EL")
 
@@ -158,11 +154,21 @@ def _hdf5(path: Path, place: str) -> Table:
             found.bits = "before" if start is not None and "zonda_flags" not in other else "toast"
             if "boresight_azel" in group:
                 _check_rotation(group["boresight_azel"], place)
-            if "boresight_radec" in group:
-                found.radec = np.asarray(group["boresight_radec"][:], np.float64)
-            for name, spans in file["intervals"].items() if "intervals" in file else ():
-                found.intervals[name] = np.asarray(spans[:], np.float64)
+            if isinstance(radec := group.get("boresight_radec"), h5py.Dataset) and radec.dtype.kind == "f":
+                found.radec = np.asarray(radec[()], np.float64)
+            parts = file["intervals"].items() if isinstance(file.get("intervals"), h5py.Group) else ()
+            kept = ((name, spans) for name, spans in parts if isinstance(spans, h5py.Dataset) and spans.dtype.kind in "fiu")
+            found.intervals = {name: np.asarray(spans[()], np.float64) for name, spans in kept}
         return found
+
+
+def _fits_intervals(rows: Any) -> dict[str, Floats]:
+    """Of SaveTOD's table: (2, n) by name."""
+    if not {"NAME", "START", "STOP"} <= set(rows.names):
+        return {}
+    names = np.asarray(rows["NAME"]).astype(str)
+    spans = np.array([rows["START"], rows["STOP"]], np.float64)
+    return {str(name): spans[:, names == name] for name in dict.fromkeys(names)}
 
 
 def _check_rotation(quaternions: Any, place: str) -> None:

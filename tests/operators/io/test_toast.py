@@ -10,6 +10,7 @@ import pytest
 
 import zonda
 from zonda.core.flags import DEAD, OPAQUE
+from zonda.core.intervals import samples_in
 from zonda.core.operator import Operator
 from zonda.operators.io.save_tod import SaveTOD, load_tod
 
@@ -20,8 +21,12 @@ if os.environ.get("ZONDA_TOAST") == "required":
 else:
     toast = pytest.importorskip("toast", reason="TOAST is not installed: .ci/toast makes an environment with it")
 
+from datetime import UTC
+
+import toast.instrument
 import toast.io
 import toast.ops
+import toast.schedule
 
 NSIDE = 512
 INSTRUMENT = {
@@ -224,3 +229,49 @@ def test_intervals_without_any(scan, tmp_path):
     (o,) = kept.obs
     assert len(o.intervals["turnaround"]) == 0
     assert len(o.intervals["throw"]) == 1
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """A scan that TOAST made itself: SimGround with its own transformation to the sky, weather, Sun and intervals."""
+    from datetime import datetime
+
+    import astropy.units as u
+    from astropy.table import QTable
+
+    site = toast.instrument.GroundSite("atacama", -22.958 * u.deg, -67.786 * u.deg, 5200 * u.m)
+    table = QTable({"name": ["d0"], "quat": [[0.0, 0.0, 0.0, 1.0]], "psd_net": [1e-3] * u.K * u.s**0.5})
+    table["fwhm"], table["psd_fknee"], table["psd_fmin"], table["psd_alpha"] = [10] * u.arcmin, [0.1] * u.Hz, [1e-5] * u.Hz, [1.0]
+    plane = toast.instrument.Focalplane(detector_data=table, sample_rate=40 * u.Hz, field_of_view=1 * u.deg)
+    start, stop = (datetime(2024, 6, 25, 14, minute, tzinfo=UTC) for minute in (0, 2))
+    row = toast.schedule.GroundScan("patch", start, stop, az_min=100 * u.deg, az_max=110 * u.deg, el=50 * u.deg)
+    schedule = toast.schedule.GroundSchedule([row], site.name, "dish", -22.958 * u.deg, -67.786 * u.deg, 5200 * u.m)
+    data = toast.Data(toast.Comm())
+    telescope = toast.instrument.Telescope("dish", focalplane=plane, site=site)
+    toast.ops.SimGround(telescope=telescope, schedule=schedule, weather="atacama", detset_key=None).apply(data)
+    (o,) = data.obs
+    o.detdata.ensure("signal", create_units=u.K)
+    folder = tmp_path_factory.mktemp("simulated")
+    return toast.io.save_hdf5(o, str(folder), detdata=["signal"]), data
+
+
+def test_zonda_looks_where_toast_looked(simulated):
+    """TOAST's SimGround lies some 45 arcsec from astropy on the sky; its flags, Sun and intervals come along."""
+    path, data = simulated
+    (theirs,) = data.obs
+    found = zonda.Data(zonda.Scene(**{**SCENE, "time": "2024-06-25T14:00"}))
+    zonda.PointingRecorded(file=path).observe(found)
+    (o,) = found.observations
+    np.testing.assert_array_equal(o.boresight_radec, theirs.shared["boresight_radec"].data)
+    said = {what: text for _, what, text in o.tally}[f"{o.name}: directions on the sky"]
+    assert said.startswith("as recorded, up to ")
+    assert 20 < float(said.split()[4]) < 70  # arcsec; precession, nutation and aberration of an older kind
+    flags = theirs.shared["flags"].data
+    np.testing.assert_array_equal(o.good_samples, (flags & 15) == 0)
+    np.testing.assert_array_equal(o.flags, flags)
+    assert (flags & 16).all()  # the Sun is up
+    for name in ("scanning", "turnaround", "throw_leftright", "scan_rightleft"):
+        inside = np.zeros(o.n_samples, bool)
+        for interval in theirs.intervals[name]:
+            inside[interval.first : interval.last] = True
+        np.testing.assert_array_equal(samples_in(o.intervals[name], o.seconds), inside)

@@ -466,3 +466,29 @@ def test_a_gap_parts_the_intervals(saved: Any, observe: Callable[..., Data]) -> 
     assert sum(b - a for a, b in first.intervals["throw"]) == pytest.approx(7.99, abs=1e-9)
     assert sum(b - a for a, b in second.intervals["throw"]) == pytest.approx(11.49, abs=1e-9)
     assert second.intervals["throw"][0][0] == 0.0
+
+
+@pytest.mark.filterwarnings("ignore:Pointing")
+def test_odd_items_in_toasts_layout(saved: Any, observe: Callable[..., Data]) -> None:
+    """What is not as it should be beside times and directions is left alone, or told."""
+    import h5py
+
+    path = saved("hdf5")
+    with h5py.File(path, "a") as f:
+        del f["intervals/throw"]
+        f["intervals"].create_group("throw")
+        f["intervals/words"] = "none"
+        del f["shared/boresight_radec"]
+        f["shared/boresight_radec"] = "none"
+    (o,) = observe(PointingRecorded(file=path)).observations
+    assert "scanning" in o.intervals
+    assert not {"throw", "words"} & set(o.intervals)
+    with h5py.File(path, "a") as f:
+        f["intervals/elnod"] = np.zeros(3)
+    with pytest.raises(InputError, match="the intervals elnod are no times"):
+        observe(PointingRecorded(file=path))
+    with h5py.File(path, "a") as f:
+        del f["intervals"], f["shared/boresight_radec"]
+        f["shared/boresight_radec"] = np.zeros((7, 4))
+    with pytest.raises(InputError, match="boresight_radec is 7 x 4, not 2150 x 4"):
+        observe(PointingRecorded(file=path))
