@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from .configuration.files import InputPath
-from .configuration.parameters import Parameters, named, quantity
+from .configuration.parameters import Parameters, named, named_or_written, quantity
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
 from .errors import InputError
 from .focalplane import Focalplane
@@ -34,6 +34,11 @@ class Band(Parameters):
     """Where these numbers come from."""
 
     _table: tuple[NDArray[np.float64], NDArray[np.float64]] = PrivateAttr()
+
+    def _as_argument(self) -> str:
+        from .registry import bands
+
+        return named_or_written(self, bands)
 
     @model_validator(mode="after")
     def _tabulate(self) -> Band:
@@ -139,6 +144,9 @@ class Telescope(Parameters):
     elevation_jerk_max: AngularJerk | None = Field(None, gt=0)
     """Fastest change of the elevation axis' acceleration."""
 
+    def _as_argument(self) -> str:
+        return repr(self)
+
 
 class Instrument(Parameters):
     """A camera on a telescope: hexagonally packed detectors in a round field of view. Subclass to lay out others."""
@@ -173,6 +181,11 @@ class Instrument(Parameters):
     """Read-out rate."""
     provenance: str = ""
     """Where these numbers come from."""
+
+    def _as_argument(self) -> str:
+        from .registry import instruments
+
+        return named_or_written(self, instruments)
 
     @field_validator("band", mode="before")
     @classmethod

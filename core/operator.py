@@ -261,7 +261,3 @@ class Operator(Parameters):
         from .plan.estimate import Estimate
 
         return Estimate()
-
-    def __repr__(self) -> str:
-        given = ", ".join(f"{k}={getattr(self, k)!r}" for k in sorted(self.model_fields_set))
-        return f"{type(self).__name__}({given})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from .configuration.parameters import Parameters, quantity
+from .configuration.parameters import Parameters, named_or_written, quantity
 from .configuration.units import Angle, Metres
 
 
@@ -25,3 +25,8 @@ class Site(Parameters):
     """Name of the embedded climatology, where there is one: those of the built-in sites that have one (docs/weather.md)."""
     provenance: str = ""
     """Where these numbers come from."""
+
+    def _as_argument(self) -> str:
+        from .registry import sites
+
+        return named_or_written(self, sites)

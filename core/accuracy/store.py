@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel
+
 from ..errors import InputError
 from ..storage.files import write_text
 from .front import Point, cheapest
@@ -60,7 +62,7 @@ def fingerprint(file: PipelineFile) -> str:
     """
     scene = file.scene()
     described: list[Any] = [
-        {k: repr(getattr(scene, k)) for k in type(scene).model_fields if k != "seed"},
+        {k: _plain(getattr(scene, k)) for k in type(scene).model_fields if k != "seed"},
         [
             (step.key, _described(step.operator, {*(k.parameter for k in step.operator.knobs), *_length(step.operator)}))
             for step in file.steps
@@ -183,6 +185,14 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
         reason += f"; as the file states: {' '.join(kept)}"
         error = None
     return Choice(overrides(setting), error, reason)
+
+
+def _plain(value: Any) -> str:
+    """All fields in SI, but for those that are no part of a resolved file: they change no result."""
+    if not isinstance(value, BaseModel):
+        return repr(value)
+    fields = [(name, getattr(value, name)) for name, field in type(value).model_fields.items() if not field.exclude]
+    return f"{type(value).__name__}({', '.join(f'{name}={_plain(inner)}' for name, inner in fields)})"
 
 
 def _length(operator: Operator) -> tuple[str, ...]:

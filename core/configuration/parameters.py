@@ -9,6 +9,7 @@ import re
 import sys
 import textwrap
 import tokenize
+from contextlib import suppress
 from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING, Any
 
@@ -72,6 +73,32 @@ class Parameters(BaseModel):
 
                 raise changed(type(self), name) from None
 
+    def __repr__(self) -> str:
+        """The call that makes an equal one: what was given, in units that people use."""
+        return f"{type(self).__name__}({', '.join(f'{name}={text}' for name, text in self._arguments().items())})"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        from ..data import html_table
+
+        given = self._arguments()
+        dumped = self.model_dump(mode="json")
+        rest = [
+            (name, dumped[name]) for name in type(self).model_fields if name not in given and dumped.get(name) not in (None, "")
+        ]
+        return html_table(type(self).__name__, [*given.items(), *((name, f"{value} (default)") for name, value in rest)])
+
+    def _arguments(self) -> dict[str, str]:
+        """What was given, by name, as Python text."""
+        dumped = self.model_dump(mode="json", include=self.model_fields_set)
+        names = [name for name in type(self).model_fields if name in self.model_fields_set]
+        return {name: _written(getattr(self, name), dumped.get(name)) for name in names}
+
+    def _as_argument(self) -> str:
+        """Python text that a field which holds this takes."""
+        return repr(self.model_dump(mode="json", include=self.model_fields_set))
+
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         frame = sys._getframe(1)
@@ -87,6 +114,20 @@ class Parameters(BaseModel):
             if name in properties and field.description:
                 properties[name].setdefault("description", field.description)
         return made
+
+
+def named_or_written(component: Any, names: Any) -> str:
+    """The name under which ``component`` is registered in ``names``, quoted; where it is not, the call that makes it."""
+    with suppress(ZondaError):
+        if component.name in names and names.create(component.name) == component:
+            return repr(component.name)
+    return repr(component)
+
+
+def _written(value: Any, dumped: Any) -> str:
+    if isinstance(value, Parameters):
+        return value._as_argument()
+    return repr(value if dumped is None else dumped)
 
 
 _places: dict[type, tuple[str, int, dict[str, Any]]] = {}

@@ -616,10 +616,10 @@ def test_the_beam_is_that_of_the_distance_along_the_line_of_sight() -> None:
     [
         ({"layers": 3, "wind": [{"speed": "3 m/s"}]}, "1 winds for 3 layers"),
         ({"lowest": "6 km"}, "lowest must be below highest"),
-        ({"pwv_rms": "-1 %"}, "greater than or equal"),
+        ({"pwv_rms": "-1 %"}, "must be at least"),
         ({"pwv": "0 mm"}, "greater than"),
-        ({"layers": 0}, "greater than or equal"),
-        ({"tolerance": 0.0}, "greater than or equal"),
+        ({"layers": 0}, "must be at least"),
+        ({"tolerance": 0.0}, "must be at least"),
     ],
 )
 def test_bad_parameters(parameters: dict[str, Any], message: str) -> None:
