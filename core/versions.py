@@ -1,7 +1,9 @@
-"""What a number may depend on besides the pipeline: versions."""
+"""What a number may depend on besides the pipeline: versions, and the instructions that this machine computes with."""
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from functools import cache
 
 
@@ -10,11 +12,47 @@ def versions() -> dict[str, str]:
     import platform
 
     found = {"python": platform.python_version(), "machine": platform.machine()}
-    for package in ("zonda", "numpy", "scipy", "astropy", "astropy-iers-data", "numba", "healpy", "h5py"):
+    for package in ("zonda", "numpy", "scipy", "astropy", "astropy-iers-data", "pyerfa", "numba", "llvmlite", "healpy", "h5py"):
         installed = _version(package)
         if installed is not None:
             found[package] = installed
     return found
+
+
+def arithmetic() -> dict[str, str]:
+    """What bits depend on besides the pipeline: libraries, the C library's functions, and the instructions that each may use.
+
+    ``cpu`` and ``instructions`` are those that numba compiles for, ``numpy instructions`` those that numpy chooses among;
+    ``processor`` is its name. Where all of it is the same, bits are.
+    """
+    import platform
+
+    from llvmlite import binding
+    from numba.core import config
+
+    from .storage.user_cache import processor
+
+    features = config.CPU_FEATURES
+    if features is None:
+        with suppress(RuntimeError):  # unknown to LLVM
+            features = binding.get_host_cpu_features().flatten()
+    return {
+        **versions(),
+        "processor": processor(),
+        "cpu": config.CPU_NAME or binding.get_host_cpu_name(),
+        "instructions": " ".join(sorted(f[1:] for f in (features or "").split(",") if f.startswith("+"))),
+        "numpy instructions": " ".join(_of_numpy()),
+        "libc": " ".join(filter(None, platform.libc_ver())),
+        **{name: os.environ[name] for name in ("GLIBC_TUNABLES", "OPENBLAS_CORETYPE") if os.environ.get(name)},
+    }
+
+
+def _of_numpy() -> list[str]:
+    with suppress(ImportError, AttributeError):
+        from numpy._core import _multiarray_umath as inside
+
+        return [name for name in inside.__cpu_dispatch__ if inside.__cpu_features__.get(name)]
+    return []
 
 
 @cache

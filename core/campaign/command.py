@@ -69,6 +69,11 @@ def run(
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--anyway", is_flag=True, help="Go on although zonda, the pipeline file or an input has changed.")
+@click.option(
+    "--same-machine/--any-machine",
+    default=None,
+    help="Refuse tasks of another kind of machine than the first.  [default: as in the file]",
+)
 @engine_option
 @workers_option
 @scheduler_option
@@ -78,6 +83,7 @@ def run(
 def resume(
     folder: Path,
     anyway: bool,
+    same_machine: bool | None,
     engine: str | None,
     workers: int | None,
     scheduler: str | None,
@@ -109,7 +115,7 @@ def resume(
             return
         check_output_folder(folder)
         with lock(folder), _told_how_to_go_on(folder):
-            _show(campaign.resume(folder, pool, _say, anyway=anyway), verbose)
+            _show(campaign.resume(folder, pool, _say, anyway=anyway, same_machine=same_machine), verbose)
     click.echo(f"{folder}/")
 
 
@@ -226,6 +232,7 @@ def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> 
     share = samples / job.samples if job.samples else 1.0
     rate = f", {samples / seconds:.3g} samples/s of each worker" if seconds else ""
     lines.append(f"  samples  {samples:.3g} of {job.samples:.3g} ({100 * share:.0f} %){rate}")
+    lines += _machines(done)
     if listed:
         lines += ["", "  task  state    attempts  seconds  worker                  entry"]
         for task, known in table:
@@ -244,12 +251,30 @@ def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> 
     return lines
 
 
+def _machines(done: Sequence[tuple[Task, Row]]) -> list[str]:
+    """On what the tasks ran."""
+    from .job import plural
+    from .machines import EFFECT, differences, kinds, short
+
+    found = kinds(row.machine for _, row in done)
+    if len(found) < 2:
+        return [f"  machine  {short(machine)}" for machine, _ in found]
+    lines = [f"  machine  {len(found)} kinds: {EFFECT}"]
+    lines += [f"           {plural(count, 'task')}: {short(machine)}" for machine, count in found]
+    lines += [f"           the {n}. has {differences(machine, found[0][0])}" for n, (machine, _) in enumerate(found[1:], 2)]
+    return lines
+
+
 def _as_dict(job: Job, table: Sequence[tuple[Task, Row | None]]) -> dict[str, Any]:
+    from .machines import read
+
+    made_on = list(dict.fromkeys(row.machine for _, row in table if row and row.machine))
     return {
         "name": job.name,
         "version": job.version,
         "counts": _counts(table),
         "samples": job.samples,
+        "machines": [read(machine) for machine in made_on],
         "products": [{"name": c.name, "folder": c.folder} for c in job.combinations],
         "tasks": [
             {
@@ -259,6 +284,7 @@ def _as_dict(job: Job, table: Sequence[tuple[Task, Row | None]]) -> dict[str, An
                 "error": row.error if row else "",
                 "host": row.host if row else "",
                 "seconds": row.seconds if row else 0.0,
+                "machine": made_on.index(row.machine) if row and row.machine else None,
                 "samples": task.samples,
                 "entry": task.about,
                 "scans": list(task.scans),

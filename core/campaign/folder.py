@@ -11,8 +11,8 @@ from pathlib import Path
 from ..errors import InputError, OutputError, ZondaError
 from ..storage.files import discard, temporary_sibling, write_text
 from . import log as joblog
-from . import parts
-from .job import FILE, LOG, TASKS, Job, Task
+from . import machines, parts
+from .job import FILE, LOG, TASKS, Job, Task, plural
 from .log import Log
 from .task import product_path
 
@@ -67,11 +67,15 @@ def publish(job: Job, folder: Path) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say) -> list[Task]:
-    """Tasks whose products are not there, or not what they should be; the log then says so."""
+def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say, same_machine: bool = False) -> list[Task]:
+    """Tasks whose products are not there, or not what they should be; the log then says so.
+
+    ``same_machine``: products of another kind of machine than the first task's are removed.
+    """
     rows = {row.number: row for row in log.rows()}
-    others = {row.number: row for path in sorted(folder.glob("jobs.*-of-*.sqlite")) for row in _readable(path)}
-    missing, lost = [], []
+    others = {row.number: row for path in sorted(folder.glob("jobs.*-of-*.sqlite")) for row in readable(path)}
+    missing, lost, strange = [], [], []
+    first = next(filter(None, (machines.kind((others.get(n) or rows[n]).machine) for n in sorted(rows))), None)
     for task in job.tasks:
         if task.combination in combined:
             continue
@@ -81,9 +85,16 @@ def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say) -> li
             missing.append(task)
             if row.state == "done":
                 lost.append(task)
+        elif same_machine and machines.kind((other or row).machine) not in (first, frozenset()):
+            discard(product_path(folder, task))
+            missing.append(task)
+            strange.append(task.number)
         elif row.state != "done":
-            log.done(task.number, other.host if other else row.host, other.seconds if other else row.seconds, digest)
+            known = other or row
+            log.done(task.number, known.host, known.seconds, digest, known.machine)
     gone = {task.number for task in lost}
+    if strange:
+        say(f"{plural(len(strange), 'task')} ran on another kind of machine than the first: run again")
     log.put_off(task.number for task in missing if task.number not in gone)
     log.put_off(gone, "its partial product was missing or damaged when the campaign was resumed")
     if lost:
@@ -91,7 +102,8 @@ def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say) -> li
     return missing
 
 
-def _readable(path: Path) -> list[joblog.Row]:
+def readable(path: Path) -> list[joblog.Row]:
+    """Rows of a log that may be damaged: none, then."""
     try:
         return joblog.read(path)
     except InputError:

@@ -99,6 +99,8 @@ class Job:
         What was left out or coarsened, for headers: by pipeline.
     source
         The campaign's own YAML, every default filled in: one text for each pipeline file.
+    same_machine
+        Whether what ran on another kind of machine than the first task is refused.
     files
         The pipeline files: path and digest of the text; input files: path, size and time of change.
     """
@@ -114,6 +116,7 @@ class Job:
     files: Mapping[str, str]
     combinations: tuple[Combination, ...]
     tasks: tuple[Task, ...] = field(repr=False)
+    same_machine: bool = False
 
     @property
     def samples(self) -> int:

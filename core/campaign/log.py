@@ -32,6 +32,8 @@ class Row:
         How often it was begun since it was last put off.
     error
         Of the last attempt that failed, also where a later one was done.
+    machine
+        On what it was done (`machines.here`); empty: unknown.
     """
 
     number: int
@@ -42,6 +44,7 @@ class Row:
     seconds: float
     samples: int
     digest: str
+    machine: str = ""
 
 
 WAITING = Row(-1, "waiting", 0, "", "", 0.0, 0, "")
@@ -62,6 +65,8 @@ class Log:
             )
 
             self._db.execute("CREATE TABLE IF NOT EXISTS combined (number INTEGER PRIMARY KEY, layout TEXT NOT NULL)")
+            self._db.execute("CREATE TABLE IF NOT EXISTS machines (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE)")
+            self._db.execute("CREATE TABLE IF NOT EXISTS made_on (number INTEGER PRIMARY KEY, machine INTEGER NOT NULL)")
 
     def check(self) -> None:
         """Raise `InputError` where the file is damaged, also where nobody has read yet."""
@@ -95,9 +100,13 @@ class Log:
                 "UPDATE tasks SET state = 'claimed', attempts = attempts + 1 WHERE number = ?", [(n,) for n in numbers]
             )
 
-    def done(self, number: int, host: str, seconds: float, digest: str) -> None:
+    def done(self, number: int, host: str, seconds: float, digest: str, machine: str = "") -> None:
         """A task's product is there."""
         with self._transaction():
+            self._db.execute("DELETE FROM made_on WHERE number = ?", (number,))
+            if machine:
+                self._db.execute("INSERT OR IGNORE INTO machines (text) VALUES (?)", (machine,))
+                self._db.execute("INSERT INTO made_on SELECT ?, id FROM machines WHERE text = ?", (number, machine))
             self._db.execute(
                 "UPDATE tasks SET state = 'done', host = ?, seconds = ?, digest = ? WHERE number = ?",
                 (host, seconds, digest, number),
@@ -185,11 +194,25 @@ def damaged(path: Path, err: Exception) -> InputError:
 
 def _rows(database: sqlite3.Connection) -> list[Row]:
     columns = "number, state, attempts, error, host, seconds, samples, digest"
-    found = [Row(*values) for values in database.execute(f"SELECT {columns} FROM tasks ORDER BY number")]
-    kinds = (int, str, int, str, str, float | int, int, str)
+    machines = _machines(database)
+    found = [
+        Row(*values, machines.get(values[0], "") if values[1] == "done" else "")
+        for values in database.execute(f"SELECT {columns} FROM tasks ORDER BY number")
+    ]
+    kinds = (int, str, int, str, str, float | int, int, str, str)
     if any(row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found):
         raise sqlite3.DatabaseError("it holds what is no state of a task")
     return found
+
+
+def _machines(database: sqlite3.Connection) -> dict[int, str]:
+    """By task; of a log that an older zonda wrote, none."""
+    try:
+        return dict(database.execute("SELECT number, text FROM made_on JOIN machines ON id = machine"))
+    except sqlite3.OperationalError as err:
+        if "no such table" in str(err):
+            return {}
+        raise
 
 
 def _error(err: Exception, path: Path) -> Exception:

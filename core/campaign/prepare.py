@@ -130,6 +130,7 @@ def job(
         files=files,
         combinations=tuple(combinations),
         tasks=tuple(tasks),
+        same_machine=first.same_machine,
     )
 
 

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,23 @@ from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..storage.files import check_output_folder, discard
 from . import parts
 from .engines import Pool, engine_failed
-from .folder import RESOLVED, Say, check_free, clean, make_way, open_log, opened, publish, sources_of, verify, write_sources
+from .folder import (
+    RESOLVED,
+    Say,
+    check_free,
+    clean,
+    make_way,
+    open_log,
+    opened,
+    publish,
+    readable,
+    sources_of,
+    verify,
+    write_sources,
+)
 from .job import FILE, LOG, TASKS, Job, Task, digest_of_text, plural
-from .log import Log
+from .log import Log, Row
+from .machines import Watch
 from .prepare import Source, changed, restore_layout
 from .prepare import job as prepare
 from .reduce import Combined, combine
@@ -80,11 +94,13 @@ def begin(
     write_sources(made, folder)
     with contextlib.closing(open_log(folder / LOG, made)) as log:
         made.write(folder)
-        return _work(made, folder, log, pool, say, made.tasks)
+        return _work(made, folder, log, pool, _watch(made.same_machine, folder, [log.rows()], say), made.tasks)
 
 
-def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False) -> Result:
+def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_machine: bool | None = None) -> Result:
     """Go on with a campaign: what is done is verified, what is missing is run. The caller holds the folder's lock.
+
+    ``same_machine``: refuse what another kind of machine made, or do not; default: as the campaign has it.
 
     Raises
     ------
@@ -92,6 +108,7 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False) -> Resul
         Where there is no campaign, its file is damaged, or zonda or a file has changed (not with ``anyway``).
     """
     job = Job.read(folder)
+    strict = job.same_machine if same_machine is None else same_machine
     check_unchanged(job, folder, anyway)
     clean(folder)
     log = opened(folder, job, say)
@@ -103,8 +120,8 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False) -> Resul
                     parts.read(folder / TASKS / combination.layout_file(number), "layout", combination.layout)
                 except InputError:
                     restore_layout(job, folder, number)
-        missing = verify(job, folder, log, combined, say)
-        return _work(job, folder, log, pool, say, missing)
+        missing = verify(job, folder, log, combined, say, strict)
+        return _work(job, folder, log, pool, _watch(strict, folder, [log.rows()], say), missing)
 
 
 def share(
@@ -142,7 +159,8 @@ def share(
             elif task.number not in rows or rows[task.number].state != "done":
                 log.done(task.number, "", 0.0, digest)
         log.put_off(task.number for task in missing)
-        result, failed = _flow(job, folder, log, pool, missing)
+        theirs = [readable(path) for path in sorted(folder.glob("jobs.*-of-*.sqlite"))]
+        result, failed = _flow(job, folder, log, pool, _watch(job.same_machine, folder, theirs, say), missing)
     _tell(result, say)
     _fail(folder, failed, len(mine))
     return result
@@ -170,11 +188,16 @@ def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
 # ---- tasks
 
 
-def _work(job: Job, folder: Path, log: Log, pool: Pool, say: Say, missing: Iterable[Task]) -> Result:
+def _watch(strict: bool, folder: Path, logs: Iterable[Iterable[Row]], say: Say) -> Watch:
+    known = {row.number: row.machine for rows in logs for row in rows if row.machine}
+    return Watch(known, strict, folder, say)
+
+
+def _work(job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: Iterable[Task]) -> Result:
     """Run tasks, combine what is complete, remove partial products."""
-    result, failed = _flow(job, folder, log, pool, list(missing))
+    result, failed = _flow(job, folder, log, pool, watch, list(missing))
     if result.tasks:
-        _tell(result, say)
+        _tell(result, watch.say)
     incomplete = {row.number for row in log.rows() if row.state != "done"}
     digests = {row.number: row.digest for row in log.rows()}
     combined = log.combined(job.layouts)
@@ -192,7 +215,7 @@ def _work(job: Job, folder: Path, log: Log, pool: Pool, say: Say, missing: Itera
     return result
 
 
-def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -> tuple[Result, dict[int, str]]:
+def _flow(job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> tuple[Result, dict[int, str]]:
     """Work through tasks; (what was done, errors by number).
 
     A broken pool is replaced. Whatever was at work when it broke is tried again at the end, one task at a time, so that one that
@@ -208,8 +231,11 @@ def _flow(job: Job, folder: Path, log: Log, pool: Pool, tasks: Sequence[Task]) -
     def note(task: Task, outcome: Outcome) -> None:
         nonlocal stop
         claimed.discard(task.number)
+        if not outcome.error and (error := watch.meet(outcome.machine, f"task {task.number} on {outcome.host}")):
+            discard(product_path(folder, task))
+            outcome = replace(outcome, error=error, final=True, stop=True)
         if not outcome.error:
-            log.done(task.number, outcome.host, outcome.seconds, outcome.digest)
+            log.done(task.number, outcome.host, outcome.seconds, outcome.digest, outcome.machine)
             result.tasks += 1
             result.samples += task.samples
         else:

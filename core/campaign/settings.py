@@ -82,6 +82,10 @@ class Campaign(Parameters):
     keep_tasks: bool = False
     """Keep the tasks' partial products when they are combined."""
 
+    same_machine: bool = False
+    """Refuse tasks of another kind of machine (other instructions of the CPU) than the first one's, or of other libraries: their
+    bits may differ. Otherwise they are told."""
+
     @model_validator(mode="after")
     def _axes(self) -> Campaign:
         both = sorted(set(self.grid) & {key for entry in self.observations for key in entry})

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
-from . import parts
+from . import machines, parts
 from .job import TASKS, Task
 
 if TYPE_CHECKING:
@@ -71,6 +71,8 @@ class Outcome:
         Wall time.
     peak
         Largest resident memory of the worker so far, bytes.
+    machine
+        On what it ran (`machines.here`).
     """
 
     number: int
@@ -81,6 +83,7 @@ class Outcome:
     final: bool = False
     stop: bool = False
     peak: int = 0
+    machine: str = ""
 
 
 def perform(order: Order) -> Outcome:
@@ -104,7 +107,7 @@ def perform(order: Order) -> Outcome:
         text = "".join(traceback.format_exception(err)).rstrip()
         stop = isinstance(err, OSError)
         return Outcome(number, host, time.monotonic() - begin, error=text, stop=stop, peak=_peak())
-    return Outcome(number, host, time.monotonic() - begin, digest, peak=_peak())
+    return Outcome(number, host, time.monotonic() - begin, digest, peak=_peak(), machine=machines.here())
 
 
 def product_path(folder: Path, task: Task) -> Path:

@@ -17,6 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+RESTRAINTS = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE", "GLIBC_TUNABLES")
+"""Variables with which other instructions are chosen than the processor's own."""
+
 MOST = 64
 """Entries of one kind that are kept; the oldest go first."""
 
@@ -63,7 +66,11 @@ def remember(kind: str, key: Any, value: Any) -> None:
 
 @cache
 def processor() -> str:
-    """This machine's processor, as the system calls it."""
+    """This machine's processor, as the system calls it, and what the environment forbids it."""
+    return " ".join([_name(), *(f"{name}={os.environ[name]}" for name in RESTRAINTS if os.environ.get(name))])
+
+
+def _name() -> str:
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

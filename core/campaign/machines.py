@@ -1,0 +1,114 @@
+"""On what the tasks of a campaign ran: bits are the same on one kind of machine with one set of libraries alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..versions import arithmetic
+
+if TYPE_CHECKING:
+    from .folder import Say
+
+WITHOUT_INFLUENCE = frozenset({"processor", "python"})
+"""What is recorded, and changes no bit: the model's name (its instructions count), and Python, which computes nothing."""
+
+EFFECT = "maps of the two may differ in the last bits, by some 1e-7 K"
+
+
+@cache
+def here() -> str:
+    """This process's machine and libraries, as the job log keeps it (JSON)."""
+    return json.dumps(arithmetic(), sort_keys=True)
+
+
+def read(text: str) -> dict[str, str]:
+    """What a job log says of a machine; empty where it says nothing, or what is no such thing."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return {str(k): str(v) for k, v in found.items()} if isinstance(found, dict) else {}
+
+
+def kind(text: str) -> frozenset[tuple[str, str]]:
+    """All that bits depend on; empty: unknown."""
+    return frozenset((k, v) for k, v in read(text).items() if k not in WITHOUT_INFLUENCE)
+
+
+def differences(one: str, other: str) -> str:
+    """What is otherwise: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions, those that one of the two lacks."""
+    a, b = read(one), read(other)
+    found = []
+    for key in sorted((a.keys() | b.keys()) - WITHOUT_INFLUENCE):
+        mine, theirs = a.get(key, "none"), b.get(key, "none")
+        if mine == theirs:
+            continue
+        if key.endswith("instructions"):
+            more, less = sorted(set(mine.split()) - set(theirs.split())), sorted(set(theirs.split()) - set(mine.split()))
+            words = [
+                f"{sign} {' '.join(some[:3])}{' ...' * (len(some) > 3)}"
+                for sign, some in (("with", more), ("without", less))
+                if some
+            ]
+            found.append(f"{key} {', '.join(words)}")
+        else:
+            found.append(f"{key} {mine} ({theirs} there)")
+    return ", ".join(found)
+
+
+def short(text: str) -> str:
+    """One line: the processor as the compiler calls it, and libraries."""
+    found = read(text)
+    names = ("zonda", "numpy", "numba", "scipy", "astropy", "pyerfa")
+    libraries = ", ".join(f"{name} {found[name]}" for name in names if name in found)
+    return f"{found.get('cpu', 'unknown')} ({found.get('processor', 'unknown')}), {libraries}"
+
+
+class Watch:
+    """Compares where tasks run with where the first one did, and tells of each other kind once.
+
+    Parameters
+    ----------
+    known
+        Machines of the tasks that are done, by number.
+    strict
+        Whether tasks of another kind of machine are refused.
+    """
+
+    def __init__(self, known: Mapping[int, str], strict: bool, folder: Path, say: Say) -> None:
+        self._strict, self._folder, self.say = strict, folder, say
+        self._first = ""
+        self._told: set[frozenset[tuple[str, str]]] = set()
+        for number in sorted(known):
+            self.meet(known[number], f"task {number}", strict=False)
+
+    def meet(self, machine: str, who: str, strict: bool | None = None) -> str:
+        """Why a task is refused; empty where it is not. ``who``: which task, where."""
+        if not kind(machine):
+            return ""
+        if not kind(self._first):
+            self._first = machine
+        if kind(machine) == kind(self._first):
+            return ""
+        what = f"{who} ran on another kind of machine or with other libraries than the first: {differences(machine, self._first)}"
+        if self._strict if strict is None else strict:
+            return f"{what}; same_machine refuses it"
+        if kind(machine) not in self._told:
+            self._told.add(kind(machine))
+            self.say(f"{what}; {EFFECT} (zonda status {self._folder}; campaign.same_machine refuses it)")
+        return ""
+
+
+def kinds(machines: Iterable[str]) -> list[tuple[str, int]]:
+    """One machine of each kind, the commonest first, and how many tasks ran on that kind."""
+    first: dict[frozenset[tuple[str, str]], str] = {}
+    count: dict[frozenset[tuple[str, str]], int] = {}
+    for machine in machines:
+        if this := kind(machine):
+            first.setdefault(this, machine)
+            count[this] = count.get(this, 0) + 1
+    return [(first[this], count[this]) for this in sorted(count, key=lambda k: -count[k])]

@@ -1,0 +1,165 @@
+"""The job log says on what each task ran; another kind of machine is told, or refused."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+
+import pytest
+
+from zonda.core import versions
+from zonda.core.campaign import log as joblog
+from zonda.core.campaign import machines
+from zonda.core.campaign.machines import Watch, differences, kind, kinds, read
+
+SERIAL = ("--engine", "serial", "--threads", 1)
+OTHER = {"cpu": "znver4", "numpy": "2.3.1"}
+SMALL = "{nights: 3}"  # of two scans: six tasks
+
+
+def other_kind():
+    return json.dumps(json.loads(machines.here()) | OTHER, sort_keys=True)
+
+
+@pytest.fixture
+def moving(monkeypatch):
+    """Tasks of this process run elsewhere from the ``after``-th on."""
+    mine, strange = machines.here(), other_kind()
+
+    def begin(after, until=10**6):
+        calls = iter(range(10**6))
+        monkeypatch.setattr(machines, "here", lambda: strange if after <= next(calls) < until else mine)
+
+    return begin
+
+
+def status(bench, out, capsys):
+    capsys.readouterr()
+    assert bench.command("status", out, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert bench.command("status", out) == 0
+    return found, capsys.readouterr().out
+
+
+@pytest.mark.parametrize("engine", [SERIAL, ("--engine", "processes", "--workers", 2)], ids=["serial", "processes"])
+def test_each_task_has_its_machine(bench, capsys, engine):
+    out = bench.run(SMALL, *engine)
+    assert "another kind" not in capsys.readouterr().err
+    found, said = status(bench, out, capsys)
+    (machine,) = found["machines"]
+    assert machine == versions.arithmetic()
+    assert {"zonda", "numpy", "numba", "scipy", "astropy", "cpu", "instructions", "processor"} <= machine.keys()
+    assert [task["machine"] for task in found["tasks"]] == [0] * 6
+    assert f"numpy {machine['numpy']}" in said
+    assert machine["cpu"] in said
+
+
+def test_another_kind_is_told_once(bench, moving, capsys):
+    moving(3)
+    out = bench.run(SMALL, *SERIAL)
+    said = capsys.readouterr().err
+    assert said.count("ran on another kind of machine or with other libraries than the first") == 1
+    assert "task 3" in said
+    assert f"numpy 2.3.1 ({versions.arithmetic()['numpy']} there)" in said
+    found, said = status(bench, out, capsys)
+    assert [task["machine"] for task in found["tasks"]] == [0, 0, 0, 1, 1, 1]
+    assert "2 kinds: maps of the two may differ in the last bits" in said
+    assert "3 tasks: znver4" in said
+
+
+def test_another_kind_is_refused_on_request(bench, moving, capsys):
+    whole = bench.run(SMALL, *SERIAL)
+    moving(3)
+    out = bench.run("{nights: 3, same_machine: true}", *SERIAL, status=2)
+    assert "same_machine refuses it" in capsys.readouterr().err
+    assert not (out / "map.fits").exists()
+    assert len(list((out / "tasks").glob("0000*.npz"))) == 3  # that of the fourth is gone
+    moving(0)
+    assert bench.command("resume", out, *SERIAL) == 2  # still elsewhere
+    assert "znver4" in capsys.readouterr().err
+    moving(10**6)
+    assert bench.command("resume", out, *SERIAL) == 0
+    assert bench.planes(out) == bench.planes(whole)
+    found, _ = status(bench, out, capsys)
+    assert len(found["machines"]) == 1
+
+
+def test_what_another_kind_has_done_is_done_again_on_request(bench, moving, capsys):
+    file, out = bench.file(SMALL), bench.new()
+    assert bench.command("run", file, "--output", out, *SERIAL, "--task", "1/2") == 0
+    moving(0)
+    assert bench.command("run", file, "--output", out, *SERIAL, "--task", "2/2") == 0
+    assert "another kind of machine" in capsys.readouterr().err  # the first share's log says so
+    assert len(status(bench, out, capsys)[0]["machines"]) == 2
+    moving(10**6)
+    assert bench.command("resume", out, *SERIAL, "--same-machine") == 0
+    assert "3 tasks ran on another kind of machine than the first: run again" in capsys.readouterr().err
+    assert len(status(bench, out, capsys)[0]["machines"]) == 1
+
+
+def test_the_campaign_s_word_can_be_taken_back(bench, moving, capsys):
+    moving(3)
+    out = bench.run("{nights: 3, same_machine: true}", *SERIAL, status=2)
+    moving(0)
+    assert bench.command("resume", out, *SERIAL, "--any-machine") == 0
+    assert "another kind of machine" in capsys.readouterr().err
+
+
+def test_a_log_of_an_older_version(tmp_path):
+    path = tmp_path / "jobs.sqlite"
+    log = joblog.Log(path)
+    log.begin([(0, 1)])
+    log.done(0, "h", 1.0, "d")
+    log.close()
+    with sqlite3.connect(path) as database:
+        database.execute("DROP TABLE machines")
+        database.execute("DROP TABLE made_on")
+    assert [(row.state, row.machine) for row in joblog.read(path)] == [("done", "")]
+
+
+def test_a_task_that_is_put_off_has_no_machine(tmp_path):
+    log = joblog.Log(tmp_path / "jobs.sqlite")
+    log.begin([(0, 1), (1, 1)])
+    for number in (0, 1):
+        log.done(number, "h", 1.0, "d", '{"cpu": "a"}')
+    log.put_off([1])
+    assert [row.machine for row in log.rows()] == ['{"cpu": "a"}', ""]
+    log.done(0, "h", 1.0, "d", '{"cpu": "b"}')
+    assert log.rows()[0].machine == '{"cpu": "b"}'
+    log.close()
+
+
+def test_what_counts_as_another_kind():
+    one = {"cpu": "a", "instructions": "sse2 avx2", "numpy": "2.4.6", "processor": "x", "python": "3.12.1"}
+    text = json.dumps(one)
+    assert kind(text) == kind(json.dumps(one | {"processor": "y", "python": "3.13.0"}))
+    for change in ({"cpu": "b"}, {"numpy": "2.4.5"}, {"instructions": "sse2"}, {"libc": "glibc 2.36"}):
+        assert kind(text) != kind(json.dumps(one | change))
+    assert differences(json.dumps(one | {"instructions": "sse2 avx512f", "numpy": "2.3"}), text) == (
+        "instructions with avx512f, without avx2, numpy 2.3 (2.4.6 there)"
+    )
+    assert kinds(["", "null", "[1", text, text]) == [(text, 2)]
+    assert read("[]") == {}
+
+
+def test_an_unknown_machine_is_not_compared(tmp_path):
+    said = []
+    watch = Watch({0: "", 1: '{"cpu": "a"}'}, True, tmp_path, said.append)
+    assert watch.meet("", "task 2") == ""
+    assert watch.meet('{"cpu": "b"}', "task 3")
+    assert not said
+
+
+@pytest.mark.parametrize("name", ["NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE"])
+def test_what_is_remembered_of_a_processor_knows_its_restraints(monkeypatch, name):
+    from zonda.core.storage import user_cache
+
+    monkeypatch.delenv(name, raising=False)
+    user_cache.processor.cache_clear()
+    assert f" {name}=" not in user_cache.processor()
+    monkeypatch.setenv(name, "less")
+    user_cache.processor.cache_clear()
+    try:
+        assert f" {name}=less" in user_cache.processor()
+    finally:
+        user_cache.processor.cache_clear()
