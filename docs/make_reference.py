@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import typing
 from pathlib import Path
 
+from zonda.core.configuration.describe import own_doc, written_choices
 from zonda.core.configuration.parameters import described
 from zonda.core.configuration.units import Unit
 from zonda.core.instrument import Band, Instrument, Telescope
@@ -41,7 +41,7 @@ def page() -> str:
     for folder, title in FOLDERS.items():
         lines += ["", f"## {title}"]
         for cls in sorted((c for c in classes if c.__module__.split(".")[2] == folder), key=lambda c: c.__name__):
-            lines += ["", f"### {cls.__name__}", "", inspect.cleandoc(cls.__doc__ or ""), ""]
+            lines += ["", f"### {cls.__name__}", "", own_doc(cls), ""]
             needs, gives = (", ".join(f"`{n}`" for n in sorted(names)) or "nothing" for names in (cls.requires, cls.provides))
             lines += [f"Requires {needs}; provides {gives}.", "", *table(cls, but="name")]
             for knob in cls.knobs:
@@ -50,11 +50,11 @@ def page() -> str:
     lines += ["", "## Noise models", "", "What `model` of `WhiteNoise` takes: a name, or `{name: background_limited, modes: 1}`."]
     for found in sorted((c for c in noise_models.candidates() if c.distribution == "zonda"), key=lambda c: c.name):
         cls = noise_models.get(found.name)
-        lines += ["", f"### {found.name}", "", inspect.cleandoc(cls.__doc__ or ""), "", *table(cls, but="name")]
+        lines += ["", f"### {found.name}", "", own_doc(cls), "", *table(cls, but="name")]
     lines += ["", "## Sites and instruments", "", "What `site:` and `instrument:` take, written out in a pipeline file"]
     lines += ["([pipelines.md](pipelines.md)), and what the classes of these names take in Python ([plugins.md](plugins.md))."]
     for cls, key in SCENE.items():
-        lines += ["", f"### {cls.__name__}", "", f"`{key}`. {inspect.cleandoc(cls.__doc__ or '')}", "", *table(cls)]
+        lines += ["", f"### {cls.__name__}", "", f"`{key}`. {own_doc(cls)}", "", *table(cls)]
     return "\n".join(lines) + "\n"
 
 
@@ -64,6 +64,7 @@ def table(cls: typing.Any, but: str = "") -> list[str]:
     for name, field in described(cls).items():
         if name != but:
             text = " ".join((field.description or "").split()).replace("|", "\\|")
+            text = " ".join(filter(None, (text, written_choices(field))))
             lines.append(f"| `{name}` | {default(field)} | {text} |")
     return lines
 

@@ -42,7 +42,45 @@ def named(names: Any, value: Any) -> Any:
         raise refusal(err) from None
 
 
-class Parameters(BaseModel):
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass as _Shown
+else:
+
+    class _Shown(type(BaseModel)):
+        """How classes of parameters look to `help()` and to tab completion: their parameters, without pydantic's own names.
+
+        All is worked out when somebody asks.
+        """
+
+        @property
+        def __doc__(cls) -> str:
+            from .describe import document
+
+            return document(cls)
+
+        @property
+        def __signature__(cls) -> inspect.Signature:
+            from .describe import signature
+
+            return signature(cls)
+
+        @__signature__.setter
+        def __signature__(cls, value: Any) -> None:
+            """pydantic sets its own, whose types nobody can read."""
+
+        def __dir__(cls) -> list[str]:
+            return [name for name in sorted(super().__dir__()) if name not in _PYDANTICS and not name.startswith("__pydantic")]
+
+
+_PYDANTICS = {name for name in dir(BaseModel) if name not in dir(object)} | {
+    "_abc_impl",
+    "__class_vars__",
+    "__private_attributes__",
+}
+"""Names that pydantic gives every class."""
+
+
+class Parameters(BaseModel, metaclass=_Shown):
     """A frozen, validated parameter set. Attribute docstrings become schema descriptions and error messages."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
@@ -89,6 +127,9 @@ class Parameters(BaseModel):
         ]
         return html_table(type(self).__name__, [*given.items(), *((name, f"{value} (default)") for name, value in rest)])
 
+    def __dir__(self) -> list[str]:
+        return [name for name in sorted(super().__dir__()) if name not in _PYDANTICS and not name.startswith("__pydantic")]
+
     def _arguments(self) -> dict[str, str]:
         """What was given, by name, as Python text."""
         dumped = self.model_dump(mode="json", include=self.model_fields_set)
@@ -108,8 +149,13 @@ class Parameters(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        from .describe import own_doc
+
         made = handler(schema)
-        properties = handler.resolve_ref_schema(made).get("properties", {})
+        resolved = handler.resolve_ref_schema(made)
+        properties = resolved.get("properties", {})
+        if "description" in resolved:
+            resolved["description"] = own_doc(cls)
         for name, field in described(cls).items():
             if name in properties and field.description:
                 properties[name].setdefault("description", field.description)

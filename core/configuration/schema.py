@@ -14,6 +14,7 @@ from ..campaign.settings import CampaignHeader
 from ..errors import ZondaError
 from ..operator import Operator
 from ..scene import Scene
+from .describe import own_doc
 from .pipeline_file import KEYS
 
 _MODE: JsonSchemaMode = "validation"
@@ -69,7 +70,7 @@ def _weather() -> dict[str, type[BaseModel]]:
 
 def _step(classes: dict[str, type[Operator]], references: Any) -> dict[str, Any]:
     properties = {
-        name: {"anyOf": [references[model, _MODE], {"type": "null"}], "description": (model.__doc__ or "").strip().split("\n")[0]}
+        name: {"anyOf": [references[model, _MODE], {"type": "null"}], "description": own_doc(model).split("\n")[0]}
         for name, model in classes.items()
     }
     whole = {"type": "object", "properties": properties, "minProperties": 1, "maxProperties": 1, "additionalProperties": False}

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import PrivateAttr
 
+from zonda.core.configuration.describe import own_doc
 from zonda.core.configuration.parameters import described, quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data, Observation
@@ -397,7 +398,7 @@ def _steps(data: Data) -> str:
     made = []
     for label, kind, parameters in data.provenance.get("operators", []):
         cls = _class(kind)
-        doc = (cls.__doc__ or "").strip().split("\n\n")[0] if cls is not None else ""
+        doc = own_doc(cls).split("\n\n")[0] if cls is not None else ""
         fields = described(cls) if cls is not None else {}
         rows = []
         for key, text in parameters.items():

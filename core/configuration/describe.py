@@ -1,0 +1,111 @@
+"""What a class of parameters takes, in words: for `help()`, signatures and docs/operators.md."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from .parameters import described
+from .target import Target
+from .time import Instant
+from .units import Unit
+
+_WORDS: dict[Any, str] = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    Path: "the path of a file",
+    Target: "a position such as '05h00m00s +20d00m00s'",
+    Instant: "a time such as '2024-11-25T07:00:00Z'",
+}
+
+
+def own_doc(cls: type) -> str:
+    """The docstring as it stands in the class."""
+    return inspect.cleandoc(next((own for c in cls.__mro__ if (own := c.__dict__.get("__doc__")) and isinstance(own, str)), ""))
+
+
+def choices(field: FieldInfo) -> tuple[Any, ...]:
+    """The values of a Literal that a parameter takes; empty where it takes others."""
+    return tuple(dict.fromkeys(v for t in _types(field.annotation) if get_origin(t) is Literal for v in get_args(t)))
+
+
+def kind(field: FieldInfo) -> str:
+    """What a parameter takes: a kind of quantity with an example, its choices, or a type in words."""
+    members = _members(field)
+    metadata = [*field.metadata, *(m for t in _types(field.annotation) for m in getattr(t, "__metadata__", ()))]
+    unit = next((m for m in metadata if isinstance(m, Unit)), None)
+    words = [f"{unit.kind.noun} such as '{unit.example}'"] if unit and float in members else []
+    chosen = [repr(value) for value in choices(field)]
+    words += [f"{', '.join(chosen[:-1])} or {chosen[-1]}" if len(chosen) > 1 else chosen[0]] if chosen else []
+    for member in members:
+        if get_origin(member) in (list, tuple):
+            words.append("a list")
+        elif get_origin(member) is dict:
+            words.append("a dict")
+        elif isinstance(member, type) and issubclass(member, BaseModel):
+            words.append(f"a{'n' * (member.__name__[0] in 'AEIOU')} {member.__name__}")
+        elif isinstance(member, type) and member in _WORDS and not (unit and member is float):
+            words.append(_WORDS[member])
+    return ", or ".join(dict.fromkeys(words)) or "see below"
+
+
+def document(cls: type[BaseModel]) -> str:
+    """The docstring with a section of parameters: what each takes, its default, what it is."""
+    lines = [own_doc(cls), "", "Parameters", "----------"]
+    for name, field in described(cls).items():
+        default = "required" if field.is_required() else f"default {_default(field)}"
+        lines.append(f"{name} : {kind(field)}; {default}")
+        lines += [f"    {line}" for line in (field.description or "").splitlines()]
+    return "\n".join(lines).strip()
+
+
+def signature(cls: type[BaseModel]) -> inspect.Signature:
+    """Parameters with their defaults as a user would write them."""
+    empty = inspect.Parameter.empty
+    return inspect.Signature(
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=empty if field.is_required() else _value(field))
+        for name, field in cls.model_fields.items()
+    )
+
+
+def written_choices(field: FieldInfo) -> str:
+    """The choices as Markdown, empty where there are none."""
+    chosen = [f"`{value}`" if isinstance(value, str) else f"`{json.dumps(value)}`" for value in choices(field)]
+    if not chosen:
+        return ""
+    others = [m for m in _members(field) if m is not NoneType and get_origin(m) is not Literal]
+    named = f"one of {', '.join(chosen)}" if len(chosen) > 1 else chosen[0]
+    if any(get_origin(t) is Literal for other in others for t in _types(other)):
+        named, others = f"one or several of {', '.join(chosen)}", []
+    return f"Or {named}." if others else f"{named[0].upper()}{named[1:]}{'.' if len(chosen) > 1 else ' only.'}"
+
+
+def _value(field: FieldInfo) -> Any:
+    return field.get_default(call_default_factory=True)
+
+
+def _default(field: FieldInfo) -> str:
+    return repr(_value(field))
+
+
+def _members(field: FieldInfo) -> tuple[Any, ...]:
+    """The types of which a parameter takes one, without what they are annotated with."""
+    annotation = field.annotation
+    members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    return tuple(get_args(m)[0] if get_origin(m) is Annotated else m for m in members)
+
+
+def _types(annotation: Any) -> Iterator[Any]:
+    yield annotation
+    if get_origin(annotation) is not Literal:
+        for argument in get_args(annotation):
+            yield from _types(argument)

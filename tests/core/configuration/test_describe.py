@@ -1,0 +1,74 @@
+"""What `help()`, signatures and the reference say of parameters."""
+
+from __future__ import annotations
+
+import inspect
+import pydoc
+from typing import Any
+
+import pytest
+
+import zonda
+from zonda.core.configuration.describe import choices, kind, own_doc, written_choices
+from zonda.core.registry import steps
+
+
+@pytest.mark.parametrize(
+    ("cls", "parameter", "words", "markdown"),
+    [
+        ("BinMap", "pixel", "an angle such as '4 arcmin'", ""),
+        ("BinMap", "frame", "'icrs' or 'galactic'", "One of `icrs`, `galactic`."),
+        ("BinMap", "projection", "'TAN'", "`TAN` only."),
+        ("BinMap", "half_difference", "True or False", ""),
+        ("SkyMap", "file", "the path of a file", ""),
+        ("SkyMap", "beam", "'gaussian' or 'none'", "One of `gaussian`, `none`."),
+        ("SkyMap", "centre", "'target', or a position such as '05h00m00s +20d00m00s'", "Or `target`."),
+        ("PointingDaisy", "offsets", "'none' or 'box', or a list", "Or one of `none`, `box`."),
+        ("PointingDaisy", "scans", "a whole number", ""),
+        (
+            "AtmosphereLayers",
+            "outputs",
+            "'pwv', 'opacity' or 'path_delay', or a list",
+            "One or several of `pwv`, `opacity`, `path_delay`.",
+        ),
+        ("Scene", "site", "a Site", ""),
+        ("Scene", "time", "a time such as '2024-11-25T07:00:00Z'", ""),
+    ],
+)
+def test_what_a_parameter_takes(cls: str, parameter: str, words: str, markdown: str) -> None:
+    field = getattr(zonda, cls).model_fields[parameter]
+    assert kind(field) == words
+    assert written_choices(field) == markdown
+
+
+@pytest.mark.parametrize("name", [*steps, "Scene", "Site", "Instrument", "Telescope", "Band"])
+def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
+    cls: Any = getattr(zonda, name)
+    text = pydoc.plain(pydoc.render_doc(cls))
+    assert own_doc(cls).splitlines()[0] in text
+    for parameter, field in cls.model_fields.items():
+        (line,) = [row for row in text.splitlines() if row.startswith(f" |  {parameter} : ")]
+        assert line.endswith("; required") if field.is_required() else "; default " in line
+        assert all(repr(choice) in line for choice in choices(field))
+        assert "see below" not in line
+    for jargon in ("model_dump", "model_validate", "__pydantic", "__class_vars__", "Annotated[", "FieldInfo"):
+        assert jargon not in text
+
+
+def test_the_signature_is_what_a_user_writes() -> None:
+    signature = inspect.signature(zonda.PointingDaisy)
+    assert signature.parameters["radius"].default == "4 arcmin"
+    assert inspect.signature(zonda.SkyMap).parameters["file"].default is inspect.Parameter.empty
+    assert "Annotated" not in str(signature)
+
+
+def test_completion_offers_parameters_without_pydantics_names() -> None:
+    names = dir(zonda.BinMap(pixel="2 arcsec"))
+    assert {"pixel", "frame", "exec"} <= set(names)
+    assert not [name for name in names if name.startswith("model_")]
+
+
+def test_the_schema_has_the_docstring_alone() -> None:
+    description = zonda.BinMap.model_json_schema()["description"]
+    assert description == own_doc(zonda.BinMap)
+    assert "Parameters\n----------" not in description
