@@ -19,6 +19,8 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
+from .discovery import RAISED
+
 Measured = float | tuple[float, str]
 """A figure, or a figure and a remark."""
 
@@ -69,7 +71,7 @@ class Check:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # what a hard case warns of is part of the case
                 found = self.measure()
-        except Exception as err:  # a check may fail in any way, the others go on
+        except RAISED as err:  # a check may fail in any way, the others go on
             return Result(self, math.nan, time.perf_counter() - start, f"{type(err).__name__}: {err}")
         figure, remark = found if isinstance(found, tuple) else (found, "")
         return Result(self, float(figure), time.perf_counter() - start, remark)

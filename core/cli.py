@@ -127,8 +127,11 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
+        from .faults import faults_named
+
         try:
-            return super().invoke(ctx)
+            with faults_named():
+                return super().invoke(ctx)
         except KeyboardInterrupt as err:
             raise Interrupted(getattr(err, "status", INTERRUPTED)) from None
 

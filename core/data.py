@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating]
 
+STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
+"""Streams that zonda's own operators make in every block: the components, and their calibrated sum."""
+
 
 class Tally:
     """Counts and figures that the user must know of: what was clipped, dropped, approximated. Thread-safe.
@@ -290,9 +293,10 @@ class Block:
         efficiency), `transmission` (relative fluctuation of e^-tau about its mean), `white` and `pink` (at the detector),
         all K_RJ but `transmission`; `signal` is the calibrated sum.
     means
-        What must be added to a stream in float64 to have all of it, by stream name: the smooth mean emission.
+        What must be added to a stream in float64 to have all of it, by stream name: the smooth mean emission. A step that does
+        not say that it knows of means (`Operator.knows_means`) finds none here: its streams are whole.
     dtype
-        float32 or float64: the type of every stream.
+        float32 or float64: the type of every stream. Where a mean was added for a step that does not know of means, float64.
     """
 
     observation: Observation

@@ -13,6 +13,10 @@ HOST = "zonda"
 """The distribution of the built-in plugins, which `ZONDA_PLUGINS` never shuts out."""
 
 
+RAISED = (Exception, SystemExit, GeneratorExit)
+"""What a plugin may raise where it is imported or called; Ctrl-C is the user's."""
+
+
 class PluginWarning(UserWarning):
     """A plugin, or a part of it, was left out; the rest goes on."""
 
@@ -90,6 +94,15 @@ def discover(group: str) -> list[Found]:
         return list(found)
     allowed = {HOST, *(normalized(name.strip()) for name in only.split(",") if name.strip())}
     return [f for f in found if normalized(f.distribution) in allowed]
+
+
+def plugin_of(module: str) -> str:
+    """``distribution version`` of the plugin to whose package a module belongs; empty where it is none's, or zonda's own."""
+    root = module.partition(".")[0]
+    for found in (f for group in _all().values() for f in group):
+        if normalized(found.distribution) != HOST and found.reference.partition(":")[0].partition(".")[0] == root:
+            return found.origin
+    return ""
 
 
 def others_may_declare(group: str) -> bool:

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Protocol, TypeVar
 
+from .discovery import RAISED, discover
+
 GROUP = "zonda.processes"
 
 
@@ -31,9 +33,8 @@ _waiting: dict[Callable[[], Any], Any] = {}
 def begin(path_or_name: str) -> None:
     """Start what the steps of a pipeline file want; nothing where that is not to be had. Call `end` in any case."""
     from .configuration.locate import locate, read
-    from .discovery import discover
 
-    with suppress(Exception):  # no such file, a broken plugin: whoever needs it says so
+    with suppress(*RAISED):  # no such file, a broken plugin: whoever needs it says so
         path = locate(path_or_name)
         if not path.is_file():  # a pipe can be read only once
             return
@@ -42,7 +43,7 @@ def begin(path_or_name: str) -> None:
             return
         for found in discover(GROUP):
             if re.search(rf"^\s*-\s+(['\"]?){re.escape(found.name)}\1\s*(:|#|$)", text, re.MULTILINE):
-                with suppress(Exception):
+                with suppress(*RAISED):
                     start = found.load()
                     _waiting[start] = start()
 
@@ -55,5 +56,5 @@ def take(start: Callable[[], P]) -> P:
 def end() -> None:
     """Close what nobody took."""
     while _waiting:
-        with suppress(Exception):
+        with suppress(*RAISED):
             _waiting.popitem()[1].close()

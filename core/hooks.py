@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from .discovery import Found, PluginWarning, discover
+from .discovery import RAISED, Found, PluginWarning, discover
 from .errors import ZondaError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def manager() -> pluggy.PluginManager:
     for found in discover(GROUP):
         try:
             load(plugins, found)
-        except Exception as err:  # a plugin may raise anything at import
+        except RAISED as err:
             _leave_out(found, f"left out: {type(err).__name__}: {err}")
     return plugins
 
@@ -108,7 +108,7 @@ def load(plugins: pluggy.PluginManager, found: Found) -> None:
             setattr(hooks, name, _isolated(function, found))
     try:
         plugins.register(hooks, name=found.qualified)
-    except Exception:
+    except BaseException:
         if plugins.has_plugin(found.qualified):
             plugins.unregister(name=found.qualified)
         raise
@@ -127,7 +127,7 @@ def _isolated(function: Callable[..., Any], found: Found) -> Callable[..., Any]:
             return function(*arguments)
         except ZondaError:
             raise
-        except Exception as err:
+        except RAISED as err:
             failed = True
             _leave_out(found, f"{function.__name__} failed and is left out from now on: {type(err).__name__}: {err}")
             return None

@@ -55,6 +55,11 @@ class Operator(Parameters):
         ``measure(stream, state)``, which reads the whole stream as often as it likes; its ``exec`` then works like that of
         a ``sample`` operator. One that says how often, in `sweeps`, need not have the stream in memory. With ``freeze`` and
         ``measure_frozen`` it can take part in companion runs with ``modes: full``.
+    knows_means
+        True where it handles the means that stand beside streams (`Block.means`, ``observation.smooth["atmosphere"]``). Without
+        it `exec` sees whole streams: where one that it declares has a mean, a float64 block with the mean in it, and no entry in
+        `Block.means`; the same mean is subtracted from what it leaves there (`core.run.whole`). `measure` likewise. A class that
+        overrides `exec` or `measure` must say so anew.
     main_run_only
         True for operators left out of companion runs (spectra, saved time streams).
     prepares_ahead
@@ -88,6 +93,7 @@ class Operator(Parameters):
     provides: ClassVar[frozenset[str]] = frozenset()
     optional: ClassVar[frozenset[str]] = frozenset()
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
+    knows_means: ClassVar[bool] = False
     main_run_only: ClassVar[bool] = False
     prepares_ahead: ClassVar[bool] = False
     at_end: ClassVar[bool] = False

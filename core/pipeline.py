@@ -12,6 +12,7 @@ import numpy as np
 
 from .data import Data, Observation, html_table
 from .errors import PipelineError
+from .faults import faults_named
 from .machine import available_memory, available_threads
 from .operator import Operator
 from .run import arguments
@@ -119,6 +120,7 @@ class Pipeline:
         """The runs in the order in which they are made: the main run (empty), what is simulated, what is derived."""
         return ["", *(r for r in self.runs if r not in self.derived), *self.derived]
 
+    @faults_named(exceptions=False)
     def run(
         self,
         scene: Scene,
@@ -224,6 +226,7 @@ class Pipeline:
         hooks.zonda_pipeline_end(pipeline=self, data=data)
         return data
 
+    @faults_named(exceptions=False)
     def pack(self, data: Data, first: bool) -> dict[str, dict[str, Mapping[str, Any]]]:
         """The partial products in ``data``, by run and label."""
         part = Part(first=first)
@@ -234,6 +237,7 @@ class Pipeline:
         data.run = ""
         return part.packed
 
+    @faults_named(exceptions=False)
     def merge(self, data: Data, packed: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
         """Add the partial products of a part to ``data``."""
         for run in self.order:
@@ -243,6 +247,7 @@ class Pipeline:
                     operator.merge(data, found)
         data.run = ""
 
+    @faults_named(exceptions=False)
     def finish(self, data: Data) -> Data:
         """Finish merged products, and let the operators act that act at the end."""
         from .hooks import manager

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any, TypeVar, overload
 
-from .discovery import Found, discover
+from .discovery import RAISED, Found, discover
 from .errors import ZondaError
 
 T = TypeVar("T")
@@ -166,7 +166,7 @@ class Registry:
         found = Found(name, _reference(component), SESSION, "") if name in self._local else self._named(name)[0]
         try:
             made = component()
-        except Exception as err:
+        except RAISED as err:
             if isinstance(err, ZondaError) and not isinstance(err, ValueError):  # a ParameterError is the plugin's fault
                 raise
             raise _broken(self.kind, found, err) from err
@@ -179,7 +179,7 @@ class Registry:
         if found not in self._loaded:
             try:
                 component = found.load()
-            except Exception as err:  # a plugin may raise anything at import
+            except RAISED as err:
                 raise _broken(self.kind, found, err) from err
             self._loaded[found] = self._check(component, found)
         return self._loaded[found]
@@ -262,7 +262,7 @@ def _reference(component: Any) -> str:
     return f"{thing.__module__}:{thing.__qualname__}"
 
 
-def _broken(kind: str, found: Found, err: Exception) -> RegistryError:
+def _broken(kind: str, found: Found, err: BaseException) -> RegistryError:
     return RegistryError(
         f"{kind} '{found.name}' could not be loaded from the plugin {found.origin}",
         label=_first_words(err),
@@ -271,7 +271,7 @@ def _broken(kind: str, found: Found, err: Exception) -> RegistryError:
     )
 
 
-def _first_words(err: Exception) -> str:
+def _first_words(err: BaseException) -> str:
     """The first line of what an exception says; of pydantic's, which has none to the point, all fields with their mistakes."""
     from pydantic import ValidationError
 

@@ -19,6 +19,7 @@ class SkySignal(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"sky"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     linear: ClassVar[bool] = True
+    knows_means: ClassVar[bool] = True
 
     @property
     def label(self) -> str:
@@ -27,6 +28,8 @@ class SkySignal(Operator):
 
     def exec(self, block: Block, state: Any) -> None:
         block.new("signal", zero=False)[...] = block.detdata["sky"]
+        if "sky" in block.means:
+            block.means["signal"] = block.means["sky"]
 
 
 def place_of_signal(operators: Sequence[Operator]) -> int | None:

@@ -13,7 +13,7 @@ import dataclasses
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,16 @@ from pydantic import ValidationError
 
 from .configuration.parameters import described
 from .configuration.time import Instant
-from .data import Block, Data, Observation
+from .data import STREAMS, Block, Data, Observation
 from .instrument import Band, Instrument, Telescope
 from .numerics.random import normals
+from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
 from .pipeline import Pipeline
 from .scene import Scene
 from .site import Site
 
-STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
-"""Streams that the kit can provide."""
 N_DETECTORS, N_SAMPLES, RATE = 37, 3 * TILE_SAMPLES + 321, 50.0
 
 
@@ -153,6 +152,25 @@ def check_frozen(operator: Operator) -> None:
     assert np.allclose(twice, 2 * once, rtol=0, atol=4 * scale), "frozen, it is not linear: twice the stream gives another result"
 
 
+def check_means(operator: Operator) -> None:
+    """What comes out is the same whether the mean, tens of kelvin, stands beside the stream or in it (`Operator.knows_means`).
+
+    Both in float64, where 30 K are rounded to 4e-15 K; what a run in float32 would round, 2^-24 of the largest value, is allowed.
+    """
+    changed = operator.provides & frozenset(STREAMS)
+    for name in sorted({"signal"} | ({"atmosphere"} if changed else set())):
+        if operator.at_end or name not in operator.requires | operator.optional:
+            continue
+        beside, inside = (
+            _products(operator, threads=1, memory=1 << 30, given=_Given(mean=name, beside=b), precision="float64")
+            for b in (True, False)
+        )
+        assert (wrong := _unlike(beside, inside)) is None, (
+            f"{wrong} is another where the mean of {name} stands beside the stream (block.means, observation.smooth), not in it: "
+            "leave knows_means out, or add that mean"
+        )
+
+
 def check_finite(operator: Operator) -> None:
     """Finite streams stay finite."""
     for name, stream in _products(operator, threads=1, memory=1 << 30).items():
@@ -167,6 +185,7 @@ CHECKS: tuple[Callable[[Operator], None], ...] = (
     check_declared_streams,
     check_same_bits,
     check_frozen,
+    check_means,
     check_finite,
 )
 
@@ -184,10 +203,23 @@ class _Point(Operator):
 
 
 class _Given(Operator):
-    """Provides every stream: a slow wave, common to all detectors, with noise of each detector's own."""
+    """Provides every stream: a slow wave, common to all detectors, with noise of each detector's own.
+
+    ``mean`` names one that has a mean of some 30 K, ``beside`` it or in it.
+    """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset(STREAMS)
+    knows_means: ClassVar[bool] = True
+    mean: str = ""
+    beside: bool = True
+
+    def prepare(self, observation: Observation) -> SmoothField:
+        """The mean: of each detector its own, falling slowly."""
+        field = SmoothField.from_values(*_slow(observation.n_samples), MEAN_STEP, observation.n_samples)
+        if self.mean == "atmosphere" and self.beside:
+            observation.smooth["atmosphere"] = field
+        return field
 
     def exec(self, block: Block, state: Any) -> None:
         start, stop = block.samples.start, block.samples.stop
@@ -197,6 +229,21 @@ class _Given(Operator):
             for d in range(block.detectors.start, block.detectors.stop):
                 noise = normals(block.observation.key("given", name, d), start, stop)
                 stream[d - block.detectors.start] = 1e-3 * (3 * wave * (number + 1) + noise)
+        if self.mean == "signal" and self.beside:
+            block.means["signal"] = state
+        elif self.mean and not self.beside:
+            block.detdata[self.mean] += state.evaluate(block.detectors, block.samples)
+
+
+MEAN_STEP = 256
+"""Samples between the coefficients of the made-up mean."""
+
+
+def _slow(n_samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (detector, node) and node values of a mean: 30 K and more, falling by 0.3 K in a straight line."""
+    weights = np.stack([30 + 0.1 * np.arange(N_DETECTORS), np.linspace(0.5, 1, N_DETECTORS)], axis=1)
+    n = -(-n_samples // MEAN_STEP) + 3
+    return weights, np.stack([np.ones(n + 24), -0.3 * np.arange(n + 24) / n])
 
 
 def _scene() -> Scene:
@@ -236,17 +283,26 @@ def _quaternions(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[
     return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
 
 
-def _products(operator: Operator, threads: int, memory: int) -> dict[str, Any]:
-    """Everything that a run of the operator over given streams makes: streams and products."""
+def _products(
+    operator: Operator,
+    threads: int,
+    memory: int,
+    given: Operator | None = None,
+    precision: Literal["float32", "float64"] = "float32",
+) -> dict[str, Any]:
+    """Everything that a run of the operator over given streams makes: streams, their means included, and products."""
     if operator.at_end:
         return {}
     pointing = "boresight" in operator.provides
-    steps = [operator] if pointing else [_Point(), _Given(), operator]
+    steps = [operator] if pointing else [_Point(), given or _Given(), operator]
     keep = sorted(operator.provides & set(STREAMS))
     with tempfile.TemporaryDirectory() as folder:
-        data = Pipeline(steps).run(_scene(), threads=threads, memory=memory, keep=keep, output=folder)
+        data = Pipeline(steps, precision=precision).run(_scene(), threads=threads, memory=memory, keep=keep, output=folder)
     found: dict[str, Any] = {}
     for observation in data.observations:
+        if "atmosphere" in observation.detdata and "atmosphere" in observation.smooth:
+            whole = slice(0, observation.n_detectors), slice(0, observation.n_samples)
+            observation.detdata["atmosphere"] += observation.smooth["atmosphere"].evaluate(*whole)
         found |= {f"{observation.name} {name}": stream for name, stream in observation.detdata.items()}
         if pointing:
             found |= {f"{observation.name} {name}": getattr(observation, name) for name in ("boresight_azel", "boresight_radec")}
@@ -292,6 +348,21 @@ def _same(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray):
         return isinstance(b, np.ndarray) and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
     return bool(a == b)
+
+
+def _unlike(a: Any, b: Any, name: str = "") -> str | None:
+    """The name of the first array or number of ``a`` that is not that of ``b`` within 2^-24 of the largest value; None: alike."""
+    if isinstance(b, Mapping):
+        if not isinstance(a, Mapping) or a.keys() != b.keys():
+            return name or "what is made"
+        return next((w for k in b if (w := _unlike(a[k], b[k], f"{name}.{k}" if name else str(k)))), None)
+    if b is None or a is None:
+        return None if a is b else name
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if a.shape != b.shape or (np.isfinite(a) != np.isfinite(b)).any():
+        return name
+    good = np.isfinite(b)
+    return None if (np.abs(a[good] - b[good]) <= 2.0**-24 * np.abs(b[good]).max(initial=0.0)).all() else name
 
 
 class _Watched(dict[str, Any]):

@@ -1,5 +1,6 @@
 """What the documentation shows, runs."""
 
+import importlib
 import re
 from pathlib import Path
 
@@ -20,10 +21,20 @@ def in_a_folder_with_a_map(folder, monkeypatch):
     monkeypatch.chdir(folder)
 
 
+def defined_before(text):
+    """Names of the page's first block of Python, where this one goes on from there."""
+    if "import zonda" in text:
+        return {}
+    page = next(page for page in map(Path.read_text, PAGES) if text in page)
+    names = {}
+    exec(compile(re.search(r"```python\n(.*?)```", page, re.S)[1], "documentation", "exec"), names)
+    return names
+
+
 @pytest.mark.parametrize("text", list(blocks("python")))
 def test_python(text, tmp_path, monkeypatch):
     in_a_folder_with_a_map(tmp_path, monkeypatch)
-    names = {}
+    names = defined_before(text)
     exec(compile(text.replace('"5 min"', '"20 s"'), "documentation", "exec"), names)  # shorter scans, same code
     assert names
 
@@ -68,3 +79,43 @@ def test_the_reference_is_made_from_the_operators():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.PAGE.read_text() == module.page(), "run python docs/make_reference.py"
+
+
+def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
+    """The gain drift multiplies all of the signal, tens of kelvin of mean included, and loses no microkelvin."""
+    import numpy as np
+
+    import zonda
+    import zonda.testing
+
+    first, second = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S)[:2]
+    (tmp_path / "page_for_authors.py").write_text(first + second)  # a file: docstrings of fields are read from it
+    monkeypatch.syspath_prepend(str(tmp_path))
+    page = importlib.import_module("page_for_authors")
+    drift, demean = page.GainDrift(period="20 s"), page.Demean()
+    zonda.testing.check_operator(drift)
+    zonda.testing.check_operator(demean)
+
+    def signal(*steps):
+        scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5)
+        chain = [
+            zonda.PointingStare(scan_duration="5 s"),
+            zonda.AtmosphereLayers(pwv="5 mm"),
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+            *steps,
+        ]
+        data = zonda.Pipeline(chain).run(scene, keep=["signal"])
+        return data.observations[0].detdata["signal"], data.observations[0]
+
+    plain, observation = signal()
+    drifting, _ = signal(drift)
+    assert plain.mean() > 10
+    phase = 2 * np.pi * observation.seconds / 20
+    gain = 1 + drift.prepare(observation) @ np.stack([np.cos(phase), np.sin(phase)])
+    assert np.abs(gain - 1).max() > 0.02
+    # what stands beside the mean, below 2 K (4 sigma of 1 % of 50 K), is rounded to 2^-24 of it, before and after
+    assert np.abs(drifting - gain * plain).max() < 2 * 2 * 2.0**-24
+    left, _ = signal(demean)
+    true = plain - plain.mean(axis=1, keepdims=True)
+    assert np.abs(left - true).max() < 2.0**-24 * np.abs(true).max()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..compilation.compiled import ensure_cache, one_blas_thread
 from ..errors import ZondaError
+from ..faults import faults_named
 
 if TYPE_CHECKING:
     from ..data import Data
@@ -109,7 +110,8 @@ def main(ask: str, answer: str) -> int:
     request = Request(**given)
     result: Any
     try:
-        result = work(request)
+        with faults_named():
+            result = work(request)
     except ZondaError as err:
         message = str(err) if hasattr(err, "diagnostics") else err.message
         result = {"message": message, "place": err.place, "cure": err.cure}

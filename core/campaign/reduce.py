@@ -16,6 +16,7 @@ import numpy as np
 
 from ..data import Data, Observation
 from ..errors import ZondaError
+from ..faults import faults_named
 from ..storage.files import check_output_folder
 from . import parts
 from .job import TASKS, Job, Task, plural
@@ -72,6 +73,7 @@ def combine(folder: str, number: int, digests: Mapping[int, str]) -> Combined:
     return Combined(tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told()))
 
 
+@faults_named()
 def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) -> Data:
     """As `combine`; the finished data. Raises `InputError` where a partial product is missing or damaged."""
     combination = job.combinations[number]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
+from ..faults import faults_named
 from . import machines, parts
 from .job import TASKS, Task
 
@@ -124,6 +125,7 @@ class _NotCombined(PipelineError):
     """A product that no operator packs."""
 
 
+@faults_named()
 def _run(order: Order) -> str:
     from ..configuration.time import Instant
     from ..pipeline import Part

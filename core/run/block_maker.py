@@ -8,13 +8,18 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
-from ..data import Block, Floats, Observation, Stream, Tally
+import numpy as np
+
+from ..data import STREAMS, Block, Floats, Observation, Stream, Tally
+from ..faults import PluginError, whose
 from ..numerics.tiles import TILE_SAMPLES
 from ..operator import Operator
 from .blocks import pieces, trimmed, within
 from .repeated import Repeated
+from .same_air import SameAir
 from .settings import Settings, Timer
 from .streams import Ledger, Stage
+from .whole import exec_whole, knows_means, means_of, names_of
 
 
 class BlockMaker:
@@ -48,6 +53,15 @@ class BlockMaker:
         self._streams, self._timer, self._ledger, self._stopped = frozenset(streams), timer, ledger, stopped
         self._repeated = repeated
         self._labels = {id(operator): operator.label for operator in operators}  # the property is slow
+        acting = [o for o in operators if type(o).exec is not Operator.exec]
+        self._declared = {o.label: names_of(o) for o in acting if not knows_means(o)}
+        self._due: dict[str, frozenset[str]] = {}
+        """By label: streams that a step must have made, for a later one requires them."""
+        required = frozenset[str]()
+        for operator in reversed(operators):
+            takes_away = isinstance(operator, SameAir)
+            self._due[operator.label] = frozenset() if takes_away else operator.provides & required & frozenset(STREAMS)
+            required |= operator.requires if operator in acting else frozenset()
         self._local = threading.local()
 
     def let_go(self) -> None:
@@ -75,7 +89,8 @@ class BlockMaker:
         if reach != samples:
             block = trimmed(block, samples)
         self._exec(rest[1:], block)
-        buffers = [*self._local.__dict__.get("blocks", {}).values(), self._local.__dict__.get("pieces", {})]
+        held = self._local.__dict__
+        buffers = [*held.get("blocks", {}).values(), held.get("pieces", {}), held.get("whole", {})]
         size = sum(array.nbytes for held in buffers for array in held.values())
         self._ledger.note(("blocks", threading.get_ident()), size)
         return block
@@ -90,12 +105,28 @@ class BlockMaker:
             if alike is not None and alike.complete:
                 alike.repeat(label, block)
             else:
-                operator.exec(block, self._states[label])
+                self._act(operator, label, block)
                 if alike is not None:
                     alike.record(label, block)
             now = time.thread_time()
             self._timer.add(label, "exec", now - start)
             start = now
+
+    def _act(self, operator: Operator, label: str, block: Block) -> None:
+        """`Operator.exec`, and a look at what it left."""
+
+        def work(block: Block) -> None:
+            before = dict(block.detdata)
+            operator.exec(block, self._states[label])
+            check_left(operator, block, before, self._due[label])
+
+        fields = {}
+        if names := self._declared.get(label, frozenset()) & block.detdata.keys():
+            fields = means_of(self._observation, block.means, names)
+        if fields:
+            exec_whole(block, operator, fields, self._local.__dict__.setdefault("whole", {}), work)
+        else:
+            work(block)
 
     def _block(
         self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool, copied: bool
@@ -154,3 +185,45 @@ class BlockMaker:
                 made[name][where] = piece.detdata[name]
             block.means = piece.means  # the same fields in every piece
         block.detdata = {**given, **made}
+
+
+def check_left(operator: Operator, block: Block, before: Mapping[str, Floats], due: frozenset[str]) -> None:
+    """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of the block's shape and type.
+
+    Parameters
+    ----------
+    before
+        The block's streams before; an array that is still there is not looked at.
+    due
+        Streams that it must have made.
+
+    Raises
+    ------
+    PluginError
+        Names the step, its class and where that comes from.
+    """
+    for name, stream in block.detdata.items():
+        if stream is before.get(name):
+            continue
+        wanted = f"an array {block.shape} of {np.dtype(block.dtype)} in C order"
+        if not isinstance(stream, np.ndarray):
+            found = f"a {type(stream).__name__}"
+        elif stream.shape != block.shape or stream.dtype != block.dtype:
+            found = f"an array {stream.shape} of {stream.dtype}"
+        elif not stream.flags.c_contiguous:
+            found = "an array that is not in C order"
+        else:
+            continue
+        raise PluginError(
+            f"exec left the stream {name!r} as {found}; it must be {wanted}",
+            place=whose(operator),
+            cure=f"fill it in place: block.new({name!r})[...] = values",
+        )
+    gone = (due - block.detdata.keys()) | (before.keys() - operator.provides - block.detdata.keys())
+    if gone:
+        name = min(gone)
+        raise PluginError(
+            f"exec left no stream {name!r}, which {'it provides' if name in operator.provides else 'others read'}",
+            place=whose(operator),
+            cure=f"make it with block.new({name!r}), or leave it out of provides" if name in due else "leave it in block.detdata",
+        )

@@ -15,11 +15,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ..data import Block, Data, Floats, Observation, Stream, Tally, in_order
+from ..discovery import RAISED
 from ..errors import PipelineError
 from ..machine import resident_memory
 from ..numerics.smooth import SmoothField
@@ -32,6 +34,7 @@ from .layout import Layout, read
 from .repeated import Repeated
 from .settings import Settings, Timer
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain, forget_pages
+from .whole import WholeStream, knows_means, may_have_means, means_of
 
 
 def _nobody(**what: Any) -> None:
@@ -60,7 +63,7 @@ class Execution:
         self.ledger = Ledger()
         self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
         streams = read(operators) | set(keep)
-        self.layout = Layout(observation, settings, streams)
+        self.layout = Layout(observation, settings, streams, may_have_means(operators))
         self._blocks = BlockMaker(
             operators, observation, settings, self.states, streams, timer, self.ledger, self._stop.is_set, repeated
         )
@@ -121,7 +124,7 @@ class Execution:
             wait([self.beforehand])
         for operator in self.operators:
             if operator.label in self.states:
-                with suppress(Exception):
+                with suppress(*RAISED):
                     operator.discard(self.observation, self.states[operator.label])
         self.states.clear()
 
@@ -217,7 +220,7 @@ class Execution:
             self.settings = settings = copy.copy(settings)
             settings.memory = room
             self._store = Store(room, settings.dtype, settings.spare, self.ledger)
-            self.layout = Layout(self.observation, settings, self.layout.streams)
+            self.layout = Layout(self.observation, settings, self.layout.streams, self.layout.means)
 
     def _measure(self, operator: Operator, source: Source, before: Callable[..., None], after: Callable[..., None]) -> None:
         names = sorted(operator.requires & source.names)
@@ -237,6 +240,9 @@ class Execution:
         else:
             stream = source.streams[names[0]]
             stream.room = max(self.settings.memory - self._store.held, 0)
+        lent: list[Floats] = []
+        if not knows_means(operator) and (fields := means_of(self.observation, source.means, frozenset(names))):
+            stream = WholeStream(stream, fields[names[0]], partial(self._lend, names[0], lent))
         before(operator=operator, observation=self.observation, stage="measure")
         start, others = time.process_time(), self._seconds("exec") + self._ahead.seconds()
         state, frozen = self.states[operator.label], self.frozen
@@ -246,11 +252,17 @@ class Execution:
             operator.measure(stream, state)
             if frozen is not None and operator.can_freeze:
                 frozen.found[operator.label] = operator.freeze(state)
+        self._store.drop(lent)
         self._same_use(operator.label, "measure")
         others = self._seconds("exec") + self._ahead.seconds() - others  # what makes the stream again is theirs
         used = time.process_time() - start - others
         self.timer.add(operator.label, "measure", used)
         after(operator=operator, observation=self.observation, stage="measure", seconds=used)
+
+    def _lend(self, name: str, lent: list[Floats], shape: tuple[int, int]) -> Floats:
+        """A float64 array, noted in ``lent``, for as long as a step measures."""
+        lent.append(self._store.allocate(name, shape, dtype=np.float64))
+        return lent[-1]
 
     def _seconds(self, stage: str) -> float:
         return sum(self.timer.seconds.get((o.label, stage), 0.0) for o in self.operators)

@@ -19,6 +19,7 @@ from .blocks import Segment, cut
 from .layout import Layout, read
 from .settings import Settings
 from .streams import Source, Stage
+from .whole import may_have_means
 
 BASE = 230_000_000
 """Bytes of the interpreter, libraries and compiled code."""
@@ -43,7 +44,7 @@ def forecast(operators: Sequence[Operator], observation: Observation, settings: 
     PipelineError
         Where a stream fits neither in memory nor on the disk and cannot be made again.
     """
-    layout = Layout(observation, settings, read(operators))
+    layout = Layout(observation, settings, read(operators), may_have_means(operators))
     segments: list[Segment] = cut(operators, observation)
     source, held, most, least, elsewhere, again = Source(), 0, 0, 0, list[str](), dict[str, int]()
     for number, segment in enumerate(segments):

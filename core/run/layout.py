@@ -13,6 +13,7 @@ from ..operator import Operator
 from .blocks import PIECE, Segment, block_share, blocks, least_block, whole_span
 from .settings import Settings
 from .streams import DISK_RATE, SAMPLE_COST, WORTH_MEASURING, Held, Source, Stage, choose, disk_rate
+from .whole import knows_means, names_of
 
 SCRATCH_STREAMS = 2
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
@@ -31,10 +32,15 @@ class Layout:
     ----------
     streams
         Names of those that are of use: `read`, and those to be kept.
+    means
+        Names of those that may have a mean (`may_have_means`).
     """
 
-    def __init__(self, observation: Observation, settings: Settings, streams: Collection[str]) -> None:
-        self.observation, self.settings, self.streams = observation, settings, frozenset(streams)
+    def __init__(
+        self, observation: Observation, settings: Settings, streams: Collection[str], means: Collection[str] = ()
+    ) -> None:
+        self.observation, self.settings = observation, settings
+        self.streams, self.means = frozenset(streams), frozenset(means)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -155,7 +161,14 @@ class Layout:
         whole, part = len(names & self.streams), len(every & self.streams)
         scratch = SCRATCH_STREAMS if rest else 0
         margins = 2 if stage.segment.halo else 1  # a block with margins is trimmed to a copy
-        return before[0] + margins * whole + scratch, max(before[1], part + (SCRATCH_STREAMS if first else 0))
+        whole, part = margins * whole + scratch, part + (SCRATCH_STREAMS if first else 0)
+        return before[0] + whole + self._copies(rest), max(before[1], part + self._copies(first))
+
+    def _copies(self, operators: Sequence[Operator]) -> int:
+        """Arrays of the run's precision that whole streams and one mean take, float64, where a step does not know of means."""
+        each = 8 // np.dtype(self.settings.dtype).itemsize
+        paying = [o for o in operators if (o.requires | o.optional) & self.means and not knows_means(o)]
+        return each * (1 + max(len(names_of(o) & self.streams) for o in paying)) if paying else 0
 
     def _ceiling_for(self, need: int) -> str:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""

@@ -30,6 +30,7 @@ class SameAir(Operator):
     """
 
     provides: ClassVar[Any] = _TakenAway()
+    knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
 
     _names: frozenset[str] = PrivateAttr(frozenset())

@@ -190,17 +190,23 @@ class Store:
         """Whether ``size`` more bytes stay within the streams' share of the budget."""
         return self._in_use + size <= self._room
 
-    def allocate(self, name: str, shape: tuple[int, int], in_memory: bool = True) -> Floats:
-        """An array of anything; a memory map of a file where it does not fit or is not wanted in memory."""
-        size = shape[0] * shape[1] * self._dtype.itemsize
+    def allocate(
+        self, name: str, shape: tuple[int, int], in_memory: bool = True, dtype: type[np.floating[Any]] | None = None
+    ) -> Floats:
+        """An array of anything; a memory map of a file where it does not fit or is not wanted in memory.
+
+        ``dtype``: where it is not that of the streams.
+        """
+        kind = self._dtype if dtype is None else np.dtype(dtype)
+        size = shape[0] * shape[1] * kind.itemsize
         if in_memory and self.fits(size):
-            alike = [a for a in self._spare if a.shape == shape and a.dtype == self._dtype]
+            alike = [a for a in self._spare if a.shape == shape and a.dtype == kind]
             self._spare[:] = alike[1:]
             if not alike:
                 self._spare.clear()
-            array = alike[0] if alike else untouched(shape, self._dtype)
+            array = alike[0] if alike else untouched(shape, kind)
         else:
-            array = self._file(name, shape)
+            array = self._file(name, shape, kind)
         self._live[id(array)] = array
         self._note()
         return array
@@ -211,6 +217,12 @@ class Store:
             self._live.pop(id(array), None)
             if not isinstance(array, np.memmap) and self.fits(array.nbytes + sum(a.nbytes for a in self._spare)):
                 self._spare.append(array)
+        self._note()
+
+    def drop(self, arrays: list[Floats]) -> None:
+        """Give back what no later stream can use."""
+        for array in arrays:
+            self._live.pop(id(array), None)
         self._note()
 
     def clear_spare(self) -> None:
@@ -226,8 +238,8 @@ class Store:
     def _note(self) -> None:
         self._ledger.note(("streams",), self.held)
 
-    def _file(self, name: str, shape: tuple[int, int]) -> Floats:
-        size = shape[0] * shape[1] * self._dtype.itemsize
+    def _file(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> Floats:
+        size = shape[0] * shape[1] * dtype.itemsize
         try:
             if self._folder is None:
                 self._folder = tempfile.TemporaryDirectory(prefix="zonda-")
@@ -242,7 +254,7 @@ class Store:
                 place=tempfile.gettempdir(),
                 cure="raise --memory, or point TMPDIR to a larger disk",
             ) from error
-        return np.memmap(path, self._dtype, "r+", shape=shape)
+        return np.memmap(path, dtype, "r+", shape=shape)
 
 
 def _reserve(handle: int, size: int) -> None:

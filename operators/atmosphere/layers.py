@@ -141,6 +141,7 @@ class AtmosphereLayers(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[Any] = _Provides()
+    knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
     only_tells: ClassVar[bool] = True
     knobs: ClassVar[tuple[Knob, ...]] = (

@@ -124,6 +124,7 @@ class PowerSpectrum(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
+    knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"

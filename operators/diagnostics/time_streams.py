@@ -31,6 +31,7 @@ class TimeStreams(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
+    knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     main_run_only: ClassVar[bool] = True

@@ -65,6 +65,7 @@ class CommonModeFilter(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"

@@ -56,6 +56,7 @@ class SaveTOD(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     provides: ClassVar[frozenset[str]] = frozenset({"tod_file"})
+    knows_means: ClassVar[bool] = True
     main_run_only: ClassVar[bool] = True
 
     format: Literal["hdf5", "fits"] = "hdf5"

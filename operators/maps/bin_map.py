@@ -70,6 +70,7 @@ class BinMap(Operator):
 
     requires: ClassVar[Any] = _Requires()
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
+    knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
     product_only: ClassVar[bool] = True
     lighter: ClassVar[str] = "choose a larger pixel or a smaller width"

@@ -26,6 +26,7 @@ from zonda.core import flags
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
+from zonda.core.errors import PipelineError
 from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import Series, SmoothField, interpolating, series_into
 from zonda.core.numerics.stretches import stretches, untouched
@@ -51,6 +52,7 @@ class Efficiency(Operator):
     """Telescope efficiencies, opacity and calibration: equation (1). Writes ``signal``; the components stay as they are."""
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
     linear: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
@@ -123,6 +125,12 @@ class Efficiency(Operator):
         """Equation (2) on one block."""
         rows, shape = block.detectors, block.shape
         have = block.detdata
+        if beside := sorted(self.optional & block.means.keys()):
+            raise PipelineError(
+                f"a mean stands beside {beside[0]} in block.means, which is not calibrated",
+                place=self.label,
+                cure="let the step that makes it add the mean to the stream, or set observation.smooth['atmosphere']",
+            )
         signal = block.buffer("signal", shape)
         absent = np.empty((0, 0), block.dtype)
         nothing = Series(absent, 0, np.ones(1, block.dtype))

@@ -286,9 +286,20 @@ def test_operating_system_errors(here: Path, capsys: pytest.CaptureFixture[str],
         cli.main(["check", "p.yaml"])
 
 
-def test_a_fault_of_the_program_shows_its_traceback(here: Path) -> None:
+def test_a_fault_of_the_program_shows_its_traceback(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from zonda.core.pipeline import Pipeline
+
+    def broken(*_: Any) -> None:
+        raise RuntimeError("a fault of the program")
+
+    monkeypatch.setattr(Pipeline, "_provenance", broken)
     with pytest.raises(RuntimeError, match="a fault of the program"):
-        cli.main(["run", "p.yaml", "--set", "Total.after=fault"])
+        cli.main(["run", "p.yaml"])
+
+
+def test_a_fault_of_a_plugin_is_told(here: Path, capsys: Any) -> None:
+    assert cli.main(["run", "p.yaml", "--set", "Total.after=fault"]) == 2
+    assert "Total: zc_toys.Total.finalize of zonda-zc 3.1 raised RuntimeError: a fault of the program" in capsys.readouterr().err
     assert not [p for p in here.rglob("*") if "total" in p.name]
 
 

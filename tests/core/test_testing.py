@@ -173,3 +173,109 @@ def test_an_operator_that_is_not_linear_when_frozen():
     check_operator(NormalizesFrozen())
     with pytest.raises(AssertionError, match="check_frozen: frozen, it is not linear"):
         check_operator(Normalizes())
+
+
+class Gain(Good):
+    """Multiplies the signal; what is kept beside it is added for it."""
+
+    def exec(self, block, state):
+        block.detdata["signal"] *= block.dtype(1.001)
+
+
+class GainThatKnows(Gain):
+    """Says that it knows of means, and overlooks them."""
+
+    knows_means: ClassVar[bool] = True
+
+    def exec(self, block, state):
+        super().exec(block, state)
+
+
+class GainThatDoes(Gain):
+    """Multiplies both."""
+
+    knows_means: ClassVar[bool] = True
+
+    def exec(self, block, state):
+        super().exec(block, state)
+        if "signal" in block.means:
+            block.means["signal"] = block.means["signal"].scaled(
+                np.full(block.observation.n_detectors, float(block.dtype(1.001)))
+            )
+
+
+class GainOfAtmosphere(Gain):
+    """Multiplies the emission."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"atmosphere"})
+    provides: ClassVar[frozenset[str]] = frozenset({"atmosphere"})
+
+    def exec(self, block, state):
+        block.detdata["atmosphere"] *= block.dtype(1.001)
+
+
+class GainOfAtmosphereThatKnows(GainOfAtmosphere):
+    """Overlooks the mean in ``observation.smooth``."""
+
+    knows_means: ClassVar[bool] = True
+
+    def exec(self, block, state):
+        super().exec(block, state)
+
+
+class Counts(Operator):
+    """Makes a product alone: the sum of all samples."""
+
+    requires: ClassVar[frozenset[str]] = SIGNAL
+    provides: ClassVar[frozenset[str]] = frozenset({"total"})
+
+    def prepare(self, observation):
+        return np.zeros((observation.n_detectors, observation.n_samples))
+
+    def exec(self, block, state):
+        state[block.detectors, block.samples] = block.detdata["signal"]
+
+    def collect(self, data, observation, state):
+        data.products["total"] = state.sum(axis=1)
+
+
+class CountsThatKnows(Counts):
+    """Leaves the mean out."""
+
+    knows_means: ClassVar[bool] = True
+
+    def exec(self, block, state):
+        super().exec(block, state)
+
+
+class MeasuresThatKnows(NormalizesFrozen):
+    """Measures without the mean, adds it in `exec`."""
+
+    knows_means: ClassVar[bool] = True
+
+    def measure(self, stream, state):
+        super().measure(stream, state)
+
+    def exec(self, block, state):
+        whole = block.total("signal") / state[0]
+        block.means.pop("signal", None)
+        block.detdata["signal"][...] = whole
+
+
+def test_the_mean_is_no_trap():
+    for right in (Gain(), GainThatDoes(), GainOfAtmosphere(), Counts(), NormalizesFrozen()):
+        check_operator(right)
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        (GainThatKnows(), "check_means: scan-000 signal is another where the mean of signal stands beside the stream"),
+        (GainOfAtmosphereThatKnows(), "check_means: scan-000 atmosphere is another where the mean of atmosphere"),
+        (CountsThatKnows(), "check_means: total is another"),
+        (MeasuresThatKnows(), "check_means: scan-000 signal is another"),
+    ],
+)
+def test_whoever_says_that_it_knows_of_means_must(broken, words):
+    with pytest.raises(AssertionError, match=words):
+        check_operator(broken)

@@ -25,6 +25,7 @@ class Holes(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     linear: ClassVar[bool] = True
 
     def exec(self, block: Block, state: object) -> None:

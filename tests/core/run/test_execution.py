@@ -49,6 +49,7 @@ class Source(Operator):
     """A value that depends on the absolute detector and sample only."""
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
 
     def exec(self, block, state):
         d = np.arange(block.detectors.start, block.detectors.stop)[:, None]
@@ -62,6 +63,7 @@ class Smooth(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     width: int = 5
 
     def halo(self, observation):
@@ -83,6 +85,7 @@ class Demean(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     couples: ClassVar = "time"
 
     def exec(self, block, state):
@@ -96,6 +99,7 @@ class FocalPlaneMean(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     couples: ClassVar = "detectors"
 
     def exec(self, block, state):
@@ -112,6 +116,7 @@ class Scale(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     couples: ClassVar = "all"
 
     def prepare(self, observation):
@@ -129,6 +134,7 @@ class Sink(Operator):
     """Count every sample once."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
 
     def prepare(self, observation):
         return np.zeros((observation.n_detectors, observation.n_samples), int)
@@ -187,6 +193,7 @@ class Peek(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"seen"})
+    knows_means: ClassVar[bool] = True
 
     def prepare(self, observation):
         return np.zeros((observation.n_detectors, observation.n_samples), int)
@@ -212,6 +219,7 @@ class Level(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
     couples: ClassVar = "all"
 
     def prepare(self, observation):
@@ -244,6 +252,7 @@ class Square(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"square", "signal"})
+    knows_means: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = frozenset({"square"})
 
     def exec(self, block, state):

@@ -1,0 +1,138 @@
+"""Whole streams for steps that do not know of means (`Operator.knows_means`).
+
+Beside a stream x may stand a mean M, tens of kelvin (`Block.means`, ``observation.smooth["atmosphere"]``). A step f that does not
+say that it knows of means is given all of the stream, in float64; the same mean is subtracted from what it makes of it, which is
+then rounded once to the precision of the run:
+
+    y = round(f(x + M) - M)                                                                                      (1)
+
+In float32, x + M itself would lose microkelvins. M has the same bits in every block, so that y does not depend on the blocks.
+What the step only reads is not written back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..data import Block, Floats, Observation, Stream
+from ..numerics.smooth import SmoothField
+from ..operator import Operator
+
+EMISSION = "atmosphere"
+"""The stream whose mean is in ``observation.smooth``, where calibration and noise models find it, too."""
+
+
+def knows_means(operator: Operator) -> bool:
+    """Whether it handles means itself. A class that overrides `exec` or `measure` of one that does must say so anew."""
+    return operator.declares("knows_means", "exec", "measure", "measure_frozen")
+
+
+def names_of(operator: Operator) -> frozenset[str]:
+    """Names that the step declares."""
+    return operator.requires | operator.optional | operator.provides
+
+
+def may_have_means(operators: Sequence[Operator]) -> frozenset[str]:
+    """Streams beside which a mean may stand, told before anything runs: steps that know of means put it there."""
+    return frozenset({EMISSION}).union(*(o.provides for o in operators if knows_means(o)))
+
+
+def means_of(observation: Observation, means: Mapping[str, SmoothField], names: frozenset[str]) -> dict[str, SmoothField]:
+    """The means of those of the streams ``names`` that have one; ``means``: `Block.means` or `Stream.means`."""
+    found = {name: field for name, field in means.items() if name in names}
+    if EMISSION in names and EMISSION in observation.smooth:
+        found.setdefault(EMISSION, observation.smooth[EMISSION])
+    return found
+
+
+def exec_whole(
+    block: Block, operator: Operator, fields: Mapping[str, SmoothField], buffers: dict[str, Floats], work: Callable[[Block], None]
+) -> None:
+    """Equation (1) on one block.
+
+    Parameters
+    ----------
+    fields
+        M, by stream (`means_of`), of streams that are in the block.
+    buffers
+        float64 memory, reused from block to block.
+    work
+        f, which changes the block that it is given.
+    """
+    means = {name: field for name, field in block.means.items() if name not in fields}
+    whole = Block(
+        block.observation, block.detectors, block.samples, means=means, dtype=np.float64, buffers=buffers, again=block.again
+    )
+    names = names_of(operator)
+    for name, stream in block.detdata.items():
+        whole.detdata[name] = stream
+        if name in names:
+            copy = whole.detdata[name] = whole.buffer(name, block.shape)
+            if name in fields:
+                fields[name].evaluate(block.detectors, block.samples, out=copy)
+                copy += stream
+            else:
+                copy[...] = stream
+    work(whole)
+    for name in operator.provides & (block.detdata.keys() | whole.detdata.keys()):
+        if name not in whole.detdata:  # the step took it away
+            del block.detdata[name]
+            block.means.pop(name, None)
+        elif name in fields and name not in whole.means:
+            mean = whole.buffer("(mean)", block.shape)
+            fields[name].evaluate(block.detectors, block.samples, out=mean)
+            np.subtract(whole.detdata[name], mean, out=block.new(name, zero=False), casting="same_kind")
+        else:
+            block.new(name, zero=False)[...] = whole.detdata[name]
+    for name in means.keys() - whole.means.keys():
+        del block.means[name]
+    block.means.update(whole.means)
+
+
+class WholeStream(Stream):
+    """A stream with its mean in it, float64, for `Operator.measure`.
+
+    Parameters
+    ----------
+    stream, field
+        x and M of equation (1).
+    allocate
+        Gives an array of a shape for all of it, where somebody wants it as one.
+    """
+
+    def __init__(self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, ...]], Floats]) -> None:
+        self.name, self.observation, self.threads, self.room = stream.name, stream.observation, stream.threads, stream.room
+        self.means = {name: other for name, other in stream.means.items() if name != stream.name}
+        self._stream, self._field, self._allocate = stream, field, allocate
+
+    @cached_property
+    def array(self) -> Floats:  # type: ignore[override]
+        """(n_det, n_samp) float64; where the stream is made again when it is read, as there: refused."""
+        whole = self._allocate(self._stream.array.shape)
+        for detectors, samples, part in self.sweep(lambda detectors, samples, part: part):
+            whole[detectors, samples] = part
+        return whole
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n_det, n_samp)."""
+        return self._stream.shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """float64."""
+        return np.dtype(np.float64)
+
+    def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+        """See `Stream.sweep`."""
+
+        def of_whole(detectors: slice, samples: slice, part: Floats) -> Any:
+            whole = self._field.evaluate(detectors, samples)
+            whole += part
+            return work(detectors, samples, whole)
+
+        return self._stream.sweep(of_whole)
