@@ -12,6 +12,7 @@ from scipy.fft import dct, idct
 
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
+from zonda.core.flags import PROCESSING, SUN_CLOSE, SUN_UP, TURNAROUND
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.highpass import ONLY_A_LINE, HighpassFilter
@@ -146,6 +147,17 @@ def test_short_scans(bench, n):
     # 3e-7: the decimation's 1e-6 of the low part
     np.testing.assert_allclose(run.signal, brick_wall(x, cut, 2 if cut else degree), rtol=0, atol=3e-7)
     assert any("shorter" in what for _, what in run.tally) == (n < 1250)
+
+
+@pytest.mark.parametrize("flag", [PROCESSING, TURNAROUND, SUN_UP, SUN_CLOSE])
+def test_samples_with_a_signal_are_not_bridged(bench, flag):
+    """Turnarounds that no map uses, ends that another filter trims, the Sun: the filter takes what they hold."""
+    x = np.random.default_rng(7).standard_normal((3, 6000))
+    plain, observation = bench.run([HighpassFilter()], bench.observation(3, 6000), {"signal": x}), bench.observation(3, 6000)
+    observation.flags[2000:2500] = flag
+    run = bench.run([HighpassFilter()], observation, {"signal": x})
+    np.testing.assert_array_equal(run.signal, plain.signal)
+    assert run.tally["HighpassFilter", "flagged samples bridged before filtering"] == "0"
 
 
 def test_modelled_mean_is_dropped_analytically(bench):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.flags import DEAD, OPAQUE
+from zonda.core.flags import DEAD, OPAQUE, SUN_UP
 from zonda.core.intervals import samples_in
 from zonda.core.operator import Operator
 from zonda.operators.io.save_tod import SaveTOD, load_tod
@@ -45,11 +45,12 @@ SCAN = {"throw": "4 deg", "speed": "1 deg/s", "acceleration": "1 deg/s2", "scan_
 
 
 class Marks(Operator):
-    """Flags a dead detector, an opaque one, and opaque samples, as CommonModeFilter and Efficiency do."""
+    """Flags a dead and an opaque detector and opaque samples, as CommonModeFilter and Efficiency do; the Sun, which is used."""
 
     def prepare(self, observation):
         observation.detector_flags[[1, 5]] |= np.array([DEAD, OPAQUE], np.uint8)
         observation.flags[400:437] |= OPAQUE
+        observation.flags[420:600] |= SUN_UP
 
 
 def toast_data(path):
