@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Band
     from zonda.core.plan.context import Context
 
-    from .skymap import Sky, SkyMap
+    from .skymap import SkyMap
+    from .working import Working
 
 CUBIC = 3e-3
 """Largest error of cubic B-splines on 4 points per FWHM, of a point source's peak (`SkyMap`)."""
@@ -34,14 +35,17 @@ def chromaticity(band: Band) -> float:
     return abs(float(np.trapezoid(t * (nu / band.centre) ** 2, nu) / np.trapezoid(t, nu)) - 1)
 
 
-def sky_estimate(operator: SkyMap, context: Context, sky: Sky, reached: bool) -> Estimate:
-    """Beam, sampling, chromaticity."""
+def sky_estimate(operator: SkyMap, context: Context, grids: list[Working], reached: bool) -> Estimate:
+    """Beam, sampling, chromaticity. ``grids``: of each observation."""
+    sky, distinct = grids[0], {w.key: w for w in grids}
     o = context.first
     fwhm = float(operator.fwhm or o.focalplane.fwhm.max()) if operator.beam == "gaussian" else 0.0
-    points = 2.0 * sky.values.size
-    convolution = 6e-7 * points
+    size = float(np.prod(sky.shape))
+    points = 2.0 * size
+    convolution = 6e-7 * sum(2.0 * float(np.prod(w.shape)) for w in distinct.values())
+    made = sky.seconds + sum(w.interpolation for k, w in distinct.items() if k != sky.key)
     cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8, per_sample=5e-9 if reached else 0.3e-9,
-                once=convolution if reached else 0.0, bytes=8.0 * sky.values.size + 24.0 * points)  # fmt: skip
+                once=made + (convolution if reached else 0.0), bytes=8.0 * size + 24.0 * points)  # fmt: skip
     choices = [full("none" if fwhm == 0 else "Gaussian" if reached else "not convolved: no detector reaches the map")]
     if fwhm and reached and context.coverage:
         # a pencil beam changes waves on the map by 1 - exp(-2 pi^2 sigma^2 k^2), most at the pixels' Nyquist frequency
@@ -63,7 +67,7 @@ def sky_estimate(operator: SkyMap, context: Context, sky: Sky, reached: bool) ->
     return Estimate(tuple(effects), cost)
 
 
-def _order(operator: SkyMap, context: Context, sky: Sky, fwhm: float) -> Effect:
+def _order(operator: SkyMap, context: Context, sky: Working, fwhm: float) -> Effect:
     """Linear sampling for cubic splines: on the grid there is, or on one twice as fine."""
     cubic = context.sky_error(CUBIC)
     if operator.interpolation == "linear" or not fwhm:
@@ -77,7 +81,7 @@ def _order(operator: SkyMap, context: Context, sky: Sky, fwhm: float) -> Effect:
     choices = [full("cubic B-spline")]
     wanted = 2 * points * math.ceil(n / points - 1e-9)
     if points >= 2 and wanted <= 16:  # the finest grid that the operator makes
-        dearer = 6e-7 * 2.0 * sky.values.size * 3 / runs
+        dearer = 6e-7 * 2.0 * float(np.prod(sky.shape)) * 3 / runs
         settings = {"interpolation": "linear", "pixels_per_fwhm": min(wanted, 16.0)}
         bound = context.sky_error(LINEAR / wanted**2)
         choices.append(

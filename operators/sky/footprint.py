@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.configuration.target import Target
+from zonda.core.errors import InputError
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import opened
@@ -20,6 +21,7 @@ from .healpix import is_healpix
 from .inputs import WcsMap
 from .placement import placed, turned
 from .planes import chosen
+from .region import Disc
 
 Floats = NDArray[np.float64]
 
@@ -83,18 +85,32 @@ def footprint(path: Path, pixel_size: float | None, centre: Target | None, hdu: 
             wcs = moved
     if wcs is None:
         return None
+    try:
+        turn = wcs_frame_rotation(wcs) if turn is None else turn
+    except InputError:  # FK4 is no rotation of ICRS
+        return None
+    with reading(place, "FITS", "check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"):
+        found, _ = extent(wcs, turn, shape)
+    if found is None:
+        return None
+    return Footprint(found.centre, found.radius, pixel_matrix(wcs) if is_plain_tan(wcs) else None, shape)
+
+
+def extent(wcs: Any, turn: Floats, shape: tuple[int, int]) -> tuple[Disc | None, bool]:
+    """A circle that holds an image, None where its middle is beyond its projection; and whether all of it is on the sky.
+
+    ``turn`` (3, 3): from ICRS directions to those in the frame of ``wcs``.
+    """
     ny, nx = shape
     x, y = np.meshgrid(np.linspace(0, nx - 1, LATTICE), np.linspace(0, ny - 1, LATTICE))
-    to_icrs = (wcs_frame_rotation(wcs) if turn is None else turn).T
-    with reading(place, "FITS", "check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"):
-        lon, lat = np.radians(wcs.wcs_pix2world([[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0).T)
+    lon, lat = np.radians(wcs.wcs_pix2world([[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0).T)
     lon, lat = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
-    rays = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1) @ to_icrs.T
-    centred, rest = rays[0], rays[1:][np.isfinite(rays[1:]).all(axis=1)]
-    if not np.isfinite(centred).all():
-        return None
-    radius = float(np.arccos(np.clip(rest @ centred, -1, 1)).max(initial=0.0)) * (1 + 2 / LATTICE)
-    return Footprint(centred, min(radius, np.pi), pixel_matrix(wcs) if is_plain_tan(wcs) else None, shape)
+    rays = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1) @ turn
+    middle, known = rays[0], np.isfinite(rays).all(axis=1)
+    if not known[0]:
+        return None, False
+    radius = float(np.arccos(np.clip(rays[known] @ middle, -1, 1)).max(initial=0.0)) * (1 + 2 / LATTICE)
+    return Disc(middle, min(radius, np.pi)), bool(known.all())
 
 
 def _header(path: Path, wanted: int | str | None, place: str) -> tuple[Any, tuple[int, int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+CHECKED = 2**22
+"""Pixels of which it is looked up whether they are on the sky."""
 BRIGHT = 1e4
 """K_RJ, averaged over a beam, above which a map's unit is doubted: the Sun has 6000 K."""
 
@@ -91,33 +93,70 @@ def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
     return np.asarray(abs(np.linalg.det(inverse)) / np.linalg.norm(rays, axis=2) ** 3)
 
 
-def kelvin(source: WcsMap | HealpixMap, band: Band, spectral_index: float, wcs: Any) -> tuple[Floats, str, int]:
-    """The map's values in K_RJ averaged over ``band``, the conversion as text, and how many pixels had no solid angle.
+@dataclass(frozen=True)
+class Conversion:
+    """From the unit of a map to K_RJ.
 
-    ``wcs``: the TAN WCS, None where resampled.
+    Attributes
+    ----------
+    factor
+        K_RJ per unit, or K_RJ sr per unit where ``per_area``: then each pixel is divided by its own solid angle.
+    typical
+        K_RJ per unit, at the median pixel where ``per_area``.
+    text
+        For the tally.
+    """
 
-    Jy/pixel is divided by each pixel's own solid angle; one beyond the projection has none, and its flux is
-    lost. Raises InputError as `core.numerics.radiation.to_kelvin_rj`.
+    factor: float
+    per_area: bool
+    typical: float
+    text: str
+
+
+def conversion(source: WcsMap | HealpixMap, band: Band, spectral_index: float) -> Conversion:
+    """Averaged over ``band``, of a map that is resampled.
+
+    Raises InputError as `core.numerics.radiation.to_kelvin_rj`.
     """
     factor = to_kelvin_rj(source.unit, band, 1.0, spectral_index, source.beam_solid_angle)
     if source.unit != "Jy/pixel":
-        return source.values * factor, f"{factor:.6g} K_RJ per {source.unit}", 0
-    areas: Floats
+        return Conversion(factor, False, factor, f"{factor:.6g} K_RJ per {source.unit}")
     if isinstance(source, HealpixMap):
-        areas = np.full(source.values.shape, np.pi / (3 * source.nside**2))
-    elif wcs is not None:
-        areas = tangent_areas(pixel_matrix(wcs), (source.values.shape[0], source.values.shape[1]))
+        area = np.pi / (3 * source.nside**2)
     else:
-        areas = pixel_areas(source.wcs, (source.values.shape[0], source.values.shape[1]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        placed = np.isfinite(areas) & (areas > 0)
-        values = np.where(placed, source.values * (factor / areas), 0.0)
-    typical = factor / float(np.nanmedian(areas))
-    return (
-        values,
-        f"{typical:.6g} K_RJ per Jy/pixel at the median pixel, {float(np.nanmedian(areas)):.6g} sr",
-        int(np.count_nonzero(source.values[~placed])),
-    )
+        area = float(np.nanmedian(pixel_areas(source.wcs, *(_some(n) for n in source.values.shape))))
+    whole = isinstance(source, HealpixMap)
+    return Conversion(factor / area if whole else factor, not whole, factor / area, _per_pixel(factor, area))
+
+
+def _per_pixel(factor: float, area: float) -> str:
+    return f"{factor / area:.6g} K_RJ per Jy/pixel at the median pixel, {area:.6g} sr"
+
+
+def _some(length: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, length - 1, min(length, 65)).astype(np.int64))
+
+
+def lost(image: WcsMap) -> int:
+    """How many bright pixels in Jy/pixel lie beyond the projection, where there is no sky; of `CHECKED` and more an estimate."""
+    if image.unit != "Jy/pixel":
+        return 0
+    step = int(np.ceil(np.sqrt(image.values.size / CHECKED)))
+    y, x = np.nonzero(image.values[::step, ::step])
+    lon, lat = from_pixels(image.wcs, x.astype(np.float64) * step, y.astype(np.float64) * step)
+    return int(np.count_nonzero(~(np.isfinite(lon) & np.isfinite(lat)))) * step * step
+
+
+def kelvin(source: WcsMap, band: Band, spectral_index: float, wcs: Any) -> tuple[Floats, str]:
+    """The values in K_RJ averaged over ``band`` of an image on the TAN WCS ``wcs``, and the conversion as text.
+
+    Jy/pixel is divided by each pixel's own solid angle. Raises InputError as `conversion`.
+    """
+    factor = to_kelvin_rj(source.unit, band, 1.0, spectral_index, source.beam_solid_angle)
+    if source.unit != "Jy/pixel":
+        return source.values * factor, f"{factor:.6g} K_RJ per {source.unit}"
+    areas = tangent_areas(pixel_matrix(wcs), (source.values.shape[0], source.values.shape[1]))
+    return source.values * (factor / areas), _per_pixel(factor, float(np.nanmedian(areas)))
 
 
 def too_bright(peak: float, conversion: str) -> str:

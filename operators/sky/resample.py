@@ -1,8 +1,12 @@
-"""Bringing maps that are not gnomonic (other projections, HEALPix) onto a gnomonic grid about the observation."""
+"""Bringing maps that are not gnomonic (other projections, HEALPix) onto a gnomonic grid about the observation.
+
+The grid is worked on in blocks, and of each block the tiles that a scan reaches; each block takes of the map what lies under it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,83 +16,119 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 
 from .inputs import HealpixMap, WcsMap
+from .region import MARGIN, TILE
 
 Floats = NDArray[np.float64]
+Tell = Callable[[int, int], None]
+"""Told how many points of all are done."""
 
-WIDEST = np.radians(60.0)
-"""Largest radius of a working grid: beyond it a gnomonic projection stretches pixels by more than 1 / cos^2 = 4."""
-MOST_PIXELS = 2**27
 NEIGHBOURS = 24
 """HEALPix pixels in each local fit: two rings and a few more."""
 ROWS = 64
+BLOCK = 8 * TILE
+AT_ONCE = 16384
 
 
-def tangent_wcs(ra: float, dec: float, radius: float, step: float, place: str = "") -> Any:
-    """A square north-up TAN `WCS` (ICRS) about (ra, dec) that holds ``radius``; `pixel_shape` is set. All in rad.
+@dataclass(frozen=True)
+class _Block:
+    """Points of a grid: ``y``, ``x`` (n,) and their ICRS directions ``d`` (n, 3)."""
 
-    Raises InputError where the radius or the number of pixels is too large.
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    d: Floats
+
+
+def _blocks(target: Any, tiles: NDArray[np.bool_] | None, tell: Tell, thin: int = 1) -> Iterator[_Block]:
+    """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True, where given.
+
+    ``thin``: every so manieth point along each axis only.
     """
-    from astropy.wcs import WCS
-
-    if radius > WIDEST:
-        raise InputError(
-            f"the scan reaches {np.degrees(radius):.0f} deg from its centre; a map that must be resampled serves up to "
-            f"{np.degrees(WIDEST):.0f} deg",
-            place=place,
-            cure="scan a smaller field, or give a TAN map",
-        )
-    size = 2 * int(np.ceil(np.tan(radius) / step)) + 1
-    if size * size > MOST_PIXELS:
-        raise InputError(
-            f"the working grid would have {size} x {size} pixels",
-            place=place,
-            cure="scan a smaller field, or give a TAN map of it",
-        )
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.crval = [np.degrees(ra), np.degrees(dec)]
-    wcs.wcs.crpix = [(size + 1) / 2, (size + 1) / 2]
-    wcs.wcs.cdelt = [-np.degrees(step), np.degrees(step)]
-    wcs.wcs.radesys = "ICRS"
-    wcs.pixel_shape = (size, size)
-    wcs.wcs.set()
-    return wcs
+    nx, ny = target.pixel_shape
+    to_sky = np.linalg.inv(pixel_matrix(target)).T
+    total, done = nx * ny if tiles is None else int(tiles.sum()) * TILE**2, 0
+    tell(0, total)
+    for first in range(0, ny, BLOCK):
+        for left in range(0, nx, BLOCK):
+            y, x = (k.ravel() for k in np.mgrid[first : min(first + BLOCK, ny) : thin, left : min(left + BLOCK, nx) : thin])
+            if tiles is not None:
+                wanted = tiles[y // TILE, x // TILE]
+                y, x = y[wanted], x[wanted]
+            if not y.size:
+                continue
+            rays = np.stack([x, y, np.ones(y.size)], axis=1) @ to_sky
+            yield _Block(y, x, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+            done += y.size * thin * thin
+            tell(min(done, total), total)
 
 
-def directions(wcs: Any, first: int, last: int) -> Floats:
-    """ICRS unit vectors (last - first, nx, 3) of the pixel centres in rows first .. last - 1 of a TAN ``wcs``."""
-    nx = wcs.pixel_shape[0]
-    y, x = np.mgrid[first:last, 0:nx].astype(np.float64)
-    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(pixel_matrix(wcs)).T
-    return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
+def nothing(done: int, total: int) -> None:
+    """Tell nobody."""
 
 
-def resample_image(image: WcsMap, target: Any) -> tuple[Floats, NDArray[np.bool_]]:
+# ------------------------------------------------------------------------------------------------------------ images
+
+
+def resample_image(
+    image: WcsMap, target: Any, tiles: NDArray[np.bool_] | None = None, tell: Tell = nothing, per_area: bool = False
+) -> tuple[Floats, NDArray[np.bool_]]:
     """(values, covered) of an image on the TAN grid ``target``, by cubic B-splines. NaN-free: not covered is 0.
 
     A cylindrical map that goes round the sky is joined at its seam.
+
+    Parameters
+    ----------
+    tiles
+        `region.Region.tiles`: where False nothing is worked on, and not covered.
+    per_area
+        Divide each pixel by its solid angle [sr]; one beyond the projection, which has none, counts as 0.
     """
     from scipy.ndimage import map_coordinates, spline_filter
 
-    coordinates = _coordinates(image)
-    rows, columns = image.values.shape
-    period = _period(image.wcs)
-    wrap = 12 if period and abs(columns - period) < 0.5 else 0
-    source = np.pad(image.values, ((0, 0), (wrap, wrap)), mode="wrap") if wrap else image.values
-    coefficients = spline_filter(source, 3, mode="mirror")
     nx, ny = target.pixel_shape
     values, covered = np.zeros((ny, nx)), np.zeros((ny, nx), bool)
-    for first in range(0, ny, ROWS):
-        last = min(first + ROWS, ny)
-        d = directions(target, first, last)
-        x, y = _to_pixels(image.wcs, *coordinates(d))
-        if period:
-            x = (x + 0.5) % period - 0.5
-        inside = (x >= -0.5) & (x < columns - 0.5) & (y >= -0.5) & (y < rows - 0.5)
-        at = np.array([np.where(inside, y, 0.0), np.where(inside, x + wrap, 0.0)])
-        values[first:last] = np.where(inside, map_coordinates(coefficients, at, order=3, prefilter=False, mode="mirror"), 0.0)
-        covered[first:last] = inside
+    coordinates = _coordinates(image)
+    for block in _blocks(target, tiles, tell):
+        x, y, inside = _on_image(image, coordinates, block.d)
+        if not inside.any():
+            continue
+        x, y = x[inside], y[inside]
+        rows, columns = _under(image, x, y)
+        source = image.values[np.ix_(rows, columns % image.values.shape[1])]
+        if per_area:
+            areas = pixel_areas(image.wcs, rows, columns)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                source = np.where(np.isfinite(areas) & (areas > 0), source / areas, 0.0)
+        at = np.array([y - rows[0], x - columns[0]])
+        found = map_coordinates(spline_filter(source, 3, mode="mirror"), at, order=3, prefilter=False, mode="mirror")
+        values[block.y[inside], block.x[inside]] = found
+        covered[block.y[inside], block.x[inside]] = True
     return values, covered
+
+
+def _on_image(
+    image: WcsMap, coordinates: Callable[[Floats], tuple[Floats, Floats]], d: Floats
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """0-based pixels (x, y) of directions (n, 3), and whether they are on the image; x is continuous across a seam."""
+    rows, columns = image.values.shape
+    x, y = _to_pixels(image.wcs, *coordinates(d))
+    period = _period(image.wcs)
+    if period:
+        x = (x + 0.5) % period - 0.5
+    inside = (x >= -0.5) & (x < columns - 0.5) & (y >= -0.5) & (y < rows - 0.5)
+    if period and abs(columns - period) < 0.5 and inside.any():  # all round the sky: from where most of the points are
+        middle = np.median(x[inside])
+        x = (x - middle + period / 2) % period - period / 2 + middle
+    return x, y, inside
+
+
+def _under(image: WcsMap, x: Floats, y: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the image, with a margin, that splines at pixels (x, y) feel; columns beyond a seam go on counting."""
+    rows, columns = image.values.shape
+    period = _period(image.wcs)
+    joined = bool(period and abs(columns - period) < 0.5)
+    low, high = int(np.floor(x.min())) - MARGIN, int(np.ceil(x.max())) + MARGIN + 1
+    across = np.arange(low, high) if joined else np.arange(max(low, 0), min(high, columns))
+    return np.arange(max(int(np.floor(y.min())) - MARGIN, 0), min(int(np.ceil(y.max())) + MARGIN + 1, rows)), across
 
 
 def _coordinates(image: WcsMap) -> Callable[[Floats], tuple[Floats, Floats]]:
@@ -134,13 +174,12 @@ def _period(wcs: Any) -> float | None:
     return float(360.0 / abs(matrix[0, 0]))
 
 
-def pixel_areas(wcs: Any, shape: tuple[int, int]) -> Floats:
-    """Solid angles (ny, nx) [sr] of the pixels of any projection, by the edges' midpoints; NaN beyond the projection."""
-    rows, columns = shape
-    areas = np.empty(shape)
-    for first in range(0, rows, ROWS):
-        last = min(first + ROWS, rows)
-        y, x = np.mgrid[first:last, 0:columns].astype(np.float64)
+def pixel_areas(wcs: Any, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+    """Solid angles (ny, nx) [sr] of an image's pixels of any projection, by the edges' midpoints; NaN beyond the projection."""
+    areas = np.empty((len(rows), len(columns)))
+    for first in range(0, len(rows), ROWS):
+        some = slice(first, first + ROWS)
+        x, y = np.meshgrid(columns.astype(np.float64), rows[some].astype(np.float64))
 
         def ray(dx: float, dy: float, x: Floats = x, y: Floats = y) -> Floats:
             lon, lat = (np.radians(c) for c in from_pixels(wcs, x + dx, y + dy))
@@ -148,7 +187,7 @@ def pixel_areas(wcs: Any, shape: tuple[int, int]) -> Floats:
 
         h = 0.25
         across, along = ray(h, 0.0) - ray(-h, 0.0), ray(0.0, h) - ray(0.0, -h)
-        areas[first:last] = np.linalg.norm(np.cross(across, along), axis=2) / (2 * h) ** 2
+        areas[some] = np.linalg.norm(np.cross(across, along), axis=2) / (2 * h) ** 2
     return areas
 
 
@@ -159,53 +198,70 @@ def from_pixels(wcs: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return np.asarray(lon), np.asarray(lat)
 
 
-def resample_healpix(sky: HealpixMap, target: Any) -> tuple[Floats, NDArray[np.bool_], int]:
+# ----------------------------------------------------------------------------------------------------------- HEALPix
+
+
+def resample_healpix(
+    sky: HealpixMap, target: Any, tiles: NDArray[np.bool_] | None = None, tell: Tell = nothing
+) -> tuple[Floats, NDArray[np.bool_], int]:
     """(values, covered, poor) of a HEALPix map on the TAN grid ``target``. A grid point is covered where its HEALPix pixel is.
 
     Each value comes from the polynomial of third degree that best fits the `NEIGHBOURS` nearest covered pixel centres in the
     tangent plane, with weights 1 / distance^4 (moving least squares): it passes through the pixel values, whatever the
     orientation of the pixels. Where the neighbours do not determine it, it is their weighted mean: ``poor`` counts those.
+    ``tiles`` as of `resample_image`.
     """
     import healpy
     from scipy.spatial import cKDTree
 
     from zonda.core.numerics.projection import frame_rotation
 
-    to_frame = frame_rotation(sky.frame)
+    to_frame, matrix = frame_rotation(sky.frame), pixel_matrix(target)
     nx, ny = target.pixel_shape
-    matrix = pixel_matrix(target)
-    pixel = np.sqrt(healpy.nside2pixarea(sky.nside))
-    corners = directions(target, 0, ny)[:: max(ny - 1, 1), :: max(nx - 1, 1)].reshape(-1, 3)
-    middle = np.linalg.inv(matrix) @ [(nx - 1) / 2, (ny - 1) / 2, 1.0]
-    middle /= np.linalg.norm(middle)
-    reach = float(np.arccos(np.clip((corners @ middle).min(), -1, 1))) + 6 * pixel
-    near = healpy.query_disc(sky.nside, to_frame @ middle, min(reach, np.pi), nest=sky.nest)
-    slot = near if sky.pixels is None else np.flatnonzero(np.isin(sky.pixels, near, assume_unique=True))
     values, covered, poor = np.zeros((ny, nx)), np.zeros((ny, nx), bool), 0
-    if len(slot) < NEIGHBOURS:
+    if len(sky.values) < NEIGHBOURS:
         return values, covered, poor
-    numbers = slot if sky.pixels is None else sky.pixels[slot]
-    rays = np.stack(healpy.pix2vec(sky.nside, numbers, nest=sky.nest), axis=1) @ to_frame
-    projected = rays @ matrix.T
-    front = projected[:, 2] > 0
-    slot, points = slot[front], projected[front, :2] / projected[front, 2:]
-    tree, data = cKDTree(points), sky.values[slot]
-    for first in range(0, ny, ROWS):
-        last = min(first + ROWS, ny)
-        d = (directions(target, first, last) @ to_frame.T).reshape(-1, 3)
-        own = healpy.vec2pix(sky.nside, *d.T, nest=sky.nest)
-        seen = np.ones(len(own), bool)
-        if sky.pixels is not None:
-            seen = sky.pixels[np.minimum(np.searchsorted(sky.pixels, own), len(sky.pixels) - 1)] == own
-        y, x = np.mgrid[first:last, 0:nx].astype(np.float64)
-        at = np.stack([x.ravel(), y.ravel()], axis=1)[seen]
-        flat = np.zeros(len(seen))
-        for part in range(0, len(at), 16384):
-            found, undetermined = _local_fit(tree, points, data, at[part : part + 16384])
-            flat[np.flatnonzero(seen)[part : part + 16384]] = found
-            poor += undetermined
-        values[first:last], covered[first:last] = flat.reshape(-1, nx), seen.reshape(-1, nx)
+    for block in _blocks(target, tiles, tell):
+        own = healpy.vec2pix(sky.nside, *(block.d @ to_frame.T).T, nest=sky.nest)
+        seen = _slots(sky, own)[1]
+        near = _near(sky, block.d[seen] @ to_frame.T) if seen.any() else np.zeros(0, np.int64)
+        if len(near) < NEIGHBOURS:
+            continue
+        numbers = near if sky.pixels is None else sky.pixels[near]
+        projected = np.stack(healpy.pix2vec(sky.nside, numbers, nest=sky.nest), axis=1) @ to_frame @ matrix.T
+        front = projected[:, 2] > 0
+        points, data = projected[front, :2] / projected[front, 2:], sky.values[near[front]]
+        tree = cKDTree(points)
+        at = np.stack([block.x[seen], block.y[seen]], axis=1).astype(np.float64)
+        parts = [_local_fit(tree, points, data, at[k : k + AT_ONCE]) for k in range(0, len(at), AT_ONCE)]
+        values[block.y[seen], block.x[seen]] = np.concatenate([found for found, _ in parts])
+        covered[block.y[seen], block.x[seen]] = True
+        poor += sum(undetermined for _, undetermined in parts)
     return values, covered, poor
+
+
+def _slots(sky: HealpixMap, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Where pixels of these numbers stand in ``sky.values``, and whether they are there."""
+    if sky.pixels is None:
+        return numbers, np.ones(len(numbers), bool)
+    slots = np.minimum(np.searchsorted(sky.pixels, numbers), len(sky.pixels) - 1)
+    return slots, sky.pixels[slots] == numbers
+
+
+def _near(sky: HealpixMap, d: Floats) -> NDArray[np.int64]:
+    """Places in ``sky.values`` of the pixels about directions (n, 3) in the map's frame; more of them where few are covered."""
+    import healpy
+
+    middle = d.mean(axis=0)
+    middle /= np.linalg.norm(middle)
+    radius, pixel = float(np.arccos(np.clip((d @ middle).min(), -1, 1))), float(np.sqrt(healpy.nside2pixarea(sky.nside)))
+    slots = np.zeros(0, np.int64)
+    for margin in (MARGIN * pixel, 8 * MARGIN * pixel, np.pi):
+        slots, there = _slots(sky, np.sort(healpy.query_disc(sky.nside, middle, min(radius + margin, np.pi), nest=sky.nest)))
+        slots = slots[there]
+        if len(slots) >= NEIGHBOURS:
+            break
+    return slots
 
 
 def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Floats, int]:
@@ -226,3 +282,32 @@ def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Flo
         w2 = weight[poor] ** 2
         value[poor] = np.sum(w2 * data[index[poor]], axis=1) / np.sum(w2, axis=1)
     return value, int(poor.sum())
+
+
+# ----------------------------------------------------------------------------------------------------------- extremes
+
+
+def extremes(source: WcsMap | HealpixMap, target: Any, tiles: NDArray[np.bool_] | None) -> tuple[float, float]:
+    """Least and largest value of the map's pixels under a grid, from a thinned set of its points; (0, 0) where there are none."""
+    import healpy
+
+    found: list[Floats] = []
+    if isinstance(source, WcsMap):
+        coordinates = _coordinates(source)
+        for block in _blocks(target, tiles, nothing, thin=16):
+            x, y, inside = _on_image(source, coordinates, block.d)
+            if inside.any():
+                rows, columns = _under(source, x[inside], y[inside])
+                found.append(source.values[np.ix_(rows, columns % source.values.shape[1])].ravel())
+    else:
+        from zonda.core.numerics.projection import frame_rotation
+
+        to_frame = frame_rotation(source.frame)
+        for block in _blocks(target, tiles, nothing, thin=16):
+            own = healpy.vec2pix(source.nside, *(block.d @ to_frame.T).T, nest=source.nest)
+            there = _slots(source, own)[1]
+            if there.any():
+                found.append(source.values[_near(source, block.d[there] @ to_frame.T)])
+    if not found:
+        return 0.0, 0.0
+    return min(float(v.min()) for v in found), max(float(v.max()) for v in found)

@@ -6,7 +6,7 @@ import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -31,11 +31,12 @@ from .footprint import Footprint, footprint, off_the_map, position
 from .inputs import HealpixMap, WcsMap
 from .limits import check_brightness
 from .linear import sample_linear
-from .placement import kelvin, placed, too_bright, turned
+from .placement import conversion, kelvin, lost, placed, too_bright, turned
 from .read import read_map
-from .resample import resample_healpix, resample_image, tangent_wcs
+from .resample import extremes, resample_healpix, resample_image
 from .sampling import Chunks, pointing, sample
 from .stokes import STOKES
+from .working import Working, on_a_grid, on_own_pixels
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
@@ -43,10 +44,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-GRID_MARGIN = 16
-"""Points of a working grid beyond the last sample: the spline feels the grid's border by 0.27^16 = 8e-10 there."""
-
-
+TOLD = 1 << 26
+"""Bytes of a file above which the progress bar says that it is read."""
 ZEROED = "pixels of the input map that are NaN or infinite, taken as zero"
 LOST = "bright pixels of the input map beyond its projection, whose flux is lost"
 POOR = "grid points whose neighbours determine no third-order fit, taken as their mean"
@@ -145,9 +144,9 @@ class SkyMap(Operator):
 
     def prepare(self, observation: Observation) -> State:
         widths, index = self._widths(observation)
-        widest, finest = float(widths.max(initial=0.0)), float(widths.min(initial=np.inf))
-        sky = self._sky(observation, widest, finest)
-        if not _reaches(observation, sky, widest):
+        working = self._working(observation)
+        sky = self._sky(working, observation.instrument.band)
+        if not _reaches(observation, working, float(widths.max(initial=0.0))):
             observation.tally.state(self.label, f"{observation.name}: not convolved", "no detector reaches the input map")
             return State(sky, [], index)
         key = (*sky.key, "beam", self.pixels_per_fwhm, self.interpolation)
@@ -218,36 +217,40 @@ class SkyMap(Operator):
     def memory(self, observation: Observation) -> int:
         """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""
         widths, _ = self._widths(observation)
-        sky = self._sky(observation, float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)))
-        return (5 + 2 * len(widths)) * sky.nbytes
+        working = self._working(observation)
+        return (5 + 2 * len(widths)) * working.nbytes + (working.source.nbytes if working.resampled else 0)
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
         from zonda.core.plan.estimate import Traits
 
         widths, _ = self._widths(observation)
-        sky = self._sky(observation, float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)))
-        if not _reaches(observation, sky, float(widths.max(initial=0.0))):
+        working, band = self._working(observation), observation.instrument.band
+        if not _reaches(observation, working, float(widths.max(initial=0.0))):
             return Traits(peak=abs(self.outside))
-        return Traits(peak=float(np.nanmax(np.abs(sky.values - self.outside), initial=0.0)))
+        if not working.resampled:
+            return Traits(peak=float(np.nanmax(np.abs(self._sky(working, band).values - self.outside), initial=0.0)))
+        factor = self.scale * conversion(working.source, band, self.spectral_index).typical
+        return Traits(peak=max(abs(v * factor - self.outside) for v in extremes(working.source, working.wcs, working.tiles)))
 
     def estimate(self, context: Context) -> Estimate:
         """Beam, sampling, chromaticity."""
         from .estimate import sky_estimate
 
-        widths, _ = self._widths(context.first)
-        widest, finest = float(widths.max(initial=0.0)), float(widths.min(initial=np.inf))
-        skies = [(o, self._sky(o, widest, finest)) for o in context.observations]
-        return sky_estimate(self, context, skies[0][1], any(_reaches(o, sky, widest) for o, sky in skies))
+        widest = float(self._widths(context.first)[0].max(initial=0.0))
+        grids = [(o, self._working(o)) for o in context.observations]
+        return sky_estimate(self, context, [w for _, w in grids], any(_reaches(o, w, widest) for o, w in grids))
 
     def _widths(self, observation: Observation) -> tuple[Floats, NDArray[np.int64]]:
         """Distinct beams [rad] and the number of each detector's."""
         fwhm = np.full(observation.n_detectors, self.fwhm) if self.fwhm is not None else observation.focalplane.fwhm
         return (np.zeros(1), np.zeros(len(fwhm), np.int64)) if self.beam == "none" else distinct(fwhm)
 
-    def _sky(self, observation: Observation, widest: float, finest: float) -> Sky:
-        """The map in K_RJ on a TAN grid, from memory where it is there."""
+    def _working(self, observation: Observation) -> Working:
+        """Where the map will be worked on: nothing is convolved or interpolated yet."""
         place, band = f"{self.label}, sky map {self.file}", observation.instrument.band
+        widths, _ = self._widths(observation)
+        widest, finest = float(widths.max(initial=0.0)), float(widths.min(initial=np.inf))
         stamp = self.file.stat() if self.file.exists() else None
         identity = ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
         source: WcsMap | HealpixMap = self._memory.get(identity, self._read)
@@ -256,20 +259,15 @@ class SkyMap(Operator):
             centre = self._centre(observation, source)
             wcs = placed(source, centre)
             if wcs is not None:
-                there = (*bandwise, "image", tuple(wcs.wcs.crval))
-                return cast(Sky, self._memory.get(there, lambda: self._direct(source, wcs, band, there)))
+                return on_own_pixels(source, wcs, bandwise)
             if centre is not None:
                 source, bandwise = turned(source, centre, place), (*bandwise, centre)
-        ra, dec = observation.centre
-        radius = _reach(observation) + REACH * SIGMA * widest
-        pixel = _pixel(source)
-        step = float(np.clip(finest / self.pixels_per_fwhm, pixel / 4, pixel if isinstance(source, WcsMap) else pixel / 1.5))
-        radius = float(
-            step * 1.1 ** np.ceil(np.log(radius / step + GRID_MARGIN) / np.log(1.1))
-        )  # scans of nearly one size share a grid
-        key = (*bandwise, "grid", ra, dec, radius, step)
-        wcs = tangent_wcs(ra, dec, radius, step, place)
-        return cast(Sky, self._memory.get(key, lambda: self._resampled(source, wcs, band, key)))
+        return on_a_grid(source, observation, (REACH * SIGMA * widest, finest / self.pixels_per_fwhm), bandwise, place)
+
+    def _sky(self, working: Working, band: Any) -> Sky:
+        """The map in K_RJ there, from memory where it has it."""
+        make = self._resampled if working.resampled else self._direct
+        return cast(Sky, self._memory.get(working.key, lambda: make(working, band)))
 
     @property
     def wanted(self) -> dict[str, Any]:
@@ -279,6 +277,8 @@ class SkyMap(Operator):
         return {"centred": self.centre is not None, "plane": plane} | {name: getattr(self, name) for name in names}
 
     def _read(self) -> WcsMap | HealpixMap:
+        if self.file.exists() and self.file.stat().st_size > TOLD:
+            self._teller(f"reading {self.file.name}")(0, 1)
         source = read_map(self.file, **self.wanted)
         if STOKES in source.notes:
             warnings.warn(f"{self.label}: {self.file}: {source.notes[STOKES]}", stacklevel=2)
@@ -289,8 +289,9 @@ class SkyMap(Operator):
             return self.centre.icrs()
         return observation.centre if self.centre == "target" or source.wcs is None else None
 
-    def _direct(self, source: WcsMap, wcs: Any, band: Any, key: tuple[Hashable, ...]) -> Sky:
-        values, factor, lost = kelvin(source, band, self.spectral_index, wcs)
+    def _direct(self, working: Working, band: Any) -> Sky:
+        source, wcs = cast(WcsMap, working.source), working.wcs
+        values, factor = kelvin(source, band, self.spectral_index, wcs)
         pixel = np.linalg.norm(np.asarray(wcs.pixel_scale_matrix), axis=0) * 3600
         notes = {
             **source.notes,
@@ -298,29 +299,39 @@ class SkyMap(Operator):
             "conversion": factor,
         }
         check_brightness(values * self.scale, f"{self.label}, sky map {self.file}")
-        return Sky(key, values * self.scale, np.zeros((0, 0), bool), wcs, notes, {ZEROED: source.zeroed, LOST: lost})
+        return Sky(working.key, values * self.scale, np.zeros((0, 0), bool), wcs, notes, {ZEROED: source.zeroed})
 
-    def _resampled(self, source: WcsMap | HealpixMap, wcs: Any, band: Any, key: tuple[Hashable, ...]) -> Sky:
-        values, factor, lost = kelvin(source, band, self.spectral_index, None)
-        check_brightness(values * self.scale, f"{self.label}, sky map {self.file}")
+    def _resampled(self, working: Working, band: Any) -> Sky:
+        source, wcs = working.source, working.wcs
+        found = conversion(source, band, self.spectral_index)
+        least_and_largest = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
+        check_brightness(least_and_largest * (found.typical * self.scale), f"{self.label}, sky map {self.file}")
+        tell = self._teller(f"interpolating {self.file.name}")
+        counts = {ZEROED: source.zeroed}
         if isinstance(source, HealpixMap):
             kind = f"HEALPix of nside {source.nside}"
-            scaled: WcsMap | HealpixMap = replace(source, values=values, unit="K_RJ")
-            grid, covered, poor = resample_healpix(cast(HealpixMap, scaled), wcs)
+            grid, covered, counts[POOR] = resample_healpix(source, wcs, working.tiles, tell)
         else:
             kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
-            grid, covered = resample_image(replace(source, values=values, unit="K_RJ"), wcs)
-            poor = 0
+            grid, covered = resample_image(source, wcs, working.tiles, tell, found.per_area)
+            counts[LOST] = lost(source)
         step = abs(float(wcs.wcs.cdelt[1])) * 3600
+        part = f", of which {working.points / grid.size:.0%} is reached" if working.tiles is not None else ""
         notes = {
             **source.notes,
             "input map": f"{kind}, interpolated (third order) onto a TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of "
-            f"{step:.6g} arcsec about the observation; its error falls with the third power of the input's pixel size",
-            "conversion": factor,
+            f"{step:.6g} arcsec about the observation{part}; its error falls with the third power of the input's pixel size",
+            "conversion": found.text,
         }
         mask = np.zeros((0, 0), bool) if covered.all() else covered
-        counts = {ZEROED: source.zeroed, LOST: lost, POOR: poor}
-        return Sky(key, np.where(covered, grid * self.scale, self.outside), mask, wcs, notes, counts)
+        return Sky(working.key, np.where(covered, grid * (found.factor * self.scale), self.outside), mask, wcs, notes, counts)
+
+    def _teller(self, what: str) -> Callable[[int, int], None]:
+        """Tells the progress bar."""
+        from zonda.core.hooks import manager
+
+        hook, text = manager().hook, f"{self.label}: {what}"
+        return lambda done, total: hook.zonda_progress(done=done, total=total, what=text)
 
     def _beam(self, sky: Sky, fwhm: float) -> Beam:
         """The map convolved with one beam; the Jacobian is that at the tangent point."""
@@ -464,11 +475,11 @@ def _on_grid(covered: NDArray[np.bool_], convolved: Convolved) -> NDArray[np.uin
     return whole
 
 
-def _reaches(observation: Observation, sky: Sky, widest: float) -> bool:
+def _reaches(observation: Observation, working: Working, widest: float) -> bool:
     """Whether any detector comes within the beam's reach of the map."""
-    ny, nx = sky.values.shape
+    ny, nx = working.shape
     corners = [[-0.5, -0.5], [-0.5, ny - 0.5], [nx - 0.5, -0.5], [nx - 0.5, ny - 0.5], [(nx - 1) / 2, (ny - 1) / 2]]
-    lon, lat = np.radians(sky.wcs.celestial.wcs_pix2world(corners, 0).T)
+    lon, lat = np.radians(working.wcs.celestial.wcs_pix2world(corners, 0).T)
     if not np.isfinite([lon, lat]).all():
         return True
     *rim, centre = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]).T
@@ -491,18 +502,3 @@ def _behind(sky: Sky, quaternions: Floats, xi: Floats, eta: Floats) -> int:
     tangent = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     along = np.einsum("nij,i->nj", rotation_matrices(quaternions), tangent)  # the tangent point in the boresight's frame
     return int((along @ np.array([-eta, -xi, np.ones(len(xi))]) <= 0).sum())
-
-
-def _reach(observation: Observation) -> float:
-    """Largest distance [rad] of a detector's direction from the observation's centre."""
-    ra, dec = observation.centre
-    centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    cosine, _ = _cosines(observation, centre)
-    return float(np.arccos(np.clip(cosine, -1, 1)) + np.arctan(observation.focalplane.radius))
-
-
-def _pixel(source: WcsMap | HealpixMap) -> float:
-    """Side of a pixel, rad."""
-    if isinstance(source, HealpixMap):
-        return float(np.sqrt(np.pi / 3) / source.nside)
-    return float(np.radians(np.sqrt(abs(np.linalg.det(source.wcs.pixel_scale_matrix)))))

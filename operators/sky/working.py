@@ -1,0 +1,132 @@
+"""The grid on which a map is worked on: its own pixels, or a TAN grid of what a scan reaches; laid out before it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.numerics.projection import wcs_frame_rotation
+
+from .footprint import extent
+from .inputs import HealpixMap, WcsMap
+from .region import Disc, region, tangent_wcs
+
+if TYPE_CHECKING:
+    from zonda.core.data import Observation
+
+Floats = NDArray[np.float64]
+
+PER_VALUE = 2.5e-8
+"""Seconds on the reference machine for a pixel of a file: read, checked, converted."""
+LARGE = 2**22
+"""Values of a file below which reading is no matter."""
+PER_POINT = {"image": 1.5e-6, "healpix": 2.5e-5}
+"""Seconds for a point of a grid that is interpolated."""
+
+
+@dataclass(frozen=True)
+class Working:
+    """Where the map of ``source`` is worked on.
+
+    Attributes
+    ----------
+    key
+        Of what is made there.
+    wcs
+        TAN, two-dimensional.
+    shape
+        (ny, nx).
+    tiles
+        `region.Region.tiles`.
+    resampled
+        False: on the pixels of the file.
+    points
+        How many are worked on.
+    """
+
+    key: tuple[Hashable, ...]
+    source: WcsMap | HealpixMap
+    wcs: Any
+    shape: tuple[int, int]
+    tiles: NDArray[np.bool_] | None
+    resampled: bool
+    points: int
+
+    @property
+    def nbytes(self) -> int:
+        """Of the map there, and of what is kept of the file where that is another."""
+        ny, nx = self.shape
+        return 8 * ny * nx + (ny * nx if self.resampled else 0)
+
+    @property
+    def interpolation(self) -> float:
+        """Seconds on the reference machine to bring the map onto the grid."""
+        return self.points * PER_POINT["image" if isinstance(self.source, WcsMap) else "healpix"] if self.resampled else 0.0
+
+    @property
+    def seconds(self) -> float:
+        """On the reference machine, to read the file and bring it onto the grid."""
+        size = self.source.values.size
+        return (PER_VALUE * size if size > LARGE else 0.0) + self.interpolation
+
+
+def on_own_pixels(source: WcsMap, wcs: Any, key: tuple[Hashable, ...]) -> Working:
+    """Of a TAN image."""
+    shape = (source.values.shape[0], source.values.shape[1])
+    return Working((*key, "image", tuple(wcs.wcs.crval)), source, wcs, shape, None, False, source.values.size)
+
+
+def on_a_grid(
+    source: WcsMap | HealpixMap, observation: Observation, beam: tuple[float, float], key: tuple[Hashable, ...], place: str
+) -> Working:
+    """About an observation: of the part of the map that its detectors reach.
+
+    ``beam``: its reach, and the step that it needs [rad]. Raises InputError as `region.region`.
+    """
+    reach, step = beam
+    pixel = pixel_side(source)
+    step = float(np.clip(step, pixel / 4, pixel if isinstance(source, WcsMap) else pixel / 1.5))
+    found = region(observation, step, reach, _disc(source), place)
+    ra, dec = observation.centre
+    wcs = tangent_wcs(ra, dec, found.box, step)
+    tiles = None if found.tiles is None else found.tiles.tobytes()
+    return Working((*key, "grid", ra, dec, step, found.box, tiles), source, wcs, found.shape, found.tiles, True, found.points)
+
+
+def _disc(source: WcsMap | HealpixMap) -> Disc | None:
+    if isinstance(source, HealpixMap):
+        return None if source.pixels is None else _disc_of_pixels(source)
+    try:
+        turn = wcs_frame_rotation(source.wcs) if source.turn is None else source.turn
+    except InputError:  # FK4 is no rotation of ICRS
+        return None
+    found, whole = extent(source.wcs, turn, (source.values.shape[0], source.values.shape[1]))
+    return found if whole else None
+
+
+def _disc_of_pixels(source: HealpixMap) -> Disc | None:
+    import healpy
+
+    from zonda.core.numerics.projection import frame_rotation
+
+    if source.pixels is None or not len(source.pixels):
+        return None
+    d = np.stack(healpy.pix2vec(source.nside, source.pixels, nest=source.nest), axis=1)
+    middle = d.mean(axis=0)
+    length = float(np.linalg.norm(middle))
+    if length < 0.1:  # all round the sky
+        return None
+    radius = float(np.arccos(np.clip((d @ middle).min() / length, -1, 1))) + float(healpy.max_pixrad(source.nside))
+    return Disc(frame_rotation(source.frame).T @ (middle / length), radius)
+
+
+def pixel_side(source: WcsMap | HealpixMap) -> float:
+    """rad"""
+    if isinstance(source, HealpixMap):
+        return float(np.sqrt(np.pi / 3) / source.nside)
+    return float(np.radians(np.sqrt(abs(np.linalg.det(source.wcs.pixel_scale_matrix)))))
