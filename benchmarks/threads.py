@@ -15,9 +15,13 @@ import multiprocessing
 import statistics
 import sys
 import time
+from queue import Empty
 from typing import Any
 
 from stages import CASES, pipeline_of, scene_of
+
+PATIENCE = 600
+"""Seconds after which a process that has not answered counts as dead."""
 
 STREAM = 1 << 23
 """Numbers in each of the three arrays of the memory stream: 64 MB, beyond any cache."""
@@ -43,10 +47,14 @@ def stream_seconds(processes: int, passes: int = 10) -> float:
     workers = [context.Process(target=stream, args=(start, done, passes)) for _ in range(processes)]
     for worker in workers:
         worker.start()
-    seconds = max(done.get() for _ in workers)
-    for worker in workers:
-        worker.join()
-    return seconds
+    try:
+        return max(done.get(timeout=PATIENCE) for _ in workers)
+    except Empty:
+        raise RuntimeError(f"a process has died: exit codes {[worker.exitcode for worker in workers]}") from None
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.join()
 
 
 def chain_seconds(name: str, threads: int) -> float:
