@@ -17,7 +17,7 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.flags import of_before
+from zonda.core.flags import Flags, of_before
 from zonda.core.intervals import Intervals
 from zonda.core.storage.files import writing
 from zonda.core.storage.hdf5_files import Disk, check_size, opened
@@ -263,6 +263,17 @@ def azimuth_elevation(boresight_azel: Floats) -> tuple[Floats, Floats]:
     return azimuth % (2 * np.pi), elevation
 
 
+def _read_flags(file: Any, names: list[str]) -> tuple[Flags, Flags]:
+    """Of samples and of detectors, in TOAST's bits."""
+    shared, other = file["shared"], file["metadata/other"].attrs
+    found = json.loads(file.attrs["observation_detector_flags"])
+    flags = shared["flags"][:] if "flags" in shared else np.zeros(len(shared["times"]), np.uint8)
+    detector_flags = np.array([found[d] for d in names], np.uint8)
+    if "zonda_start_utc" in other and FLAGS_ARE not in other:
+        return of_before(flags, samples=True), of_before(detector_flags, samples=False)
+    return flags, detector_flags
+
+
 def _read_intervals(file: Any, times: Floats, seconds: Floats) -> Intervals:
     found: Intervals = {}
     for name, spans in file["intervals"].items() if "intervals" in file else ():
@@ -309,7 +320,6 @@ def _read(file: Any, place: str) -> TimeOrderedData:
     order = {name: k for k, name in enumerate(np.asarray(table["name"]).astype(str))}
     names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]
     rows = np.array([order[d] for d in names], int)
-    flags = json.loads(file.attrs["observation_detector_flags"])
     columns = {}
     for ours, (theirs, unit, si) in _COLUMNS.items():
         if theirs in table.colnames:
@@ -323,10 +333,7 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         start = Instant(round(float(times[0]) * 1e9)).isoformat()
     kept = (k for k in other if k.startswith("zonda_") and k not in ("zonda_start_utc", FLAGS_ARE))
     own = {k.removeprefix("zonda_"): other[k] for k in kept}
-    sample_flags = shared["flags"][:] if "flags" in shared else np.zeros(len(times), np.uint8)
-    detector_flags = np.array([flags[d] for d in names], np.uint8)
-    if "zonda_start_utc" in other and FLAGS_ARE not in other:
-        sample_flags, detector_flags = of_before(sample_flags, samples=True), of_before(detector_flags, samples=False)
+    flags, detector_flags = _read_flags(file, names)
     a = instrument.attrs
     return TimeOrderedData(
         name=str(file.attrs["observation_name"]),
@@ -344,7 +351,7 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         ),
         boresight_azel=shared["boresight_azel"][:],
         boresight_radec=shared["boresight_radec"][:],
-        flags=sample_flags,
+        flags=flags,
         detector_flags=detector_flags,
         names=names,
         quats=np.asarray(table["quat"][rows], np.float64),

@@ -209,6 +209,22 @@ def test_weather_of_the_scene_where_no_step_makes_air(make_observation, data, st
         assert weather.time == data.scene.time.posix
 
 
+def test_weather_is_that_of_the_simulated_air(scene, tmp_path):
+    """Its water, and the wind that drives its layers, not what the scene's weather would have had."""
+    from zonda.core.pipeline import Pipeline
+    from zonda.operators.atmosphere.layers import AtmosphereLayers
+    from zonda.operators.optics.efficiency import Efficiency
+    from zonda.operators.pointing.stare import PointingStare
+
+    stare = PointingStare(target={"az": "120 deg", "el": "60 deg"}, scan_duration="2 s")
+    air = AtmosphereLayers(pwv="1.5 mm", wind={"speed": "10 m/s", "direction": "270 deg"}, layers=1)
+    Pipeline([stare, air, Efficiency(), SaveTOD()]).run(scene, output=tmp_path, threads=1)
+    weather = load_tod(tmp_path / "tod_scan-000.h5").weather
+    assert weather.pwv == pytest.approx(1.5e-3, rel=1e-9)
+    assert (weather.wind_east, weather.wind_north) == pytest.approx((10.0, 0.0), abs=1e-12)  # a west wind
+    assert weather.time == scene.time.posix
+
+
 def test_xi_and_eta_of_sotodlib():
     """so3g's rotation_xieta: xi = -sin(theta) sin(phi), eta = -sin(theta) cos(phi), gamma = psi + phi. Ours are tangents."""
     from zonda.operators.io.time_ordered_data import TimeOrderedData
