@@ -53,7 +53,7 @@ class Footprint:
     def holds(self, direction: Floats) -> bool:
         """Whether an ICRS direction (3,) is on the map; of another projection than TAN: within its `radius`."""
         if self.matrix is None:
-            return float(direction @ self.centre) >= np.cos(self.radius)
+            return bool(direction @ self.centre >= np.cos(self.radius))
         x, y, depth = self.matrix @ direction
         ny, nx = self.shape
         return bool(depth > 0 and -0.5 <= x / depth <= nx - 0.5 and -0.5 <= y / depth <= ny - 0.5)
@@ -106,7 +106,7 @@ def extent(wcs: Any, turn: Floats, shape: tuple[int, int]) -> tuple[Disc | None,
     lon, lat = np.radians(wcs.wcs_pix2world([[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0).T)
     lon, lat = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
     rays = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1) @ turn
-    middle, known = rays[0], np.isfinite(rays).all(axis=1)
+    middle, known = rays[0], np.isfinite(rays.sum(axis=1))
     if not known[0]:
         return None, False
     radius = float(np.arccos(np.clip(rays[known] @ middle, -1, 1)).max(initial=0.0)) * (1 + 2 / LATTICE)

@@ -254,7 +254,7 @@ class SkyMap(Operator):
         stamp = self.file.stat() if self.file.exists() else None
         identity = ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
         source: WcsMap | HealpixMap = self._memory.get(identity, self._read)
-        bandwise = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
+        bandwise: tuple[Hashable, ...] = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
         if isinstance(source, WcsMap):
             centre = self._centre(observation, source)
             wcs = placed(source, centre)
