@@ -55,8 +55,9 @@ def text(plan: Plan, width: int | None = None) -> str:
         coverage, fwhm = plan.context.coverage, float(np.mean(plan.context.first.focalplane.fwhm))
         smoothing = (coverage.pixel if coverage else math.inf) / fwhm * math.sqrt(2 * math.log(2) / math.pi)
         if smoothing < 0.5:  # sqrt(pixel area / (4 pi sigma^2)), where pixels are small
-            beam = f"{math.degrees(fwhm) * 3600:.3g} arcsec"
-            lines[-1] += f";\n  {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam}), the white noise alone"
+            beam, both = (f"{math.degrees(f) * 3600:.3g} arcsec" for f in (fwhm, math.sqrt(2) * fwhm))
+            lines[-1] += f";\n  {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam}; resolution {both}), "
+            lines[-1] += "the white noise alone"
     else:
         lines.append(f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none")
     for metric, limit in plan.limits.items():

@@ -55,7 +55,7 @@ def draw_map(file: str, run: str, key: str, product: FlatMap, style: Style) -> l
     }.get(run, "A companion run.")
     limit = shown.limit("signal", shown.hits, SHOWN if run == "noiseless" else 99.7)
     png = _panels([(shown, _titled(title, how))], style, limit)
-    return [Picture(file, title, f"{meaning} {how[0].upper()}{how[1:]}.", png)]
+    return [Picture(file, title, f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}", png)]
 
 
 def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Picture]:
@@ -73,7 +73,7 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Pic
             figures.append(f"{words[of]} {rms * 1e6:.4g} µK_RJ")
     limit = max((x for x in limits if x), default=None)
     png = _panels(panels, style, limit, circle=True)
-    text = f"Noise maps on one scale, {how}."
+    text = f"Noise maps on one scale, {how}.{_resolution(panels[0][0])}"
     if figures:
         text += f" Weighted rms within the dotted circle of {np.degrees(style.central_diameter) * 60:.3g}′: {', '.join(figures)}."
     return [Picture(file, "Noise", text, png)]
@@ -140,6 +140,17 @@ def _shown(product: FlatMap, style: Style) -> tuple[FlatMap, str]:
         return product, f"smoothed by {angle_text(product.smoothed_by)}" if product.smoothed_by else "not smoothed"
     fwhm = product.fwhm if style.smooth is None else style.smooth
     return (product.smoothed(fwhm), f"smoothed by {angle_text(fwhm)} for this picture") if fwhm > 0 else (product, "not smoothed")
+
+
+def _resolution(shown: FlatMap) -> str:
+    """What the circle in a map's corner is."""
+    if not shown.fwhm:
+        return ""
+    beam, smoothing = angle_text(shown.fwhm), angle_text(shown.smoothed_by)
+    if not shown.smoothed_by:
+        return f" Resolution {beam} FWHM, the beam's."
+    whole = angle_text(math.hypot(shown.fwhm, shown.smoothed_by))
+    return f" Resolution {whole} FWHM: the beam's {beam} and the smoothing's {smoothing}, added in quadrature."
 
 
 def _titled(title: str, how: str) -> str:

@@ -18,23 +18,22 @@ from zonda.core.configuration.describe import own_doc
 from zonda.core.configuration.parameters import described, quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data, Observation
-from zonda.core.errors import ZondaError
-from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.operator import Operator
 from zonda.core.storage.files import write_text
-from zonda.operators.io.map_view import maps_of, noise_figures
 from zonda.operators.io.save_map import output_folder
 
 from .plot_operators import Picture, Plots, pictures
+from .report_results import angle, class_of, flux_density, results
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
-    from zonda.operators.maps.map_product import MapProduct
 
 _WIDE = 1000
 """Pictures wider than this many pixels take a whole row."""
+LONG = 12
+"""Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files, in one cell."""
 
 
 class Report(Operator):
@@ -84,7 +83,7 @@ class Report(Operator):
 
 def _known(data: Data, central_diameter: float) -> dict[str, str]:
     """The sections that are settled once all runs have ended."""
-    return {"results": _results(data, central_diameter), "scene": _scene(data), "scans": _scans(data), "steps": _steps(data)}
+    return {"results": results(data, central_diameter), "scene": _scene(data), "scans": _scans(data), "steps": _steps(data)}
 
 
 def page(data: Data, shown: Sequence[Picture], central_diameter: float, known: Mapping[str, str] | None = None) -> str:
@@ -150,100 +149,22 @@ def _table(rows: Iterable[Sequence[Any]], head: Sequence[str] = (), numbers: Seq
     return f'<div class="scroll"><table{style}>{top}<tbody>{body}</tbody></table></div>' if body else ""
 
 
+def _folded(rows: Sequence[Sequence[Any]], head: Sequence[str], what: str) -> str:
+    """A table of which the first `LONG` rows are shown, and all others folded away as so many more ``what``."""
+    if len(rows) <= LONG + 3:  # nobody unfolds three rows
+        return _table(rows, head)
+    return f"{_table(rows[:LONG], head)}{_details(f'{len(rows) - LONG} more {what}', _table(rows[LONG:], head))}"
+
+
+def _details(summary: str, body: str) -> str:
+    return f"<details><summary>{escape(summary)}</summary>{body}</details>"
+
+
 class _Html:
     """Text that is markup already."""
 
     def __init__(self, text: str) -> None:
         self.text = text
-
-
-def _brightness(kelvin: float) -> str:
-    """A brightness with three figures, in the unit that reads best."""
-    if not math.isfinite(kelvin):
-        return "unknown"
-    for factor, unit in ((1e6, "µK_RJ"), (1e3, "mK_RJ")):
-        if abs(kelvin) * factor < 1e3:
-            return f"{kelvin * factor:.3g}\u00a0{unit}".replace("-", "−")
-    return f"{kelvin:.3g}\u00a0K_RJ".replace("-", "−")
-
-
-def _flux_density(kelvin: float, fwhm: float, data: Data) -> str:
-    """Of a point source with a flat spectrum whose peak is ``kelvin`` behind a Gaussian beam of ``fwhm`` [rad]."""
-    jansky = kelvin / to_kelvin_rj("Jy/beam", data.scene.instrument.band, beam_solid_angle=math.pi / math.log(16) * fwhm**2)
-    for factor, unit in ((1, "Jy"), (1e3, "mJy")):
-        if abs(jansky) * factor >= 0.9995:
-            return f"{jansky * factor:.3g}\u00a0{unit}"
-    return f"{jansky * 1e6:.3g}\u00a0µJy"
-
-
-def _results(data: Data, diameter: float) -> str:
-    maps = maps_of(data.products)
-    seconds = sum(o.duration for o in data.observations)
-    samples = sum(o.n_samples * o.n_detectors for o in data.observations)
-    cards = [
-        (str(len(data.observations)), "scan" if len(data.observations) == 1 else "scans"),
-        (f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s", "on the sky"),
-        (f"{samples:,}".replace(",", "\u202f"), "samples of all detectors"),
-    ]
-    words = {"half_difference": "even − odd scans", "source_free": "run without the sky"}
-    where = f"central {np.degrees(diameter) * 60:.3g}′"
-    for figure in noise_figures(maps, diameter):
-        label = "" if figure.product == "map" else f", {figure.product}"
-        smoothed = math.isfinite(figure.smoothed)
-        if not (smoothed or math.isfinite(figure.rms)):
-            cards.append(("unknown", f"rms, {where}, {words[figure.of]}{label}: too few pixels; set central_diameter"))
-            continue
-        beam = math.sqrt(2) * maps[figure.product].fwhm  # the telescope's, and the one that smooths
-        density = f" ({_flux_density(figure.smoothed, beam, data)} per beam of {_angle(beam)})" if smoothed else ""
-        cards.append(
-            (
-                _brightness(figure.smoothed if smoothed else figure.rms),
-                f"rms, {where}, {words[figure.of]}{', beam-smoothed' * smoothed}{density}{label}",
-            )
-        )
-        if smoothed:
-            cards.append((_brightness(figure.rms), f"the same before smoothing, per {_angle(maps[figure.product].pixel)} pixel"))
-    if _has_white_noise(data):
-        cards += [card for name, product in maps.items() if "/" not in name for card in _expected(name, product, diameter, data)]
-    if (image := data.products.get("input")) is not None and hasattr(image, "values") and np.isfinite(image.values).any():
-        cards.append((_brightness(_extreme(image.values)), "strongest pixel of the input"))
-    if (product := maps.get("noiseless/map")) is not None and np.isfinite(product.signal).any():
-        cards.append((_brightness(_extreme(product.signal)), "strongest pixel of the noiseless map"))
-    return (
-        '<div class="cards">'
-        + "".join(f"<div class=card><b>{escape(b)}</b><span>{escape(s)}</span></div>" for b, s in cards)
-        + "</div>"
-    )
-
-
-def _has_white_noise(data: Data) -> bool:
-    classes = (_class(kind) for _, kind, _ in data.provenance.get("operators", []))
-    return any(cls is not None and "white" in cls.provides for cls in classes)
-
-
-def _expected(name: str, product: MapProduct, diameter: float, data: Data) -> list[tuple[str, str]]:
-    """What the NET and the samples promise for the centre of a map: a card, or none where nothing is known.
-
-    Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 / A.
-    """
-    noise = product.noise[product.distance() <= diameter / 2]
-    known = np.isfinite(noise) & (noise > 0)
-    if not known.any() or product.noise_from != "net" or product.contents != "all":
-        return []
-    rms = float(1 / np.sqrt(np.sum(noise[known] ** -2.0) / noise.size))  # of the mean weight
-    label = "" if name == "map" else f", {name}"
-    where = f"central {np.degrees(diameter) * 60:.3g}′"
-    factor = product.pixel / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
-    if product.smoothed_by or factor > 0.5:  # pixels that are not small beside the beam
-        return [(_brightness(rms), f"white noise by NET and samples, {where}{label}")]
-    beam = math.sqrt(2) * product.fwhm
-    density = f"{_flux_density(rms * factor, beam, data)} per beam of {_angle(beam)}"
-    return [(_brightness(rms * factor), f"white noise by NET and samples, {where}, beam-smoothed ({density}){label}")]
-
-
-def _extreme(values: Any) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite[np.abs(finite).argmax()])
 
 
 def _pictures(shown: Sequence[Picture]) -> str:
@@ -258,13 +179,6 @@ def _pictures(shown: Sequence[Picture]) -> str:
     return f'<div class="pictures">{"".join(figures)}</div>' if figures else ""
 
 
-def _angle(value: float) -> str:
-    for factor, unit in ((180 / math.pi, "°"), (10800 / math.pi, "′")):
-        if abs(value) * factor >= 1:
-            return f"{value * factor:.4g}{unit}"
-    return f"{value * 648000 / math.pi:.4g}″"
-
-
 def _scene(data: Data) -> str:
     scene = data.scene
     instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
@@ -272,7 +186,7 @@ def _scene(data: Data) -> str:
     rows: list[tuple[str, Any]] = [
         ("Site", f"{site.name}: {np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°, {site.altitude:.0f} m"),
         ("Telescope", f"{telescope.name}, {telescope.diameter:.4g} m"),
-        ("Instrument", f"{instrument.name}: {instrument.detectors} detectors in a field of {_angle(instrument.field_of_view)}"),
+        ("Instrument", f"{instrument.name}: {instrument.detectors} detectors in a field of {angle(instrument.field_of_view)}"),
         (
             "Band",
             f"{band.name}: {band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz about {band.centre / 1e9:.4g} GHz",
@@ -285,7 +199,7 @@ def _scene(data: Data) -> str:
         plane, rate = data.observations[0].focalplane, data.observations[0].sample_rate
         rows[4:4] = [
             ("Beam (FWHM)", _spread(plane.fwhm * 648000 / np.pi, "″")),
-            ("1 K_RJ at a point source's peak", _flux_density(1.0, float(np.mean(plane.fwhm)), data)),
+            ("1 K_RJ at a point source's peak", flux_density(1.0, float(np.mean(plane.fwhm)), data)),
             ("Main-beam efficiency ζ", _spread(plane.main_beam_efficiency)),
             ("Illumination efficiency ε", _spread(plane.illumination_efficiency)),
             ("NET on the sky", _spread(plane.net * 1e3, " mK_RJ √s")),
@@ -350,7 +264,7 @@ def _scans(data: Data) -> str:
         "azimuth",
         "flagged samples / detectors",
     )
-    return f'<div class="compact">{_table(rows, head)}</div>'
+    return f'<div class="compact">{_folded(rows, head, "scans")}</div>'
 
 
 def _ranges(observation: Observation) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -397,7 +311,7 @@ def readable(text: str) -> str:
 def _steps(data: Data) -> str:
     made = []
     for label, kind, parameters in data.provenance.get("operators", []):
-        cls = _class(kind)
+        cls = class_of(kind)
         doc = own_doc(cls).split("\n\n")[0] if cls is not None else ""
         fields = described(cls) if cls is not None else {}
         rows = []
@@ -419,40 +333,30 @@ def _prose(text: str) -> str:
     return re.sub(r"``(.+?)``|`(.+?)`", lambda m: f"<code>{m[1] or m[2]}</code>", escape(" ".join(text.split())))
 
 
-def _class(kind: str) -> type[Operator] | None:
-    """The operator class of that name; None where its plugin cannot be had any more."""
-    from zonda.core.registry import mapmakers, operators
-
-    for registry in (operators, mapmakers):
-        with suppress(ZondaError, KeyError):
-            if kind in registry:
-                found = registry.get(kind)
-                if isinstance(found, type) and issubclass(found, Operator):
-                    return found
-    return None
-
-
 def _tally(data: Data) -> str:
     """The main run's rows in the order of the steps; those of companion runs (``noiseless/BinMap``) folded below."""
     by_run: dict[str, list[tuple[str, str, str]]] = {"": []}
     previous = ""
     order = {label: k for k, (label, *_) in enumerate(data.provenance.get("operators", []))}
-    for who, what, value in sorted(data.tally, key=lambda row: order.get(row[0].rpartition("/")[2], len(order))):
+    for who, what, value in sorted(data.tally.told(), key=lambda row: order.get(row[0].rpartition("/")[2], len(order))):
         run, _, step = who.rpartition("/")
-        number = f"{int(value):,}".replace(",", "\u202f") if re.fullmatch(r"\d+", value) else value
-        by_run.setdefault(run, []).append((step if who != previous else "", what, number))
+        counted = re.fullmatch(r"(\d+)( \(.* %\))?", value)
+        number = f"{int(counted[1]):,}{counted[2] or ''}".replace(",", "\u202f") if counted else value
+        again = who == previous and len(by_run.get(run, ())) != LONG  # a folded table begins with a name
+        by_run.setdefault(run, []).append(("" if again else step, what, number))
         previous = who
     head = ("step", "what", "value")
-    parts = [_table(by_run.pop(""), head)]
+    parts = [_folded(by_run.pop(""), head, "counts and figures")]
     for run, rows in by_run.items():
-        parts.append(f"<details><summary>Run {escape(run)}</summary>{_table(rows, head)}</details>")
+        parts.append(_details(f"Run {run}", _table(rows, head)))
     return f'<div class="steps">{"".join(parts)}</div>' if any(parts) else ""
 
 
 def _plan(data: Data) -> str:
     """What was left out, dropped or coarsened, and what that may cost (`core.plan`)."""
     head = ("effect", "decision", "error bound", "formula or reason")
-    return f'<div class="steps">{table}</div>' if (table := _table(data.provenance.get("plan", []), head)) else ""
+    table = _folded(list(data.provenance.get("plan", [])), head, "decisions")
+    return f'<div class="steps">{table}</div>' if table else ""
 
 
 def _timings(data: Data) -> str:
@@ -490,7 +394,11 @@ def _provenance(data: Data) -> str:
         parts = [f"{how} {' and '.join(what) if isinstance(what, list) else what}" for how, what in run.items()]
         rows.append((f"run {name}", ", ".join(parts)))
     files = [str(p.name) for key in ("map_file", "tod_file") for p in data.products.get(key, [])]
-    if files:
+    if len(files) > LONG // 2 + 2:
+        listed = "".join(f"<li>{escape(name)}</li>" for name in files)
+        body = f'<ul class="files">{listed}</ul>'
+        rows.append(("files", _Html(f"{escape(files[0])} to {escape(files[-1])}{_details(f'all {len(files)} files', body)}")))
+    elif files:
         rows.append(("files", ", ".join(files)))
     text = str(provenance.get("resolved_yaml", ""))
     folded = (

@@ -93,7 +93,8 @@ def _type(name: str, plane: Any) -> np.dtype[Any]:
 
 def _beam(view: MapView) -> Cards:
     degrees = float(np.degrees(view.fwhm))
-    cards = [("BMAJ", degrees, "[deg] FWHM"), ("BMIN", degrees, "[deg] FWHM"), ("BPA", 0.0, "[deg]")]
+    what = "[deg] FWHM: beam, smoothing in quadrature" if view.smoothed else "[deg] FWHM of the beam"
+    cards = [("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")]
     return Cards(cards if view.fwhm else ())
 
 

@@ -34,8 +34,8 @@ class MapView:
         FITS header with the WCS; None for HEALPix.
     nside, pixels, nest, frame
         HEALPix: resolution, pixel numbers (n_pix,) int64, ordering, astropy frame name.
-    fwhm
-        Resolution of the map, rad; 0 where unknown.
+    fwhm, smoothed
+        Resolution of the map, rad, 0 where unknown: the beam's; of a smoothed map that of beam and smoothing, in quadrature.
     centre
         (lon, lat) of the map's centre in ``frame``, rad.
     """
@@ -50,6 +50,7 @@ class MapView:
     frame: str = "icrs"
     fwhm: float = 0.0
     centre: tuple[float, float] = (0.0, 0.0)
+    smoothed: bool = False
 
     @classmethod
     def of(cls, name: str, product: MapProduct) -> MapView:
@@ -70,6 +71,7 @@ class MapView:
             product.frame,
             math.hypot(product.fwhm, product.smoothed_by),
             product.centre,
+            product.smoothed_by > 0,
         )
 
     @property
@@ -106,7 +108,14 @@ class MapView:
         there = self.pixels[found] == wanted
         planes = {k: np.where(there, v[found], 0 if k == "hits" else np.nan) for k, v in self.planes.items()}
         return MapView(
-            self.name, planes, self.units, wcs.to_header(relax=True), frame=self.frame, fwhm=self.fwhm, centre=self.centre
+            self.name,
+            planes,
+            self.units,
+            wcs.to_header(relax=True),
+            frame=self.frame,
+            fwhm=self.fwhm,
+            centre=self.centre,
+            smoothed=self.smoothed,
         )
 
     def _plane(self, size: int) -> tuple[Any, tuple[int, int]]:

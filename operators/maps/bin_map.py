@@ -100,7 +100,8 @@ class BinMap(Operator):
     half_difference: bool = True
     """Keep even and odd scans apart and make a noise map of their difference (needs two scans)."""
     smooth: Angle | Literal["beam"] | None = None
-    """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam."""
+    """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam; the resolution is then that of both, added in
+    quadrature."""
     product: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
     """Name of the map among the products."""
 

@@ -15,14 +15,12 @@ from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
 from zonda.operators.diagnostics.report import (
     Report,
-    _expected,
-    _flux_density,
     _ranges,
-    _results,
     _sexagesimal,
     _target,
     readable,
 )
+from zonda.operators.diagnostics.report_results import expected, flux_density, results
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
 EVIL = "<script>alert('x')</script>&\"quoted\""
@@ -197,7 +195,7 @@ def test_the_flux_density_of_a_beam(data):
     low, high = band.frequency[0], band.frequency[-1]
     fwhm = np.radians(10 / 3600)
     expected = 2 * 1.380649e-23 * 1e-3 * 1.13309 * fwhm**2 / 299792458.0**2 * low * high / 1e-26  # Jy for 1 mK
-    shown = _flux_density(1e-3, fwhm, data)
+    shown = flux_density(1e-3, fwhm, data)
     value, unit = shown.split("\u00a0")
     assert float(value) * {"Jy": 1, "mJy": 1e-3, "µJy": 1e-6}[unit] == pytest.approx(expected, rel=5e-3)  # three figures
 
@@ -208,16 +206,16 @@ def test_the_white_noise_that_is_expected():
     steps = [zonda.PointingDaisy(scan_duration="20 s"), zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="3 arcsec")]
     data = zonda.Pipeline(steps).run(scene)
     product, circle = data.products["map"], np.radians(2 / 60)
-    ((shown, what),) = _expected("map", product, circle, data)
+    ((shown, what),) = expected("map", product, circle, data)
     value, unit = shown.split("\u00a0")
     smoothed = product.smoothed(product.fwhm).noise[product.distance() <= circle / 2]
-    expected = np.nanmedian(smoothed)
-    assert float(value) * {"µK_RJ": 1e-6, "mK_RJ": 1e-3}[unit] == pytest.approx(expected, rel=0.05)
-    assert "beam-smoothed" in what
-    assert what in _results(data, circle).replace("&#x27;", "'")
-    ((shown, what),) = _expected("map", dataclasses.replace(product, fwhm=0.0), circle, data)
+    wanted = np.nanmedian(smoothed)
+    assert float(value) * {"µK_RJ": 1e-6, "mK_RJ": 1e-3}[unit] == pytest.approx(wanted, rel=0.05)
+    assert "smoothed with the beam to 12″ (8.5″ beam and as much smoothing, added in quadrature)" in what
+    assert what in results(data, circle).replace("&#x27;", "'")
+    ((shown, what),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle, data)
     assert "beam" not in what
-    assert _expected("map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle, data) == []
+    assert expected("map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle, data) == []
 
 
 def test_the_ranges_of_a_scan_are_those_of_its_samples(make_observation):
@@ -236,10 +234,65 @@ def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeyp
 
     report()
     operator = Report()
-    monkeypatch.setattr("zonda.operators.diagnostics.report.noise_figures", broken)
+    monkeypatch.setattr("zonda.operators.diagnostics.report_results.noise_figures", broken)
     operator.meanwhile(data, "runs")
     with pytest.raises(MemoryError):
         operator.finalize(data)
     monkeypatch.undo()
     operator.meanwhile(data, "runs")
     operator.finalize(data)
+
+
+def test_long_lists_are_folded(data, make_observation):
+    """Scans, counts, decisions and files beyond a dozen or so are in <details>; each is there, once, under its step's name."""
+    data.observations += [make_observation(50, index=k) for k in range(40)]
+    for k in range(30):
+        data.tally.state("Step", f"figure {k:02d}", "1")
+    data.provenance["plan"] = [(f"effect {k}", "full", "0", "x") for k in range(20)]
+    data.products["tod_file"] = [data.output / f"tod_{k:03d}.h5" for k in range(50)]
+    data.products["pictures"] = []
+    Report().finalize(data)
+    page = (data.output / "report.html").read_text(encoding="utf-8")
+    checker = Checker()
+    checker.feed(page)
+    assert checker.open == []
+    shown = re.sub(r"<details>.*?</details>", "", page, flags=re.S)
+    for what, count, some in (("28 more scans", 40, 12), ("18 more counts and figures", 30, 12), ("8 more decisions", 20, 12)):
+        assert f"<summary>{what}</summary>" in page
+        word = {"scans": "scan_", "figures": "figure ", "decisions": "effect "}[what.split()[-1]]
+        assert len(set(re.findall(rf"{word}\d+", page))) == count
+        assert len(set(re.findall(rf"{word}\d+", shown))) == some
+    assert "<summary>all 50 files</summary>" in page
+    assert page.count("<li>tod_") == 50
+    rest = page[page.index("18 more counts") :]
+    assert rest.index("<th>Step</th>") < rest.index("figure 12")  # the folded table begins with the name
+
+
+def test_short_lists_are_not_folded(data, make_observation):
+    data.observations += [make_observation(50, index=k) for k in range(14)]
+    data.products["tod_file"] = [data.output / f"tod_{k}.h5" for k in range(4)]
+    data.products["pictures"] = []
+    Report().finalize(data)
+    page = (data.output / "report.html").read_text(encoding="utf-8")
+    assert "more scans" not in page
+    assert "tod_0.h5, tod_1.h5, tod_2.h5, tod_3.h5" in page
+
+
+def test_counts_have_their_share(data, report):
+    data.tally.count("SkyMap", "samples outside the input map", 2623184, 57531250)
+    _, text, _ = report()
+    assert "2 623 184 (4.56 %)" in text  # spaces are narrow ones that do not break
+
+
+def test_the_depth_of_a_map_is_told_per_beam():
+    """An area A that N detectors cover evenly for a time t has N t Omega / A per beam; the read-out is slower than usual."""
+    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+    daisy = zonda.PointingDaisy(scan_duration="20 s", sample_rate="40 Hz")
+    data = zonda.Pipeline([daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="3 arcsec")]).run(scene)
+    product = data.products["map"]
+    near = product.distance() <= np.radians(1 / 60)
+    seconds = np.median(product.hits[near]) / 40 * np.pi / (4 * np.log(2)) * (8.5 / 3) ** 2
+    shown = results(data, np.radians(2 / 60))
+    assert f"{seconds:.3g}\u00a0s" in shown
+    assert "of all detectors per 8.5″ beam, central 2′; " in shown
+    assert f"{np.median(product.hits[near]):.4g} samples per 3″ pixel" in shown
