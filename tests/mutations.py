@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from zonda.core.data import Block, Observation
+from zonda.core.run import block_maker
 from zonda.operators.atmosphere import band, covariance, turbulence
 from zonda.operators.filters import brick_wall, common_mode
 from zonda.operators.maps import bin_map
@@ -178,6 +179,18 @@ def gaps_filled_in_silence(patch: Patch) -> None:
     patch.setattr(recording, "NOT_RECORDED", np.uint8(0))
 
 
+def noise_that_all_bands_share(patch: Patch) -> None:
+    patch.setattr(Observation, "detector_key", Observation.key)
+
+
+def the_instruments_net_whatever_the_load(patch: Patch) -> None:
+    patch.setattr(white, "resolve", lambda observation: None)
+
+
+def steps_that_see_no_mean(patch: Patch) -> None:
+    patch.setattr(block_maker, "knows_means", lambda operator: True)
+
+
 MUTATIONS = (
     Mutation("1 - C by subtraction", "covariance.structure_function", one_minus_correlation),
     Mutation("C(0) - C(r) by subtraction", "covariance.behind_a_beam", difference_of_covariances),
@@ -203,4 +216,7 @@ MUTATIONS = (
     Mutation("the air is sampled by a comb", "timing.jittered_atmosphere", air_that_ignores_the_times),
     Mutation("NaN rows and gaps are interpolated", "timing.recorded_gaps_and_nan", gaps_filled_in_silence),
     Mutation("days of 86400 s", "pointing.leap_second", days_of_86400_seconds),
+    Mutation("noise keyed without instrument and band", "noise.two_bands", noise_that_all_bands_share),
+    Mutation("the noise of a map follows from the instrument's NET", "noise.stated", the_instruments_net_whatever_the_load),
+    Mutation("a plugin's step multiplies the stream without its mean", "means.gain_of_the_whole", steps_that_see_no_mean),
 )

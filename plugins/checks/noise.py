@@ -1,4 +1,4 @@
-"""Pink noise from f_min on, for any length; the noise that a map states, for every noise model."""
+"""Pink noise from f_min on, for any length; the noise that a map states, for every noise model; two bands of one seed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 import zonda
 from zonda.core.checks import Family, Measured
+from zonda.core.data import Observation
 from zonda.core.errors import ZondaError
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.registry import noise_models
@@ -17,7 +18,7 @@ from zonda.operators.noise.one_over_f import PowerLawFilter, power_law_filter
 from zonda.operators.noise.pink import Streams
 from zonda.operators.noise.white import WhiteNoise
 
-from .cases import PINK, STATED
+from .cases import BANDS, LEVEL, PINK
 from .scenes import camera, largest, unrefused
 
 checks = Family("noise")
@@ -151,9 +152,50 @@ def levels() -> dict[str, WhiteNoise]:
     return found
 
 
-@checks.add(STATED, reference="1", limit=4.5, unit="standard errors")
+@checks.add(LEVEL, reference="1", limit=4.5, unit="standard errors")
 def stated() -> Measured:
     """std(signal / NOISE) of maps of white noise, NET on the sky, at the detector, every noise model, 850 GHz, 1.5 mm of PWV"""
     found = {name: over_stated(level, scatter="10 %") for name, level in levels().items()}
     text = ", ".join(f"{name} {ratio:.3f}" for name, (ratio, _) in found.items())
     return largest(*(abs(ratio - 1) / error for ratio, error in found.values())), text
+
+
+def _two_bands() -> tuple[Observation, Observation]:
+    """One scene at 93 and at 225 GHz: the same beams, detectors and seed."""
+    found = []
+    for low, high in (("78 GHz", "108 GHz"), ("195 GHz", "255 GHz")):
+        steps = [
+            zonda.PointingDaisy(radius="4 arcmin", speed="1 arcmin/s", scan_duration="30 s"),
+            zonda.AtmosphereLayers(pwv="1 mm"),
+            zonda.WhiteNoise(),
+            zonda.PinkNoise(),
+            zonda.Efficiency(),
+        ]
+        scene = zonda.Scene(
+            site="chajnantor", instrument=camera(low=low, high=high), time="2024-07-25T03:00", target="17h -20d", seed=1
+        )
+        found += zonda.Pipeline(steps).run(scene, threads=1, keep=("white", "pink", "atmosphere")).observations
+    return found[0], found[1]
+
+
+def _correlation(a: Any, b: Any) -> float:
+    a, b = (np.asarray(x, np.float64) - x.mean() for x in (a, b))
+    return float((a * b).mean() / (a.std() * b.std()))
+
+
+@checks.add(BANDS, reference="no correlation", limit=4.5, unit="standard errors")
+def two_bands() -> Measured:
+    """correlation of the white noise, and of pink noise's second differences, of two bands of one seed"""
+    one, two = (o.detdata for o in _two_bands())
+    white = _correlation(one["white"], two["white"]) * math.sqrt(one["white"].size)
+    a, b = (np.diff(o["pink"].astype(np.float64), 2, axis=1) for o in (one, two))
+    # of nearly white noise, twice differenced: the sum over lags of rho^2 is 1 + 2 (4/9 + 1/36) = 35/18 (Bartlett)
+    pink = _correlation(a, b) / math.sqrt(35 / 18 / a.size)
+    return largest(abs(white), abs(pink)), f"white {white:+.2f}, pink {pink:+.2f}"
+
+
+@checks.add(BANDS, reference="one turbulence", limit=1e-3)
+def one_atmosphere() -> float:
+    """1 - correlation of the atmosphere's fluctuation at 93 and at 225 GHz, equal beams"""
+    one, two = _two_bands()
+    return 1 - _correlation(one.detdata["atmosphere"], two.detdata["atmosphere"])
