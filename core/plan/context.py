@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,8 +22,12 @@ DEEP = 0.9
 """Quantile of the hits over the covered map: its deeper part has the least noise, so what holds there holds everywhere."""
 
 CELLS, POINTS, DETECTORS = 32, 8192, 96
-"""Hits are counted on CELLS x CELLS cells from at most about POINTS instants of all scans and DETECTORS detectors of each."""
+"""Hits are counted on CELLS x CELLS cells from at most about POINTS instants of all scans and DETECTORS detectors of each; in
+pixels where no more samples than that are taken."""
 
+
+LOOKED_AT = 4
+"""Observations whose levels of noise are looked at, apart from those at the extremes of elevation."""
 
 LEAKS = 1.5
 """Factor on what passes a brick wall: a scan has ends."""
@@ -41,11 +45,31 @@ class Coverage:
         Side of a pixel, rad.
     speed
         Median speed of the boresight on the sky, rad/s.
+    exact
+        Whether every sample was counted, in pixels of this side.
     """
 
     hits: float
     pixel: float
     speed: float
+    exact: bool = False
+
+
+@dataclass(frozen=True)
+class Depth:
+    """White noise of all scans.
+
+    Attributes
+    ----------
+    sample
+        rms of one sample of the calibrated stream over detectors and scans, K.
+    weighed
+        sqrt(hits) times the noise of a map pixel, K, where all detectors and scans share in every pixel alike: with weights w,
+        sqrt(N sum w^2 sigma^2) / sum w over the N samples.
+    """
+
+    sample: float
+    weighed: float
 
 
 @dataclass
@@ -77,6 +101,8 @@ class Context:
     metrics: frozenset[str] = frozenset()
     limits: dict[str, float] = field(default_factory=dict)
     """The budget by metric: a coarser form whose bound alone exceeds it need not be looked into."""
+    depth: Depth = Depth(0.0, 0.0)
+    """The white noise that the run will have."""
     kept_streams: frozenset[str] = frozenset()
     """Streams that some operator saves, measures or draws besides ``signal``."""
 
@@ -85,15 +111,26 @@ class Context:
         """The first observation."""
         return self.observations[0]
 
+    @cached_property
+    def lowest(self) -> Observation:
+        """The observation at the lowest elevation: there the atmosphere is thickest, and what depends on it largest."""
+        return min(self.observations, key=lambda o: float(o.elevation.min()))
+
     @property
     def noise(self) -> float:
-        """White noise of one sample of the calibrated stream, K: (sum of squares)^(1/2) over the operators."""
+        """White noise of one sample of the calibrated stream, the quietest detector's, K: (sum of squares)^(1/2) over the
+        operators. See `depth` for that of all of them."""
         return math.sqrt(sum(t.noise**2 for t in self.traits.values()))
 
     @property
     def fluctuation(self) -> float:
         """Largest rms of one sample's fluctuation, all components, K."""
-        return math.sqrt(sum(t.rms**2 + t.noise**2 + (t.peak or 0.0) ** 2 for t in self.traits.values()))
+        return math.sqrt(sum(t.rms**2 + t.loudest**2 + (t.peak or 0.0) ** 2 for t in self.traits.values()))
+
+    @cached_property
+    def mean_emission(self) -> float:
+        """Largest mean emission in the calibrated stream, K; 0: there is none."""
+        return max((float(_calibrated_mean(o).max(initial=0.0)) for o in self.observations), default=0.0)
 
     @cached_property
     def passed(self) -> float:
@@ -113,7 +150,7 @@ class Context:
         total = 0.0
         for t in self.traits.values():
             parts = np.array([t.faster(float(f)) if t.faster else t.rms for f in grid]) ** 2
-            noise = t.noise**2 * np.maximum(1 - 2 * grid / self.first.sample_rate, 0.0)
+            noise = t.loudest**2 * np.maximum(1 - 2 * grid / self.first.sample_rate, 0.0)
             above = parts + noise + (t.peak or 0.0) ** 2 * (1 if high == math.inf else 1 - grid / top)
             w = np.array([weight(float(f)) ** 2 for f in grid])
             last = above[-1] * w[-1] if high == math.inf else 0.0
@@ -128,7 +165,7 @@ class Context:
     @property
     def map_noise(self) -> float:
         """White noise of a map pixel in the deep part, K: sigma / sqrt(hits)."""
-        return self.noise / math.sqrt(self.coverage.hits) if self.coverage else 0.0
+        return self.depth.weighed / math.sqrt(self.coverage.hits) if self.coverage else 0.0
 
     @property
     def removes_common(self) -> bool:
@@ -192,6 +229,12 @@ class Context:
         """Bound on map and stream from an error of rms ``tod`` in the stream."""
         return {"tod": tod, "map_rms": self.in_map(tod, correlated, common)}
 
+    def other_modes(self, label: str) -> dict[str, float]:
+        """Bound on what changes where other singular modes are removed, because what ``label`` makes is no longer the largest
+        of what the detectors have in common: all that the others make, and all of the sky."""
+        others = replace(self, traits={k: t for k, t in self.traits.items() if k != label or t.removes_common or t.response})
+        return {**self.bound(others.passed, self.first.duration, common=True), **self.sky_error(1.0), "psd": 0.0}
+
     def affords(self, bound: Mapping[str, float]) -> bool:
         """Whether a bound alone is within the budget."""
         return all(v <= self.limits[m] for m, v in bound.items() if m in self.limits)
@@ -208,17 +251,62 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
     for operator in operators:
         if not (operator.at_end or operator.main_run_only):
             operator.observe(data)
-    for operator in operators:
-        operator.configure(data.observations[0])
+    shown = _some(data.observations)
+    for observation in shown:
+        for operator in operators:
+            operator.configure(observation)
     runs = selected(pipeline, structure)
     streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.main_run_only))
     context = Context(scene, data.observations, operators, runs, kept_streams=streams)
-    context.traits = {o.label: o.traits(data.observations[0]) for o in operators}
+    context.traits = {o.label: o.traits(context.lowest) for o in operators}
+    context.depth = _depth(operators, shown, context)
     pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
     if pixels:
         context.coverage = cover(data.observations, min(pixels))
     context.metrics = _metrics(pipeline, structure, context)
     return context
+
+
+def _some(observations: Sequence[Observation]) -> list[Observation]:
+    """The first, the last, those at the lowest and at the highest elevation, and up to `LOOKED_AT` between them."""
+    evenly = np.linspace(0, len(observations) - 1, min(LOOKED_AT, len(observations))).astype(int)
+    low = min(range(len(observations)), key=lambda k: float(observations[k].elevation.min()))
+    high = max(range(len(observations)), key=lambda k: float(observations[k].elevation.max()))
+    return [observations[k] for k in sorted({*evenly.tolist(), low, high})]
+
+
+def _depth(operators: Sequence[Operator], observations: Sequence[Observation], context: Context) -> Depth:
+    """See `Depth`. The quietest detector of all scans is noted in the traits."""
+    makers = [o for o in operators if context.traits[o.label].noise > 0]
+    if not makers:
+        return Depth(0.0, 0.0)
+    variances, numbers = [], []
+    quietest = dict.fromkeys((o.label for o in makers), math.inf)
+    for observation in observations:
+        total = np.zeros(observation.n_detectors)
+        for operator in makers:
+            found = operator.traits(observation)
+            total += found.noise**2 if found.each is None else found.each**2
+            quietest[operator.label] = min(quietest[operator.label], found.noise)
+        variances.append(total)
+        numbers.append(np.full(len(total), float(observation.n_samples)))
+    for label, level in quietest.items():
+        context.traits[label] = replace(context.traits[label], noise=level)
+    variance, number = np.concatenate(variances), np.concatenate(numbers)
+    sample = math.sqrt(float(number @ variance / number.sum()))
+    weighs = any(t.weighs for t in context.traits.values()) and bool((variance > 0).all())
+    weighed = math.sqrt(float(number.sum() / (number @ (1 / variance)))) if weighs else sample
+    return Depth(sample, weighed)
+
+
+def _calibrated_mean(o: Observation) -> NDArray[np.float64]:
+    """(n_det,) largest mean emission of a scan behind the calibration, K."""
+    emission, transmission = o.smooth.get("atmosphere"), o.smooth.get("transmission")
+    if emission is None:
+        return np.zeros(1)
+    share = o.focalplane.illumination_efficiency / o.focalplane.main_beam_efficiency
+    passed = np.ones(1) if transmission is None else np.maximum((transmission.weights @ transmission.coefficients).min(1), 1e-6)
+    return np.asarray(share * (emission.weights @ emission.coefficients).max(1) / passed, np.float64)
 
 
 def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> frozenset[str]:
@@ -239,10 +327,12 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     weights: list[NDArray[np.float64]] = []
     speeds = []
     centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
-    number = max(POINTS // len(observations), 64)
+    number, most = max(POINTS // len(observations), 64), DETECTORS
+    if exact := sum(o.n_samples * o.n_detectors for o in observations) <= POINTS * DETECTORS:
+        number, most = (max(sizes) for sizes in zip(*((o.n_samples, o.n_detectors) for o in observations), strict=True))
     for o in observations:
         times = np.unique(np.linspace(0, o.n_samples - 1, min(number, o.n_samples)).astype(int))
-        rows = np.unique(np.linspace(0, o.n_detectors - 1, min(DETECTORS, o.n_detectors)).astype(int))
+        rows = np.unique(np.linspace(0, o.n_detectors - 1, min(most, o.n_detectors)).astype(int))
         turn = centre.T @ rotation_matrices(o.boresight_radec[times])
         plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
         looking = turn @ plane  # (time, 3, detector)
@@ -254,13 +344,37 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
             ends = rotation_matrices(o.boresight_radec[np.stack([at, at + 1], 1).ravel()])[:, :, 2].reshape(-1, 2, 3)
             speeds.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * o.sample_rate)
     where, weight = np.concatenate(points, axis=1), np.concatenate(weights)
+    speed = float(np.median(np.concatenate(speeds))) if speeds else 0.0
+    if exact:
+        index = np.floor(where / pixel).astype(np.int64)
+        index -= index.min(axis=1, keepdims=True)
+        _, hits = np.unique(index[0] * (index[1].max() + 1) + index[1], return_counts=True)
+        return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed, exact)
     reach = np.maximum(np.ptp(where, axis=1), pixel)
     cells = np.maximum(1, np.minimum(CELLS, np.floor(reach / pixel))).astype(int)
     low = where.min(axis=1)
     side = np.maximum(np.ptp(where, axis=1) / cells, 1e-15)
     column, row = (np.minimum(((where[k] - low[k]) / side[k]).astype(np.int64), cells[k] - 1) for k in (0, 1))
-    counts = np.bincount(column * cells[1] + row, weight)
-    area = max(float(side[0] * side[1]), pixel**2)
-    hits = counts[counts > 0] * min(1.0, pixel**2 / area)
-    speed = float(np.median(np.concatenate(speeds))) if speeds else 0.0
+    cell = column * cells[1] + row
+    covered = _covered(where, cell, pixel, max(float(side[0] * side[1]) / pixel**2, 1.0))
+    counts = np.bincount(cell, weight, len(covered))
+    hits = counts[covered > 0] / covered[covered > 0]
     return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed)
+
+
+def _covered(where: NDArray[np.float64], cell: NDArray[np.int64], pixel: float, most: float) -> NDArray[np.float64]:
+    """Pixels in each cell that samples fall in, of ``most`` in it, from the n points ``where`` (2, n) that fall in u of them.
+
+    Points fall in u = P (1 - exp(-n / P)) of P pixels if they do so at random: P follows from n and u. Few points in a cell,
+    each in a pixel of its own, do not tell, and the cell counts as covered.
+    """
+    number = int(cell.max()) + 1
+    index = np.floor(where / pixel).astype(np.int64)
+    index -= index.min(axis=1, keepdims=True)
+    one = (cell * (index[0].max() + 1) + index[0]) * (index[1].max() + 1) + index[1]
+    _, first = np.unique(one, return_index=True)
+    n, u = np.bincount(cell, minlength=number), np.bincount(cell[first], minlength=number)
+    covered = np.minimum(u.astype(np.float64), most)
+    for _ in range(50):
+        covered = np.minimum(u / np.maximum(-np.expm1(-n / np.maximum(covered, 1e-9)), 1e-9), most)
+    return np.asarray(np.where(n > 0, np.maximum(covered, 1.0), 0.0), np.float64)

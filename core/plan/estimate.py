@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 METRICS = {
     "map_rms": "rms error of a map pixel, K",
     "peak": "largest error of the sky's brightness in the map, K",
@@ -101,10 +104,12 @@ class Cost:
 
 @dataclass(frozen=True)
 class Estimate:
-    """An operator's effects and its cost; ``cost`` None: unknown, the planner says so."""
+    """An operator's effects and its cost; ``cost`` None: unknown, the planner says so. ``without``: what leaving the whole
+    operator out would cost, where that is not what its effects contribute."""
 
     effects: tuple[Effect, ...] = ()
     cost: Cost | None = None
+    without: Bound | None = None
 
 
 @dataclass(frozen=True)
@@ -114,7 +119,9 @@ class Traits:
     Attributes
     ----------
     noise
-        Adds this much white noise: rms of one sample of the calibrated stream, K.
+        Adds this much white noise: rms of one sample of the calibrated stream, K; of the quietest detector.
+    each
+        (n_det,) The same of each detector; None: they are alike.
     rms
         Adds a fluctuation of at most this rms to the calibrated stream, K (the smooth mean apart).
     faster
@@ -127,15 +134,32 @@ class Traits:
         Amplitude that passes at a frequency [Hz]; None: all.
     removes_common
         Removes what all detectors have in common.
+    weighs
+        Makes a map in which samples are weighed by the inverse variance of their white noise.
+    gain_error
+        Scatters the detectors' gains by this relative rms, unknown to the calibration.
     """
 
     noise: float = 0.0
+    each: NDArray[np.float64] | None = None
     rms: float = 0.0
     faster: Callable[[float], float] | None = None
     peak: float | None = None
     pixel: float = 0.0
     response: Callable[[float], float] | None = None
     removes_common: bool = False
+    weighs: bool = False
+    gain_error: float = 0.0
+
+    @property
+    def loudest(self) -> float:
+        """`noise` of the noisiest detector, K."""
+        return self.noise if self.each is None else float(self.each.max(initial=0.0))
+
+
+def add(*bounds: Bound) -> dict[str, float]:
+    """The sum of bounds."""
+    return {m: sum(b.get(m, 0.0) for b in bounds) for m in METRICS if any(m in b for b in bounds)}
 
 
 def full(what: str, **more: Any) -> Choice:

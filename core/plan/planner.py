@@ -23,6 +23,7 @@ from .cost import predict
 from .estimate import METRICS, Bound, Choice, Cost, Effect, Estimate, full
 from .outcome import Prediction, apply
 from .structure import Structure, prune, selected
+from .whole import everything_of, without
 
 LARGEST_RATIO = 1e5
 """Of a stream's rms to its noise up to which float32 is thought of where the pipeline asks for float64."""
@@ -68,7 +69,8 @@ class Plan:
     limits, spent
         By metric: the budget, and the sum of the bounds of what was dropped or coarsened.
     noise
-        White noise: rms of one sample and of a map pixel (0: no map), K; samples per pixel in the deep part of the map.
+        White noise that the run will have, under the load of the atmosphere: rms of one sample and of a map pixel (0: no map), K;
+        samples per pixel in the deep part of the map.
     prediction, unpruned
         With the plan, and with everything on.
     costs
@@ -166,17 +168,22 @@ def plan(
     labels = [o.label for o in pipeline.operators]
     derived = {run: derivation(parts) for run, parts in pipeline.derived.items()}
     everything = Structure(tuple(labels), tuple(pipeline.runs), (), derived=derived)
-    operators_dropped = [name for name in drop if name in labels]
     structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
-    structure = dataclasses.replace(structure, operators=tuple(k for k in structure.operators if k not in operators_dropped))
     context = look(pipeline, scene, structure)
-    allowed = {m: v for m, v in limits(file.header.budget, context.map_noise, context.noise).items() if m in context.metrics}
+    budget = limits(file.header.budget, context.map_noise, context.depth.sample)
+    allowed = {m: v for m, v in budget.items() if m in context.metrics}
     context.limits = allowed
     estimates = {o.label: o.estimate(context) for o in context.operators}
     effects = [Decided(label, e, 0) for label, estimate in estimates.items() for e in estimate.effects]
     effects += [Decided("pipeline", e, 0) for e in _of_pipeline(pipeline, context)]
-    kept, forced = _named(keep, effects, labels), _named(drop, effects, labels)
+    _named(drop, effects, labels)
     _check_droppable(drop, effects, labels)
+    whole = [label for label in structure.operators if label in drop]
+    left = without(file, structure, whole) if whole else context
+    effects = [d for d in effects if d.operator not in whole]
+    effects += [Decided(label, everything_of(label, estimates, context, left), 0) for label in whole]
+    kept = _named(keep, effects, labels)
+    forced = {d.name for d in effects if d.operator in whole or {d.name, d.effect.name, d.operator} & {*drop}}
     item = 8 if pipeline.precision == "float64" else 4
     settings = threads or available_threads(), item, memory or available_memory() // 2
     costs = {label: estimate.cost for label, estimate in estimates.items()}
@@ -188,7 +195,7 @@ def plan(
         costs |= measured(file, [label for label, cost in costs.items() if cost is None])
     now = predict(context, costs, *settings)
     spent = {m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed}
-    noise = (context.noise, context.map_noise, context.coverage.hits if context.coverage else 0.0)
+    noise = (left.depth.sample, left.map_noise, left.coverage.hits if left.coverage else 0.0)
     prediction = _saving(now, decided, context)
     unpruned = _unpruned(pipeline, scene, structure, everything, context, estimates, now, settings)
     planning = time.process_time() - begin

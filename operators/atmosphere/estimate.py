@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.instrument import Band
-from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, add, full
 
 from .averaging import shares
 from .band import BandAtmosphere, _BandTransfer
 from .geometry import Track, axes, crossing, rays, tracks
 from .nodes import LayerModel, differential_rms, some
 from .plan import make_plan
+from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 from .turbulence import FIDELITIES
 
 if TYPE_CHECKING:
@@ -56,7 +57,8 @@ PAYS = 0.3
 class Air:
     """What `AtmosphereLayers` knows of one observation before it draws anything.
 
-    ``kelvin``: K of equation (1). ``variances`` s_l^2. ``stretch`` of distances along the elevation.
+    ``kelvin``: K of equation (1), of the detector that sees most. ``uneven``: rms of K over the detectors, of the largest.
+    ``variances`` s_l^2. ``stretch`` of distances along the elevation.
     """
 
     band: BandAtmosphere
@@ -71,6 +73,7 @@ class Air:
     velocities: list[Floats]
     points: dict[float, float] = field(default_factory=dict)
     averages: dict[str, list[float]] = field(default_factory=dict)
+    uneven: float = 0.0
 
     @property
     def rms(self) -> float:
@@ -113,18 +116,26 @@ def _air(operator: AtmosphereLayers, observation: Observation) -> Air:
     variances = [_turbulence(operator, observation, n, m).variance for n, m in enumerate(models)]
     elevation = observation.elevation
     low, high = float(elevation.min()), float(elevation.max())
-    plane = observation.focalplane
-    step = 1e-3
-    slope = float(band.emission_difference(pwv, pwv * step, low)) / step
-    share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max()) / max(
-        float(band.transmission(pwv, low)), 1e-6
-    )
+    gains = _gains(observation, band, pwv, low)
+    largest = float(gains.max())
     scale = operator.pwv_rms
     if operator.pwv_rms_after_beam:
         scale /= math.sqrt(sum(m.amplitude**2 * v for m, v in zip(models, variances, strict=True)))
     stretch = 1 / math.sin(track.elevation) if track.kind == "horizontal" else 1.0
     velocities = _velocities(observation, track, layers)
-    return Air(band, profile, pwv, layers, models, variances, scale * abs(slope) * share, stretch, (low, high), velocities)
+    uneven = float(gains.std()) / max(largest, 1e-30)
+    made = (band, profile, pwv, layers, models, variances, scale * largest, stretch, (low, high), velocities)
+    return Air(*made, uneven=uneven)
+
+
+def _gains(observation: Observation, band: BandAtmosphere, pwv: float, elevation: float) -> Floats:
+    """(n_det,) what a relative change of the water makes in a calibrated sample, K: dT/dlnPWV epsilon / (zeta e^-tau), where the
+    boresight has this elevation."""
+    plane, step = observation.focalplane, 1e-3
+    at = np.clip(elevation + plane.eta, ELEVATION_MIN, ELEVATION_MAX)
+    passed = np.maximum(np.asarray(band.transmission(pwv, at), np.float64), 1e-6)
+    slope = np.abs(np.asarray(band.emission_difference(pwv, pwv * step, at), np.float64)) / step
+    return np.asarray(slope * plane.illumination_efficiency / (plane.main_beam_efficiency * passed), np.float64)
 
 
 def _velocities(o: Observation, track: Track, layers: list[Layer]) -> list[Floats]:
@@ -149,8 +160,9 @@ def atmosphere_traits(operator: AtmosphereLayers, observation: Observation) -> T
 
 
 def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimate:
-    """Layers, their resolution, the band's spectrum, ozone, slopes with elevation."""
-    a = air(operator, context.first)
+    """Layers, their resolution, the band's spectrum, ozone, slopes with elevation. As for the observation at the lowest
+    elevation."""
+    a = air(operator, context.lowest)
     effects = [*_layer_effects(operator, context, a), *_resolution(operator, context, a), *_spectral(operator, context, a)]
     effects += _slopes(context, a)
     points = _points(operator, context, a, operator.tolerance) / len(context.observations)
@@ -159,16 +171,31 @@ def atmosphere_estimate(operator: AtmosphereLayers, context: Context) -> Estimat
     choice = CHOICE[0] + CHOICE[1] * context.first.n_detectors
     once = 0.05 + choice * len(context.observations)  # companions use the same plan
     cost = Cost(fixed + LATTICE * _cells(operator, context.first, a), per_sample=0.6e-9, once=once, bytes=20.0 * points + 60e6)
-    return Estimate(tuple(effects), cost)
+    return Estimate(tuple(effects), cost, _without(operator, context, effects))
+
+
+def _without(operator: AtmosphereLayers, context: Context, effects: list[Effect]) -> dict[str, float]:
+    """All layers; the mean emission, where no filter takes it out; and what other modes would then be removed."""
+    found = add(*(e.size for e in effects if e.name.startswith("layer ")))
+    if not any(t.response for t in context.traits.values()):
+        found = add(found, {"tod": context.mean_emission, "map_rms": context.mean_emission})
+    return add(found, context.other_modes(operator.label)) if context.removes_common else found
 
 
 def left_of_layer(context: Context, a: Air, k: int) -> float:
-    """rms of layer k in one calibrated sample after the common mode is gone, K."""
+    """rms of layer k in one calibrated sample after the common mode is gone, K: what the detectors see apart, and what they see
+    alike with other gains."""
     model = a.models[k]
+    whole = a.kelvin * model.amplitude * math.sqrt(a.variances[k])
     if not context.removes_common:
-        return a.kelvin * model.amplitude * math.sqrt(a.variances[k])
+        return whole
     xi, eta = some(context.first.focalplane.xi, context.first.focalplane.eta)
-    return a.kelvin * differential_rms(xi, eta, [model], a.stretch)
+    return math.hypot(a.kelvin * differential_rms(xi, eta, [model], a.stretch), _gain_scatter(context, a) * whole)
+
+
+def _gain_scatter(context: Context, a: Air) -> float:
+    """Relative rms of the detectors' gains: known ones, and the calibration's errors."""
+    return math.hypot(a.uneven, *(t.gain_error for t in context.traits.values()))
 
 
 def _correlated(operator: AtmosphereLayers, context: Context, model: LayerModel, wind: Any) -> float:
@@ -277,7 +304,7 @@ def _opacity_share(a: Air) -> float:
 def _resolution(operator: AtmosphereLayers, context: Context, a: Air) -> list[Effect]:
     """Nodes and steps in time; lattice; fidelity."""
     xi, eta = some(context.first.focalplane.xi, context.first.focalplane.eta)
-    left = a.kelvin * differential_rms(xi, eta, a.models, a.stretch)
+    left = math.hypot(a.kelvin * differential_rms(xi, eta, a.models, a.stretch), _gain_scatter(context, a) * a.rms)
     left = max(left, 0.01 * a.rms if len(xi) == 1 else 0.0)
     correlated = max(_correlated(operator, context, m, layer.wind) for m, layer in zip(a.models, a.layers, strict=True))
     choices = [full(f"within {operator.tolerance:g} of what the detectors' mean leaves")]
@@ -339,7 +366,7 @@ def _slopes(context: Context, a: Air) -> list[Effect]:
     share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max()) / float(a.band.transmission(a.pwv, low))
     size = context.bound(emission * share, context.first.duration, True)
     gone = "removed analytically by the high-pass filter" if context.cut > 0 else "in float64 beside the stream"
-    noise = context.bound(opacity / 2 * context.noise) | {"psd": opacity}
+    noise = context.bound(opacity / 2 * math.sqrt(sum(t.loudest**2 for t in context.traits.values()))) | {"psd": opacity}
     return [
         Effect("mean emission with elevation", (full(gone),), size, "difference of the band's emission over the elevations seen"),
         Effect("opacity with elevation", (full("calibrated at the current elevation"),), noise | context.sky_error(opacity),

@@ -42,7 +42,8 @@ def highpass_estimate(operator: HighpassFilter, context: Context) -> Estimate:
             )
     size = context.bound(context.fluctuation, o.duration, common=True)
     effect = Effect("high-pass decimation", tuple(choices), size, "rms of the stream: its low part removed wrongly altogether")
-    return Estimate((effect,), cost)
+    left_in = {m: size[m] + context.mean_emission for m in size}
+    return Estimate((effect,), cost, left_in | context.sky_error(1.0))
 
 
 LANCZOS = 0.5e-9
@@ -69,8 +70,10 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
     """
     count = steps(operator.residual, operator.modes, context) if operator.method == "svd" else 1.0
     cost = Cost(fixed=0.01, per_sample=0.4e-9 + LANCZOS * count)
+    size = context.bound(context.passed, _slow(context), common=True)
+    without = size | context.sky_error(1.0)
     if operator.method == "mean":
-        return Estimate((), cost)
+        return Estimate((), cost, without)
     choices = [full(f"residual {operator.residual:g}")]
     for residual in (1e-4, 1e-3, 1e-2):
         if residual > operator.residual:
@@ -87,9 +90,8 @@ def common_mode_estimate(operator: CommonModeFilter, context: Context) -> Estima
                     seconds=saved,
                 )
             )
-    size = context.bound(context.passed, _slow(context), common=True)
     effect = Effect("common-mode residual", tuple(choices), size, "rms of the stream: no common mode removed at all")
-    return Estimate((effect,), cost)
+    return Estimate((effect,), cost, without)
 
 
 def _slow(context: Context) -> float:

@@ -251,10 +251,11 @@ class BinMap(Operator):
         return 128 * self._n_pixels() + 150 * observation.n_samples
 
     def traits(self, observation: Observation) -> Traits:
-        """Size of the pixels."""
+        """Size of the pixels, and the weights."""
         from zonda.core.plan.estimate import Traits
 
-        return Traits(pixel=math.sqrt(4 * math.pi / (12 * self.nside**2)) if self.nside else self.pixel)
+        side = math.sqrt(4 * math.pi / (12 * self.nside**2)) if self.nside else self.pixel
+        return Traits(pixel=side, weighs=self.weights == "inverse_variance" and self.contents == "all")
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""

@@ -7,10 +7,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.errors import ZondaError
 from zonda.core.plan.context import LEAKS
-from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, add, full
 
 from .level import NoiseLevel, announced
 from .models import FixedNet
@@ -31,9 +32,14 @@ def pink_cost(poles: int) -> Cost:
 
 
 def white_traits(level: NoiseLevel, observation: Observation) -> Traits:
-    """rms of one calibrated sample, the quietest detector's; a level at the detector is taken behind a clear sky."""
-    net = float(np.min(level.sky_net(observation)))
-    return Traits(noise=net * math.sqrt(observation.sample_rate))
+    """rms of one calibrated sample of each detector, under the load that ``observation.smooth`` says."""
+    each = calibrated(level, observation)
+    return Traits(noise=float(each.min(initial=np.inf)) if each.size else 0.0, each=each)
+
+
+def calibrated(level: NoiseLevel, observation: Observation) -> NDArray[np.float64]:
+    """(n_det,) rms of one calibrated sample over the scan, K, under the load of its smooth means."""
+    return np.asarray(level.sky_net(observation) * math.sqrt(observation.sample_rate), np.float64)
 
 
 def pink_traits(pink: PinkNoise, observation: Observation) -> Traits:
@@ -55,7 +61,7 @@ def pink_traits(pink: PinkNoise, observation: Observation) -> Traits:
 
 def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
     """Poles of the recursive filter, and the noise altogether."""
-    o = context.first
+    o = context.lowest
     law, sigma, factor = _law(pink, o, pink.poles)
     cost = pink_cost(pink.poles)
     if law is None:
@@ -95,7 +101,10 @@ def pink_estimate(pink: PinkNoise, context: Context) -> Estimate:
         # a common part would be what a singular mode consists of: it is not dropped
         saved = cost.seconds(context.times, o.n_detectors) + 0.5e-9 * context.samples
         choices.append(Choice("dropped", "none", leave_out=True, bound=size, formula=text, seconds=saved))
-    return Estimate((Effect("poles", tuple(choices), size, text),), cost)
+    without = dict(size)
+    if pink.shared > 0 and context.removes_common:
+        without = add(size, context.other_modes(pink.label))
+    return Estimate((Effect("poles", tuple(choices), size, text),), cost, without)
 
 
 def difference(a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float) -> float:
@@ -154,5 +163,5 @@ def _law(pink: PinkNoise, observation: Observation, poles: int) -> tuple[PowerLa
     level = announced(observation)
     if pink.net is not None:
         level = NoiseLevel(FixedNet.of(pink.net, pink.reference), np.ones(observation.n_detectors))
-    sigma = float(np.max(level.sky_net(observation))) * math.sqrt(rate)
+    sigma = float(np.max(calibrated(level, observation)))
     return power_law_filter(f_min / rate, slope, poles), sigma, (knee / f_min) ** (slope / 2)

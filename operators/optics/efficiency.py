@@ -34,7 +34,7 @@ from zonda.core.operator import Operator
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
+    from zonda.core.plan.estimate import Estimate, Traits
 
 Floats = NDArray[np.float64]
 
@@ -114,6 +114,12 @@ class Efficiency(Operator):
         """Means at their nodes, and what is worked on at a time in `quotient`."""
         at_once = min(AT_ONCE, observation.n_detectors)
         return 700 * observation.n_detectors + 64 * at_once * (observation.n_samples // 512 + 3)
+
+    def traits(self, observation: Observation) -> Traits:
+        """Gains that the calibration does not know."""
+        from zonda.core.plan.estimate import Traits
+
+        return Traits(gain_error=self.calibration_error)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""

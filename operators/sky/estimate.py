@@ -53,7 +53,9 @@ def sky_estimate(operator: SkyMap, context: Context, grids: list[Working], reach
         error = -math.expm1(-2 * math.pi**2 * sigma**2 * k**2)
         text = "1 - exp(-2 pi^2 sigma^2 k^2) at k = 1 / (2 pixel) of the map, of the sky's peak"
         settings = {"beam": "none", "fwhm": None}
-        choices.append(Choice("dropped", "no beam", settings, bound=context.sky_error(error), formula=text, seconds=convolution))
+        bound = context.sky_error(error)
+        bound["transfer"] = math.expm1(min(2 * math.pi**2 * sigma**2 * k**2, 700.0))  # of the waves under the beam
+        choices.append(Choice("dropped", "no beam", settings, bound=bound, formula=text, seconds=convolution))
     effects = [Effect("beam convolution", tuple(choices), context.sky_error(1.0), "the sky's peak")]
     effects.append(_order(operator, context, sky, fwhm if reached else 0.0))
     effects.append(

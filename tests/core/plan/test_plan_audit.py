@@ -139,6 +139,16 @@ def test_a_slice_of_detectors(file):
     assert np.isfinite(data.products["map"].signal).any()
 
 
+def test_a_bound_that_nothing_exercised_is_not_said_to_hold(file):
+    """A layer of the atmosphere is not in the run of the sky alone, whose peak an audit compares."""
+    found = audit(file, zonda.plan(file, drop=["layer 3"], threads=1), threads=1, seconds=10.0)
+    verdicts = {(r.effect, r.metric): r.verdict for r in found.rows}
+    assert verdicts["AtmosphereLayers.layer 3", "tod"] == "holds"
+    assert verdicts["AtmosphereLayers.layer 3", "peak"] == verdicts["AtmosphereLayers.layer 3", "transfer"] == "not exercised"
+    assert "not exercised" in str(found).splitlines()[-1]
+    assert not found.violated
+
+
 class _Map:
     def __init__(self, signal, hits):
         self.signal, self.hits = np.asarray(signal), np.asarray(hits)
