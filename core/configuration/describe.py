@@ -71,10 +71,11 @@ def document(cls: type[BaseModel]) -> str:
 def signature(cls: type[BaseModel]) -> inspect.Signature:
     """Parameters with their defaults as a user would write them."""
     empty = inspect.Parameter.empty
-    return inspect.Signature(
+    made = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=empty if field.is_required() else _value(field))
         for name, field in cls.model_fields.items()
-    )
+    ]
+    return inspect.Signature(made)
 
 
 def written_choices(field: FieldInfo) -> str:

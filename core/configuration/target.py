@@ -49,6 +49,9 @@ _SEXAGESIMAL = re.compile(
     r"(?P<minutes>\d+(?:\.\d*)?)\s*(?P<mark2>m|'|′|:)?\s*(?:(?P<seconds>\d+(?:\.\d*)?)\s*(?:s|\"|″)?)?",
     re.IGNORECASE,
 )
+_SPACED = re.compile(r"(\d{1,2}) +(\d{1,2}) +(\d{1,2}(?:\.\d*)?)[ ,]+([-+]?\d{1,2}) +(\d{1,2}) +(\d{1,2}(?:\.\d*)?)")
+"""05 00 00 +20 00 00, as catalogues write it."""
+_EQUINOX = re.compile(r"\(?\b(?:J2000(?:\.0)?|FK5|B1950(?:\.0)?|FK4)\)?", re.IGNORECASE)
 _DECIMAL = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>.*)")
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "d", "°"), 1.0),
@@ -78,10 +81,10 @@ class Target:
 
     @classmethod
     def parse(cls, value: Any) -> Target:
-        """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, or a Target.
+        """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, a pair of angles (ICRS), a SkyCoord or a Target.
 
-        Text: two angles, sexagesimal (h for hours; colons mean hours for a right ascension and degrees elsewhere) or with
-        a unit; the frame's name or the coordinates' names may stand before them; ICRS where neither does.
+        Text: two angles, sexagesimal (h for hours; colons or spaces mean hours for a right ascension and degrees elsewhere) or
+        with a unit; the frame's name or the coordinates' names may stand before them; ICRS where neither does.
         Raises `pydantic_core.PydanticCustomError` (a ValueError) that says what was expected.
         """
         if isinstance(value, Target):
@@ -90,16 +93,39 @@ class Target:
             return cls._from_text(value)
         if isinstance(value, Mapping):
             return cls._from_mapping(value)
+        if isinstance(value, list | tuple) and len(value) == 2:
+            return cls._of("icrs", *value)
+        if hasattr(getattr(value, "icrs", None), "ra") and getattr(value, "isscalar", False):  # a SkyCoord
+            return cls("icrs", float(value.icrs.ra.rad) % (2 * math.pi), float(value.icrs.dec.rad))
         raise PydanticCustomError(
             "target_type", "expected a position such as '{eg}', got {got}", {"eg": _EXAMPLES[0], "got": repr(value)}
         )
 
     @classmethod
     def _from_text(cls, text: str) -> Target:
-        match = _PAIR.fullmatch(text.replace("\N{MINUS SIGN}", "-").strip())
+        plain = text.replace("\N{MINUS SIGN}", "-").strip()
+        if spaced := _SPACED.fullmatch(plain):
+            h, m, s, *dec = spaced.groups()
+            return cls._of("icrs", f"{h}:{m}:{s}", ":".join(dec))
+        match = _PAIR.fullmatch(plain)
         if match is None and text.strip().lower() == "map":
             raise PydanticCustomError(
                 "target_map", "'map', the centre of the input map, is for the target at the top level of a pipeline file", {}
+            )
+        if match is None and (_SEXAGESIMAL.fullmatch(plain) or (_DECIMAL.fullmatch(plain) and plain[-1:].isalpha())):
+            raise PydanticCustomError(
+                "target_one",
+                "{got} is one angle; a position needs two, a right ascension and a declination, such as '{eg}'",
+                {"got": repr(text), "eg": _EXAMPLES[0], "label": "one angle is missing"},
+            )
+        if match is None and (named := _EQUINOX.search(plain)):
+            raise PydanticCustomError(
+                "target_equinox",
+                "positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read",
+                {
+                    "word": named[0].strip(),
+                    "label": f"leave '{named[0].strip()}' out" + ("" if "2000" in named[0] else "; precess it"),
+                },
             )
         if match is None:
             raise PydanticCustomError(
@@ -181,7 +207,8 @@ class Target:
             }
             for pair in _KEYS.values()
         ]
-        return {"anyOf": [{"type": "string"}, *pairs], "examples": _EXAMPLES}
+        pair = {"type": "array", "items": {"type": "string"}, "minItems": 2, "maxItems": 2}
+        return {"anyOf": [{"type": "string"}, *pairs, pair], "examples": _EXAMPLES}
 
 
 def _radians(value: Any, name: str, *, hours: bool, wrap: bool = False) -> float:
@@ -234,6 +261,8 @@ def _sexagesimal(match: re.Match[str], name: str, *, hours: bool) -> float:
     minutes, seconds = float(match["minutes"]), float(match["seconds"] or 0)
     if minutes >= 60 or seconds >= 60:
         raise PydanticCustomError("target_sixty", "minutes and seconds of {name} {got} must be below 60", _about(name, match[0]))
+    if (match["mark"].lower() == "h" or (colons and hours)) and int(match["whole"]) >= 24:
+        raise PydanticCustomError("target_hours", "the hours of {name} {got} must be below 24", _about(name, match[0]))
     magnitude = int(match["whole"]) + (minutes + seconds / 60) / 60
     unit = 15.0 if match["mark"].lower() == "h" or (colons and hours) else 1.0
     return (-magnitude if match["sign"] == "-" else magnitude) * unit

@@ -86,8 +86,16 @@ def test_icrs_of_icrs_is_itself_and_horizontal_has_none() -> None:
     [
         ("Crab", "names of objects are not looked up"),
         ("75 20", "ra '75' has no unit; write an angle such as '75 deg'"),
-        ("75 deg", "cannot read"),
-        ("05 00 00 +20 00 00", "cannot read"),
+        ("75 deg", "'75 deg' is one angle; a position needs two"),
+        ("+25:00", "'+25:00' is one angle; a position needs two, a right ascension and a declination"),
+        ("05h00m00s", "is one angle"),
+        ("05 00 +20 00", "cannot read"),
+        ("05:00:00 +20:00:00 J2000", "positions are ICRS (FK5 J2000 to 0.1 arcsec); 'J2000' is not read"),
+        ("B1950 05:00:00 +20:00:00", "'B1950' is not read"),
+        ("25:00 +20:00", "the hours of ra '25:00' must be below 24"),
+        ("24h00m00s +20d", "the hours of ra '24h00m00s' must be below 24"),
+        (["75 deg"], "expected a position such as"),
+        (["75 deg", "2 K"], "unknown unit 'k' in dec"),
         ("5h 95 deg", "dec must lie between -90 deg and 90 deg, got 95 deg"),
         ("az 10 deg el -91 deg", "el must lie between"),
         ("05h61m00s 20 deg", "must be below 60"),
@@ -106,6 +114,23 @@ def test_bad_positions_say_what_is_expected(bad: object, message: str) -> None:
     (error,) = caught.value.errors()
     assert error["loc"] == ("target",)
     assert message in error["msg"]
+
+
+def test_forms_that_people_bring_along() -> None:
+    from astropy.coordinates import SkyCoord
+
+    wanted = Target.parse("13:47:30.6 -11:45:09")
+    for form in (
+        "13 47 30.6 -11 45 09",
+        "13 47 30.6, -11 45 09",
+        ["13:47:30.6", "-11:45:09"],
+        {"ra": "13:47:30.6", "dec": "-11:45:09"},
+    ):
+        assert Target.parse(form) == wanted
+    there = Target.parse(SkyCoord("13h47m30.6s -11d45m09s"))
+    assert there.frame == "icrs"
+    assert abs(there.longitude - wanted.longitude) < 1e-15 * 2 * math.pi  # two roundings of astropy's own at most
+    assert abs(there.latitude - wanted.latitude) < 1e-15
 
 
 def test_schema_examples_parse() -> None:
