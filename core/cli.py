@@ -120,8 +120,10 @@ class Commands(click.Group):
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
             from .configuration.diagnostics import nearest
+            from .configuration.locate import shipped
 
-            hint = f"did you mean 'zonda run {name}'?" if name.endswith((".yaml", ".yml")) else nearest(name, self.commands)
+            a_file = name.endswith((".yaml", ".yml")) or name in shipped()
+            hint = f"did you mean 'zonda run {name}'?" if a_file else nearest(name, self.commands)
             ctx.fail(f"there is no command '{name}'; {hint or 'see zonda --help'}")
         return super().resolve_command(ctx, args)
 

@@ -33,6 +33,17 @@ _WANTED = {
     "path": "the path of a file or folder",
 }
 """What pydantic's errors of type (or parsing) want, by the first word of their kind."""
+SYNONYMS = {
+    **dict.fromkeys(("steps", "pipeline", "ops"), "operators"),
+    **dict.fromkeys(("camera", "telescope", "receiver"), "instrument"),
+    **dict.fromkeys(("location", "observatory", "place"), "site"),
+    **dict.fromkeys(("date", "start", "begin", "epoch"), "time"),
+    **dict.fromkeys(("position", "source", "center", "field"), "target"),
+    **dict.fromkeys(("pwv", "atmosphere"), "weather"),
+    **dict.fromkeys(("output", "folder", "out"), "outputs"),
+}
+"""Keys that people write for another one."""
+
 _IN_PYTHON = {"a mapping of keys": "a dict", "true or false": "True or False"}
 
 
@@ -75,8 +86,7 @@ def explain(
 
 def _together(found: list[Diagnostic]) -> list[Diagnostic]:
     """More than two parameters that are missing at one place as one mistake; none that another name was meant for."""
-    meant = {d.label for d in found if d.message.startswith("unknown ")}
-    found = [d for d in found if not (" needs '" in d.message and f"did you mean {_missing(d)}?" in meant)]
+    found = without_meant(found)
     for span in dict.fromkeys(d.span for d in found):
         lacking = [d for d in found if d.span == span and " needs '" in d.message]
         if len(lacking) > 2:
@@ -85,6 +95,13 @@ def _together(found: list[Diagnostic]) -> list[Diagnostic]:
             one = Diagnostic(f"{lacking[0].message.split(' needs ')[0]} needs {names}", span, "these are missing", texts)
             found = [one if d is lacking[0] else d for d in found if d is lacking[0] or d not in lacking]
     return found
+
+
+def without_meant(found: list[Diagnostic]) -> list[Diagnostic]:
+    """Without what is missing as its name is written wrong: the wrong name says so."""
+    meant = {d.label for d in found if d.message.startswith("unknown ")}
+    lacking = [re.search(r" needs '(\w+)'", d.message) for d in found]
+    return [d for d, match in zip(found, lacking, strict=True) if not (match and f"did you mean '{match[1]}'?" in meant)]
 
 
 def _missing(diagnostic: Diagnostic) -> str:
@@ -103,7 +120,11 @@ def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str,
         owner, _ = _field(model, loc[:-1])
         options = list(keys if keys and len(loc) == 1 else (owner or model).model_fields)
         inside = who if len(loc) == 1 else f"{who}, {'.'.join(map(str, loc[:-1]))}"
-        hint = glued(e["loc"][-1], options) or nearest(e["loc"][-1], options, "not a known key")
+        name = e["loc"][-1]
+        meant = SYNONYMS.get(str(name).lower(), "")
+        hint = glued(name, options) or (
+            f"did you mean '{meant}'?" if meant in options else nearest(name, options, "not a known key")
+        )
         message = f"unknown {'parameter' if python else 'key'} '{e['loc'][-1]}' for {inside}"
         return Diagnostic(message, mark.start, hint, f"{inside} takes: {', '.join(options)}")
     if kind == "missing":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from .. import registry
 from . import yaml_places
 from .diagnostics import Diagnostic, nearest
 from .yaml_places import Document, Mark, Path, Source, Span
@@ -55,7 +56,10 @@ def _header_path(document: Document, parts: list[str]) -> Path:
         here = here.get(part)
         if not isinstance(here, dict):
             where = ".".join(parts[:depth])
-            raise _Refused(f"'{where}' is not a mapping", "", f"set '{where}' itself, or write it as a mapping in the file")
+            cure = f"set '{where}' itself, or write it as a mapping in the file"
+            if where in ("site", "instrument"):
+                cure += ": resolved.yaml of a run has it written out, under x-resolved"
+            raise _Refused(f"'{where}' is {'a name' if isinstance(here, str) else 'one value'}, not a mapping", "", cure)
     return tuple(parts)
 
 
@@ -65,7 +69,10 @@ def _step_path(document: Document, key: str, keys: list[str]) -> Path:
     name = max((n for n in names if key.startswith(f"{n}.") or key == n), key=len, default=None)
     if name is None:
         first = key.split(".")[0]
-        near = nearest(first, [*names, *keys])
+        owners = [
+            f"'{name}.{key}'" for name in names if name in registry.steps and first in registry.steps.get(name).model_fields
+        ]
+        near = f"did you mean {' or '.join(owners)}?" if owners and "." not in key else nearest(first, [*names, *keys])
         cure = f"it has the steps {', '.join(names)} and the keys {', '.join(keys)}"
         raise _Refused(f"nothing is called '{first}' in this pipeline", near, cure)
     same = [path for path, labels in steps if name in labels]

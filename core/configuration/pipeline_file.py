@@ -22,7 +22,7 @@ from ..weather import WeatherSource, resolve
 from . import overrides as settings
 from . import yaml_places
 from .diagnostics import ConfigurationError, Diagnostic, nearest
-from .explain import explain, glued
+from .explain import explain, glued, without_meant
 from .locate import locate, read
 from .parameters import Parameters, quantity
 from .units import Fraction
@@ -233,7 +233,7 @@ class _Check:
         if scene is not None and not self.mistakes and self.target_of_map:
             scene = self.targeted(scene, [s.operator for s in steps if s is not None])
         if self.mistakes:
-            raise ConfigurationError(self.mistakes, self.name)
+            raise ConfigurationError(without_meant(self.mistakes), self.name)
         assert header is not None
         assert scene is not None
         stem = re.sub(r"[^\w.+-]", "_", Path(self.name).stem).lstrip("_.+-") or "pipeline"
@@ -330,7 +330,7 @@ class _Check:
         if isinstance(given.get("instrument"), dict):
             given["instrument"] = dict(given["instrument"])
             if not self.named(given["instrument"], "band", registry.bands, ("instrument", "band")):
-                given["instrument"]["band"] = {"name": "", "low": 1.0, "high": 2.0}  # goes on to find the other mistakes
+                given["instrument"]["band"] = {"name": "", "low": "1 Hz", "high": "2 Hz"}  # goes on to find the other mistakes
         if given.get("weather") is not None:
             given["weather"] = self.weather(given["weather"])
         before = len(self.mistakes)

@@ -81,7 +81,7 @@ class Target:
 
     @classmethod
     def parse(cls, value: Any) -> Target:
-        """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, a pair of angles (ICRS), a SkyCoord or a Target.
+        """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, a pair of angles (ICRS), SkyCoord or Target.
 
         Text: two angles, sexagesimal (h for hours; colons or spaces mean hours for a right ascension and degrees elsewhere) or
         with a unit; the frame's name or the coordinates' names may stand before them; ICRS where neither does.

@@ -370,3 +370,8 @@ def test_warnings_are_one_line(here: Path, plugin: Callable[..., Path]) -> None:
     done = subprocess.run([*RUN, "--help"], capture_output=True, text=True, env=environment, check=True)
     (line,) = done.stderr.splitlines()
     assert line.startswith("warning: plugin zonda-typo 0.8 (zc_typo): 'zonda_progress' is not called")
+
+
+def test_a_shipped_pipeline_given_as_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["mustang2_cluster"]) == 2
+    assert "did you mean 'zonda run mustang2_cluster'?" in capsys.readouterr().err

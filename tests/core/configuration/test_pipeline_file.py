@@ -342,7 +342,7 @@ def test_settings_by_own_name_and_number(toys: Any) -> None:
         ("ToyNoise.=3", 1, "is a step, not a parameter"),
         ("ToyNoise.3.knee=1 Hz", 1, "there is no step 'ToyNoise.3'"),
         ("ToyNoise.knee.x=1 Hz", 1, "'ToyNoise.knee' is not a mapping"),
-        ("site.altitude=1 km", 1, "'site' is not a mapping"),
+        ("site.altitude=1 km", 1, "'site' is a name, not a mapping"),
         ("operators=[]", 1, "the list of operators cannot be set"),
         ("seed=[", 7, "not valid YAML"),
         ("site=moon", 6, "unknown site 'moon'"),
@@ -460,6 +460,27 @@ def test_a_space_missing_in_a_step(toys: Any, step: str, column: int, words: str
     (found,) = mistakes(toys.head + "".join(steps[:-1]) + f"  - {step}\n")
     assert found.span.column + 1 == column
     assert found.label == words
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [("intrument", "instrument"), ("camera", "instrument"), ("observatory", "site"), ("start", "time"), ("steps", "operators")],
+)
+def test_a_key_of_another_name_is_one_mistake(toys: Any, written: str, meant: str) -> None:
+    (found,) = mistakes((toys.head + toys.steps).replace(f"{meant}:", f"{written}:"))
+    assert found.message == f"unknown key '{written}' for the pipeline"
+    assert found.label == f"did you mean '{meant}'?"
+
+
+def test_many_missing_keys_are_one_mistake(toys: Any) -> None:
+    (found,) = mistakes(toys.head.replace("instrument: toy_camera", "instrument: {name: x, band: toy_band}") + toys.steps)
+    assert "needs 'telescope', 'detectors', 'field_of_view'" in found.message
+    assert "detectors: Number of detectors." in found.help
+
+
+def test_a_setting_without_its_step_names_the_step(toys: Any) -> None:
+    (found,) = mistakes(toys.head + toys.steps, "pixel=3 arcsec")
+    assert found.label == "did you mean 'ToyMap.pixel'?"
 
 
 @pytest.mark.parametrize("zone", ["+25:00", "-15:00", "+05:99"])
