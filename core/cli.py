@@ -192,7 +192,8 @@ _no_prune = click.option("--no-prune", is_flag=True, help="Simulate everything i
     "--memory",
     type=Bytes(),
     metavar="SIZE",
-    help="Most memory to hold, e.g. 4GB; results do not depend on it.  [default: half of the free]",
+    help="Most memory to hold, of a campaign all its workers' on this machine (with MPI and Dask each process's), e.g. 4GB; "
+    "results do not depend on it.  [default: half of the free]",
 )
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
 @click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")

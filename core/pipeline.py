@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -196,7 +197,11 @@ class Pipeline:
             self._meanwhile(data, "pointing")
         if ceiling is not None or memory is None:
             steps, parts = self.selection.steps(""), len(parts_of(self.derived))
-            divide(steps, data.observations, settings, ahead, ceiling, memory, parts, self.name)
+            divide(steps, data.observations, settings, ahead, ceiling, memory, parts, self.name, part is None)
+            if settings.threads < data.threads and part is None:
+                text = f"{settings.threads} of {data.threads} threads work: more do not fit in the memory budget"
+                warnings.warn(f"{self.name}: {text}", stacklevel=2)
+            data.threads = settings.threads
         simulation = Simulation(self.selection, self.order, self.derived, data, keep, hooks, settings, timer, ahead)
         derivation = Derivation(self.selection, self.derived)
         try:

@@ -78,7 +78,7 @@ def run(
 @workers_option
 @scheduler_option
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads of each task.  [default: a worker's share]")
-@click.option("--memory", metavar="SIZE", help="Memory budget of each task, e.g. 4GB.  [default: a worker's share]")
+@click.option("--memory", metavar="SIZE", help="As of `zonda run`, e.g. 4GB.  [default: half of the free]")
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated.")
 def resume(
     folder: Path,

@@ -37,7 +37,13 @@ class Pool:
     ahead
         Tasks that may wait in the executor's own queue, so that no worker is idle while results are noted down.
     threads, memory
-        For each task; None: the worker decides (all it may use).
+        For each task; None: the worker decides (all it may use). The memory is that of its whole process.
+    asked
+        Memory that the user asked for; None: nothing.
+    fixed
+        Whether the user asked for this number of workers.
+    resize
+        Go on with another number of workers; None: they were started by others.
     remake
         A new executor in place of a broken one; None where there is no such thing.
     stop
@@ -51,6 +57,9 @@ class Pool:
     memory: int | None = None
     remake: Callable[[], Executor] | None = None
     stop: Callable[[], None] | None = None
+    asked: int | None = None
+    fixed: bool = False
+    resize: Callable[[int], None] | None = None
 
 
 class SerialExecutor(Executor):
@@ -88,7 +97,8 @@ def engine(
     workers
         Of ``processes``; default: as many as CPUs. MPI and Dask have those that were started.
     threads, memory
-        For each task; default: the machine's CPUs, and half of its free memory, shared among the workers.
+        Threads for each task, and memory of the whole campaign on this machine (with MPI and Dask: of each process); default:
+        the machine's CPUs, and half of its free memory, shared among the workers. `memory.share_out` divides and checks it.
 
     Raises
     ------
@@ -96,7 +106,7 @@ def engine(
         Where a package is missing, or the scheduler of Dask is not named or cannot be reached.
     """
     if name == "serial":
-        yield Pool(SerialExecutor(), 1, 0, threads, memory)
+        yield Pool(SerialExecutor(), 1, 0, threads, memory, asked=memory)
     elif name == "processes":
         with _processes(workers, threads, memory) as pool:
             yield pool
@@ -122,8 +132,7 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
                 return super().submit(fn, *args, **kwargs)
 
     count = workers or available_threads()
-    threads = threads or max(1, available_threads() // count)
-    memory = memory or available_memory() // 2 // count
+    share = (memory or available_memory() // 2) // count
     made: list[ProcessPoolExecutor] = []
 
     def make() -> Executor:
@@ -139,8 +148,15 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
         for pool in made:
             _end(pool)
 
+    def resize(number: int) -> None:
+        opened.workers = number
+        opened.threads = threads or max(1, available_threads() // number)
+        opened.executor = make()
+
+    opened = Pool(None, count, 1, threads, share, make, stop, memory, workers is not None, resize)
+    resize(count)
     try:
-        yield Pool(make(), count, 1, threads, memory, make, stop)
+        yield opened
     except BaseException:
         stop()
         raise
@@ -217,7 +233,9 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
         mine = max(1, here - 1) if size == here else here
         bound = available_threads() < (os.cpu_count() or 1)  # each process has CPUs of its own, as srun gives them
         threads = threads or (available_threads() if bound else max(1, available_threads() // mine))
-        yield Pool(cast(Executor | None, executor), size - 1, size - 1, threads, memory or available_memory() // 2 // mine)
+        yield Pool(
+            cast(Executor | None, executor), size - 1, size - 1, threads, memory or available_memory() // 2 // mine, asked=memory
+        )
 
 
 @contextlib.contextmanager
@@ -259,8 +277,9 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
         count = max(1, sum(int(w["nthreads"]) for w in workers))  # a Dask worker does as many tasks at once as it has threads
         limits = [int(w["memory_limit"]) // int(w["nthreads"]) for w in workers if w.get("memory_limit")]
         yield Pool(
-            client.get_executor(pure=False, retries=0), count, count, threads or 1, memory or min(limits, default=0) // 2 or None
-        )
+            client.get_executor(pure=False, retries=0), count, count, threads or 1, memory or min(limits, default=0) // 2 or None,
+            asked=memory,
+        )  # fmt: skip
 
 
 def _address(scheduler: str) -> str:

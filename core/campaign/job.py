@@ -117,6 +117,8 @@ class Job:
     combinations: tuple[Combination, ...]
     tasks: tuple[Task, ...] = field(repr=False)
     same_machine: bool = False
+    need: int = 0
+    """Least bytes with which a process runs any task; 0: not known."""
 
     @property
     def samples(self) -> int:

@@ -19,6 +19,11 @@ from .settings import MOST_TASKS, Campaign
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
     from ..configuration.time import Instant
+    from ..data import Data
+
+
+MEASURED = 8
+"""Pipelines of each combination that are asked how much memory they need."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def job(
     tasks: list[Task] = []
     planned_files: list[PipelineFile] = []
     files: dict[str, str] = {}
-    entry_number = 0
+    entry_number, need = 0, 0
     for source in sources:
         campaign = source.campaign
         found = entries(campaign, source.file.scene().seed, lambda settings, s=source: s.load(settings).scene().time)  # type: ignore[misc]
@@ -106,7 +111,9 @@ def job(
                     files |= _files(planned_files[-1])
                 planned.append((number, entry, groups[entry.settings, share]))
             looks = [Look(group, entry.seed, entry.time, about(entry)) for _, entry, group in planned]
-            layouts, scans = agree(looks, planned_files)
+            pointed: dict[int, Data] = {}
+            layouts, scans = agree(looks, planned_files, pointed)
+            need = max([need, *(_need(planned_files[group], data, layouts) for group, data in pointed.items())])
             name, subfolder = _names(source, together[0][1], combinations)
             combination = Combination(name, subfolder, "")
             path = folder / TASKS / combination.layout_file(len(combinations))
@@ -131,6 +138,7 @@ def job(
         combinations=tuple(combinations),
         tasks=tuple(tasks),
         same_machine=first.same_machine,
+        need=need,
     )
 
 
@@ -159,11 +167,13 @@ def changed(job: Job) -> list[str]:
     return [path for path, stamp in job.files.items() if _stamp(Path(path), stamp.partition(":")[0]) != stamp]
 
 
-def agree(looks: Sequence[Look], files: Sequence[PipelineFile]) -> tuple[dict[str, Mapping[str, Any]], list[tuple[int, ...]]]:
+def agree(
+    looks: Sequence[Look], files: Sequence[PipelineFile], pointed: dict[int, Data] | None = None
+) -> tuple[dict[str, Mapping[str, Any]], list[tuple[int, ...]]]:
     """What the operators agree on for all scans of a combination; and the samples (detectors x samples) of each entry's scans.
 
     The telescope is pointed for one entry after the other, once for those that begin at the same time, and only as long as that
-    can change something. Raises `PointingError` where it cannot be.
+    can change something. Raises `PointingError` where it cannot be. ``pointed``: takes the first entry of some of the pipelines.
     """
     layouts: dict[str, Mapping[str, Any]] = {}
     by_start: dict[tuple[int, int], tuple[int, ...]] = {}
@@ -177,7 +187,9 @@ def agree(looks: Sequence[Look], files: Sequence[PipelineFile]) -> tuple[dict[st
                 by_start[at] = by_pipeline[look.pipeline]
             else:
                 with _placed(look.place):
-                    by_start[at] = _point(files[look.pipeline], look, layouts)
+                    data, by_start[at] = _point(files[look.pipeline], look, layouts)
+                if pointed is not None and len(pointed) < MEASURED:
+                    pointed.setdefault(look.pipeline, data)
                 by_pipeline[look.pipeline] = by_start[at]
         found.append(by_start[at])
     return layouts, found
@@ -200,8 +212,8 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
         )
 
 
-def _point(file: PipelineFile, look: Look, layouts: dict[str, Mapping[str, Any]]) -> tuple[int, ...]:
-    """Point the telescope, let the operators agree; the samples of each scan."""
+def _point(file: PipelineFile, look: Look, layouts: dict[str, Mapping[str, Any]]) -> tuple[Data, tuple[int, ...]]:
+    """Point the telescope, let the operators agree; the observations, and the samples of each."""
     from ..data import Data
 
     pipeline = file.pipeline()
@@ -212,7 +224,20 @@ def _point(file: PipelineFile, look: Look, layouts: dict[str, Mapping[str, Any]]
     for operator in pipeline.operators:
         if not operator.at_end and (agreed := operator.agree(data, layouts.get(operator.label))) is not None:
             layouts[operator.label] = agreed
-    return tuple(o.n_detectors * o.n_samples for o in data.observations)
+    return data, tuple(o.n_detectors * o.n_samples for o in data.observations)
+
+
+def _need(file: PipelineFile, data: Data, layouts: Mapping[str, Mapping[str, Any]]) -> int:
+    """Least bytes with which a process runs a pipeline over these observations."""
+    from ..run.memory_budget import least
+
+    pipeline = file.pipeline()
+    for operator in pipeline.operators:
+        if operator.label in layouts:
+            operator.lay_out(layouts[operator.label])
+        elif not operator.at_end and "boresight" not in operator.provides:
+            operator.observe(data)
+    return least(pipeline, data.observations)
 
 
 def _tasks(

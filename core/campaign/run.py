@@ -33,6 +33,7 @@ from .folder import (
 from .job import FILE, LOG, TASKS, Job, Task, digest_of_text, plural
 from .log import Log, Row
 from .machines import Watch
+from .memory import share_out
 from .prepare import Source, changed, restore_layout
 from .prepare import job as prepare
 from .reduce import Combined, combine
@@ -90,6 +91,11 @@ def begin(
     except BaseException:
         make_way(folder)  # of the layouts of a campaign that does not begin
         raise
+    try:
+        share_out(pool, made.need, made.name)
+    except BaseException:
+        make_way(folder)
+        raise
     _describe(made, folder, say)
     write_sources(made, folder)
     with contextlib.closing(open_log(folder / LOG, made)) as log:
@@ -110,6 +116,7 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_mac
     job = Job.read(folder)
     strict = job.same_machine if same_machine is None else same_machine
     check_unchanged(job, folder, anyway)
+    share_out(pool, job.need, job.name)
     clean(folder)
     log = opened(folder, job, say)
     with contextlib.closing(log):
@@ -141,6 +148,7 @@ def share(
     job = Job.read(folder)
     if job.source != tuple(s.file.resolved_yaml() for s in sources) or job.version != __version__:
         raise OutputError("holds another campaign", place=str(folder), cure="choose another output folder")
+    share_out(pool, job.need, job.name)
     mine = [task for task in job.tasks if task.number % of == which - 1]
     path = folder / f"jobs.{which}-of-{of}.sqlite"
     try:

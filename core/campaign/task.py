@@ -39,7 +39,7 @@ class Order:
     folder
         The campaign's output folder, as the worker sees it.
     threads, memory
-        For this task; None: all of the machine's.
+        For this task; None: all of the machine's. The memory is that of the worker's whole process.
     version
         Of the zonda that sends it.
     """
@@ -140,7 +140,7 @@ def _run(order: Order) -> str:
         scene_of(file, task.seed, Instant(task.time)),
         output=entry_folder(folder, task),
         threads=order.threads,
-        memory=order.memory,
+        ceiling=order.memory,
         provenance={"resolved_yaml": order.pipeline},
         part=part,
     )

@@ -3,7 +3,8 @@
 numba's own cache keeps an index beside numbered files. Two first runs at once may give one number to two kernels, so that the
 next run loads the wrong machine code; a truncated file ends the run with a traceback; and a kernel stays as it was compiled
 when a function of another module that it calls has changed. Here a file's name is a hash of all that its content depends on,
-its content is checked by a hash, and it is written under another name first. So files are written by any number of runs at
+its content is checked by a hash, which knows the name too, and it is written under another name first. What others may have
+written is not run (`core.storage.own_files`). So files are written by any number of runs at
 once, damaged ones are compiled again, and nothing stale is ever loaded. Processes that share the work (`share`) compile no
 kernel twice: each locks the name of what it compiles, and who wants the same waits for it.
 """
@@ -32,9 +33,11 @@ from numba.core import caching, codegen, dispatcher, environment
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
+from ..storage import user_cache
+from ..storage.own_files import ForeignFile, own_folder, read_own
 from .keep_kernels import CHANGED, left_to_numba
 
-FORMAT = 2
+FORMAT = 3
 _DIGEST = 16
 SUFFIX = ".zkc"
 
@@ -249,6 +252,8 @@ class KernelFiles:
     """
 
     def __init__(self, folder: str, base: str, function: Any) -> None:
+        with suppress(OSError, RuntimeError):
+            folder = str(own_folder(Path(folder), user_cache.folder() / "kernels"))
         self.folder, self.base, self.function = Path(folder), base, function
         self._meaning = b""
         self.asked: Path | None = None
@@ -265,11 +270,15 @@ class KernelFiles:
         """What was kept under ``key``, or None."""
         path = self.asked = self.path(key)
         try:
-            content = path.read_bytes()
+            content = read_own(path)
+        except ForeignFile as error:
+            warnings.warn(f"compiled code is not taken from {path}: {error}", stacklevel=2)
+            self.asked = None
+            return None
         except OSError:
             return None
         body = memoryview(content)[_DIGEST:]
-        if hashlib.blake2b(body, digest_size=_DIGEST).digest() != content[:_DIGEST]:
+        if _checksum(path, body) != content[:_DIGEST]:
             self.give_up()
             return None
         return _Reader(io.BytesIO(body)).load()
@@ -280,7 +289,8 @@ class KernelFiles:
         temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(hashlib.blake2b(body, digest_size=_DIGEST).digest() + body)
+            temporary.write_bytes(_checksum(path, body) + body)
+            temporary.chmod(0o644)  # whatever the umask: what others may write to is not read
             os.replace(temporary, path)
         except BaseException:
             with suppress(OSError):
@@ -299,6 +309,11 @@ class KernelFiles:
         for path in self.folder.glob(f"{self.base}.*{SUFFIX}"):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
+
+
+def _checksum(path: Path, body: Any) -> bytes:
+    """Of a file's name and content: a whole file of another kernel, put in this one's place, is damaged too."""
+    return hashlib.blake2b(path.name.encode() + b"\0" + bytes(body), digest_size=_DIGEST).digest()
 
 
 class _Reader(pickle.Unpickler):

@@ -218,6 +218,9 @@ class Execution:
         room = max(settings.ceiling - (resident_memory() - known), 1)
         if room < settings.memory:
             self.settings = settings = copy.copy(settings)
+            if room < settings.least:  # the operators took a little more than they said: work on fewer blocks at once
+                threads = max(1, settings.threads * room // settings.least)
+                room, settings.threads = max(room, settings.least * threads // settings.threads), threads
             settings.memory = room
             self._store = Store(room, settings.dtype, settings.spare, self.ledger)
             self.layout = Layout(self.observation, settings, self.layout.streams, self.layout.means)

@@ -84,9 +84,18 @@ def spares(operators: Sequence[Operator], observation: Observation, settings: Se
 
 
 def room(
-    operators: Sequence[Operator], observations: Sequence[Observation], settings: Settings, budget: int, place: str
+    operators: Sequence[Operator],
+    observations: Sequence[Observation],
+    settings: Settings,
+    budget: int,
+    place: str,
+    kept: int = 0,
+    fresh: bool = True,
 ) -> tuple[int, int]:
     """Bytes that streams and blocks may take in a process that may hold ``budget``, and bytes of products still to come.
+
+    ``kept``: bytes of products that other runs are derived from. Where the blocks of all threads do not fit, ``settings.threads``
+    becomes less: results do not depend on it. ``fresh``: this process holds nothing yet but its libraries.
 
     Raises
     ------
@@ -95,23 +104,41 @@ def room(
         make it fit.
     """
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
-    parts = {"zonda and its libraries": max(resident_memory(), BASE)}
+    parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
     parts.update((o.label, o.memory(longest)) for o in operators)
+    parts |= {"products to derive runs from": kept} if kept else {}
     fixed = sum(parts.values())
     left = dataclasses.replace(settings, memory=max(budget - fixed, 1))
     found = forecast(operators, longest, left)
+    if fixed + found.least > budget and left.threads > 1:
+        left.threads = max(1, min(left.threads - 1, (budget - fixed) * left.threads // found.least))
+        found = forecast(operators, longest, left)
     if fixed + found.least > budget:
-        _refuse(operators, parts, found.least, budget, settings.threads, place)
-    return left.memory, sum(parts[o.label] for o in operators if o.product_only)
+        _refuse(operators, parts, found.least, budget, left.threads, place)
+    settings.threads, settings.least = left.threads, found.least
+    return left.memory, kept + sum(parts[o.label] for o in operators if o.product_only)
+
+
+def need(operators: Sequence[Operator], observations: Sequence[Observation], settings: Settings, kept: int = 0) -> int:
+    """Least bytes with which a process runs these operators over the observations, on one thread, libraries included.
+
+    ``kept`` as in `room`; ``settings.memory`` plays no part.
+    """
+    longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
+    one = dataclasses.replace(settings, threads=1)
+    return _with_margin(BASE + kept + sum(o.memory(longest) for o in operators) + forecast(operators, longest, one).least)
+
+
+def _with_margin(size: int) -> int:
+    """A size that is to be asked for: what the libraries take differs a little from run to run."""
+    return -(-size * 21 // 20_000_000) * 1_000_000
 
 
 def _refuse(operators: Sequence[Operator], parts: Mapping[str, int], blocks: int, budget: int, threads: int, place: str) -> None:
     need, free = sum(parts.values()) + blocks, available_memory() + resident_memory()
-    rows = sorted([*parts.items(), (f"blocks on {threads} threads", blocks)], key=lambda row: -row[1])
+    rows = sorted([*parts.items(), (f"blocks on {threads} thread{'s' if threads > 1 else ''}", blocks)], key=lambda row: -row[1])
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
-    cures = [f"use --memory {-(-need * 21 // 20_000_000)}MB"] if need * 1.05 <= free else []
-    if threads > 1 and blocks * (1 - 1 / threads) >= need - budget:
-        cures.append("use --threads 1")
+    cures = [f"use --memory {_with_margin(need) // 1_000_000}MB"] if need * 1.05 <= free else []
     cures += [f"{o.label}: {o.lighter}" for o in operators if o.lighter and parts[o.label] > 0.1 * need]
     if blocks > 0.1 * need and parts["zonda and its libraries"] < budget:
         cures.append("split the scan into shorter ones")

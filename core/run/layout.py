@@ -173,5 +173,5 @@ class Layout:
     def _ceiling_for(self, need: int) -> str:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""
         settings = self.settings
-        fixed = max(settings.ceiling - settings.memory, 0) if settings.ceiling else 0
-        return f"{-(-(need + fixed) // 1_000_000)}MB"
+        fixed = max(settings.asked - settings.memory, 0) if settings.asked else 0
+        return f"{-(-(need + fixed) * 21 // 20_000_000)}MB"

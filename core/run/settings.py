@@ -27,6 +27,10 @@ class Settings:
         Bytes that the whole process may hold; None: only ``memory`` counts.
     dtype
         Type of the streams.
+    asked
+        Bytes that were asked for (``--memory``), of which ``memory`` is what is left for streams and blocks.
+    least
+        Bytes of the smallest blocks on all ``threads``.
     prefer
         What is done with streams that do not fit in memory where there is a choice; None: what is quicker.
     progress
@@ -45,6 +49,8 @@ class Settings:
     kept: list[Floats] = field(default_factory=list)
     ceiling: int | None = None
     prefer: Held | None = None
+    asked: int | None = None
+    least: int = 0
 
 
 @dataclass

@@ -437,3 +437,36 @@ def test_kernels_that_others_call_say_how_they_round():
             called = (function.__globals__.get(name) for name in function.__code__.co_names)
             silent |= {k.py_func.__qualname__ for k in called if isinstance(k, Dispatcher) and "fastmath" not in k.targetoptions}
     assert not silent
+
+
+def test_a_kernel_in_the_place_of_another_does_not_run(folder, monkeypatch):
+    """A whole file of another kernel under this one's name: its content is right, its name is not."""
+    assert fresh(folder, monkeypatch)(2.0) == 7.0
+    (mine,) = kept(folder, "outer")
+    write(folder, factor=5.0)
+    assert fresh(folder, monkeypatch)(2.0) == 11.0
+    (other,) = (path for path in kept(folder, "outer") if path != mine)
+    mine.write_bytes(other.read_bytes())
+    write(folder)
+    again = fresh(folder, monkeypatch)
+    with pytest.warns(UserWarning, match="was damaged; it is compiled again"):
+        assert again(2.0) == 7.0
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners and modes are those of POSIX")
+def test_a_kernel_that_others_may_write_to_does_not_run(folder, monkeypatch, tmp_path):
+    monkeypatch.setenv("ZONDA_CACHE_DIR", str(tmp_path / "mine"))
+    assert fresh(folder, monkeypatch)(2.0) == 7.0
+    (path,) = kept(folder, "outer")
+    path.chmod(0o666)
+    again = fresh(folder, monkeypatch)
+    with pytest.warns(UserWarning, match="is not taken from .*it may be written to by others"):
+        assert (again(2.0), hits(again)) == (7.0, 0)
+    assert path.stat().st_mode & 0o777 == 0o644  # made anew
+    path.parent.chmod(0o777)
+    elsewhere = fresh(folder, monkeypatch)
+    assert (elsewhere(2.0), hits(elsewhere)) == (7.0, 0)
+    assert kept(tmp_path / "mine", "outer")
+    assert (tmp_path / "mine/kernels").stat().st_mode & 0o777 == 0o700
+    third = fresh(folder, monkeypatch)
+    assert (third(2.0), hits(third)) == (7.0, 1)

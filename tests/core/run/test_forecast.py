@@ -9,7 +9,7 @@ import pytest
 from tests.core.run.test_execution import CHAIN, Demean, Level, Scale, Sink, Source, execute, observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.run.forecast import BASE, forecast, room
+from zonda.core.run.forecast import BASE, forecast, need, room
 from zonda.core.run.settings import Settings
 
 
@@ -68,11 +68,27 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
     assert left == 10**9 - BASE
 
 
-def test_blocks_that_are_too_large_ask_for_fewer_threads_or_shorter_scans(monkeypatch):
-    obs = observation(16, 1_000_000)
+def test_blocks_that_are_too_large_are_worked_on_by_fewer_threads(monkeypatch):
+    """Blocks of 4 threads take 774 MB, of one 193.5 MB: 630 MB less the libraries' 230 MB have room for two of them."""
+    obs, settings = observation(16, 1_000_000), Settings(threads=4)
     monkeypatch.setattr("zonda.core.run.forecast.resident_memory", lambda: BASE)
-    with pytest.raises(PipelineError, match=r"(?s)blocks on 4 threads 774 MB.*--threads 1; or split the scan into shorter ones"):
-        room(labelled([Source(), Demean(), Sink()]), [obs], Settings(threads=4), 6 * 10**8, "test")
+    room(labelled([Source(), Demean(), Sink()]), [obs], settings, 630 * 10**6, "test")
+    assert settings.threads == 2
+
+
+def test_the_figure_that_a_refusal_names_works(monkeypatch):
+    obs, chain = observation(16, 1_000_000), labelled([Source(), Demean(), Sink()])
+    monkeypatch.setattr("zonda.core.run.forecast.resident_memory", lambda: BASE)
+    for kept in (0, 300_000_000):
+        with pytest.raises(PipelineError, match=r"blocks on 1 thread 19\d MB") as refused:
+            room(chain, [obs], Settings(threads=4), 3 * 10**8, "test", kept)
+        found = re.search(r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure)
+        assert found is not None
+        settings = Settings(threads=4)
+        settings.memory, _ = room(chain, [obs], settings, int(found[1]) * 10**6, "test", kept)
+        assert settings.threads == 1
+        assert settings.memory >= settings.least
+        assert int(found[1]) * 10**6 >= need(chain, [obs], Settings(threads=4), kept)
 
 
 def test_no_cure_is_named_that_cannot_work(monkeypatch):
