@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -199,3 +201,42 @@ def one_atmosphere() -> float:
     """1 - correlation of the atmosphere's fluctuation at 93 and at 225 GHz, equal beams"""
     one, two = _two_bands()
     return 1 - _correlation(one.detdata["atmosphere"], two.detdata["atmosphere"])
+
+
+PLANNED = """
+site: chajnantor
+instrument:
+  name: check
+  telescope: {{name: dish, diameter: 6 m}}
+  band: {{name: b, low: 800 GHz, high: 900 GHz}}
+  detectors: 37
+  field_of_view: 10 arcmin
+  main_beam_efficiency: 0.6
+  illumination_efficiency: 0.9
+  net: 1 mK s(1/2)
+  sample_rate: 50 Hz
+time: 2024-07-25T11:00
+target: 05h00m00s -20d00m00s
+operators:
+  - PointingDaisy: {{scan_duration: 20 s, scans: 2, gap: 1 h, radius: 3 arcmin, speed: 1 arcmin/s}}
+  - AtmosphereLayers: {{pwv: 1.5 mm, layers: 3}}
+  - WhiteNoise: {white}
+  - Efficiency
+  - BinMap: {{pixel: 8 arcsec}}
+"""
+
+
+@checks.add(LEVEL, reference="the NET of the run, which is simulated", limit=0.02, quick=False)
+def planned() -> float:
+    """largest relative difference of the noise of a sample that a plan states, at the detector and background-limited, 850 GHz"""
+    worst = 0.0
+    for white in ("{net: 1 mK s(1/2), reference: detector}", "{model: background_limited}"):
+        with TemporaryDirectory(prefix="zonda-check-") as folder:
+            path = Path(folder) / "planned.yaml"
+            path.write_text(PLANNED.format(white=white), encoding="utf-8")
+            file = zonda.load(path)
+            made = zonda.plan(file, threads=1)
+        run = file.pipeline().run(file.scene(), threads=1)
+        squares = [float(np.mean(o.focalplane.net**2)) * o.sample_rate for o in run.observations]
+        worst = largest(worst, abs(made.noise[0] / math.sqrt(np.mean(squares)) - 1))
+    return worst
