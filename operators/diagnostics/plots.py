@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .canvas import ARCMIN, CHARACTER, COLOURS, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
-from .map_plots import map_axes, plot_coverage, plot_map
+from .map_layout import map_axes
+from .map_plots import plot_coverage, plot_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -61,11 +61,11 @@ def results(data: Data, diameter: float) -> str:
         cards.append((shown, f"rms, {where}, {words[figure.of]}{how}{label}"))
         if smoothed:
             cards.append((brightness(figure.rms), f"the same before smoothing, per {angle(maps[figure.product].pixel)} pixel"))
-    for name, product in maps.items():
+    for name, made in maps.items():
         if "/" not in name:
-            cards += _depth(name, product, diameter)
+            cards += _depth(name, made, diameter)
     if _has_white_noise(data):
-        cards += [card for name, product in maps.items() if "/" not in name for card in expected(name, product, diameter, data)]
+        cards += [card for name, made in maps.items() if "/" not in name for card in expected(name, made, diameter, data)]
     if (image := data.products.get("input")) is not None and hasattr(image, "values") and np.isfinite(image.values).any():
         cards.append((brightness(_extreme(image.values)), "strongest pixel of the input"))
     if (product := maps.get("noiseless/map")) is not None and np.isfinite(product.signal).any():
