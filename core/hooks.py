@@ -57,7 +57,7 @@ class Hooks:
 
     @hookspec
     def zonda_progress(self, done: int, total: int, what: str) -> None:
-        """``done`` of ``total`` steps of ``what`` are finished; may come from any thread."""
+        """``done`` of ``total`` steps of ``what`` are finished; may come from any thread. ``total`` 0: it has ended."""
 
     @hookspec
     def zonda_campaign_progress(self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float) -> None:

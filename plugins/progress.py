@@ -25,6 +25,9 @@ class Progress:
         """One line: ``what [#####.....] 50 %, 12 s left``."""
         if not sys.stderr.isatty():
             return
+        if total == 0:
+            self._clear()
+            return
         now = time.monotonic()
         with self._lock:
             if what != self._what:

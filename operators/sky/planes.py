@@ -117,7 +117,7 @@ def _numbers(
     example = "1" if len(asked) == 1 else f"[{', '.join('1' for _ in asked)}]"
     if wanted is None:
         if asked:
-            more = "" if any(name == "STOKES" for name in names.values()) else ", or CTYPE3 to STOKES if its planes are I, Q, U"
+            more = "" if all(names[axis] for axis in asked) else ", or CTYPE3 to STOKES if its planes are I, Q, U"
             cure = f"set the operator's parameter plane: {example} ({', '.join(told)}){more}"
             raise InputError(f"the image is a cube of {sides} pixels", place=place, cure=cure)
         return {}

@@ -33,7 +33,7 @@ from .limits import check_brightness
 from .linear import sample_linear
 from .placement import conversion, kelvin, lost, placed, too_bright, turned
 from .read import read_map
-from .resample import extremes, resample_healpix, resample_image
+from .resample import extremes, nothing, resample_healpix, resample_image
 from .sampling import Chunks, pointing, sample
 from .stokes import STOKES
 from .working import Working, on_a_grid, on_own_pixels
@@ -277,9 +277,11 @@ class SkyMap(Operator):
         return {"centred": self.centre is not None, "plane": plane} | {name: getattr(self, name) for name in names}
 
     def _read(self) -> WcsMap | HealpixMap:
-        if self.file.exists() and self.file.stat().st_size > TOLD:
-            self._teller(f"reading {self.file.name}")(0, 1)
+        large = self.file.exists() and self.file.stat().st_size > TOLD
+        tell = self._teller(f"reading {self.file.name}") if large else nothing
+        tell(0, 1)
         source = read_map(self.file, **self.wanted)
+        tell(0, 0)
         if STOKES in source.notes:
             warnings.warn(f"{self.label}: {self.file}: {source.notes[STOKES]}", stacklevel=2)
         return source
@@ -315,6 +317,7 @@ class SkyMap(Operator):
             kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
             grid, covered = resample_image(source, wcs, working.tiles, tell, found.per_area)
             counts[LOST] = lost(source)
+        tell(0, 0)
         step = abs(float(wcs.wcs.cdelt[1])) * 3600
         part = f", of which {working.points / grid.size:.0%} is reached" if working.tiles is not None else ""
         notes = {

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-PER_VALUE = 2.5e-8
+PER_VALUE = 1e-7
 """Seconds on the reference machine for a pixel of a file: read, checked, converted."""
 LARGE = 2**22
 """Values of a file below which reading is no matter."""

@@ -128,3 +128,14 @@ def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
     assert operator.traits(wide).peak == pytest.approx(2.0)
     assert operator.memory(wide) > operator.memory(small) > 0
     assert operator._working(wide).seconds > 2 * operator._working(small).seconds > 0
+
+
+def test_the_progress_bar_hears_of_interpolation_and_its_end(made, tmp_path, monkeypatch):
+    healpy.write_map(tmp_path / "h.fits", np.full(12 * 64**2, 2.0), coord="C", column_units="K_RJ", dtype=np.float64)
+    told = []
+    monkeypatch.setattr(SkyMap, "_teller", lambda self, what: lambda done, total: told.append((what, done, total)))
+    SkyMap(file=tmp_path / "h.fits").prepare(strip(made, fwhm=3600.0))
+    assert {what for what, _, _ in told} == {"interpolating h.fits"}
+    assert told[0][1] == 0
+    assert told[-2][1] == told[-2][2] > 0
+    assert told[-1][1:] == (0, 0)
