@@ -253,10 +253,13 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
         products = part.pipeline().run(part.scene(), threads=threads).products
     except PipelineError:  # an opaque atmosphere, calibrated and not filtered, is too large for the sums
         return []
-    maps = {run: next((v for k, v in products.items() if k.startswith(f"{run}/") and hasattr(v, "hits")), None) for run in runs}
-    first = maps["white"]
-    if first is None:
+    maps: dict[str, Any] = {run: v for run in runs for k, v in products.items() if k.startswith(f"{run}/") and hasattr(v, "hits")}
+    several = sum("map" in p for p in provided) > 1
+    if (
+        maps.keys() != runs.keys() or several or getattr(maps["white"], "smoothed_by", 0.0) > 0
+    ):  # the plan's pixel is none of these maps'
         return []
+    first = maps["white"]
     noise, hits = np.ravel(first.signal - (maps["air"].signal if air else 0.0)), np.ravel(first.hits)
     seen = (hits > 0) & np.isfinite(noise)
     if np.count_nonzero(seen) < 2 * PARTS:

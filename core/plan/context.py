@@ -348,8 +348,8 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     if exact:
         index = np.floor(where / pixel).astype(np.int64)
         index -= index.min(axis=1, keepdims=True)
-        _, hits = np.unique(index[0] * (index[1].max() + 1) + index[1], return_counts=True)
-        return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed, exact)
+        _, each = np.unique(index[0] * (index[1].max() + 1) + index[1], return_counts=True)
+        return Coverage(max(float(np.quantile(each, DEEP)), 1.0), pixel, speed, exact)
     reach = np.maximum(np.ptp(where, axis=1), pixel)
     cells = np.maximum(1, np.minimum(CELLS, np.floor(reach / pixel))).astype(int)
     low = where.min(axis=1)

@@ -187,6 +187,11 @@ def test_a_stare_has_its_hits_where_its_detectors_pass(scene):
     assert made.noise[2] == pytest.approx(np.quantile(hits[hits > 0], 0.9), rel=0.5)
 
 
+def test_a_smoothed_map_is_not_what_the_noise_is_stated_of(scene):
+    file = scene(SKY, binning="{pixel: 8 arcsec, smooth: beam}")
+    assert not audit(file, zonda.plan(file, threads=1), threads=1).rows
+
+
 def test_a_prediction_is_missed_on_either_side():
     row = Checked("white noise", "of the plan", "map_rms", 1.0, 1.1, 0.01, within=0.2)
     assert (row.verdict, row.violated) == ("agrees", False)
