@@ -112,6 +112,8 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
             fontsize=8,
             rotation=90,
             va="bottom",
+            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
+            zorder=4,
         )
     if 0 < bottom < top:
         floor = level if level > 0 and {"white", "signal"} & set(spectrum.psd) else bottom
