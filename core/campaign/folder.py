@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,9 @@ from .log import Log
 from .task import product_path
 
 RESOLVED = "resolved.yaml"
+
+PART = re.compile(r"\.\d+-[0-9a-f]{8}\.part")
+"""In the names of `temporary_sibling`."""
 
 Say = Callable[[str], None]
 
@@ -137,13 +141,12 @@ def opened(folder: Path, job: Job, say: Say) -> Log:
 
 
 def clean(folder: Path) -> None:
-    """Remove what killed workers left half written."""
-    for place in (folder, folder / TASKS, *(folder / "entries").glob("*")):
-        for path in place.glob(".*.part*"):
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                discard(path)
+    """Remove what killed workers left half written, wherever in the folder. None may be at work there."""
+    for path in [p for p in folder.rglob(".*.part*") if PART.search(p.name)]:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            discard(path)
 
 
 def sources_of(job: Job, folder: Path) -> list[Path]:

@@ -215,6 +215,7 @@ def _work(job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: I
         if number not in combined and not any(t.number in incomplete for t in job.tasks_of(number))
     ]
     _combine(job, folder, log, pool, ready, digests, result)
+    clean(folder)  # of workers that were killed while they wrote
     _fail(folder, failed, len(job.tasks))
     if incomplete:
         raise PipelineError(f"{len(incomplete)} tasks were not run", place=str(folder), cure=f"zonda resume {folder}")
