@@ -120,7 +120,7 @@ def mean_emission_in_float32(patch: Patch) -> None:
 
 
 def nan_pixels_that_stay(patch: Patch) -> None:
-    patch.setattr(read, "_filled", lambda place, values, missing, first: int((~np.isfinite(values)).sum()))
+    patch.setattr(read, "filled", lambda place, values, missing, first: int((~np.isfinite(values)).sum()))
 
 
 def nan_samples_that_count_as_zero(patch: Patch) -> None:
