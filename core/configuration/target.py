@@ -118,13 +118,13 @@ class Target:
                 "{got} is one angle; a position needs two, a right ascension and a declination, such as '{eg}'",
                 {"got": repr(text), "eg": _EXAMPLES[0], "label": "one angle is missing"},
             )
-        if match is None and (named := _EQUINOX.search(plain)):
+        if match is None and (equinox := _EQUINOX.search(plain)):
             raise PydanticCustomError(
                 "target_equinox",
                 "positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read",
                 {
-                    "word": named[0].strip(),
-                    "label": f"leave '{named[0].strip()}' out" + ("" if "2000" in named[0] else "; precess it"),
+                    "word": equinox[0].strip(),
+                    "label": f"leave '{equinox[0].strip()}' out" + ("" if "2000" in equinox[0] else "; precess it"),
                 },
             )
         if match is None:
