@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -88,6 +89,10 @@ class Campaign(Parameters):
 
     @model_validator(mode="after")
     def _axes(self) -> Campaign:
+        nights = self.nights.count or 1 if self.nights else 1
+        number = math.prod(map(len, self.grid.values())) * max(1, len(self.observations)) * nights * self.realizations
+        if number > MOST_TASKS:
+            raise ValueError(f"a campaign of {number} entries; make its axes shorter: at most {MOST_TASKS}")
         both = sorted(set(self.grid) & {key for entry in self.observations for key in entry})
         if both:
             raise ValueError(f"{both[0]} stands in grid and in observations; it can only be in one of them")

@@ -33,6 +33,10 @@ P = TypeVar("P", bound=Parameters)
 EXAMPLE = "write at least: site, instrument, time, and operators (a list of steps); `zonda pipelines` lists examples"
 
 
+MOST_STEPS = 1000
+"""Longer pipelines are refused before they are looked at."""
+
+
 class Accuracy(Parameters):
     """What the knobs are chosen for."""
 
@@ -364,6 +368,10 @@ class _Check:
     def steps(self) -> list[Step | None]:
         """The steps; None stands for one that could not be made."""
         items = self.tree.get("operators")
+        if isinstance(items, list) and len(items) > MOST_STEPS:
+            at = self.document.mark(("operators",)).start
+            self.wrong(f"a pipeline of {len(items)} steps", at, "", f"write at most {MOST_STEPS}")
+            return []
         if not isinstance(items, list) or not items:
             there = ("operators",) in self.document.marks
             span = self.document.mark(("operators",)).start if there else Span(self.document.mark(()).value.source)

@@ -572,3 +572,20 @@ def test_schema_describes_every_parameter(toys: Any) -> None:
     assert pointing["duration"]["description"] == "Length of one scan."
     assert pointing["radius"]["x-unit"] == "rad"
     assert "toy_site" in schema["properties"]["site"]["anyOf"][0]["examples"]
+
+
+def test_more_steps_than_anybody_writes_are_refused_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    from zonda.core.configuration import pipeline_file
+
+    monkeypatch.setattr(pipeline_file, "MOST_STEPS", 3)
+    monkeypatch.setattr(pipeline_file._Check, "step", lambda *a: pytest.fail("a step was looked at"), raising=False)
+    with pytest.raises(pipeline_file.ConfigurationError, match=r"(?s)a pipeline of 4 steps.*write at most 3"):
+        pipeline_file.parse("operators: [A, B, C, D]\n")
+
+
+def test_a_campaign_too_large_is_refused_before_its_entries_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    from zonda.core.campaign.settings import Campaign
+    from zonda.core.errors import ZondaError
+
+    with pytest.raises(ZondaError, match="a campaign of 79210000 entries; make its axes shorter: at most 1000000"):
+        Campaign(grid={"a": list(range(8900)), "b": list(range(8900))})
