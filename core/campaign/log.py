@@ -10,7 +10,7 @@ import errno
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 from ..errors import InputError
@@ -195,10 +195,8 @@ def damaged(path: Path, err: Exception) -> InputError:
 def _rows(database: sqlite3.Connection) -> list[Row]:
     columns = "number, state, attempts, error, host, seconds, samples, digest"
     machines = _machines(database)
-    found = [
-        Row(*values, machines.get(values[0], "") if values[1] == "done" else "")
-        for values in database.execute(f"SELECT {columns} FROM tasks ORDER BY number")
-    ]
+    found = [Row(*values) for values in database.execute(f"SELECT {columns} FROM tasks ORDER BY number")]
+    found = [replace(row, machine=machines.get(row.number, "")) if row.state == "done" else row for row in found]
     kinds = (int, str, int, str, str, float | int, int, str, str)
     if any(row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found):
         raise sqlite3.DatabaseError("it holds what is no state of a task")
