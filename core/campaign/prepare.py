@@ -113,7 +113,7 @@ def job(
             looks = [Look(group, entry.seed, entry.time, about(entry)) for _, entry, group in planned]
             pointed: dict[int, Data] = {}
             layouts, scans = agree(looks, planned_files, pointed)
-            need = max([need, *(_need(planned_files[group], data, layouts) for group, data in pointed.items())])
+            need = max([need, *(_need(planned_files[group], data, layouts, folder) for group, data in pointed.items())])
             name, subfolder = _names(source, together[0][1], combinations)
             combination = Combination(name, subfolder, "")
             path = folder / TASKS / combination.layout_file(len(combinations))
@@ -227,11 +227,11 @@ def _point(file: PipelineFile, look: Look, layouts: dict[str, Mapping[str, Any]]
     return data, tuple(o.n_detectors * o.n_samples for o in data.observations)
 
 
-def _need(file: PipelineFile, data: Data, layouts: Mapping[str, Mapping[str, Any]]) -> int:
-    """Least bytes with which a process runs a pipeline over these observations."""
+def _need(file: PipelineFile, data: Data, layouts: Mapping[str, Mapping[str, Any]], folder: Path) -> int:
+    """Least bytes with which a process runs a pipeline over these observations. ``folder``: the campaign's, to write to."""
     from ..run.memory_budget import least
 
-    pipeline = file.pipeline()
+    pipeline, data.output = file.pipeline(), folder
     for operator in pipeline.operators:
         if operator.label in layouts:
             operator.lay_out(layouts[operator.label])
