@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile, Step
@@ -11,11 +14,19 @@ from ..errors import ZondaError
 from ..run.companion import Companion
 from .outcome import same_labels
 
+if TYPE_CHECKING:
+    from .estimate import Traits
+
+FROM_OUTSIDE = frozenset({"sky"})
+"""Streams whose level follows from no other step."""
+
 
 def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:
-    """The file without the steps that make other components than these; the same random numbers, so the same bits.
+    """The file without the steps that make other components than these; the same random numbers.
 
-    Companion runs go on with what is left of their components; one that has nothing left, or everything, is left out.
+    The bits are those of the companion run with ``only``, unless the level of what is kept follows from a step that is left out (noise under
+    the load of the atmosphere, pink noise that refers to the white noise): a warning states both levels. Companion runs go on
+    with what is left of their components; one that has nothing left, or everything, is left out.
 
     Raises
     ------
@@ -50,4 +61,34 @@ def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:
     steps: list[Step] = [step for label, step in labelled if label not in dropped]
     labels = [label for label, _ in labelled if label not in dropped]
     header = file.header.model_copy(update={"runs": runs})
-    return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, labels)))
+    alone_file = dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, labels)))
+    if dropped and not frozenset().union(*(o.provides for o in left)) <= FROM_OUTSIDE:
+        _warn_of_levels(file, alone_file, [o.label for o in left], components)
+    return alone_file
+
+
+def _warn_of_levels(whole: PipelineFile, alone: PipelineFile, labels: Sequence[str], components: Sequence[str]) -> None:
+    """Say which of the steps ``labels`` make their component at another level alone than in the whole scene."""
+    from .planner import kelvin
+
+    there, here = _traits(whole), _traits(alone)
+    for label in labels:
+        before, after = (math.hypot(t[label].loudest, t[label].rms) for t in (there, here))
+        if not math.isclose(before, after, rel_tol=1e-9):
+            name = "_".join(components)
+            warnings.warn(
+                f"--only: {label} makes {kelvin(after)} per sample alone, {kelvin(before)} in the whole scene: its level follows "
+                f"from steps that are left out. For the level of the scene leave --only out and write "
+                f"runs: {{{name}_alone: {{only: [{', '.join(components)}], modes: full}}}}",
+                stacklevel=3,
+            )
+
+
+def _traits(file: PipelineFile) -> Mapping[str, Traits]:
+    """What the planner knows of each step, by label."""
+    from .context import look
+    from .structure import Structure
+
+    pipeline = file.pipeline()
+    every = Structure(tuple(o.label for o in pipeline.operators), tuple(pipeline.runs), ())
+    return look(pipeline, file.scene(), every).traits

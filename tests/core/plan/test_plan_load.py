@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ import zonda
 from zonda.core.errors import ZondaError
 from zonda.core.plan.audit import Checked, audit
 from zonda.core.plan.context import Depth
+from zonda.core.plan.only import only
 from zonda.core.plan.whole import NAME
+from zonda.core.run.companion import Companion
 
 SCENE = """
 site: chajnantor
@@ -169,6 +173,59 @@ def test_what_is_dropped_whole_is_charged_its_effects(scene):
     assert "PinkNoise" not in [s.key for s in made.apply(file).steps]
     assert made.prediction.seconds["PinkNoise"] == 0.0
     assert zonda.plan(file, threads=1, drop=["WhiteNoise", "PinkNoise"]).noise[0] == 0.0
+
+
+def pink_rms(file, run=""):
+    """rms of the pink noise at the detector, mK, as the run states it."""
+    file = dataclasses.replace(file, steps=tuple(s for s in file.steps if s.key not in ("SaveMap", "HighpassFilter")))
+    tally = file.pipeline().run(file.scene(), threads=1).tally
+    who = f"{run}/PinkNoise" if run else "PinkNoise"
+    (text,) = (text for name, what, text in tally.figures() if name == who and what.startswith("rms at the detector"))
+    return float(text)
+
+
+@pytest.mark.parametrize(("white", "kept"), [("{net: 3 mK s(1/2)}", ["pink"]), (BACKGROUND, ["pink"]), (BACKGROUND, ["white"])])
+def test_a_component_alone_at_another_level_is_told(scene, white, kept):
+    """Pink noise alone referred to the instrument's NET, noise limited by the background saw none: without a word."""
+    with pytest.warns(UserWarning, match=f"--only: {kept[0].title()}Noise makes .* in the whole scene") as told:
+        only(scene(white), kept)
+    assert len(told) == 1
+    assert f"only: [{kept[0]}], modes: full" in str(told[0].message)
+
+
+def test_the_levels_that_are_told_are_those_of_the_runs(scene):
+    """What the warning states of pink noise, and the run that it advises."""
+    file = scene("{net: 3 mK s(1/2)}")
+    with pytest.warns(UserWarning, match="--only") as told:
+        alone = only(file, ["pink"])
+    after, before = map(float, re.findall(r"([\d.]+) mK", str(told[0].message)))
+    assert before == pytest.approx(3 * after, rel=0.01)  # three figures are told
+    header = file.header.model_copy(update={"runs": {"pink_alone": Companion(only=["pink"], modes="full")}})
+    whole = pink_rms(file)
+    assert pink_rms(dataclasses.replace(file, header=header), "pink_alone") == whole
+    # alone its NET on the sky is a third, and there is no atmosphere with whose e^-tau it reaches the detector
+    assert pink_rms(alone) > whole / 3
+
+
+@pytest.mark.parametrize(
+    ("white", "kept"), [(SKY, ["pink"]), (SKY, ["white", "pink"]), (BACKGROUND, ["white", "pink", "atmosphere"])]
+)
+def test_a_component_alone_at_its_level_is_not(scene, white, kept):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        only(scene(white), kept)
+
+
+@pytest.mark.parametrize("white", ["{net: 3 mK s(1/2)}", BACKGROUND])
+def test_without_white_noise_pink_noise_has_the_level_of_the_plan(scene, white):
+    """It then refers to the instrument's NET, in the run as in what the plan charges; their difference is within the bound."""
+    file = scene(white)
+    made = zonda.plan(file, threads=1, drop=["WhiteNoise"])
+    (charged,) = [d for d in made.decided if d.operator == "WhiteNoise"]
+    alike = made.apply(scene("{net: 1 mK s(1/2)}"))  # the instrument's NET
+    assert pink_rms(made.apply(file)) == pink_rms(alike)
+    left = zonda.plan(made.apply(file), threads=1).context.traits["PinkNoise"].rms
+    assert charged.choice.bound["map_rms"] >= made.context.bound(abs(made.context.traits["PinkNoise"].rms - left))["map_rms"] > 0
 
 
 @pytest.mark.parametrize(("name", "words"), [("Efficiency", "HighpassFilter reads its signal"), ("PointingDaisy", "boresight")])
