@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating]
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
-"""Streams that zonda's own operators make in every block: the components, and their calibrated sum."""
+"""Streams that zonda's own operators make in every block: the components, and their calibrated sum. Their only use is to be read
+by a later operator of the same run."""
 
 
 class Tally:

@@ -313,7 +313,9 @@ class KernelFiles:
 
 def _checksum(path: Path, body: Any) -> bytes:
     """Of a file's name and content: a whole file of another kernel, put in this one's place, is damaged too."""
-    return hashlib.blake2b(path.name.encode() + b"\0" + bytes(body), digest_size=_DIGEST).digest()
+    found = hashlib.blake2b(path.name.encode() + b"\0", digest_size=_DIGEST)
+    found.update(body)
+    return found.digest()
 
 
 class _Reader(pickle.Unpickler):

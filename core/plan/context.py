@@ -29,6 +29,9 @@ pixels where no more samples than that are taken."""
 LOOKED_AT = 4
 """Observations whose levels of noise are looked at, apart from those at the extremes of elevation."""
 
+INSTANTS = 64
+"""Nodes of a smooth field that are looked at, at most."""
+
 LEAKS = 1.5
 """Factor on what passes a brick wall: a scan has ends."""
 
@@ -305,8 +308,19 @@ def _calibrated_mean(o: Observation) -> NDArray[np.float64]:
     if emission is None:
         return np.zeros(1)
     share = o.focalplane.illumination_efficiency / o.focalplane.main_beam_efficiency
-    passed = np.ones(1) if transmission is None else np.maximum((transmission.weights @ transmission.coefficients).min(1), 1e-6)
-    return np.asarray(share * (emission.weights @ emission.coefficients).max(1) / passed, np.float64)
+    passed = np.ones(1)
+    if transmission is not None:
+        passed = np.maximum(-_largest(transmission.weights, -transmission.coefficients), 1e-6)
+    return np.asarray(share * _largest(emission.weights, emission.coefficients) / passed, np.float64)
+
+
+def _largest(weights: NDArray[np.floating], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n_det,) largest value of a smooth field over the scan: at the node where the detectors' mean is largest, and at `INSTANTS`
+    others at most; all nodes of all detectors would take gigabytes."""
+    nodes = coefficients.shape[1]
+    evenly = np.linspace(0, nodes - 1, min(INSTANTS, nodes)).astype(int)
+    at = np.r_[evenly, np.argmax(weights.mean(axis=0) @ coefficients)]
+    return np.asarray((weights @ coefficients[:, at]).max(axis=1), np.float64)
 
 
 def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> frozenset[str]:

@@ -24,9 +24,9 @@ FROM_OUTSIDE = frozenset({"sky"})
 def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:
     """The file without the steps that make other components than these; the same random numbers.
 
-    The bits are those of the companion run with ``only``, unless the level of what is kept follows from a step that is left out (noise under
-    the load of the atmosphere, pink noise that refers to the white noise): a warning states both levels. Companion runs go on
-    with what is left of their components; one that has nothing left, or everything, is left out.
+    The bits are those of the companion run with ``only``, unless the level of what is kept follows from a step that is left out
+    (noise under the load of the atmosphere, pink noise that refers to the white noise): a warning states both levels. Companion
+    runs go on with what is left of their components; one that has nothing left, or everything, is left out.
 
     Raises
     ------

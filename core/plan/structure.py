@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from .. import data
 from ..operator import Operator
 from ..pipeline import Pipeline
 from ..run.companion import Companion
 from ..run.derived import derivable, derivation
 
-STREAMS = frozenset({"sky", "atmosphere", "transmission", "white", "pink", "signal"})
-"""Names whose only use is to be read by a later operator of the same run."""
+STREAMS = frozenset(data.STREAMS)
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,9 @@ import warnings
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ..data import Data
+from ..data import STREAMS, Data
 from ..operator import Operator
 from ..pipeline import Pipeline
-from ..plan.structure import STREAMS
 
 if TYPE_CHECKING:
     from ..scene import Scene
@@ -32,4 +31,4 @@ def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[
 
 def writes(operators: Iterable[Operator]) -> bool:
     """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its products in memory."""
-    return any(not (o.product_only or "boresight" in o.provides or (o.provides and o.provides <= STREAMS)) for o in operators)
+    return any(not (o.product_only or "boresight" in o.provides or (o.provides and o.provides <= {*STREAMS})) for o in operators)

@@ -11,6 +11,7 @@ import pytest
 
 import zonda
 from zonda.core.errors import ZondaError
+from zonda.core.numerics.smooth import SmoothField
 from zonda.core.plan.audit import Checked, audit
 from zonda.core.plan.context import Depth
 from zonda.core.plan.only import only
@@ -255,3 +256,31 @@ def test_a_prediction_is_missed_on_either_side():
     for actual in (0.7, 1.3):
         assert dataclasses.replace(row, actual=actual).verdict == "DISAGREES"
     assert Depth(0.0, 0.0).sample == 0.0
+
+
+def test_the_largest_mean_emission_takes_no_memory_for_all_instants(scene):
+    """Of 3000 nodes the one where the emission peaks counts; 2000 detectors at all of them would be 48 MB for each field."""
+    import copy
+    import tracemalloc
+
+    made = zonda.plan(scene(SKY), threads=1)
+    (o,) = made.context.observations
+    n_det, nodes, peak = 2000, 3000, 1111  # not among the 64 that are evenly spaced: 1111 is no multiple of 2999 / 63
+    observation = copy.copy(o)
+    observation.focalplane = copy.copy(o.focalplane)
+    observation.focalplane.main_beam_efficiency = np.full(n_det, 0.6)
+    observation.focalplane.illumination_efficiency = np.full(n_det, 0.9)
+    emission = np.full((1, nodes), 20.0)
+    emission[0, peak] = 30.0
+    weights = np.linspace(0.5, 1.0, n_det)[:, None]
+    observation.smooth = {
+        "atmosphere": SmoothField(weights, emission, 64, o.n_samples),
+        "transmission": SmoothField(np.ones((n_det, 1)), emission * -0.01 + 1, 64, o.n_samples),
+    }
+    context = dataclasses.replace(made.context, observations=[observation])
+    tracemalloc.start()
+    found = context.mean_emission
+    _, held = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found == pytest.approx(0.9 / 0.6 * 30.0 / 0.7)
+    assert held < 12e6
