@@ -119,6 +119,15 @@ class Campaign(Parameters):
         return self.combine == "all" or axis in self.combine
 
 
+def at_least(campaign: dict[str, Any]) -> int:
+    """Number of entries that ``campaign:`` as it was written comes to, whatever else may be wrong with it."""
+    grid, given, nights = (campaign.get(key) for key in ("grid", "observations", "nights"))
+    sizes = [len(values) for values in grid.values() if isinstance(values, list)] if isinstance(grid, dict) else []
+    sizes.append(len(given) if isinstance(given, list) else 1)
+    counts = [nights.get("count") if isinstance(nights, dict) else nights, campaign.get("realizations")]
+    return math.prod(max(1, n) for n in [*sizes, *(n for n in counts if isinstance(n, int))])
+
+
 class CampaignHeader(Header):
     """Top level of a pipeline file that has a campaign."""
 

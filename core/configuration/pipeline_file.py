@@ -198,7 +198,7 @@ def load(path_or_name: str | Path, overrides: Iterable[str] = ()) -> PipelineFil
 def parse(text: str, *, name: str = "<text>", folder: str | Path | None = None, overrides: Iterable[str] = ()) -> PipelineFile:
     """As `load`, from text; relative paths in it are looked for in ``folder`` first."""
     source = Source(name, text)
-    document = yaml_places.load(source)
+    document = yaml_places.load(source, longest={"operators": MOST_STEPS})
     mistakes = [Diagnostic(fault.message, fault.span, fault.label) for fault in document.faults]
     if not isinstance(document.value, dict):
         if document.value is None and not mistakes:
@@ -223,6 +223,7 @@ class _Check:
     def run(self) -> PipelineFile:
         head = {k: v for k, v in self.tree.items() if k not in (*SCENE_KEYS, "operators") and not str(k).startswith("x-")}
         header = self.validate(self.kind_of_header(), head, (), "the pipeline", KEYS)
+        self.sizes()
         self.requirements()
         scene = self.scene()
         steps = self.steps()
@@ -245,6 +246,20 @@ class _Check:
         header = header.model_copy(update={"name": name, "outputs": header.outputs or Path("out") / name})
         parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree}
         return PipelineFile(header, parameters, tuple(s for s in steps if s is not None), self.name, scene)
+
+    def sizes(self) -> None:
+        """Raise `ConfigurationError` for more steps (of an alias; written ones are counted before) or entries than are looked at."""
+        items, campaign = self.tree.get("operators"), self.tree.get("campaign")
+        many = isinstance(items, list) and len(items) > MOST_STEPS
+        if many:
+            at = self.document.mark(("operators",)).start
+            self.wrong(f"a pipeline of {len(items or [])} steps", at, "", f"write at most {MOST_STEPS}")
+        if isinstance(campaign, dict) and not many:
+            from ..campaign.settings import MOST_TASKS, at_least
+
+            many = at_least(campaign) > MOST_TASKS  # the header's own check has said so
+        if many:
+            raise ConfigurationError(without_meant(self.mistakes), self.name)
 
     @property
     def target_of_map(self) -> bool:
@@ -368,10 +383,6 @@ class _Check:
     def steps(self) -> list[Step | None]:
         """The steps; None stands for one that could not be made."""
         items = self.tree.get("operators")
-        if isinstance(items, list) and len(items) > MOST_STEPS:
-            at = self.document.mark(("operators",)).start
-            self.wrong(f"a pipeline of {len(items)} steps", at, "", f"write at most {MOST_STEPS}")
-            return []
         if not isinstance(items, list) or not items:
             there = ("operators",) in self.document.marks
             span = self.document.mark(("operators",)).start if there else Span(self.document.mark(()).value.source)

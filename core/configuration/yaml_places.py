@@ -7,7 +7,9 @@ keys. Here scalars follow the YAML 1.2 core schema, equal keys are errors, and e
 from __future__ import annotations
 
 import copy
+import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,9 +152,10 @@ def _integer(loader: Any, node: Any) -> int:
 _Loader.add_constructor("tag:yaml.org,2002:int", _integer)
 
 
-def load(source: Source, *, column: int = 0, text: str | None = None) -> Document:
+def load(source: Source, *, column: int = 0, text: str | None = None, longest: Mapping[str, int] | None = None) -> Document:
     """Read a YAML document from ``text`` (default: all of the source), whose first line begins at ``column``.
 
+    ``longest``: items that the list under a key of the top level may have; of a longer one nothing is built.
     Never raises for bad text: what is wrong is in `Document.faults`, and what could be read in its value.
     """
     reader = _Reader(source, column, source.text if text is None else text)
@@ -162,7 +165,7 @@ def load(source: Source, *, column: int = 0, text: str | None = None) -> Documen
         reader.fault(err)
         return reader.document(None)
     try:
-        reader.survey(reader.text)
+        reader.survey(reader.text, longest or {})
         node = loader.get_single_node()
         value = reader.build(loader, node, (), None, ()) if node is not None else None
     except yaml.YAMLError as err:
@@ -180,6 +183,14 @@ def dump(value: Any) -> str:
 
 class _TooMany(yaml.YAMLError):
     pass
+
+
+class _TooLong(yaml.YAMLError):
+    """The list under a key of the top level: the key's event, and how many items it may have."""
+
+    def __init__(self, key: Any, most: int) -> None:
+        super().__init__(f"{key.value} has more than {most} items")
+        self.key, self.most = key, most
 
 
 def _too_deep(mark: Any) -> yaml.MarkedYAMLError:
@@ -200,11 +211,24 @@ class _Reader:
         self.flat: dict[int, list[tuple[Any, Any]]] = {}
         self.merged = 0
 
-    def survey(self, text: str) -> None:
+    def survey(self, text: str, longest: Mapping[str, int]) -> None:
         """Count values and depth event by event, without recursion, before anything is built. Raises yaml.YAMLError."""
-        depth = 0
+        depth = members = items = 0
+        key, limit = None, math.inf  # of the top level
         for values, event in enumerate(yaml.parse(text, Loader=_Loader)):
-            depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
+            closes = isinstance(event, _CLOSING)
+            if depth == 1 and not closes:
+                members += 1
+                if members % 2:
+                    key = event
+                else:
+                    listed = isinstance(event, yaml.SequenceStartEvent)
+                    items, limit = 0, longest.get(getattr(key, "value", None) or "", math.inf) if listed else math.inf
+            elif depth == 2 and not closes:
+                items += 1
+                if items > limit:
+                    raise _TooLong(key, int(limit))
+            depth += isinstance(event, _OPENING) - closes
             if depth > MAXIMUM_DEPTH:
                 raise _too_deep(event.start_mark)
             if values > 2 * MAXIMUM_VALUES:  # a list or mapping makes two events
@@ -222,6 +246,8 @@ class _Reader:
     def fault(self, err: yaml.YAMLError) -> None:
         if isinstance(err, _TooMany):
             self.faults.append(Fault(str(err), Span(self.source)))
+        elif isinstance(err, _TooLong):
+            self.faults.append(Fault(str(err), self.span(err.key), f"write at most {err.most}"))
         elif isinstance(err, yaml.MarkedYAMLError):
             mark = err.problem_mark or err.context_mark
             rows = self.source.text.splitlines() or [""]
