@@ -248,7 +248,7 @@ class _Check:
         return PipelineFile(header, parameters, tuple(s for s in steps if s is not None), self.name, scene)
 
     def sizes(self) -> None:
-        """Raise `ConfigurationError` for more steps (of an alias; written ones are counted before) or entries than are looked at."""
+        """Raise `ConfigurationError` for more steps (of an alias; those written are counted before) or entries than allowed."""
         items, campaign = self.tree.get("operators"), self.tree.get("campaign")
         many = isinstance(items, list) and len(items) > MOST_STEPS
         if many:
