@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -308,19 +309,19 @@ def _calibrated_mean(o: Observation) -> NDArray[np.float64]:
     if emission is None:
         return np.zeros(1)
     share = o.focalplane.illumination_efficiency / o.focalplane.main_beam_efficiency
-    passed = np.ones(1)
+    passed: NDArray[Any] = np.ones(1)
     if transmission is not None:
         passed = np.maximum(-_largest(transmission.weights, -transmission.coefficients), 1e-6)
     return np.asarray(share * _largest(emission.weights, emission.coefficients) / passed, np.float64)
 
 
-def _largest(weights: NDArray[np.floating], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+def _largest(weights: NDArray[Any], coefficients: NDArray[Any]) -> NDArray[Any]:
     """(n_det,) largest value of a smooth field over the scan: at the node where the detectors' mean is largest, and at `INSTANTS`
     others at most; all nodes of all detectors would take gigabytes."""
     nodes = coefficients.shape[1]
     evenly = np.linspace(0, nodes - 1, min(INSTANTS, nodes)).astype(int)
     at = np.r_[evenly, np.argmax(weights.mean(axis=0) @ coefficients)]
-    return np.asarray((weights @ coefficients[:, at]).max(axis=1), np.float64)
+    return np.asarray((weights @ coefficients[:, at]).max(axis=1))
 
 
 def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> frozenset[str]:

@@ -157,13 +157,14 @@ def distinct(fwhm: Floats, tolerance: float = 1e-3) -> tuple[Floats, NDArray[np.
     Equal widths share one; widths that differ by less than ``tolerance`` share their mean.
     """
     order = np.argsort(fwhm, kind="stable")
+    rising = fwhm[order]
     index = np.empty(len(fwhm), np.int64)
     values: list[float] = []
     start = 0
-    for k in range(1, len(fwhm) + 1):
-        if k == len(fwhm) or fwhm[order[k]] > fwhm[order[start]] * (1.0 + tolerance):
-            group = fwhm[order[start:k]]
-            index[order[start:k]] = len(values)
-            values.append(float(group[0] if group[0] == group[-1] else group.mean()))
-            start = k
+    while start < len(fwhm):
+        stop = int(np.searchsorted(rising, rising[start] * (1.0 + tolerance), side="right"))
+        group = rising[start:stop]
+        index[order[start:stop]] = len(values)
+        values.append(float(group[0] if group[0] == group[-1] else group.mean()))
+        start = stop
     return np.array(values), index
