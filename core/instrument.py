@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from .configuration.parameters import Parameters, named, named_or_written, quant
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
 from .errors import InputError
 from .focalplane import Focalplane
+from .storage import packed
 
 SPEED_OF_LIGHT = 299792458.0
 
@@ -95,7 +97,7 @@ GIGAHERTZ_MAX = 1e5
 def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     place, cure = f"passband file {path}", "write two columns: frequency in GHz and transmission"
     try:
-        table = np.loadtxt(path, ndmin=2)
+        table = np.loadtxt(io.StringIO(packed.text(path, place)), ndmin=2)
     except OSError:
         raise InputError("no such file", place=place, cure="check the path; it is relative to the folder zonda runs in") from None
     except ValueError as err:

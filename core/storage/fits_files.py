@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import math
 import os
 import re
 import warnings
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
 from ..errors import InputError
+from . import packed
 from .files import check_memory, reading
 
 COMPRESSED = (".gz", ".bz2", ".xz", ".z", ".zip")
@@ -32,16 +33,18 @@ def opened(path: str | os.PathLike[str], place: str, cure: str, kind: str = "FIT
         from astropy.io import fits
         from astropy.utils.exceptions import AstropyWarning
 
-        _survey(path, place)
+        source = _survey(path, place)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AstropyWarning)
-            with fits.open(path, memmap=False, ignore_missing_simple=False) as hdus:
+            with fits.open(source, memmap=False, ignore_missing_simple=False) as hdus:
                 yield hdus
 
 
 def check_size(path: str | os.PathLike[str], hdu: Any, place: str) -> None:
     """Before data are read: OSError where the file ends before them, `InputError` where they need more memory than is free."""
     size = _data_bytes(hdu.header)
+    if (hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU") and size > packed.UNPACKED_MAX:
+        raise packed.too_large(size, packed.UNPACKED_MAX, place, least=False)
     check_memory(size, "the array or table", place)
     info = hdu.fileinfo()
     if (
@@ -56,19 +59,22 @@ def check_size(path: str | os.PathLike[str], hdu: Any, place: str) -> None:
         raise OSError(f"the file is truncated: {found} bytes, its header promises at least {needed}")
 
 
-def _survey(path: str | os.PathLike[str], place: str) -> None:
-    """Refuse headers that would keep a reader busy without end (`InputError`); what else is wrong is left to astropy."""
-    with open(path, "rb") as raw:
-        magic = raw.read(3)
-    unpack = next((m for start, m in _PACKED.items() if magic.startswith(start)), "")
-    if magic.startswith((b"PK", b"\x1f\x9d")):  # zip and compress, one file in each: astropy unpacks them into memory
-        return
-    with import_module(unpack).open(path, "rb") if unpack else open(path, "rb") as file:
+def _survey(path: str | os.PathLike[str], place: str) -> Any:
+    """What astropy may open: the path, or what was in a zip archive, which astropy would unpack to a temporary file.
+
+    Refused are headers that would keep a reader busy without end, and compressed files whose headers lead beyond
+    `packed.UNPACKED_MAX` (`InputError`); what else is wrong is left to astropy.
+    """
+    content, compressed = packed.stream(path, place)
+    with content as file:
         while size := _next_header(file, place):
-            file.seek(-(-size // 2880) * 2880 - 2880, 1)
+            end = file.tell() - (-size // 2880) * 2880 - 2880
+            if compressed and end > packed.UNPACKED_MAX:
+                raise packed.too_large(end, packed.UNPACKED_MAX, place, least=True)
+            file.seek(end)
+        return io.BytesIO(file.getvalue()) if isinstance(file, io.BytesIO) else path
 
 
-_PACKED = {b"\x1f\x8b\x08": "gzip", b"BZh": "bz2", b"\xfd7z": "lzma"}
 _END = re.compile(rb"END( {0,76}[^A-Z0-9_-]|$)")
 """What astropy takes for the end of a header."""
 _NUMBER = re.compile(rb"(NAXIS\d{0,3}|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *(-?\d+)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import subprocess
 import sys
@@ -64,7 +65,30 @@ def check_size(dataset: Any, place: str) -> None:
             place=place,
             cure="the file is corrupt or was never filled: copy or make it again",
         )
+    _check_chunks(dataset, place)
     check_memory(size, str(dataset.name), place)
+
+
+def _check_chunks(dataset: Any, place: str) -> None:
+    """Refuse chunks that unpack to more than they hold: libhdf5 unpacks whatever is stored, before it looks at the size."""
+    import h5py
+
+    plist = dataset.id.get_create_plist()
+    filters = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
+    if not dataset.chunks or not filters:
+        return
+    harm = "the file is corrupt or made to harm: make it again, e.g. with h5repack -f GZIP=4"
+    if filters.count(h5py.h5z.FILTER_DEFLATE) > 1:
+        raise InputError(f"{dataset.name} is deflated twice over", place=place, cure=harm)
+    size = math.prod(dataset.chunks) * int(dataset.dtype.itemsize)
+    most = size + size // 16 + 4096  # what cannot be compressed grows: deflate by less than 0.1 %, others by less than 1/16
+
+    def larger(chunk: Any) -> int | None:
+        return int(chunk.size) if chunk.size > most else None
+
+    if found := dataset.id.chunk_iter(larger):
+        message = f"a chunk of {dataset.name} is stored in {found} bytes, more than the {size} that it holds unpacked"
+        raise InputError(message, place=place, cure=harm)
 
 
 class Disk:

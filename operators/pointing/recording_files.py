@@ -15,6 +15,7 @@ from zonda.core.configuration.time import SECOND, Instant
 from zonda.core.configuration.units import read_unit
 from zonda.core.errors import InputError
 from zonda.core.intervals import Intervals
+from zonda.core.storage import fits_files, hdf5_files
 
 from .recording import Recording, longest_rising
 
@@ -32,6 +33,8 @@ ALIASES = {
 """Our name of a column, and names that files have for it, in small letters."""
 
 Clock = Literal["unix", "mjd", "scene"]
+
+CURE = "give HDF5, a FITS table or CSV"
 
 Columns = Mapping[str, tuple[Any, str | None]]
 """By name in small letters: values and unit."""
@@ -85,7 +88,7 @@ def read(path: Path, clock: Clock, mask: int | None = None) -> Recording:
         kind = _hdf5 if magic.startswith(b"\x89HDF") else _fits if magic.startswith(b"SIMPLE  =") else _csv
         return _recording(kind(path, place), clock, mask, place)
     except OSError as err:
-        raise InputError(f"cannot be read: {err}", place=place, cure="give HDF5, a FITS table or CSV") from None
+        raise InputError(f"cannot be read: {err}", place=place, cure=CURE) from None
 
 
 def _csv(path: Path, place: str) -> Table:
@@ -112,8 +115,9 @@ def _csv(path: Path, place: str) -> Table:
 def _fits(path: Path, place: str) -> Table:
     from astropy.io import fits
 
-    with fits.open(path) as file:
+    with fits_files.opened(path, place, CURE) as file:
         for table in file:
+            fits_files.check_size(path, table, place)
             names = (
                 {name.lower() for name in getattr(table.columns, "names", [])} if isinstance(table, fits.BinTableHDU) else set()
             )
@@ -135,13 +139,14 @@ def _fits(path: Path, place: str) -> Table:
 def _hdf5(path: Path, place: str) -> Table:
     import h5py
 
-    with h5py.File(path, "r") as file:
+    with hdf5_files.opened(path, place, "HDF5", CURE) as file:
         toast = "shared" in file
         group = file["shared"] if toast else file.get("pointing", file)
         columns: dict[str, tuple[Any, str | None]] = {}
         for name, values in group.items():
             if not isinstance(values, h5py.Dataset) or values.ndim != 1 or values.dtype.kind not in "fiub":
                 continue
+            hdf5_files.check_size(values, place)
             unit = values.attrs.get("units", values.attrs.get("unit"))
             known = next((ours for ours, names in ALIASES.items() if name.lower() in names), None)
             si = {"time": "s", "seconds": "s", "az": "rad", "el": "rad"}.get(known or "") if toast else None
@@ -152,11 +157,14 @@ def _hdf5(path: Path, place: str) -> Table:
             start = other.get("zonda_start_utc")
             found.start = Instant.parse(str(start)) if start is not None else None
             found.bits = "before" if start is not None and "zonda_flags" not in other else "toast"
+            parts = file["intervals"].items() if isinstance(file.get("intervals"), h5py.Group) else ()
+            for dataset in (group.get("boresight_azel"), group.get("boresight_radec"), *(spans for _, spans in parts)):
+                if isinstance(dataset, h5py.Dataset):
+                    hdf5_files.check_size(dataset, place)
             if "boresight_azel" in group:
                 _check_rotation(group["boresight_azel"], place)
             if isinstance(radec := group.get("boresight_radec"), h5py.Dataset) and radec.dtype.kind == "f":
                 found.radec = np.asarray(radec[()], np.float64)
-            parts = file["intervals"].items() if isinstance(file.get("intervals"), h5py.Group) else ()
             kept = ((name, spans) for name, spans in parts if isinstance(spans, h5py.Dataset) and spans.dtype.kind in "fiu")
             found.intervals = {name: np.asarray(spans[()], np.float64) for name, spans in kept}
         return found
