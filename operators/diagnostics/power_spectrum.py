@@ -194,7 +194,8 @@ class PowerSpectrum(Operator):
             rows = [state.found[d][name] for d in sorted(state.found) if name in state.found[d]]
             psd[name] = np.mean(rows, axis=0)
         count = len(state.found)
-        white = 2 * float(np.mean(observation.focalplane.net[sorted(state.found)] ** 2))
+        net = observation.focalplane.net[sorted(state.found)]
+        white = 2 * float(np.mean(net**2)) if "white" in observation.components else 0.0
         mean = Spectrum(state.welch.frequency, psd, state.welch.independent * count, white, self.label, count)
         self._add(data, mean, observation.tally)
 

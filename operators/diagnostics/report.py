@@ -23,7 +23,7 @@ from zonda.core.storage.files import write_text
 from zonda.operators.io.save_map import output_folder
 
 from .plot_operators import Picture, Plots, pictures
-from .report_results import angle, class_of, flux_density, results
+from .report_results import angle, class_of, flux_density, has_white_noise, results
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
@@ -202,7 +202,7 @@ def _scene(data: Data) -> str:
             ("1 K_RJ at a point source's peak", flux_density(1.0, float(np.mean(plane.fwhm)), data)),
             ("Main-beam efficiency ζ", _spread(plane.main_beam_efficiency)),
             ("Illumination efficiency ε", _spread(plane.illumination_efficiency)),
-            ("NET on the sky", _spread(plane.net * 1e3, " mK_RJ √s")),
+            ("NET on the sky", _net(data)),
             ("Read-out", f"{rate:.6g} Hz"),
         ]
     if campaign := data.provenance.get("campaign"):
@@ -213,6 +213,15 @@ def _scene(data: Data) -> str:
         if text:
             rows.append((f"{kind}: source of the numbers", text))
     return _table(rows)
+
+
+def _net(data: Data) -> str:
+    """Of all detectors in all scans, which differ where the noise follows from the load; of a campaign, in the first."""
+    known = data.observations[:1] if "campaign" in data.provenance else data.observations
+    text = _spread(np.concatenate([o.focalplane.net for o in known]) * 1e3, " mK_RJ √s")
+    if not has_white_noise(data):
+        return f"{text} (no white noise is simulated)"
+    return f"{text} (of the first scan)" if len(known) < len(data.observations) else text
 
 
 def _target(target: Target) -> str:

@@ -64,7 +64,7 @@ def results(data: Data, diameter: float) -> str:
     for name, made in maps.items():
         if "/" not in name:
             cards += _depth(name, made, diameter)
-    if _has_white_noise(data):
+    if has_white_noise(data):
         cards += [card for name, made in maps.items() if "/" not in name for card in expected(name, made, diameter, data)]
     if (image := data.products.get("input")) is not None and hasattr(image, "values") and np.isfinite(image.values).any():
         cards.append((brightness(_extreme(image.values)), "strongest pixel of the input"))
@@ -77,7 +77,8 @@ def results(data: Data, diameter: float) -> str:
     )
 
 
-def _has_white_noise(data: Data) -> bool:
+def has_white_noise(data: Data) -> bool:
+    """Whether a step of the pipeline makes white noise."""
     classes = (class_of(kind) for _, kind, _ in data.provenance.get("operators", []))
     return any(cls is not None and "white" in cls.provides for cls in classes)
 

@@ -24,7 +24,7 @@ class Spectrum:
         Equivalent number of independent periodograms in each value: its relative standard error is averages^-1/2 where
         detectors are independent.
     white_level
-        2 <NET^2> of the detectors used, K_RJ^2/Hz: the level of white noise.
+        2 <NET^2> of the detectors used, K_RJ^2/Hz: the level of white noise; 0 where none is simulated.
     label
         Of the step that measured it.
     detectors, observations

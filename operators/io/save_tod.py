@@ -115,6 +115,8 @@ class SaveTOD(Operator):
         state.tod.weather = observation.weather or self._weather(data, observation)
         if self.dtype == "float32":
             observation.tally.state(self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}")
+        if "white" not in observation.components:
+            observation.tally.state(self.label, "NET of the detectors", "the instrument's; this run has no white noise")
         state.tod.metadata.update(_provenance(data), tally="\n".join(f"{who}: {what}: {v}" for who, what, v in observation.tally))
         state.writer.finish()
         publish(state.temporary, state.path)

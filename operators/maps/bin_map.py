@@ -63,6 +63,8 @@ class _Requires:
 
 WIDEST_SMOOTH = 0.1
 """FWHM of a map's smoothing, rad."""
+NO_WHITE = "what the detectors' NET would make; this run has no white noise"
+"""Said of the noise that the map of such a run states."""
 
 
 class BinMap(Operator):
@@ -94,7 +96,8 @@ class BinMap(Operator):
     weights: Literal["uniform", "inverse_variance"] = "inverse_variance"
     """Weigh samples alike, or by the inverse variance that follows from each detector's NET."""
     noise: Literal["net", "scatter"] = "net"
-    """Noise of each pixel: from the detectors' NET, or from the scatter of its samples."""
+    """Noise of each pixel: from the detectors' NET, or from the scatter of its samples. From the NET also in a run without white
+    noise; the tally then says so."""
     contents: Literal["all", "hits"] = "all"
     """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
     half_difference: bool = True
@@ -241,6 +244,8 @@ class BinMap(Operator):
             much = "the detectors' NETs differ by more than a factor of 1000"
             far = "the NET is more than 1000 times larger or smaller than that of the first scan"
             raise PipelineError(much if spread else far, place=self.label, cure="set weights: uniform")
+        if "white" not in observation.components and self.noise == "net" and self.contents == "all":
+            observation.tally.state(self.label, "noise of a pixel", NO_WHITE)
         noise = weight**2 * variance
         alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
         good = observation.good_samples.astype(np.uint8)

@@ -119,7 +119,9 @@ class WhiteNoise(Operator):
         """State the level."""
         net = 1e3 * state.level.sky_net(observation)
         text = f"{np.median(net):.4g}" + (f" ({net.min():.4g} to {net.max():.4g})" if net.max() > net.min() else "")
-        observation.tally.state(self.label, "NET on the sky, median (range), mK s^1/2", text)
+        varies = self.model is not None or self.reference == "detector"  # with the load, from scan to scan
+        whose = f"{observation.name}: " if varies else ""
+        observation.tally.state(self.label, f"{whose}NET on the sky, median (range), mK s^1/2", text)
 
     def _amplitude(self, observation: Observation, state: _State) -> SmoothField:
         with state.lock:

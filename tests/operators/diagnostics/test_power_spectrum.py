@@ -73,6 +73,7 @@ def test_a_drift_is_taken_out():
 
 def test_components_are_referred_to_the_sky(make_observation, data, noise):
     observation = make_observation(20000)
+    observation.components = frozenset({"sky", "white", "atmosphere"})
     found = run(PowerSpectrum(segment="20 s"), observation, data, noise)
     level = 2 * 1e-6 / 50.0
     # 16 detectors x 39 half-overlapping segments x 500 frequencies (1.5: Hann): 0.23 %; five sigma

@@ -296,3 +296,14 @@ def test_the_depth_of_a_map_is_told_per_beam():
     assert f"{seconds:.3g}\u00a0s" in shown
     assert "of all detectors per 8.5″ beam, central 2′; " in shown
     assert f"{np.median(product.hits[near]):.4g} samples per 3″ pixel" in shown
+
+
+def test_the_net_is_that_of_all_scans(data, report, make_observation):
+    first = make_observation(500)
+    first.focalplane.net = first.focalplane.net * 5  # noise that follows from the load: every scan has its own
+    data.observations.append(first)
+    assert "1 to 5 mK_RJ √s, mean 3 (no white noise is simulated)" in report()[1]
+    data.provenance["operators"] = [("WhiteNoise", "WhiteNoise", {})]
+    text = report()[1]
+    assert "1 to 5 mK_RJ √s" in text
+    assert "no white noise" not in text

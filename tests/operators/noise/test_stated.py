@@ -30,7 +30,7 @@ def run(white, *, runs=None, output=None, extra=(), pwv="1.5 mm", weights="inver
         *after,
         zonda.BinMap(pixel="10 arcsec", weights=weights, half_difference=False),
     ]
-    return zonda.Pipeline(steps, runs=runs or {}).run(scene, output=output, keep=["white"])
+    return zonda.Pipeline(steps, runs=runs or {}).run(scene, output=output, keep=["white"] if white else [])
 
 
 @pytest.mark.parametrize("kind", levels())
@@ -122,3 +122,30 @@ def test_noise_grows_with_the_transmission_at_every_moment():
     field = SmoothField.from_values(np.ones((3, 1)), t[None], 128, n)
     exact = np.sqrt(np.mean(field.evaluate(slice(0, 3), slice(0, n)) ** -2.0, axis=1))
     np.testing.assert_allclose(rms_of_inverse(field, 3), exact, rtol=1e-3)  # midpoints of 32 cells: h^2 f'' / 24
+
+
+def test_each_scan_has_a_level_of_its_own():
+    """Two scans an hour apart: the load differs, and so does the NET that is told of each."""
+    instrument = camera(low="800 GHz", high="900 GHz")
+    scene = zonda.Scene(site="chajnantor", instrument=instrument, time="2024-07-25T03:00", target="17h -20d", seed=1)
+    steps = [
+        zonda.PointingDaisy(radius="4 arcmin", speed="1 arcmin/s", scan_duration="5 s", scans=2, gap="1 h"),
+        zonda.AtmosphereLayers(pwv="1.5 mm", pwv_rms="0 %"),
+        WhiteNoise(model="background_limited"),
+        zonda.Efficiency(),
+    ]
+    data = zonda.Pipeline(steps).run(scene)
+    told = {what: text for who, what, text in data.tally if who == "WhiteNoise"}
+    for o in data.observations:
+        net = 1e3 * float(np.median(o.focalplane.net))
+        assert float(told[f"{o.name}: NET on the sky, median (range), mK s^1/2"].split()[0]) == pytest.approx(net, rel=1e-3)
+    first, second = (float(o.focalplane.net.mean()) for o in data.observations)
+    assert abs(second / first - 1) > 0.01
+
+
+@pytest.mark.parametrize("white", [[], [WhiteNoise()]], ids=["none", "white"])
+def test_a_run_without_white_noise_says_so(white, tmp_path):
+    data = run(white, output=tmp_path, after=[zonda.SaveTOD(), zonda.PowerSpectrum(segment="2 s")])
+    told = [who for who, _, text in data.tally if text.endswith("no white noise")]
+    assert told == ([] if white else ["BinMap", "SaveTOD"])
+    assert (data.products["spectrum"].white_level > 0) == bool(white)
