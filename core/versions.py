@@ -48,10 +48,9 @@ def arithmetic() -> dict[str, str]:
 
 
 def _of_numpy() -> list[str]:
-    from importlib import import_module
-
     with suppress(ImportError, AttributeError):
-        inside = import_module("numpy._core._multiarray_umath")
+        from numpy._core import _multiarray_umath as inside  # type: ignore[attr-defined]
+
         return [name for name in inside.__cpu_dispatch__ if inside.__cpu_features__.get(name)]
     return []
 

@@ -42,13 +42,11 @@ ALLOWED = {
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
     ("core/storage/packed.py", "import_module"): "gzip, bz2, lzma, uncompresspy, from tables in the same file",
     ("core/storage/hdf5_files.py", "subprocess.run"): "zonda itself, as a child; no shell; the file's path is one argument",
-    ("core/versions.py", "import_module"): "a module of numpy's, by its name",
     ("operators/atmosphere/era5_fetch.py", "import_module"): "cdsapi, by its name, when the user asks to fetch",
     ("operators/diagnostics/artist.py", "import_module"): "names from a table in the same file",
     ("operators/diagnostics/artist.py", "pickle.load"): "between parent and child, through pipes that nobody else has",
     ("operators/diagnostics/artist.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
     ("core/registry.py", "import_module"): "names from the registries' own declarations",
-    ("plugins/checks/dispatch.py", "importlib.import_module"): "a module of numpy's, by its name",
     ("plugins/checks/dispatch.py", "subprocess.run"): "zonda itself, as a child; no shell; the folder's path is one argument",
     ("zonda/__init__.py", "import_module"): "names from a table in the same file",
 }

@@ -197,6 +197,9 @@ def plan(
     spent = {m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed}
     noise = (left.depth.sample, left.map_noise, left.coverage.hits if left.coverage else 0.0)
     prediction = _saving(now, decided, context)
+    if whole:  # what is left out holds nothing
+        rest = {o.label: costs[o.label] for o in left.operators}
+        prediction = dataclasses.replace(prediction, bytes=predict(left, rest, *settings).bytes)
     unpruned = _unpruned(pipeline, scene, structure, everything, context, estimates, now, settings)
     planning = time.process_time() - begin
     prediction, unpruned = (dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned))

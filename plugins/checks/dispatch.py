@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,6 +11,8 @@ import numpy as np
 
 import zonda
 from zonda.core.checks import Family, Measured
+from zonda.core.children import command
+from zonda.core.versions import arithmetic
 
 from .cases import DISPATCH
 from .scenes import camera, scene, sky_file
@@ -22,7 +23,7 @@ SCALE = 2.0**-20
 """Rounding of float32, relative, of some sixteen operations one after the other."""
 
 
-def small_map(folder: Path) -> None:
+def small_map(place: str) -> None:
     """Run a small scene with everything in it; write its map and the largest value of its streams."""
     with sky_file(1e-3 * np.random.default_rng(0).standard_normal((64, 64))) as path:
         steps = [
@@ -38,14 +39,18 @@ def small_map(folder: Path) -> None:
         ]
         data = zonda.Pipeline(steps).run(scene(camera(37)), threads=1, keep=("atmosphere", "pink"))
     largest = max(float(np.abs(x).max()) for x in data.observations[0].detdata.values())
-    np.savez(folder / "map.npz", signal=data.products["map"].signal, hits=data.products["map"].hits, largest=largest)
+    np.savez(Path(place) / "map.npz", signal=data.products["map"].signal, hits=data.products["map"].hits, largest=largest)
 
 
 def _in_a_process(folder: Path, environment: dict[str, str]) -> dict[str, np.ndarray]:
     folder.mkdir()
-    code = "import sys, pathlib; from zonda.plugins.checks.dispatch import small_map; small_map(pathlib.Path(sys.argv[1]))"
-    command = [sys.executable, "-P", "-c", code, str(folder)]
-    done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command(__name__, "small_map", str(folder)),
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         raise RuntimeError(f"the run on another instruction set failed: {done.stderr[-2000:]}")
     with np.load(folder / "map.npz") as found:
@@ -54,11 +59,8 @@ def _in_a_process(folder: Path, environment: dict[str, str]) -> dict[str, np.nda
 
 def baseline() -> dict[str, str]:
     """Environment variables that switch off what numba and numpy know beyond the architecture's least."""
-    import importlib
-
-    umath = importlib.import_module("numpy._core._multiarray_umath")
-    there = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__.get(name)]
-    return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NPY_DISABLE_CPU_FEATURES": " ".join(there)}
+    numpy = str(arithmetic()["numpy instructions"])
+    return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NPY_DISABLE_CPU_FEATURES": numpy}
 
 
 @checks.add(

@@ -277,7 +277,9 @@ def zonda_commands(group):
 """
 
 
-def test_a_plugin_s_own_command_ends_as_it_likes(plugin: Plugin) -> None:
+def test_a_plugin_s_own_command_ends_as_it_likes(plugin: Plugin, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli.zonda, "commands", dict(cli.zonda.commands))
+    monkeypatch.setattr(cli.zonda, "_extended", False)  # another test may have asked for the plugins' commands
     plugin("zf-command", "0.1", {"zonda.hooks": {"x": "zf_command"}}, zf_command=COMMAND)
     with pytest.raises(SystemExit) as caught:
         cli.main(["leave"])

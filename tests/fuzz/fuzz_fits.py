@@ -51,8 +51,9 @@ def target(data: bytes) -> None:
             continue
         assert np.isfinite(found.values).all()
         if isinstance(found, HealpixMap):
-            assert len(found.pixels) == len(found.values)
-            assert not len(found.pixels) or (found.pixels.min() >= 0 and found.pixels.max() < 12 * found.nside**2)
+            pixels = np.arange(12 * found.nside**2) if found.pixels is None else found.pixels  # None: of all the sky
+            assert len(pixels) == len(found.values)
+            assert not len(pixels) or (pixels.min() >= 0 and pixels.max() < 12 * found.nside**2)
         else:
             assert found.values.ndim == 2
             assert (found.wcs is None) == (found.scale is not None)

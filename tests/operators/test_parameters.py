@@ -93,6 +93,9 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         columns = [1732518000 + t, az + 0.02 * np.sin(t), el + 0.01 * np.cos(t)]
         head = "time [s], az [deg], el [deg]"
         np.savetxt(folder / f"{name}.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=head)
+        if name == "scan":
+            columns.append(np.arange(t.size) // 10 % 4)  # in turn no flag, 1, 2 and both
+            np.savetxt(folder / "flagged.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=f"{head}, flags")
     return folder
 
 
@@ -181,6 +184,8 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "clock": ({}, {"clock": "scene"}),
         "split": ({}, {"split": "2 s"}),
         "target": ({}, {"target": "05h00m10s +20d00m00s"}),
+        "flag_mask": ({"file": "flagged.csv"}, {"flag_mask": 2}),
+        "celestial": ({}, {"celestial": "recorded"}),
         "interpolation_error": ({"file": "long.csv"}, {"interpolation_error": 1e-9}),
     },
     "SkyMap": {
@@ -370,6 +375,7 @@ REFUSALS = {
     ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
     ("SaveMap", "overwrite"): "is there already",
     ("PointingRecorded", "clock"): "is too large",
+    ("PointingRecorded", "celestial"): "no boresight_radec",
     ("PointingDaisy", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingStare", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingBackAndForth", "check_limits"): "dish's largest speed of the azimuth axis",

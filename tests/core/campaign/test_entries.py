@@ -102,7 +102,7 @@ def test_a_target_is_at_the_same_place_on_the_next_night():
     ("campaign", "words", "place"),
     [
         ("{grid: {sed: [1]}}", ["nothing is called 'sed'", "did you mean 'seed'?"], "17:19"),
-        ("{grid: {site: [green_bank, greenbank]}}", ["unknown site 'greenbank'", "did you mean 'green_bank'?"], "17:38"),
+        ("{grid: {site: [green_bank, green_bnak]}}", ["unknown site 'green_bnak'", "did you mean 'green_bank'?"], "17:38"),
         ("{grid: {BinMap.pixel: [4 arcsec, 2 s]}}", ["BinMap, pixel: expected an angle"], "17:46"),
         ("{grid: {BinMap.pixle: [4 arcsec]}}", ["unknown key 'pixle' for BinMap", "did you mean 'pixel'?"], "17:19"),
         ("{observations: [{time: now}]}", ["cannot read 'now' as a time"], "17:34"),

@@ -66,7 +66,7 @@ def test_processes_give_the_same_bits(undisturbed, bench):
 def test_any_order_of_completion_gives_the_same_bits(undisturbed, bench, monkeypatch):
     for seed in (1, 2):
         monkeypatch.setattr("zonda.core.campaign.engines.SerialExecutor", lambda seed=seed: Shuffled(12, seed))
-        monkeypatch.setattr("zonda.core.campaign.engines.Pool", lambda ex, *rest: Pool(ex, 12, 0, 1, None))
+        monkeypatch.setattr("zonda.core.campaign.engines.Pool", lambda ex, *rest, **more: Pool(ex, 12, 0, 1, None))
         out = bench.run(bench.CAMPAIGN, *SERIAL)
         assert bench.planes(out) == bench.planes(undisturbed)
 

@@ -305,7 +305,7 @@ def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
     run(chain, obs, memory=int(1.9 * size), prefer="again")
     assert any("spilled" in what for _, what, _ in obs.tally)
     monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 1000)
-    with pytest.raises(PipelineError, match=r"(?s)neither in memory nor on the disk.*Scale.2 reads it as a whole.*--memory 15MB"):
+    with pytest.raises(PipelineError, match=r"(?s)neither in memory nor on the disk.*Scale.2 reads it as a whole.*--memory 16MB"):
         run(chain, observation(), memory=int(1.9 * size))
     level = [Source(), Demean(), Level(), Sink()]
     run(level, observation(), memory=int(1.9 * size), prefer="spilled")  # the disk has no room: made again

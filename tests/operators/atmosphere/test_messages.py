@@ -67,7 +67,7 @@ def complaint(capsys: Any, monkeypatch: Any, folder: Path, parameters: str, targ
         ("weights: vapor", ["did you mean 'vapour'?"]),
         ("edge_taper: 4", ["edge_taper is for beam: tapered"]),
         ("tolerance: .nan", ["tolerance: expected a finite number, got nan"]),
-        ("outputs: [ozone]", ["outputs", "should be 'pwv', 'opacity' or 'path_delay'"]),
+        ("outputs: [ozone]", ["outputs", "must be 'pwv', 'opacity' or 'path_delay'"]),
     ],
 )
 def test_parameters(capsys: Any, monkeypatch: Any, tmp_path: Path, parameters: str, words: list[str]) -> None:
