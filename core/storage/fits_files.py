@@ -60,7 +60,7 @@ def check_size(path: str | os.PathLike[str], hdu: Any, place: str) -> None:
 
 
 def _survey(path: str | os.PathLike[str], place: str) -> Any:
-    """What astropy may open: the path, or what was in a zip archive, which astropy would unpack to a temporary file.
+    """What astropy may open: the path, or what was in an xz file or a zip archive (astropy would unpack it to a temporary file).
 
     Refused are headers that would keep a reader busy without end, and compressed files whose headers lead beyond
     `packed.UNPACKED_MAX` (`InputError`); what else is wrong is left to astropy.
@@ -72,6 +72,9 @@ def _survey(path: str | os.PathLike[str], place: str) -> Any:
             if compressed and end > packed.UNPACKED_MAX:
                 raise packed.too_large(end, packed.UNPACKED_MAX, place, least=True)
             file.seek(end)
+        if type(file).__name__ == "LZMAFile":  # astropy 6 does not know xz
+            file.seek(0)
+            return io.BytesIO(file.read(packed.UNPACKED_MAX))
         return io.BytesIO(file.getvalue()) if isinstance(file, io.BytesIO) else path
 
 

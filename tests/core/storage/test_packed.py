@@ -123,7 +123,10 @@ def test_a_chunk_that_unpacks_to_more_than_it_holds_is_refused(tmp_path: Path) -
     with h5py.File(path, "w") as file:
         data = file.create_dataset("az", (8,), "f8", chunks=(8,), compression="gzip")
         data.attrs["unit"] = "deg"
-        data.id.write_direct_chunk((0,), zlib.compress(bytes(100_000_000), 9))
+        try:
+            data.id.write_direct_chunk((0,), zlib.compress(bytes(100_000_000), 9))
+        except OSError:
+            pytest.skip("this libhdf5 writes no chunk larger than what it holds")
     with pytest.raises(InputError, match=r"a chunk of /az is stored in \d+ bytes, more than the 64 that it holds"):
         read_pointing(path, "unix")
 
