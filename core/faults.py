@@ -1,4 +1,4 @@
-"""Whose fault it is: plugin code that raised, or left what it must not leave, is named.
+"""Errors of plugins: code of a plugin that raised, or left an invalid stream, is named.
 
 What a plugin raises is no user's mistake and no fault of zonda; it is told as one error that names the step, the function and the
 distribution. The traceback shows whose code it was, so that no call of a plugin needs to be guarded: not one of the methods of an

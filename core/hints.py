@@ -1,4 +1,4 @@
-"""Names that mean another thing: a site called like a telescope, an instrument called like a site."""
+"""Suggestions for names of the wrong kind: a telescope given as a site, a site given as an instrument."""
 
 from __future__ import annotations
 

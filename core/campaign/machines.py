@@ -1,4 +1,4 @@
-"""On what the tasks of a campaign ran: bits are the same on one kind of machine with one set of libraries alone."""
+"""CPU and libraries of each task of a campaign: bits are the same only on one kind of machine with the same libraries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What YAML's parser stumbled over, told as the mistake that was made: it stops one or more lines below its cause."""
+"""Syntax errors of YAML, reported at the line of their cause: the parser itself stops one or more lines below."""
 
 from __future__ import annotations
 

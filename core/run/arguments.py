@@ -1,4 +1,4 @@
-"""What is given to a pipeline in Python, checked before anything is done with it."""
+"""Checks of the arguments of `Pipeline` and `Pipeline.run`."""
 
 from __future__ import annotations
 

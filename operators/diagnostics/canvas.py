@@ -1,4 +1,4 @@
-"""Figures that belong to nobody else, their margins, colours and labels."""
+"""Matplotlib figures without pyplot: margins, colours and labels that all pictures share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a map's numbers may be: beyond these, products of a few of them are no numbers, and nothing on the sky is like that."""
+"""Largest and smallest values accepted in a sky map: beyond them arithmetic overflows, and nothing on the sky is like that."""
 
 from __future__ import annotations
 
