@@ -19,6 +19,7 @@ from .intervals import Intervals, runs
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from .types import AnyFloats
 
 if TYPE_CHECKING:
     from .configuration.time import Instant
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from .scene import Scene
     from .site import Site
     from .weather import GroundWeather
-
-Floats = NDArray[np.floating]
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
 """Streams that zonda's own operators make in every block: the components, and their calibrated sum. Their only use is to be read
@@ -167,12 +166,12 @@ class Observation:
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
     smooth: dict[str, SmoothField] = field(default_factory=dict)
-    detdata: dict[str, Floats] = field(default_factory=dict)
+    detdata: dict[str, AnyFloats] = field(default_factory=dict)
     resolved: dict[str, Any] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None
-    expected_net: Callable[[], Floats] | None = None
+    expected_net: Callable[[], AnyFloats] | None = None
     components: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -234,7 +233,7 @@ class Observation:
         """
         return self.key(*self.instrument.identity, *names)
 
-    def derotate(self, which: str) -> tuple[Floats, Floats, Floats]:
+    def derotate(self, which: str) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """(lon, lat, psi) of ``boresight_azel`` or ``boresight_radec`` [rad]; for azel lon = -azimuth."""
         x, y, z, w = getattr(self, which).T
         lat = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
@@ -243,23 +242,23 @@ class Observation:
         return lon % (2 * np.pi), lat, psi
 
     @property
-    def azimuth(self) -> Floats:
+    def azimuth(self) -> AnyFloats:
         """(n_samp,) rad, north through east, 0 to 2 pi."""
         return (-self.derotate("boresight_azel")[0]) % (2 * np.pi)
 
     @property
-    def elevation(self) -> Floats:
+    def elevation(self) -> AnyFloats:
         """(n_samp,) rad."""
         x, y, z, w = self.boresight_azel.T
         return np.asarray(np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x)), np.float64)
 
     @property
-    def ra(self) -> Floats:
+    def ra(self) -> AnyFloats:
         """(n_samp,) rad, ICRS."""
         return self.derotate("boresight_radec")[0]
 
     @property
-    def dec(self) -> Floats:
+    def dec(self) -> AnyFloats:
         """(n_samp,) rad, ICRS."""
         return self.derotate("boresight_radec")[1]
 
@@ -303,12 +302,12 @@ class Block:
     observation: Observation
     detectors: slice
     samples: slice
-    detdata: dict[str, Floats] = field(default_factory=dict)
+    detdata: dict[str, AnyFloats] = field(default_factory=dict)
     means: dict[str, SmoothField] = field(default_factory=dict)
     dtype: type[np.floating[Any]] = np.float32
-    buffers: dict[str, Floats] = field(default_factory=dict, repr=False)
+    buffers: dict[str, AnyFloats] = field(default_factory=dict, repr=False)
     """Memory reused from block to block; `exec` must not keep a stream beyond the call."""
-    places: dict[str, Floats] = field(default_factory=dict, repr=False)
+    places: dict[str, AnyFloats] = field(default_factory=dict, repr=False)
     """Where the executor wants a stream to be made, so that it need not be copied there."""
     again: bool = False
     """These samples were worked on before, and are made again because the streams do not fit in memory: an operator makes the
@@ -318,7 +317,7 @@ class Block:
     def shape(self) -> tuple[int, int]:
         return self.detectors.stop - self.detectors.start, self.samples.stop - self.samples.start
 
-    def new(self, name: str, *, zero: bool = True) -> Floats:
+    def new(self, name: str, *, zero: bool = True) -> AnyFloats:
         """Stream ``name``, made of zeros when it is not there yet; or of anything (not ``zero``), to be overwritten."""
         if name not in self.detdata:
             self.detdata[name] = self.places[name] if name in self.places else self.buffer(name, self.shape)
@@ -326,7 +325,7 @@ class Block:
                 self.detdata[name].fill(0)
         return self.detdata[name]
 
-    def buffer(self, name: str, shape: tuple[int, int]) -> Floats:
+    def buffer(self, name: str, shape: tuple[int, int]) -> AnyFloats:
         """An uninitialized array of `dtype`, reused between blocks under this name."""
         size = shape[0] * shape[1]
         held = self.buffers.get(name)
@@ -361,7 +360,7 @@ class Stream:
 
     name: str
     observation: Observation
-    array: Floats
+    array: AnyFloats
     means: dict[str, SmoothField]
     threads: int
     room: int = 0
@@ -376,7 +375,7 @@ class Stream:
         """float32 or float64."""
         return self.array.dtype
 
-    def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+    def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
         """(detectors, samples, result) of ``work(detectors, samples, part)`` over blocks that cover the stream once.
 
         ``work`` is called from several threads and must not change or keep the part. Results come in an order in which no

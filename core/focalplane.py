@@ -6,11 +6,9 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import InputError
-
-Floats = NDArray[np.float64]
+from .types import Floats
 
 
 @dataclass(repr=False)

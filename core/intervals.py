@@ -12,12 +12,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating]
+from .types import AnyFloats
+
 Intervals = dict[str, list[tuple[float, float]]]
 """By name: (start, stop) [s], in order and disjoint."""
 
 
-def runs(inside: NDArray[np.bool_], seconds: Floats) -> list[tuple[float, float]]:
+def runs(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, float]]:
     """The intervals of those samples (n,) that are ``inside``, taken at ``seconds`` (n,).
 
     A run of the last sample alone has no length, and is left out: TOAST's rule gives that sample to the interval before.
@@ -28,7 +29,7 @@ def runs(inside: NDArray[np.bool_], seconds: Floats) -> list[tuple[float, float]
     return [(start, stop) for start, stop in spans if stop > start]
 
 
-def samples_in(spans: list[tuple[float, float]], seconds: Floats) -> NDArray[np.bool_]:
+def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> NDArray[np.bool_]:
     """(n,) True for the samples in any of the intervals ``spans``."""
     inside = np.zeros(len(seconds), bool)
     for first, last in np.searchsorted(seconds, np.reshape(spans, (-1, 2))).tolist():

@@ -35,7 +35,7 @@ class Operator(Parameters):
     4. ``collect(data, observation, state)`` once per observation, in observation order: add partial products to ``data``.
     5. ``finalize(data)`` once at the end of the run: turn sums into products, write files.
 
-    `at_end` operators hear of what is done by ``meanwhile(data, done)``.
+    `at_end` operators hear of what is done by ``watch(data, done)``.
 
     A campaign (`core.campaign`) shares the observations out among tasks. What `observe` works out from all of them comes from
     `agree` and `lay_out`; between `collect` and `finalize`, `pack` takes a task's partial products out of ``data.products`` and
@@ -191,7 +191,7 @@ class Operator(Parameters):
     def collect(self, data: Data, observation: Observation, state: Any) -> None:
         """Add this observation's partial products to ``data.products``."""
 
-    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+    def watch(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         """Called for `at_end` operators once the telescope is pointed, after every scan, after every run (``data.run``), and when
         all runs have ended: time to begin with what `finalize` will do, as far as it depends on products that are there and will
         not change; in the background, until the runs have ended."""

@@ -275,7 +275,7 @@ class Pipeline:
     def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         for operator in self.operators:
             if operator.at_end:
-                operator.meanwhile(data, done)
+                operator.watch(data, done)
 
     def _finalize(self, operator: Operator, data: Data, timer: Timer, hooks: Any) -> None:
         hooks.zonda_before_operator(operator=operator, observation=None, stage="finalize")

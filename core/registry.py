@@ -295,10 +295,15 @@ checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
 metrics = Registry("metric", "zonda.metrics", classes=True)  # classes, or functions of `Data`: core.accuracy.metrics
 weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True)
 
+planning = Registry("planning", "zonda.planning", classes=True, exact=True)
+"""By the name of the operator's class: its `core.plan.planning.Planning`."""
+
 steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
 
-registries = (operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics)
+registries = (
+    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics, planning,
+)  # fmt: skip
 
 
 def refresh() -> None:

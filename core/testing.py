@@ -28,6 +28,7 @@ from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
 from .pipeline import Pipeline
+from .plan.planning import planning_of
 from .scene import Scene
 from .site import Site
 
@@ -74,7 +75,7 @@ def check_parameters_survive_text(operator: Operator) -> None:
 
 def check_knobs(operator: Operator) -> None:
     """Knobs turn parameters that exist, on ladders of at least two values that these accept."""
-    for knob in operator.knobs:
+    for knob in planning_of(operator).knobs:
         assert knob.parameter in type(operator).model_fields, f"knob {knob.parameter} is not a parameter"
         assert len(knob.ladder) >= 2, f"knob {knob.parameter} needs a ladder of at least two values"
         try:

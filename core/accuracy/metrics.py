@@ -10,16 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import registry
+from ..types import Floats
 
 if TYPE_CHECKING:
     from ..data import Data
     from ..operator import Operator
     from ..run.companion import Companion
-
-Floats = NDArray[np.float64]
 
 
 class Metric:

@@ -10,6 +10,7 @@ from ..configuration import yaml_places
 from ..configuration.diagnostics import nearest
 from ..errors import InputError
 from ..knobs import PRECISION, Knob
+from ..plan.planning import planning_of
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
@@ -74,7 +75,7 @@ def knobs_of(file: PipelineFile, only: Iterable[str] = ()) -> list[PipelineKnob]
     names = _names(file)
     for step, label, name in zip(file.steps, labels, names, strict=True):
         values = step.operator.model_dump(mode="json")
-        for knob in step.operator.knobs:
+        for knob in planning_of(step.operator).knobs:
             given = knob.parameter in step.operator.model_fields_set
             present = _on_ladder(knob, step.operator) or text(values[knob.parameter])
             found.append(_knob(knob, f"{name}.{knob.parameter}", label, present, given))

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from ..errors import InputError
+from ..plan.planning import planning_of
 from ..storage.files import write_text
 from .front import Point, cheapest
 from .metrics import get
@@ -64,7 +65,10 @@ def fingerprint(file: PipelineFile) -> str:
     described: list[Any] = [
         {k: _plain(getattr(scene, k)) for k in type(scene).model_fields if k != "seed"},
         [
-            (step.key, _described(step.operator, {*(k.parameter for k in step.operator.knobs), *_length(step.operator)}))
+            (
+                step.key,
+                _described(step.operator, {*(k.parameter for k in planning_of(step.operator).knobs), *_length(step.operator)}),
+            )
             for step in file.steps
             if not step.operator.at_end
         ],

@@ -15,17 +15,15 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..types import Floats
 from .stretches import stretches, untouched
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
     from .tangent import TangentWcs
-
-Floats = NDArray[np.float64]
 
 GALACTIC = (
     (-0.05487565771259163, -0.8734370519556159, -0.48383507361671546),

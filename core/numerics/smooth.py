@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compilation.columns import fused
-
-Floats = NDArray[np.floating]
+from ..types import AnyFloats
 
 PAD = 1
 """Coefficients before the first sample's interval, so that every sample has its four neighbours."""
@@ -36,17 +35,17 @@ REACH = 28
 """Values on either side beyond which the filter is below rounding: 0.27^28 = 1e-16."""
 
 
-def spline_coefficients(values: Floats, dtype: type = np.float64) -> Floats:
+def spline_coefficients(values: AnyFloats, dtype: type = np.float64) -> AnyFloats:
     """Cubic B-spline coefficients of rows of values (n, m + 2 `SPLINE_MARGIN`): (n, m), each from its neighbours alone.
 
     A finite filter, normalized to unit sum, so that a coefficient has the same bits wherever the rows begin.
     """
-    out: Floats = np.empty((values.shape[0], values.shape[1] - 2 * SPLINE_MARGIN), dtype)
+    out: AnyFloats = np.empty((values.shape[0], values.shape[1] - 2 * SPLINE_MARGIN), dtype)
     _prefilter(np.ascontiguousarray(values, np.float64), _inverse_taps(SPLINE_MARGIN), out)
     return out
 
 
-def interpolating(values: Floats) -> NDArray[np.float64]:
+def interpolating(values: AnyFloats) -> NDArray[np.float64]:
     """Cubic B-spline coefficients (n, m) of rows of values (n, m), mirrored about their first and their last: exact."""
     out = np.empty(values.shape)
     rows = np.pad(np.ascontiguousarray(values, np.float64), ((0, 0), (REACH, REACH)), mode="reflect")
@@ -71,7 +70,7 @@ def coarse_times(n_samples: int, step: int) -> NDArray[np.int64]:
 
 
 @lru_cache(maxsize=32)
-def _inside(step: int, dtype: str) -> Floats:
+def _inside(step: int, dtype: str) -> AnyFloats:
     """(step,) r / step."""
     return (np.arange(step) / step).astype(dtype)
 
@@ -79,10 +78,10 @@ def _inside(step: int, dtype: str) -> Floats:
 class Series(NamedTuple):
     """A field over a block, for kernels that evaluate it where they use it with `series_into`."""
 
-    lines: Floats
+    lines: AnyFloats
     """(n_det_block, n): each detector's B-spline coefficients from cell ``first`` on, C order."""
     first: int
-    inside: Floats
+    inside: AnyFloats
     """(step,): r / step, where a sample stands in its cell."""
 
 
@@ -102,15 +101,17 @@ class SmoothField:
         Samples covered.
     """
 
-    weights: Floats
-    coefficients: Floats
+    weights: AnyFloats
+    coefficients: AnyFloats
     step: int
     n_samples: int
-    _kept: dict[str, Floats] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _kept: dict[str, AnyFloats] = field(default_factory=dict, init=False, repr=False, compare=False)
     """All detectors' lines by type, where they are small."""
 
     @classmethod
-    def from_values(cls, weights: Floats, values: Floats, step: int, n_samples: int, dtype: type = np.float64) -> SmoothField:
+    def from_values(
+        cls, weights: AnyFloats, values: AnyFloats, step: int, n_samples: int, dtype: type = np.float64
+    ) -> SmoothField:
         """From node values with a margin: ``values`` (n_node, n_coarse + 2 * margin) sampled every ``step`` samples.
 
         The margin (equal on both sides, inferred from the width) is used by the spline prefilter and then dropped;
@@ -124,16 +125,16 @@ class SmoothField:
         return cls(np.ascontiguousarray(weights, dtype), kept.astype(dtype), step, n_samples)
 
     @classmethod
-    def constant(cls, per_detector: Floats, n_samples: int, step: int = 2048) -> SmoothField:
+    def constant(cls, per_detector: AnyFloats, n_samples: int, step: int = 2048) -> SmoothField:
         """A field that does not vary in time: ``per_detector`` (n_det,)."""
         ones = np.ones((1, -(-n_samples // step) + 3))
         return cls(np.ascontiguousarray(np.asarray(per_detector, np.float64)[:, None]), ones, step, n_samples)
 
-    def scaled(self, per_detector: Floats) -> SmoothField:
+    def scaled(self, per_detector: AnyFloats) -> SmoothField:
         """The field times a per-detector factor (n_det,)."""
         return SmoothField(self.weights * np.asarray(per_detector)[:, None], self.coefficients, self.step, self.n_samples)
 
-    def evaluate(self, detectors: slice, samples: slice, out: Floats | None = None) -> Floats:
+    def evaluate(self, detectors: slice, samples: slice, out: AnyFloats | None = None) -> AnyFloats:
         """f at the detectors and samples of a block: (n_det_block, n_samp_block), of ``out``'s dtype or float64.
 
         Bits depend on the absolute detector and sample only. ``out`` is overwritten.
@@ -167,7 +168,7 @@ class SmoothField:
         self._kept.clear()
 
 
-def product(rows: Floats, matrix: Floats) -> NDArray[np.float64]:
+def product(rows: AnyFloats, matrix: AnyFloats) -> NDArray[np.float64]:
     """Rows (n, m) times a small matrix (m, k), (n, k): not by BLAS, whose bits in one row depend on how many there are and
     where it stands among them."""
     out = np.empty((len(rows), matrix.shape[1]))
@@ -187,11 +188,11 @@ class DetectorField:
         As in `SmoothField`.
     """
 
-    coefficients: Floats
+    coefficients: AnyFloats
     step: int
     n_samples: int
 
-    def evaluate(self, detectors: slice, samples: slice, out: Floats | None = None) -> Floats:
+    def evaluate(self, detectors: slice, samples: slice, out: AnyFloats | None = None) -> AnyFloats:
         """As `SmoothField.evaluate`."""
         start, stop = samples.start, samples.stop
         if not 0 <= start <= stop <= self.n_samples:

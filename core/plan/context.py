@@ -17,6 +17,7 @@ from ..operator import Operator
 from ..pipeline import Pipeline
 from ..scene import Scene
 from .estimate import Traits
+from .planning import planning_of
 from .structure import STREAMS, Structure, selected
 
 DEEP = 0.9
@@ -262,7 +263,7 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
     runs = selected(pipeline, structure)
     streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.main_run_only))
     context = Context(scene, data.observations, operators, runs, kept_streams=streams)
-    context.traits = {o.label: o.traits(context.lowest) for o in operators}
+    context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(operators, shown, context)
     pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
     if pixels:
@@ -289,7 +290,7 @@ def _depth(operators: Sequence[Operator], observations: Sequence[Observation], c
     for observation in observations:
         total = np.zeros(observation.n_detectors)
         for operator in makers:
-            found = operator.traits(observation)
+            found = planning_of(operator).traits(observation)
             total += found.noise**2 if found.each is None else found.each**2
             quietest[operator.label] = min(quietest[operator.label], found.noise)
         variances.append(total)

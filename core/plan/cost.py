@@ -21,6 +21,7 @@ from ..storage import user_cache
 from .context import Context
 from .estimate import Cost
 from .outcome import Prediction
+from .planning import planning_of
 
 REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
 """Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""
@@ -103,7 +104,7 @@ def predict(
     factors = dict.fromkeys(REFERENCE, 1.0) if portable else calibrate()
     late = {o.label for o in context.operators if o.at_end}
     longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
-    own = {o.label: o.memory(longest) for o in context.operators}
+    own = {o.label: planning_of(o).memory(longest) for o in context.operators}
     held = sum(own.get(label) or cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
     steps = [o for o in context.operators if not o.at_end and "boresight" not in o.provides]
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)

@@ -22,6 +22,7 @@ from .context import Context, look
 from .cost import predict
 from .estimate import METRICS, Bound, Choice, Cost, Effect, Estimate, full
 from .outcome import Prediction, apply
+from .planning import planning_of
 from .structure import Structure, prune, selected
 from .whole import everything_of, without
 
@@ -173,7 +174,7 @@ def plan(
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
     allowed = {m: v for m, v in budget.items() if m in context.metrics}
     context.limits = allowed
-    estimates = {o.label: o.estimate(context) for o in context.operators}
+    estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
     effects = [Decided(label, e, 0) for label, estimate in estimates.items() for e in estimate.effects]
     effects += [Decided("pipeline", e, 0) for e in _of_pipeline(pipeline, context)]
     _named(drop, effects, labels)
@@ -320,7 +321,7 @@ def _unpruned(
             if not (operator.at_end or operator.main_run_only):
                 operator.observe(Data(scene=scene, observations=list(context.observations)))
             operator.configure(whole.first)
-            known = operator.estimate(whole)
+            known = planning_of(operator).estimate(whole)
         costs[operator.label] = known.cost
     return predict(whole, costs, *settings)
 

@@ -9,6 +9,7 @@ from ..configuration.pipeline_file import PipelineFile
 from ..errors import ZondaError
 from .context import Context, look
 from .estimate import Bound, Choice, Effect, Estimate, add, full
+from .planning import planning_of
 from .structure import Structure
 
 NAME = "everything"
@@ -48,8 +49,8 @@ def everything_of(label: str, estimates: Mapping[str, Estimate], context: Contex
         before, after = context.traits[other.label], left.traits[other.label]
         if (before.loudest, before.noise, before.rms) != (after.loudest, after.noise, after.rms):
             # two levels differ by less than the larger of them
-            both = (_contributes(other.label, e, c) for e, c in ((estimates[other.label], context), (other.estimate(left), left)))
-            one, two = both
+            there, here = estimates[other.label], planning_of(other).estimate(left)
+            one, two = (_contributes(other.label, e, c) for e, c in ((there, context), (here, left)))
             bound = add(bound, {m: max(one.get(m, 0.0), two.get(m, 0.0)) for m in {*one, *two}})
     text = "sum of what its effects contribute, and of what others make at another level without it"
     return Effect(NAME, (full("in full"), Choice("dropped", "left out", leave_out=True, bound=bound, formula=text)), bound, text)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from ..data import Observation
 from ..operator import Operator
+from ..plan.planning import planning_of
 from .forecast import spares
 from .settings import Settings
 
@@ -42,7 +43,7 @@ def reach(operators: Sequence[Operator]) -> int:
 def memory(operators: Sequence[Operator], observations: Sequence[Observation]) -> int:
     """Bytes that an observation prepared ahead holds."""
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
-    return sum(o.memory(longest) for o in operators[: reach(operators)] if not o.product_only)
+    return sum(planning_of(o).memory(longest) for o in operators[: reach(operators)] if not o.product_only)
 
 
 def affordable(operators: Sequence[Operator], observations: Sequence[Observation], settings: Settings) -> int | None:

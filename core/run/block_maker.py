@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ..data import STREAMS, Block, Floats, Observation, Stream, Tally
+from ..data import STREAMS, Block, Observation, Stream, Tally
 from ..faults import PluginError, whose
 from ..numerics.tiles import TILE_SAMPLES
 from ..operator import Operator
+from ..types import AnyFloats
 from .blocks import pieces, trimmed, within
 from .repeated import Repeated
 from .same_air import SameAir
@@ -168,7 +169,7 @@ class BlockMaker:
 
     def _in_pieces(self, operators: list[Operator], block: Block, passed_on: set[str]) -> None:
         """Let operators that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
-        given, means, made = block.detdata, block.means, dict[str, Floats]()
+        given, means, made = block.detdata, block.means, dict[str, AnyFloats]()
         buffers = self._local.__dict__.setdefault("pieces", {})
         for detectors, samples in pieces(block.detectors, block.samples):
             piece = Block(
@@ -187,7 +188,7 @@ class BlockMaker:
         block.detdata = {**given, **made}
 
 
-def check_left(operator: Operator, block: Block, before: Mapping[str, Floats], due: frozenset[str]) -> None:
+def check_left(operator: Operator, block: Block, before: Mapping[str, AnyFloats], due: frozenset[str]) -> None:
     """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of the block's shape and type.
 
     Parameters

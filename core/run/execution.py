@@ -20,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Block, Data, Floats, Observation, Stream, Tally, in_order
+from ..data import Block, Data, Observation, Stream, Tally, in_order
 from ..discovery import RAISED
 from ..errors import PipelineError
 from ..machine import resident_memory
 from ..numerics.smooth import SmoothField
 from ..operator import Operator
+from ..types import AnyFloats
 from .ahead import Ahead, reach
 from .block_maker import BlockMaker
 from .blocks import Segment, cut, least_block
@@ -236,14 +237,14 @@ class Execution:
             stage, name, threads = source.stage, names[0], self.settings.threads
             what = f"{operator.label} measures {name}"
 
-            def sweeper(work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+            def sweeper(work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
                 return self._sweep(stage, name, work, what)
 
             stream = StreamMadeAgain(name, self.observation, source.means, threads, self.settings.dtype, sweeper)
         else:
             stream = source.streams[names[0]]
             stream.room = max(self.settings.memory - self._store.held, 0)
-        lent: list[Floats] = []
+        lent: list[AnyFloats] = []
         if not knows_means(operator) and (fields := means_of(self.observation, source.means, frozenset(names))):
             stream = WholeStream(stream, fields[names[0]], partial(self._lend, names[0], lent))
         before(operator=operator, observation=self.observation, stage="measure")
@@ -262,7 +263,7 @@ class Execution:
         self.timer.add(operator.label, "measure", used)
         after(operator=operator, observation=self.observation, stage="measure", seconds=used)
 
-    def _lend(self, name: str, lent: list[Floats], shape: tuple[int, int]) -> Floats:
+    def _lend(self, name: str, lent: list[AnyFloats], shape: tuple[int, int]) -> AnyFloats:
         """A float64 array, noted in ``lent``, for as long as a step measures."""
         lent.append(self._store.allocate(name, shape, dtype=np.float64))
         return lent[-1]
@@ -271,7 +272,7 @@ class Execution:
         return sum(self.timer.seconds.get((o.label, stage), 0.0) for o in self.operators)
 
     def _sweep(
-        self, stage: Stage, name: str, work: Callable[[slice, slice, Floats], Any], what: str
+        self, stage: Stage, name: str, work: Callable[[slice, slice, AnyFloats], Any], what: str
     ) -> Iterator[tuple[slice, slice, Any]]:
         """`Stream.sweep` of a stream that ``stage`` makes."""
 

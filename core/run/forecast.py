@@ -15,6 +15,7 @@ from ..data import Observation, Stream
 from ..errors import PipelineError
 from ..machine import available_memory, resident_memory
 from ..operator import Operator
+from ..plan.planning import planning_of
 from .blocks import Segment, cut
 from .layout import Layout, read
 from .settings import Settings
@@ -105,7 +106,7 @@ def room(
     """
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
     parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
-    parts.update((o.label, o.memory(longest)) for o in operators)
+    parts.update((o.label, planning_of(o).memory(longest)) for o in operators)
     parts |= {"products to derive runs from": kept} if kept else {}
     fixed = sum(parts.values())
     left = dataclasses.replace(settings, memory=max(budget - fixed, 1))
@@ -126,7 +127,9 @@ def need(operators: Sequence[Operator], observations: Sequence[Observation], set
     """
     longest = max(observations, key=lambda o: o.n_detectors * o.n_samples)
     one = dataclasses.replace(settings, threads=1)
-    return _with_margin(BASE + kept + sum(o.memory(longest) for o in operators) + forecast(operators, longest, one).least)
+    return _with_margin(
+        BASE + kept + sum(planning_of(o).memory(longest) for o in operators) + forecast(operators, longest, one).least
+    )
 
 
 def _with_margin(size: int) -> int:
@@ -139,7 +142,7 @@ def _refuse(operators: Sequence[Operator], parts: Mapping[str, int], blocks: int
     rows = sorted([*parts.items(), (f"blocks on {threads} thread{'s' if threads > 1 else ''}", blocks)], key=lambda row: -row[1])
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
     cures = [f"use --memory {_with_margin(need) // 1_000_000}MB"] if need * 1.05 <= free else []
-    cures += [f"{o.label}: {o.lighter}" for o in operators if o.lighter and parts[o.label] > 0.1 * need]
+    cures += [f"{o.label}: {planning_of(o).smaller}" for o in operators if planning_of(o).smaller and parts[o.label] > 0.1 * need]
     if blocks > 0.1 * need and parts["zonda and its libraries"] < budget:
         cures.append("split the scan into shorter ones")
     beyond = f", more than this machine has ({_size(free)})" if need > free else ""

@@ -10,6 +10,7 @@ from ..data import Observation
 from ..errors import PipelineError
 from ..numerics.tiles import TILE_DETECTORS
 from ..operator import Operator
+from ..plan.planning import planning_of
 from .blocks import PIECE, Segment, block_share, blocks, least_block, whole_span
 from .settings import Settings
 from .streams import DISK_RATE, SAMPLE_COST, WORTH_MEASURING, Held, Source, Stage, choose, disk_rate
@@ -75,7 +76,7 @@ class Layout:
         following = later[0]
         head, span = following.operators[0], stage.span
         hindrance = ""
-        if head.couples == "all" and not head.sweeps(self.observation):
+        if head.couples == "all" and not planning_of(head).sweeps(self.observation):
             hindrance = f"{head.label} reads it as a whole"
         elif {span, following.span} == {"time", "detectors"}:
             hindrance = f"{head.label} needs the other direction whole"
@@ -101,7 +102,7 @@ class Layout:
     def readings(self, later: Sequence[Segment]) -> int:
         """How often, beyond once, the segments to come read what is passed on to the first of them."""
         heads = [s.operators[0] for s in later]
-        swept = sum(o.sweeps(self.observation) for o in heads if o.couples == "all")
+        swept = sum(planning_of(o).sweeps(self.observation) for o in heads if o.couples == "all")
         return swept + round(2 * later[0].halo / PIECE + 0.4)
 
     # ---- blocks

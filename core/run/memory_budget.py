@@ -10,6 +10,7 @@ import numpy as np
 from ..data import Observation
 from ..machine import available_memory, resident_memory
 from ..operator import Operator
+from ..plan.planning import planning_of
 from . import ahead as preparation
 from .ahead import Ahead
 from .derived import parts_of
@@ -73,4 +74,4 @@ def least(pipeline: Pipeline, observations: Sequence[Observation]) -> int:
 
 def _summed(operators: Sequence[Operator], observation: Observation) -> int:
     """Bytes of what one run keeps, to derive others from."""
-    return sum(o.memory(observation) for o in operators if type(o).subtract is not Operator.subtract)
+    return sum(planning_of(o).memory(observation) for o in operators if type(o).subtract is not Operator.subtract)

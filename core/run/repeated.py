@@ -11,10 +11,11 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from ..data import Block, Floats, Observation, Tally
+from ..data import Block, Observation, Tally
 from ..errors import PipelineError
 from ..numerics.stretches import untouched
 from ..operator import Operator
+from ..types import AnyFloats
 from .forecast import spares
 from .layout import read
 from .settings import Settings
@@ -69,7 +70,7 @@ class Repeated:
         """What the steps told in `Operator.collect` of the main run."""
         self.complete = False
         """The main run is through: `repeat` may be called, `record` not any more."""
-        self._arrays: dict[tuple[str, str], Floats] = {}
+        self._arrays: dict[tuple[str, str], AnyFloats] = {}
 
     def begin(self, shape: tuple[int, int], settings: Settings) -> None:
         """Take memory; ``settings`` knows of it."""

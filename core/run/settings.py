@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Floats
+from ..types import AnyFloats
 from .streams import Held
 
 
@@ -45,8 +45,8 @@ class Settings:
     memory: int = 2 << 30
     dtype: type[np.floating[Any]] = np.float32
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
-    spare: list[Floats] = field(default_factory=list)
-    kept: list[Floats] = field(default_factory=list)
+    spare: list[AnyFloats] = field(default_factory=list)
+    kept: list[AnyFloats] = field(default_factory=list)
     ceiling: int | None = None
     prefer: Held | None = None
     asked: int | None = None

@@ -26,10 +26,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..data import Floats, Observation, Stream
+from ..data import Observation, Stream
 from ..errors import OutputError, PipelineError
 from ..numerics.smooth import SmoothField
 from ..numerics.stretches import untouched
+from ..types import AnyFloats
 
 if TYPE_CHECKING:
     from .blocks import Segment
@@ -140,13 +141,13 @@ class StreamMadeAgain(Stream):
         means: dict[str, SmoothField],
         threads: int,
         dtype: type[np.floating[Any]],
-        sweeper: Callable[[Callable[[slice, slice, Floats], Any]], Iterator[tuple[slice, slice, Any]]],
+        sweeper: Callable[[Callable[[slice, slice, AnyFloats], Any]], Iterator[tuple[slice, slice, Any]]],
     ) -> None:
         self.name, self.observation, self.means, self.threads = name, observation, means, threads
         self._dtype, self._sweeper = np.dtype(dtype), sweeper
 
     @property
-    def array(self) -> Floats:  # type: ignore[override]
+    def array(self) -> AnyFloats:  # type: ignore[override]
         """Refused: there is no such array."""
         raise PipelineError(
             f"the stream {self.name} is made again when it is read and is nowhere held as a whole",
@@ -164,7 +165,7 @@ class StreamMadeAgain(Stream):
         """Of its parts."""
         return self._dtype
 
-    def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+    def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
         """See `Stream.sweep`."""
         return self._sweeper(work)
 
@@ -172,10 +173,10 @@ class StreamMadeAgain(Stream):
 class Store:
     """Arrays for whole streams: in memory up to half of the budget, or in a temporary folder, removed at the end."""
 
-    def __init__(self, memory: int, dtype: type[np.floating[Any]], spare: list[Floats], ledger: Ledger) -> None:
+    def __init__(self, memory: int, dtype: type[np.floating[Any]], spare: list[AnyFloats], ledger: Ledger) -> None:
         self._room, self._dtype, self._spare, self._ledger = memory // 2, np.dtype(dtype), spare, ledger
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._live: dict[int, Floats] = {}
+        self._live: dict[int, AnyFloats] = {}
 
     @property
     def held(self) -> int:
@@ -192,7 +193,7 @@ class Store:
 
     def allocate(
         self, name: str, shape: tuple[int, int], in_memory: bool = True, dtype: type[np.floating[Any]] | None = None
-    ) -> Floats:
+    ) -> AnyFloats:
         """An array of anything; a memory map of a file where it does not fit or is not wanted in memory.
 
         ``dtype``: where it is not that of the streams.
@@ -211,7 +212,7 @@ class Store:
         self._note()
         return array
 
-    def release(self, arrays: list[Floats]) -> None:
+    def release(self, arrays: list[AnyFloats]) -> None:
         """Keep memory that is no longer used for the next stream: touching fresh memory costs as much as the physics."""
         for array in {id(a): a for a in arrays}.values():
             self._live.pop(id(array), None)
@@ -219,7 +220,7 @@ class Store:
                 self._spare.append(array)
         self._note()
 
-    def drop(self, arrays: list[Floats]) -> None:
+    def drop(self, arrays: list[AnyFloats]) -> None:
         """Give back what no later stream can use."""
         for array in arrays:
             self._live.pop(id(array), None)
@@ -238,7 +239,7 @@ class Store:
     def _note(self) -> None:
         self._ledger.note(("streams",), self.held)
 
-    def _file(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> Floats:
+    def _file(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> AnyFloats:
         size = shape[0] * shape[1] * dtype.itemsize
         try:
             if self._folder is None:
@@ -265,14 +266,14 @@ def _reserve(handle: int, size: int) -> None:
         os.ftruncate(handle, size)
 
 
-def forget_pages(array: Floats) -> None:
+def forget_pages(array: AnyFloats) -> None:
     """Take the pages of a spilled stream out of this process's memory; the file keeps them."""
     pages = getattr(array, "_mmap", None)
     if pages is not None and hasattr(mmap, "MADV_DONTNEED"):
         pages.madvise(mmap.MADV_DONTNEED)
 
 
-def columns(array: Floats, samples: slice) -> Floats:
+def columns(array: AnyFloats, samples: slice) -> AnyFloats:
     """(n_det, n) samples of all detectors as an array of its own.
 
     A spilled stream's are read from its file: around each page that is touched in a mapping the system maps up to 64 kB, which is

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Block, Floats, Observation, Stream
+from ..data import Block, Observation, Stream
 from ..numerics.smooth import SmoothField
 from ..operator import Operator
+from ..types import AnyFloats
 
 EMISSION = "atmosphere"
 """The stream whose mean is in ``observation.smooth``, where calibration and noise models find it, too."""
@@ -50,7 +51,11 @@ def means_of(observation: Observation, means: Mapping[str, SmoothField], names: 
 
 
 def exec_whole(
-    block: Block, operator: Operator, fields: Mapping[str, SmoothField], buffers: dict[str, Floats], work: Callable[[Block], None]
+    block: Block,
+    operator: Operator,
+    fields: Mapping[str, SmoothField],
+    buffers: dict[str, AnyFloats],
+    work: Callable[[Block], None],
 ) -> None:
     """Equation (1) on one block.
 
@@ -104,13 +109,13 @@ class WholeStream(Stream):
         Gives an array of a shape for all of it, where somebody wants it as one.
     """
 
-    def __init__(self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, ...]], Floats]) -> None:
+    def __init__(self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, ...]], AnyFloats]) -> None:
         self.name, self.observation, self.threads, self.room = stream.name, stream.observation, stream.threads, stream.room
         self.means = {name: other for name, other in stream.means.items() if name != stream.name}
         self._stream, self._field, self._allocate = stream, field, allocate
 
     @cached_property
-    def array(self) -> Floats:  # type: ignore[override]
+    def array(self) -> AnyFloats:  # type: ignore[override]
         """(n_det, n_samp) float64; where the stream is made again when it is read, as there: refused."""
         whole = self._allocate(self._stream.array.shape)
         for detectors, samples, part in self.sweep(lambda detectors, samples, part: part):
@@ -127,10 +132,10 @@ class WholeStream(Stream):
         """float64."""
         return np.dtype(np.float64)
 
-    def sweep(self, work: Callable[[slice, slice, Floats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+    def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
         """See `Stream.sweep`."""
 
-        def of_whole(detectors: slice, samples: slice, part: Floats) -> Any:
+        def of_whole(detectors: slice, samples: slice, part: AnyFloats) -> Any:
             whole = self._field.evaluate(detectors, samples)
             whole += part
             return work(detectors, samples, whole)

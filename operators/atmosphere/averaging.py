@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.types import Floats
 
 from .geometry import axes, crossing, rays, tracks
 
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
     from .estimate import Air
     from .layers import AtmosphereLayers
-
-Floats = NDArray[np.float64]
 
 INSTANTS, CANDIDATES, HITS, WAVES = 4000, 48, 160, 160
 

@@ -24,11 +24,11 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from zonda.core.types import Floats
 
 from .covariance import NU
-
-Floats = NDArray[np.float64]
 
 GAUSSIAN_FWHM = math.sqrt(8 * math.log(2))
 

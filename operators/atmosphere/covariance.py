@@ -19,9 +19,9 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 NU = 5 / 6
 """Smoothness of frozen Kolmogorov turbulence seen through a layer."""

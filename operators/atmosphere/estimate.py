@@ -16,10 +16,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.instrument import Band
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, add, full
+from zonda.core.types import Floats
 
 from .averaging import shares
 from .band import BandAtmosphere, _BandTransfer
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from zonda.core.plan.context import Context
 
     from .layers import AtmosphereLayers, Layer
-
-Floats = NDArray[np.float64]
 
 INSTANTS = 200
 """Of a scan at which the speed through the air is looked at."""

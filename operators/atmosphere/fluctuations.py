@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, Floats, SmoothField, spline_coefficients
+from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, SmoothField, spline_coefficients
+from zonda.core.types import AnyFloats
 
 from .nodes import Nodes
 from .response import Response
@@ -83,7 +84,7 @@ class AtNodes:
         """Number of values of the water, their sum, and that of their squares."""
         return self.sums
 
-    def into(self, detectors: slice, samples: slice, out: dict[str, Floats]) -> None:
+    def into(self, detectors: slice, samples: slice, out: dict[str, AnyFloats]) -> None:
         """Overwrite the arrays ``out`` (n_det, n_samp), by name, with the fluctuations of a block."""
         for name, array in out.items():
             self.fields[name].evaluate(detectors, samples, array)
@@ -95,7 +96,7 @@ class OfDetectors:
     def __init__(self, nodes: Nodes, layers: Layers, water: Water, response: Response, step: int, n_samples: int) -> None:
         self._xi, self._eta, self._layers, self._water, self._response = nodes.xi, nodes.eta, layers, water, response
         self.step, self._n_samples = step, n_samples
-        self._units: OrderedDict[tuple[int, int], Future[dict[str, Floats]]] = OrderedDict()
+        self._units: OrderedDict[tuple[int, int], Future[dict[str, AnyFloats]]] = OrderedDict()
         self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
         self._lock = threading.Lock()
         self._size = 4 * min(UNIT_DETECTORS, len(nodes.xi)) * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * len(response.names)
@@ -111,7 +112,7 @@ class OfDetectors:
         parts = [self._sums[key] for key in sorted(self._sums)]
         return sum(p[0] for p in parts), math.fsum(p[1] for p in parts), math.fsum(p[2] for p in parts)
 
-    def into(self, detectors: slice, samples: slice, out: dict[str, Floats]) -> None:
+    def into(self, detectors: slice, samples: slice, out: dict[str, AnyFloats]) -> None:
         """As `AtNodes.into`."""
         for unit, of_detectors in _parts(detectors, UNIT_DETECTORS):
             for number, of_samples in _parts(samples, UNIT_SAMPLES):
@@ -130,7 +131,7 @@ class OfDetectors:
                     else:
                         part[...] = field.evaluate(rows, at, np.empty(part.shape, part.dtype))
 
-    def _unit(self, unit: int, number: int) -> dict[str, Floats]:
+    def _unit(self, unit: int, number: int) -> dict[str, AnyFloats]:
         """The coefficients of a unit. A thread that would wait for another to make it makes one that comes later instead."""
         room = max(1, BYTES_KEPT // self._size)
         while True:
@@ -144,7 +145,7 @@ class OfDetectors:
                     if not wanted.done():
                         key = next((k for k in self._next(unit, number, min(AHEAD, room)) if k not in self._units), None)
                 if key is not None:
-                    mine: Future[dict[str, Floats]] = Future()
+                    mine: Future[dict[str, AnyFloats]] = Future()
                     self._units[key] = mine
                     while len(self._units) > room:
                         self._units.popitem(last=False)  # whoever waits for it still holds it
@@ -168,7 +169,7 @@ class OfDetectors:
         for k in range(unit + 1, min(unit + reach, -(-len(self._xi) // UNIT_DETECTORS))):
             yield k, number
 
-    def _make(self, unit: int, number: int) -> dict[str, Floats]:
+    def _make(self, unit: int, number: int) -> dict[str, AnyFloats]:
         rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)
         samples = slice(number * UNIT_SAMPLES, min((number + 1) * UNIT_SAMPLES, self._n_samples))
         first, count = times(samples, self.step)

@@ -36,10 +36,9 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
+from zonda.core.types import Floats
 
 from .radiative_transfer import EARTH_RADIUS
-
-Floats = NDArray[np.float64]
 
 FLAT = 0.02
 """Largest relative error of squared separations up to which one transverse plane serves a whole scan."""

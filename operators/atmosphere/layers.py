@@ -18,7 +18,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from zonda.core.configuration.diagnostics import refusal
@@ -31,6 +30,7 @@ from zonda.core.knobs import Knob
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 
 from . import weather
 from .absorption import AbsorptionTable
@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from zonda.core.plan.estimate import Estimate, Traits
 
     from .weather import Profile
-
-Floats = NDArray[np.float64]
 
 LOG_NORMAL_FROM = 0.15
 """PWV rms from which y is exp(s g - s^2 var(g) / 2) - 1, so that water stays positive (below, 1 + y < 0 takes 6.7 sigma)."""

@@ -19,14 +19,12 @@ from collections.abc import Callable
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
+from zonda.core.types import Floats
 
 from .geometry import Cone, Track, axes_at, rim
-
-Floats = NDArray[np.float64]
 
 _ERROR = 1e-9
 """Of a polynomial in equation (1): micrometres at a layer some kilometres away."""

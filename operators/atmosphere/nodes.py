@@ -27,11 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN
+from zonda.core.types import Floats
 
 from .beams import Aperture
 from .covariance import mixture
-
-Floats = NDArray[np.float64]
 
 SPLINE_TABLE = Path(__file__).parent / "data" / "spline_error.npz"
 

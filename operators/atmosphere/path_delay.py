@@ -9,10 +9,7 @@ waves far from water lines; dispersion in the submillimetre windows (some per ce
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 WATER_DENSITY = 1000.0  # kg / m3
 VAPOUR_GAS_CONSTANT = 461.52  # J / (kg K)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.types import Floats
 
 from .band import BandAtmosphere
 from .geometry import Track, axes, axes_at, crossing, rays
@@ -30,8 +31,6 @@ from .nodes import (
     times_with_margin,
 )
 from .radiative_transfer import ELEVATION_MAX
-
-Floats = NDArray[np.float64]
 
 SMALLEST_DIFFERENCE = 1e-5
 """Share of the fluctuation that must differ between detectors for the tolerance to be judged by it."""

@@ -17,12 +17,11 @@ from functools import lru_cache
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
+
+from zonda.core.types import Floats
 
 from .band import BandAtmosphere
 from .radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
-
-Floats = NDArray[np.float64]
 
 ERROR = 1e-5
 """Largest error of f / y, of the largest |f / y|."""

@@ -22,12 +22,12 @@ from zonda.core.compilation.columns import four_columns_at
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
+from zonda.core.types import Floats
 
 from .geometry import Track, rim
 from .lines_of_sight import LinesOfSight
 from .turbulence import Field, Turbulence
 
-Floats = NDArray[np.float64]
 _Key = tuple[int, tuple[int, int, int, int]]
 
 SQUARE, STRIP = (8, 8), (5, 10)

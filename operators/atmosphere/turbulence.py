@@ -38,11 +38,11 @@ from numpy.typing import NDArray
 from zonda.core.compilation.columns import fused
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import lattice_normals, stream_key
+from zonda.core.types import Floats
 
 from .beams import Aperture
 from .covariance import NU, beam_correlation, mixture_between, spectrum_between
 
-Floats = NDArray[np.float64]
 Field = NDArray[np.float32]
 
 SMALLEST_RATIO, LARGEST_RATIO = 1e-3, 1e6

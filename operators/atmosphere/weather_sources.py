@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.files import InputPath
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import normals, stream_key, uniforms
+from zonda.core.types import AnyFloats
 from zonda.core.weather import Column, GroundWeather, WeatherSource
 
 from .era5 import read_era5
@@ -23,9 +23,6 @@ from .weather import Profile, check_pwv, climatology_column, on_heights
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
-
-
-Floats = NDArray[np.floating]
 
 
 class Climatology(WeatherSource):
@@ -120,7 +117,7 @@ def air_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, 
     return replace(profile, stated=(*profile.stated, ("water", how), *_supersaturated(profile), ("wind", wind)))
 
 
-def on_the_ground(profile: Profile, time: Instant, wind: Floats | None = None) -> GroundWeather:
+def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None) -> GroundWeather:
     """What instruments at the telescope read in this air; ``wind`` (east, north) [m/s] where it is not the profile's."""
     ground, air = profile.at(0.0), profile.at(10.0)
     vapour, temperature = float(air.vapour_density), float(air.temperature)

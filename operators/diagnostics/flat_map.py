@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .sky_axes import SkyAxes
+from zonda.core.types import AnyFloats
 
-Floats = NDArray[np.floating]
+from .sky_axes import SkyAxes
 
 FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
 
@@ -41,9 +41,9 @@ class FlatMap:
         `MapProduct.seconds_per_beam`.
     """
 
-    planes: dict[str, Floats]
-    hits: Floats
-    weights: Floats
+    planes: dict[str, AnyFloats]
+    hits: AnyFloats
+    weights: AnyFloats
     axes: SkyAxes | None
     header: dict[str, Any]
     centre: tuple[float, float]
@@ -52,7 +52,7 @@ class FlatMap:
     smoothed_by: float = 0.0
     rms: dict[str, float] = field(default_factory=dict)
     smooth: bool = True
-    per_beam: Floats | float | None = None
+    per_beam: AnyFloats | float | None = None
 
     def window(self) -> tuple[slice, slice]:
         """Rows and columns where there are samples, with a margin of a hundredth of the longer side; all, if they are most."""
@@ -108,7 +108,7 @@ class FlatMap:
         seen = hits[self.hits > 0]
         return np.asarray(hits >= least * np.percentile(seen, 99) if seen.size else self.hits > 0)
 
-    def limit(self, plane: str, hits: Floats, share: float) -> float | None:
+    def limit(self, plane: str, hits: AnyFloats, share: float) -> float | None:
         """Brightness scale that covers ``share`` per cent of what ``hits`` cover well: the noisy rim must not set it."""
         values = self.planes[plane]
         if not hits.any():
@@ -126,14 +126,14 @@ class FlatMap:
         return math.sqrt((w * values[use].astype(np.float64) ** 2).sum() / w.sum()) if w.sum() > 0 else math.nan
 
 
-def gaussian(sigma: float) -> Callable[[Floats], Floats]:
+def gaussian(sigma: float) -> Callable[[AnyFloats], AnyFloats]:
     """Convolution of an image (ny, nx) with a Gaussian of ``sigma`` pixels, cut at 5 sigma, of sum 1; nothing lies outside."""
     reach = np.arange(math.ceil(5 * sigma) + 1)
     kernel = np.exp(-(reach**2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
     kernel = (kernel / (2 * kernel.sum() - kernel[0])).astype(np.float32)
 
-    def rows(values: Floats) -> Floats:
-        out: Floats = values * kernel[0]
+    def rows(values: AnyFloats) -> AnyFloats:
+        out: AnyFloats = values * kernel[0]
         part = np.empty_like(values)
         for k in range(1, min(len(kernel), len(values))):
             np.multiply(values, kernel[k], out=part)
@@ -141,7 +141,7 @@ def gaussian(sigma: float) -> Callable[[Floats], Floats]:
             out[:-k] += part[k:]
         return out
 
-    def convolve(values: Floats) -> Floats:
+    def convolve(values: AnyFloats) -> AnyFloats:
         down = rows(np.asarray(values, np.float32))
         return np.ascontiguousarray(rows(np.ascontiguousarray(down.T)).T)
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .sky_axes import Ticks, label_of, multiples, round_steps
+from zonda.core.types import Floats
 
-Floats = NDArray[np.float64]
+from .sky_axes import Ticks, label_of, multiples, round_steps
 
 EDGES = ("bottom", "left", "top", "right")
 _FINE = 241

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.types import AnyFloats
+
 from .canvas import ARCMIN, angle_text, log_labels, unit_of, write_title
 from .graticule import AstropyAxes
 from .map_layout import located, map_axes
@@ -14,8 +16,6 @@ from .sky_axes import SkyAxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Floats = NDArray[np.floating]
 
 SHOWN = 99.95
 """Per cent of the pixels of a noise-free map that its colour scale covers."""
@@ -26,7 +26,7 @@ POSITIVE, NEGATIVE, FAR = "inferno", "Blues_r", "viridis"
 
 
 def plot_map(
-    values: Floats,
+    values: AnyFloats,
     wcs: Any,
     *,
     ax: Any = None,
@@ -79,7 +79,7 @@ def plot_map(
 
 
 def plot_coverage(
-    hits: NDArray[np.integer] | Floats, wcs: Any, *, ax: Any = None, title: str = "", per_beam: Floats | float | None = None
+    hits: NDArray[np.integer] | AnyFloats, wcs: Any, *, ax: Any = None, title: str = "", per_beam: AnyFloats | float | None = None
 ) -> Axes:
     """Where the telescope looked: samples per pixel (ny, nx), pixels without any in grey. Other arguments as `plot_map`.
 
@@ -125,7 +125,7 @@ def _count_samples(ax: Any, per_beam: float) -> None:
         log_labels(axis, *(edge / per_beam for edge in limits))
 
 
-def _range_of(values: Floats, limit: float | None) -> tuple[float, float, str]:
+def _range_of(values: AnyFloats, limit: float | None) -> tuple[float, float, str]:
     """Lowest and highest brightness of the colours, and their name."""
     finite = values[np.isfinite(values)]
     if limit is None:

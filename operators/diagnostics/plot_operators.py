@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.parameters import quantity
@@ -20,6 +19,7 @@ from zonda.core.data import Data
 from zonda.core.early import take
 from zonda.core.operator import Operator
 from zonda.core.storage.files import atomic_path, product_path
+from zonda.core.types import AnyFloats
 from zonda.operators.io.map_view import MapView, maps_of, noise_sources
 from zonda.operators.io.save_map import MOST_AT_ONCE, output_folder
 from zonda.operators.maps.image import Image
@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from zonda.core.plan.estimate import Estimate
 
 __all__ = ["Picture", "Plots", "pictures"]
-
-Floats = NDArray[np.floating]
 
 LARGEST = 1500
 """Pixels of an image's longer side in a picture; larger images are thinned out."""
@@ -88,7 +86,7 @@ class Plots(Operator):
             with suppress(OSError):
                 self._artist = take(Artist)
 
-    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+    def watch(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         """Begin with the pictures of what will not change any more."""
         if self._artist is not None:
             for drawing in _drawings(data, self.style()):
@@ -232,7 +230,7 @@ def _input(name: str, image: Image) -> tuple[Any, ...]:
 
 
 def _flat(
-    name: str, product: MapProduct, *planes: str, style: Style | None = None, per_beam: Floats | float | None = None
+    name: str, product: MapProduct, *planes: str, style: Style | None = None, per_beam: AnyFloats | float | None = None
 ) -> FlatMap:
     """What pictures need of a map; a HEALPix map on a plane about its centre."""
     view = MapView.of(name, product)

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.types import AnyFloats
+
 from .canvas import ARCMIN, CHARACTER, COLOURS, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
 from .map_layout import map_axes
 from .map_plots import plot_coverage, plot_map
@@ -27,8 +29,6 @@ if TYPE_CHECKING:
     from .transfer_function import Transfer
 
 __all__ = ["Track", "map_axes", "plot_coverage", "plot_map", "plot_scan", "plot_spectra", "plot_tod", "plot_transfer"]
-
-Floats = NDArray[np.floating]
 
 MANY = 2000
 """Points of a track that are drawn, however near to one another."""
@@ -51,7 +51,7 @@ class Track:
         return cls(observation.name, observation.centre, directions)
 
 
-def _binned(frequency: Floats, psd: Floats, per_decade: int = 24) -> tuple[Floats, Floats]:
+def _binned(frequency: AnyFloats, psd: AnyFloats, per_decade: int = 24) -> tuple[AnyFloats, AnyFloats]:
     """Means of a spectrum in logarithmic bins (each at least one frequency wide)."""
     position = np.floor(np.log10(frequency / frequency[0]) * per_decade).astype(int)
     _, first = np.unique(position, return_index=True)
@@ -167,7 +167,7 @@ def _to_kilolambda(arcsec: Any) -> Any:
         return 1e-3 / (np.asarray(arcsec, np.float64) * ARCMIN / 60)
 
 
-def _envelope(x: Floats, y: Floats, columns: int = 1600) -> tuple[Floats, Floats]:
+def _envelope(x: AnyFloats, y: AnyFloats, columns: int = 1600) -> tuple[AnyFloats, AnyFloats]:
     """Lowest and highest of y, in turn, in ``columns`` equal parts: what a line of many more points looks like."""
     width = len(y) // columns
     if width < 4:

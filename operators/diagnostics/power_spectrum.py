@@ -16,6 +16,7 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation, Tally
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 from zonda.operators.io.streams import StreamsAsked
 
 from .series import Spectrum
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
 
-Floats = NDArray[np.float64]
 StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
 
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")

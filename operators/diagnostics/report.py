@@ -65,7 +65,7 @@ class Report(Operator):
 
         return Estimate((), Cost(once=0.1, bytes=10e6, kernel="python"))
 
-    def meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+    def watch(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
         """Write what no later step changes while the last pictures are drawn."""
         if done == "runs":
             self._known = None

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 _FROM_CENTRE: dict[str, Callable[[Floats], Floats]] = {
     "TAN": np.arctan,

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 from zonda.operators.io.streams import StreamsAsked
 
 from .series import TimeStream
@@ -19,8 +19,6 @@ from .series import TimeStream
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
-
-Floats = NDArray[np.float64]
 
 
 class TimeStreams(Operator):

@@ -34,14 +34,13 @@ from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.run.companion import Companion
 from zonda.core.storage.files import product_path
+from zonda.core.types import Floats
 from zonda.operators.io.ecsv import Column, write_ecsv
 from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
-
-Floats = NDArray[np.float64]
 
 ARCSEC = math.pi / 648000
 NO_POWER = 1e-12

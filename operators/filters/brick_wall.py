@@ -30,8 +30,7 @@ from zonda.core.numerics.smooth import product
 from zonda.core.numerics.stretches import stretches, untouched
 from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.numerics.transforms import cosine_transform, fast_length
-
-Floats = NDArray[np.floating]
+from zonda.core.types import AnyFloats
 
 SHORTEST_STEP = 8
 """Samples per coarse knot below which the full DCT is cheaper and is used instead."""
@@ -77,15 +76,15 @@ class HighpassPlan:
     knots: int
     first: NDArray[np.int64]
     taps: int
-    modes: Floats
-    spread_modes: Floats
-    polynomials: Floats
-    response: Floats
-    sums: tuple[tuple[Floats, Floats], ...] = ()
-    _weights: dict[np.dtype[Any], Floats] = field(default_factory=dict)
+    modes: AnyFloats
+    spread_modes: AnyFloats
+    polynomials: AnyFloats
+    response: AnyFloats
+    sums: tuple[tuple[AnyFloats, AnyFloats], ...] = ()
+    _weights: dict[np.dtype[Any], AnyFloats] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
-    def apply(self, rows: Floats, bad: NDArray[np.intp] = NONE) -> int:
+    def apply(self, rows: AnyFloats, bad: NDArray[np.intp] = NONE) -> int:
         """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite; they stay as they were.
 
         ``bad``: flagged samples, bridged before filtering.
@@ -98,7 +97,7 @@ class HighpassPlan:
             self._subtract(rows, coarse)
         return sum(self._bridged(rows[d], bad) for d in np.flatnonzero(~done))
 
-    def _bridged(self, row: Floats, bad: NDArray[np.intp]) -> int:
+    def _bridged(self, row: AnyFloats, bad: NDArray[np.intp]) -> int:
         """`apply` to one row (N,) that has gaps or no coarse series."""
         lost = np.flatnonzero(~np.isfinite(row))
         gaps = np.union1d(bad, lost)
@@ -113,7 +112,7 @@ class HighpassPlan:
         row[lost] = kept
         return int(lost.size)
 
-    def _spread(self, rows: Floats) -> Floats:
+    def _spread(self, rows: AnyFloats) -> AnyFloats:
         s = np.empty((len(rows), self.knots + 3))
         for start in range(0, len(rows), ABREAST):
             some = rows[start : start + ABREAST]
@@ -122,7 +121,7 @@ class HighpassPlan:
             s[start : start + ABREAST] = sums[: s.shape[1], : len(some)].T
         return s
 
-    def _subtract(self, rows: Floats, coarse: Floats) -> None:
+    def _subtract(self, rows: AnyFloats, coarse: AnyFloats) -> None:
         c = np.zeros((len(rows), self._columns), rows.dtype)
         c[:, : coarse.shape[1]] = self._low(coarse)
         _subtract(rows, self.first, self.weights(rows.dtype), c)
@@ -132,14 +131,14 @@ class HighpassPlan:
         """Of s and c, with those that weigh nothing."""
         return self.knots - 1 + self.taps
 
-    def weights(self, kind: np.dtype[Any]) -> Floats:
+    def weights(self, kind: np.dtype[Any]) -> AnyFloats:
         """(n_group, taps, `GROUP`) of type ``kind``: B at the groups' knots at their samples; 0 past the end."""
         with self._lock:  # threads that begin together make them once
             if kind not in self._weights:
                 self._weights[kind] = _weights(self.n, self.knots, self.first, self.taps, kind)
         return self._weights[kind]
 
-    def _low(self, s: Floats) -> Floats:
+    def _low(self, s: AnyFloats) -> AnyFloats:
         """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s, (n_det, M + 3) each."""
         if self.sums:
             half = -(-s.shape[1] // 2)
@@ -166,7 +165,7 @@ class HighpassPlan:
             c[:, -1] += low[:, -2]
         return np.asarray(c)
 
-    def _low_exact(self, x: Floats) -> Floats:
+    def _low_exact(self, x: AnyFloats) -> AnyFloats:
         """P x of equation (1), directly."""
         from scipy.fft import dct, idct
 
@@ -217,7 +216,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     return HighpassPlan(n, cut, knots, *_groups(n, knots), modes, spread, np.zeros((0, n)), response, sums)
 
 
-def _sums(modes: Floats, spread: Floats, response: Floats) -> tuple[tuple[Floats, Floats], ...]:
+def _sums(modes: AnyFloats, spread: AnyFloats, response: AnyFloats) -> tuple[tuple[AnyFloats, AnyFloats], ...]:
     """For what is even and what is odd about the middle, matrices A (h, k) and B (k, h), h the half of the M + 3 knots:
     (s_j +- s_(M - j)) A B is that part of c, where equation (2) is written out in polynomials p and cosines C,
 
@@ -237,7 +236,7 @@ def _sums(modes: Floats, spread: Floats, response: Floats) -> tuple[tuple[Floats
     return tuple(found)
 
 
-def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], Floats]:
+def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], AnyFloats]:
     """Each sample's interval (m,), counted from the first knot, and B at the four knots around it (4, m)."""
     position = (np.arange(samples.start, samples.stop) + 0.5) * (knots / n)
     cell = position.astype(np.int64)
@@ -253,9 +252,9 @@ def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
     return first, max(5, 4 + int((last - first).max()))
 
 
-def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]) -> Floats:
+def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]) -> AnyFloats:
     """See `HighpassPlan.weights`."""
-    found: Floats = untouched((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
+    found: AnyFloats = untouched((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
     for some in stretches(first.size * GROUP):
         cell, weights = _around(some, n, knots)
         weights[:, max(n - some.start, 0) :] = 0.0
@@ -266,7 +265,7 @@ def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.d
     return found
 
 
-def bridge(row: Floats, gaps: NDArray[np.intp]) -> None:
+def bridge(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
     """Replace the samples ``gaps`` by straight lines between their good neighbours (held constant at the ends)."""
     good = np.ones(row.size, bool)
     good[gaps] = False

@@ -28,7 +28,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from zonda.core.data import Block, Observation, Stream
@@ -37,6 +36,7 @@ from zonda.core.flags import DEAD
 from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 
 from . import focal_plane_mean
 from .gram import MOST_COPIED, Gram, Usable
@@ -45,8 +45,6 @@ from .lanczos import NOTHING, Ritz, lanczos
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
-
-Floats = NDArray[np.float64]
 
 OF_THE_SKY = frozenset({"sky", "transmission"})
 """Streams of which a detector in order may see nothing. All see the air."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Stream
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.types import Floats
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

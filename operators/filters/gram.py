@@ -16,8 +16,7 @@ from zonda.core.data import Stream
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.run.streams import columns
-
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 MOST_COPIED = 100_000_000
 """Bytes of a tile's copy. Tiles of more detectors are shorter, down to `SHORTEST_TILE`, in memory too: the bits are the same."""

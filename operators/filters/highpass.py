@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
 
-Floats = NDArray[np.floating]
-
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
 

@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.numerics.stretches import stretches, untouched
+from zonda.core.types import Floats
 
 from .gram import Gram, directions, near_the_mean
-
-Floats = NDArray[np.float64]
 
 EMPTY = 1e-13
 """Share of the stream's energy, per detector, that G cannot tell from rounding."""

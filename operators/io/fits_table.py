@@ -15,10 +15,11 @@ from zonda.core.flags import of_before
 from zonda.core.intervals import Intervals
 from zonda.core.storage.files import writing
 from zonda.core.storage.fits_files import check_size, opened
+from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
 from .map_file import ascii_text
-from .time_ordered_data import UNITS, Floats, TimeOrderedData
+from .time_ordered_data import UNITS, TimeOrderedData
 from .toast_hdf5 import azimuth_elevation
 
 SUFFIX = ".fits"
@@ -78,7 +79,7 @@ class Writer:
                 self._file.seek(self._data_start + d * self._row)
                 self._file.write(name.encode().ljust(self._name_bytes, b"\0"))
 
-    def write(self, stream: str, detectors: slice, samples: slice, values: Floats) -> None:
+    def write(self, stream: str, detectors: slice, samples: slice, values: AnyFloats) -> None:
         """A rectangle of a stream."""
         column = self._name_bytes + (self._streams.index(stream) * self._tod.n_samples + samples.start) * self._dtype.itemsize
         rows = np.ascontiguousarray(values, self._dtype)

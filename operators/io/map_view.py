@@ -10,9 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.types import AnyFloats
 from zonda.operators.maps.map_product import MapProduct
-
-Floats = NDArray[np.floating]
 
 PLANES = ("signal", "hits", "weights", "noise", "half_difference")
 """Planes a map product may have; `signal` always, but for a map of hits alone."""
@@ -41,7 +40,7 @@ class MapView:
     """
 
     name: str
-    planes: dict[str, Floats]
+    planes: dict[str, AnyFloats]
     units: dict[str, str] = field(default_factory=dict)
     header: Any = None
     nside: int = 0

@@ -12,9 +12,8 @@ from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
 from zonda.core.intervals import Intervals
+from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
-
-Floats = NDArray[np.floating]
 
 UNITS = {"transmission": "", "flags": ""}
 """Units of streams that are not in K."""
@@ -75,7 +74,7 @@ class TimeOrderedData:
     names: list[str]
     quats: NDArray[np.float64]
     columns: dict[str, NDArray[np.float64]]
-    streams: dict[str, Floats] = field(default_factory=dict)
+    streams: dict[str, AnyFloats] = field(default_factory=dict)
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
     metadata: dict[str, str | int | float] = field(default_factory=dict)
@@ -174,7 +173,7 @@ class TimeOrderedData:
         )
 
 
-def detector_quaternions(xi: Floats, eta: Floats, angle: Floats) -> NDArray[np.float64]:
+def detector_quaternions(xi: AnyFloats, eta: AnyFloats, angle: AnyFloats) -> NDArray[np.float64]:
     """Rotations (n, 4) that take the boresight frame's Z axis to (-eta, -xi, 1) and its X axis to the polarization angle.
 
     q = Rz(phi) Ry(theta) Rz(angle - phi), theta = atan |(xi, eta)|, phi = atan2(-xi, -eta); see `Focalplane`.

@@ -21,9 +21,10 @@ from zonda.core.flags import Flags, of_before
 from zonda.core.intervals import Intervals
 from zonda.core.storage.files import writing
 from zonda.core.storage.hdf5_files import Disk, check_size, opened
+from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
-from .time_ordered_data import UNITS, Floats, TimeOrderedData
+from .time_ordered_data import UNITS, TimeOrderedData
 
 SUFFIX = ".h5"
 
@@ -76,7 +77,7 @@ class Writer:
             data = group.create_dataset(name, (tod.n_detectors, tod.n_samples), dtype)
             data.attrs["units"] = UNITS.get(name, "K")
 
-    def write(self, stream: str, detectors: slice, samples: slice, values: Floats) -> None:
+    def write(self, stream: str, detectors: slice, samples: slice, values: AnyFloats) -> None:
         """A rectangle of a stream."""
         with writing(self.path):
             self._file["detdata"][stream][detectors, samples] = values
@@ -255,7 +256,7 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
         intervals.create_dataset(name, data=tod.times[np.minimum(at, tod.n_samples - 1)])  # to the last bit those of samples
 
 
-def azimuth_elevation(boresight_azel: Floats) -> tuple[Floats, Floats]:
+def azimuth_elevation(boresight_azel: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
     """Azimuth (0 to 2 pi, north through east) and elevation of quaternions (n, 4), rad."""
     x, y, z, w = boresight_azel.T
     azimuth = -np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
@@ -274,7 +275,7 @@ def _read_flags(file: Any, names: list[str]) -> tuple[Flags, Flags]:
     return flags, detector_flags
 
 
-def _read_intervals(file: Any, times: Floats, seconds: Floats) -> Intervals:
+def _read_intervals(file: Any, times: AnyFloats, seconds: AnyFloats) -> Intervals:
     found: Intervals = {}
     for name, spans in file["intervals"].items() if "intervals" in file else ():
         start, stop = np.interp(np.asarray(spans[:], np.float64), times, seconds)

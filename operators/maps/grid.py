@@ -15,11 +15,10 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
 from zonda.core.numerics.stretches import stretches
 from zonda.core.numerics.tangent import TangentWcs
+from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
-
-Floats = NDArray[np.float64]
 
 MOST_PIXELS = 1 << 28
 """Largest grid that is made."""

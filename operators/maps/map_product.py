@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from zonda.core.data import html_table
 from zonda.core.errors import InputError
 from zonda.core.numerics import tangent
+from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from zonda.core.numerics.tangent import TangentWcs
     from zonda.core.storage.fits_image import Cards
-
-Floats = NDArray[np.float64]
 
 ARCMIN = math.pi / 180 / 60
 FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from zonda.core.compilation.columns import prefetch
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.stretches import untouched
+from zonda.core.types import Floats
 
 from .grid import Grid, TangentGrid
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
 
-Floats = NDArray[np.float64]
 Sums = NDArray[np.int64]
 
 VALUE = 2.0**36

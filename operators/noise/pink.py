@@ -20,6 +20,7 @@ from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, norma
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
 from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.operator import Operator
+from zonda.core.types import AnyFloats
 
 from .level import NoiseLevel, announced, resolve
 from .models import FixedNet, time_mean
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from zonda.core.data import Block, Data, Observation
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
-
-Floats = NDArray[np.floating[Any]]
 
 NOTHING = np.zeros(0, np.float32)
 
@@ -218,7 +217,7 @@ class Streams:
         self,
         detector: int,
         sample: int,
-        out: Floats,
+        out: AnyFloats,
         level: Series | None = None,
         common: NDArray[np.float32] = NOTHING,
         shared: float = 0.0,
@@ -249,9 +248,9 @@ class Streams:
         sample: int,
         level: Series,
         common: NDArray[np.float32],
-        shares: Floats,
+        shares: AnyFloats,
         over: bool,
-        out: Floats,
+        out: AnyFloats,
     ) -> None:
         with self._lock:
             tile = self._tiles.get(number)

@@ -25,11 +25,10 @@ from .models import INSTRUMENTS, FixedNet, NoiseModel, noise_model
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
-
     from zonda.core.data import Block, Data, Observation
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
+    from zonda.core.types import Floats
 
 _SCHEMA = {
     "anyOf": [{"type": "string"}, {"type": "object", "properties": {"name": {"type": "string"}}, "required": ["name"]}],

@@ -31,12 +31,11 @@ from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import Series, SmoothField, interpolating, series_into
 from zonda.core.numerics.stretches import stretches, untouched
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
-
-Floats = NDArray[np.float64]
 
 OPAQUE = 1e-6
 """Band transmission below which nothing can be calibrated: such samples and detectors are flagged."""

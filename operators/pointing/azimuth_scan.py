@@ -14,6 +14,7 @@ from zonda.core.errors import PointingError
 from zonda.core.flags import TURNAROUND
 from zonda.core.intervals import Intervals, runs
 from zonda.core.numerics.stretches import stretches
+from zonda.core.types import Floats
 
 from .base import Pointing
 from .transform import CelestialTransform, series, unit_vectors
@@ -21,8 +22,6 @@ from .transform import CelestialTransform, series, unit_vectors
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
     from zonda.core.data import Observation
-
-Floats = NDArray[np.float64]
 
 
 class PointingBackAndForth(Pointing):

@@ -21,6 +21,7 @@ from zonda.core.knobs import Knob
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 
 from .limits import Moved, check_elevation, excess, lower_elevation
 from .motion import POINTS, Peak, Quantity, motion, rate_text
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
-
-Floats = NDArray[np.float64]
 
 SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
 """By `Pointing.check`: scans of a step, and instants of all of them."""

@@ -6,15 +6,13 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularSpeed, Fraction
+from zonda.core.types import Floats
 
 from .base import Pointing
-
-Floats = NDArray[np.float64]
 
 
 class PointingDaisy(Pointing):

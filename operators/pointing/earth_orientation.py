@@ -10,9 +10,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 MEAN_POLE = (0.035, 0.29)
 """Polar motion where no table reaches [arcsec]: astropy's 50-year mean."""

@@ -6,9 +6,9 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import PointingError
+from zonda.core.types import Floats
 
 from .motion import Peak, Quantity, rate_text
 from .transform import CelestialTransform, unit_vectors
@@ -16,8 +16,6 @@ from .transform import CelestialTransform, unit_vectors
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
     from zonda.core.instrument import Telescope
-
-Floats = NDArray[np.float64]
 
 DAY = 86400.0
 

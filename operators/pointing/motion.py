@@ -17,9 +17,8 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 ACCURACY = 0.01
 """Error (1) aimed at, of the figure or of 0.3 of its limit, whichever is more."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.intervals import Intervals
+from zonda.core.types import Floats
 
 from .transform import unit_vectors
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from zonda.core.scene import Scene
 
     from .transform import CelestialTransform
-
-Floats = NDArray[np.float64]
 
 
 def observed(

@@ -19,6 +19,7 @@ from zonda.core.errors import InputError, PointingError
 from zonda.core.intervals import part
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 
 from .observed import centre_of, observed, state_times
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
-
-Floats = NDArray[np.float64]
 
 MOST_CHECKED = 100_000
 """Samples of a scan that `zonda check` looks at."""

@@ -16,8 +16,7 @@ from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.flags import EXCLUDE_SAMPLE, NOT_RECORDED
 from zonda.core.intervals import Intervals
-
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 UNEVEN = 0.25
 """rms of the intervals between rows, over whole numbers of samples, beyond which they are no comb with jitter."""

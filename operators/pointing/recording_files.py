@@ -16,10 +16,9 @@ from zonda.core.configuration.units import read_unit
 from zonda.core.errors import InputError
 from zonda.core.intervals import Intervals
 from zonda.core.storage import fits_files, hdf5_files
+from zonda.core.types import Floats
 
 from .recording import Recording, longest_rising
-
-Floats = NDArray[np.float64]
 
 ALIASES = {
     "time": ("time", "times", "t", "ctime", "timestamp", "mjd"),

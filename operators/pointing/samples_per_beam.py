@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
+from zonda.core.types import Floats
 
 from .motion import POINTS, rate_text
-
-Floats = NDArray[np.float64]
 
 FEW = 2.0
 """Samples per FWHM below which a scan warns: the beam's transfer at the Nyquist frequency, exp(-pi^2 N^2 / (16 ln 2)), is then

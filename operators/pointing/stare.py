@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from zonda.core.types import Floats
 
 from .base import Pointing
-
-Floats = NDArray[np.float64]
 
 
 class PointingStare(Pointing):

@@ -28,18 +28,16 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import PointingError
 from zonda.core.numerics.stretches import stretches, untouched
+from zonda.core.types import Floats
 
 from .earth_orientation import orientation
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
-
-Floats = NDArray[np.float64]
 
 SIDEREAL_RATE = 2 * np.pi * 1.00273781191135448 / 86400
 """Rate of the Earth rotation angle, rad/s of UT1."""

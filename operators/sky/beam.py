@@ -32,8 +32,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.transforms import fast_length, spline_filter, spline_response
-
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 PIXELS_PER_FWHM = 4.0
 SMOOTH_BELOW = 2.0 - 1e-9

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from zonda.core.numerics.radiation import thermal_sz
 from zonda.core.storage.files import atomic_path
-
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 P0, C500, GAMMA, ALPHA, BETA = 8.403, 1.177, 0.3081, 1.0510, 5.4905
 """Equation (2), Arnaud et al. 2010, eq. 12; P0 is in units of h70^-3/2."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.target import Target
 from zonda.core.errors import InputError
@@ -15,6 +14,7 @@ from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import opened
 from zonda.core.storage.fits_image import read_image
+from zonda.core.types import Floats
 
 from .geometry import geometry, is_plain_tan
 from .healpix import is_healpix
@@ -22,8 +22,6 @@ from .inputs import WcsMap
 from .placement import placed, turned
 from .planes import chosen
 from .region import Disc
-
-Floats = NDArray[np.float64]
 
 LATTICE = 17
 """Pixels along each side from which the extent of a map is taken."""

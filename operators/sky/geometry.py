@@ -6,15 +6,13 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics import tangent
 from zonda.core.storage.files import first_line
+from zonda.core.types import Floats
 
 from .limits import check_geometry, check_sides
-
-Floats = NDArray[np.float64]
 
 _ANGLES = {
     **dict.fromkeys(("deg", "degree", "degrees"), "deg"),

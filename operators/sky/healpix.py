@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.types import Floats
 
 from . import stokes
-from .inputs import Floats, Frame, HealpixMap, Wanted
+from .inputs import Frame, HealpixMap, Wanted
 from .units import beam_solid_angle, filled, unit_of
 
 _FRAMES: dict[str, Frame] = {

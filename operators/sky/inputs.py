@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 """Names of frames as astropy has them."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-
-Floats = NDArray[np.float64]
+from zonda.core.types import Floats
 
 LARGEST = 1e30
 """Value of a pixel, in any unit."""

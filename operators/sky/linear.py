@@ -15,9 +15,9 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from .sampling import CHUNK, CONSTANTS, Chunks, count_covered, locate, misses, span_on_grid
+from zonda.core.types import AnyFloats
 
-Floats = NDArray[np.floating]
+from .sampling import CHUNK, CONSTANTS, Chunks, count_covered, locate, misses, span_on_grid
 
 
 def sample_linear(
@@ -25,9 +25,9 @@ def sample_linear(
     xi: NDArray[np.float64],
     eta: NDArray[np.float64],
     rows: NDArray[np.int64],
-    values: Floats,
+    values: AnyFloats,
     covered: NDArray[np.uint8],
-    out: Floats,
+    out: AnyFloats,
     over: bool = False,
 ) -> tuple[int, int]:
     """As `sampling.sample`, from the grid's ``values`` (ny, nx). Samples within two points of its border are left as they are."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.types import Floats
 
 from .geometry import is_plain_tan, linear
 from .inputs import HealpixMap, WcsMap
@@ -18,8 +19,6 @@ from .resample import from_pixels, pixel_areas
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
-
-Floats = NDArray[np.float64]
 
 CHECKED = 2**22
 """Pixels of which it is looked up whether they are on the sky."""

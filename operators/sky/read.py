@@ -16,11 +16,12 @@ from zonda.core.numerics import tangent
 from zonda.core.storage.files import check_memory, reading
 from zonda.core.storage.fits_files import check_size, opened
 from zonda.core.storage.fits_image import read_image
+from zonda.core.types import Floats
 
 from . import stokes
 from .geometry import geometry
 from .healpix import is_healpix, read_healpix
-from .inputs import Floats, HealpixMap, Wanted, WcsMap
+from .inputs import HealpixMap, Wanted, WcsMap
 from .planes import chosen, plane_of_cube
 from .units import beam_solid_angle, filled, unit_of
 

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.numerics.projection import boresights
 from zonda.core.numerics.stretches import stretches
+from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
-
-Floats = NDArray[np.float64]
 
 WIDEST = np.radians(60.0)
 """Largest distance from the tangent point: beyond it a gnomonic projection stretches pixels by more than 1 / cos^2 = 4."""

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
+from zonda.core.types import Floats
 
 from .inputs import HealpixMap, WcsMap
 from .region import MARGIN, TILE
 
-Floats = NDArray[np.float64]
 Tell = Callable[[int, int], None]
 """Told how many points of all are done."""
 

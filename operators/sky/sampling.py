@@ -19,14 +19,13 @@ from numba import int32, uint64
 from numpy.typing import NDArray
 
 from zonda.core.compilation.columns import spline_of_four
-
-Floats = NDArray[np.floating]
+from zonda.core.types import AnyFloats
 
 CHUNK = 256
 """Samples that share a coordinate origin; divides `TILE_SAMPLES`, so chunks are absolute."""
 
 
-Chunks = tuple[Floats, NDArray[np.float64], Floats, NDArray[np.int32]]
+Chunks = tuple[AnyFloats, NDArray[np.float64], AnyFloats, NDArray[np.int32]]
 """What `pointing` returns."""
 
 
@@ -35,9 +34,9 @@ def sample(
     xi: NDArray[np.float64],
     eta: NDArray[np.float64],
     rows: NDArray[np.int64],
-    coefficients: Floats,
+    coefficients: AnyFloats,
     covered: NDArray[np.uint8],
-    out: Floats,
+    out: AnyFloats,
     over: bool = False,
 ) -> tuple[int, int]:
     """Add the map to ``out`` (n_det, n_samp) at its ``rows``; the numbers of samples (outside the input map, behind it).

@@ -24,6 +24,7 @@ from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_ma
 from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
 from zonda.core.storage.fits_image import Cards
+from zonda.core.types import Floats
 
 from ..maps.image import Image
 from .beam import PIXELS_PER_FWHM, REACH, SIGMA, Convolved, convolve, distinct
@@ -41,8 +42,6 @@ from .working import Working, on_a_grid, on_own_pixels
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
-
-Floats = NDArray[np.float64]
 
 TOLD = 1 << 26
 """Bytes of a file above which the progress bar says that it is read."""

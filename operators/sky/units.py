@@ -6,13 +6,11 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.types import Floats
 
 from .limits import LARGEST, check_sides, check_values
-
-Floats = NDArray[np.float64]
 
 KNOWN_UNITS = "Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y)"
 _PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6}

@@ -19,8 +19,6 @@ from .region import Disc, region, tangent_wcs
 if TYPE_CHECKING:
     from zonda.core.data import Observation
 
-Floats = NDArray[np.float64]
-
 PER_VALUE = 1e-7
 """Seconds on the reference machine for a pixel of a file: read, checked, converted."""
 LARGE = 2**22

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.checks import Family, Measured
 from zonda.core.errors import PipelineError, ZondaError
+from zonda.core.types import Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.common_mode import CommonModeFilter
@@ -20,8 +20,6 @@ from .cases import DEAD, DECADES, PARTIAL, TIME
 from .scenes import differing, run, scan, sky_file
 
 checks = Family("filters")
-
-Floats = NDArray[np.float64]
 
 WHITE = 1.7e-3 * 10.0
 """K: rms of a sample at 100 Hz."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.checks import Family, Measured
 from zonda.core.data import Data
+from zonda.core.types import Floats
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.sky.skymap import SkyMap
@@ -17,8 +17,6 @@ from .cases import DECADES, PIXELS
 from .scenes import differing, largest, run, scan, sky_file, unrefused
 
 checks = Family("maps")
-
-Floats = NDArray[np.float64]
 
 
 def _sampled(values: Floats, samples: int = 2000, radius: float = 1.0, **options: Any) -> tuple[Floats, Data]:

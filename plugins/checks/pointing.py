@@ -8,13 +8,13 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.checks import Family, Measured
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.site import Site
+from zonda.core.types import Floats
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.earth_orientation import orientation
@@ -25,8 +25,6 @@ from .cases import SPHERE, TIME
 from .scenes import camera, differing, largest, scene
 
 checks = Family("pointing")
-
-Floats = NDArray[np.float64]
 
 SITES = (
     Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m"),

@@ -20,8 +20,7 @@ from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-
-Floats = NDArray[np.floating[Any]]
+from zonda.core.types import AnyFloats
 
 SITE = Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="825 m", climatology="green_bank")
 START = Instant.parse("2024-11-25T07:00:00Z")
@@ -69,7 +68,7 @@ def scan(
     )  # fmt: skip
 
 
-def _quaternions(lon: Floats, lat: Floats) -> NDArray[np.float64]:
+def _quaternions(lon: AnyFloats, lat: AnyFloats) -> NDArray[np.float64]:
     """Rz(lon) Ry(pi/2 - lat), (n, 4) in the order x y z w."""
     a, b = lon / 2, (np.pi / 2 - lat) / 2
     return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
@@ -101,7 +100,7 @@ class Gives(Operator):
 def run(
     operators: list[Operator],
     observation: Observation,
-    signal: Floats | None = None,
+    signal: AnyFloats | None = None,
     *,
     precision: Literal["float32", "float64"] = "float64",
     keep: tuple[str, ...] = (),
@@ -115,7 +114,7 @@ def run(
 
 
 @contextmanager
-def sky_file(values: Floats, pixel: float = 1.0) -> Iterator[Path]:
+def sky_file(values: AnyFloats, pixel: float = 1.0) -> Iterator[Path]:
     """A FITS image (K_RJ, pixels of ``pixel`` arcsec) centred on `TARGET`, gone afterwards."""
     from astropy.io import fits
 

@@ -96,7 +96,7 @@ class Ends(Operator):
     at_end = True
     where: str = ""
     """The place."""
-    def meanwhile(self, data, done):
+    def watch(self, data, done):
         if self.where == done:
             act()
     def finalize(self, data):

@@ -105,7 +105,7 @@ class Late(Operator):
 
     _heard: list = PrivateAttr(default_factory=list)
 
-    def meanwhile(self, data, done):
+    def watch(self, data, done):
         self._heard.append((data.run, done, len(data.products.get(data.product("total"), [])), sorted(data.products)))
 
     def finalize(self, data):

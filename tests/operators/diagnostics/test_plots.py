@@ -273,21 +273,21 @@ def test_a_second_process_draws_the_same(data, products, make_observation):
     operator.observe(data)
     for name in ("spectrum", "map"):
         del data.products[name]
-    operator.meanwhile(data, "scan")
+    operator.watch(data, "scan")
     assert set(operator._begun) == {"input input", "scan", "streams time_streams"}
     data.products.update({name: products[name] for name in ("spectrum", "map")})
-    operator.meanwhile(data, "scan")  # the spectrum may go on changing until the run has ended
+    operator.watch(data, "scan")  # the spectrum may go on changing until the run has ended
     assert set(operator._begun) == {"input input", "scan", "streams time_streams"}
-    operator.meanwhile(data, "run")
+    operator.watch(data, "run")
     begun = set(operator._begun)
     assert begun == {"input input", "map map", "coverage map", "scan", "spectra spectrum", "streams time_streams"}
     data.products.update({"noiseless/map": products["noiseless/map"]})
     data.run = "noiseless"
-    operator.meanwhile(data, "run")
+    operator.watch(data, "run")
     assert set(operator._begun) == begun | {"map noiseless/map"}
     data.products.update(products)
     data.run = "source_free"
-    operator.meanwhile(data, "run")
+    operator.watch(data, "run")
     assert set(operator._begun) == begun | {"map noiseless/map", "noise map"}
     answers = {key: future.result() for key, future in operator._begun.items()}
     assert all(answers.values())
@@ -302,7 +302,7 @@ def test_what_the_second_process_fails_at_is_drawn_here(data, products):
     operator = Plots()
     operator.observe(data)
     operator._artist._process.kill()
-    operator.meanwhile(data, "run")
+    operator.watch(data, "run")
     operator.finalize(data)
     assert {p.name for p in data.products["pictures"]} >= {"input", "map", "noise_map"}
 

@@ -1,0 +1,91 @@
+"""What planning needs to know of an operator: bounds, ladders, cost and bytes; one class for each operator, apart from it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+from ..knobs import Knob
+from ..operator import Operator
+from ..registry import RegistryError, planning
+from .estimate import Estimate, Traits
+
+if TYPE_CHECKING:
+    from ..data import Observation
+    from .context import Context
+
+O = TypeVar("O", bound=Operator)  # noqa: E741
+
+
+class Planning(Generic[O]):
+    """The planning of an operator. Its name in the registry (``zonda.planning``) is that of the operator's class.
+
+    An operator without one is never coarsened, and the planner says that its cost is not counted.
+
+    Attributes
+    ----------
+    of
+        The class of the operator; those derived from it inherit its planning.
+    knobs
+        The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
+    smaller
+        What lessens its `memory`, in a few words (``choose a larger pixel``), for a run that does not fit.
+    """
+
+    of: ClassVar[type[Operator]]
+    knobs: ClassVar[tuple[Knob, ...]] = ()
+    smaller: ClassVar[str] = ""
+
+    def __init__(self, operator: O) -> None:
+        self.operator = operator
+
+    def traits(self, observation: Observation) -> Traits:
+        """What other operators' bounds need to know of this one (noise, pixels, filters).
+
+        Called after `Operator.configure`, before anything is prepared; ``observation`` has its pointing.
+        """
+        return Traits()
+
+    def estimate(self, context: Context) -> Estimate:
+        """Upper bounds on what its effects contribute, coarser forms of them, and what it costs."""
+        return Estimate()
+
+    def memory(self, observation: Observation) -> int:
+        """Bytes that the step will hold for one observation, besides streams and blocks: tables, accumulators, products.
+
+        An upper bound, asked after `Operator.observe` and before `Operator.prepare`: a run that would not fit is refused before
+        it starts.
+        """
+        return 0
+
+    def sweeps(self, observation: Observation) -> int:
+        """How often `Operator.measure` goes through its stream with `Stream.sweep`; 0: it wants ``stream.array``."""
+        return 0
+
+    def in_time_order(self, observation: Observation) -> bool:
+        """Whether `Operator.exec` is much cheaper when it sees all detectors at one time before it goes on to the next."""
+        return False
+
+
+def planning_of(operator: Operator) -> Planning[Any]:
+    """The planning of an operator; of one that has none, `Planning` itself."""
+    for cls in type(operator).__mro__:
+        if cls is Operator:
+            break
+        if cls.__name__ in planning:
+            try:
+                found = planning.get(cls.__name__)
+            except RegistryError:
+                continue
+            if found.of is cls:
+                return found(operator)  # type: ignore[no-any-return]
+    return _Own(operator) if hasattr(operator, "traits") else Planning(operator)
+
+
+class _Own(Planning[Any]):
+    """Of an operator that still has these methods itself. (Goes as soon as none has.)"""
+
+    def __init__(self, operator: Any) -> None:
+        super().__init__(operator)
+        self.knobs, self.smaller = operator.knobs, operator.lighter  # type: ignore[misc]
+        self.traits, self.estimate, self.memory = operator.traits, operator.estimate, operator.memory  # type: ignore[method-assign]
+        self.sweeps = operator.sweeps  # type: ignore[method-assign]

@@ -1,0 +1,12 @@
+"""Array types."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+AnyFloats = NDArray[np.floating[Any]]
+"""float32 or float64."""
