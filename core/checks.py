@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from .discovery import RAISED
+from .registry import checks
 
 Measured = float | tuple[float, str]
 """A figure, or a figure and a remark."""
@@ -130,8 +131,6 @@ class Family:
 
 def registered() -> list[Check]:
     """Every check of every registered family. Raises `RegistryError` where a plugin's cannot be imported."""
-    from .registry import checks
-
     return [check for name in checks for check in checks.create(name)]
 
 

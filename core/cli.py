@@ -344,8 +344,8 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
     whether it is on the input maps, of which the headers alone are read. A run begins with the same look.
     """
     file = _load(pipeline, settings)
-    from .hints import elsewhere
     from .run.first_look import first_look
+    from .scene import elsewhere
 
     if note := elsewhere(file.scene()):
         click.echo(f"warning: {note}", err=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .flags import EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
 from .intervals import Intervals, runs
+from .notebook import html_table
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
@@ -455,11 +456,3 @@ class Data:
             [(o.name, f"{o.n_detectors} x {o.n_samples}") for o in self.observations]
             + [("products", ", ".join(sorted(self.products)))],
         )
-
-
-def html_table(title: str, rows: list[tuple[Any, Any]]) -> str:
-    """A two-column table for notebooks; everything is escaped."""
-    from html import escape
-
-    body = "".join(f"<tr><th style='text-align:left'>{escape(str(a))}</th><td>{escape(str(b))}</td></tr>" for a, b in rows)
-    return f"<table><caption>{escape(title)}</caption>{body}</table>"

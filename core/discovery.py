@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 HOST = "zonda"
 """The distribution of the built-in plugins, which `ZONDA_PLUGINS` never shuts out."""
 
+API_VERSION = 1
+"""Version of the contract of plugins (`core.operator`); a plugin written for another one is refused."""
 
 RAISED = (Exception, SystemExit, GeneratorExit)
 """What a plugin may raise where it is imported or called; Ctrl-C is the user's."""

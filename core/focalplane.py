@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .errors import InputError
+from .notebook import html_table
 from .types import Floats
 
 
@@ -80,8 +81,6 @@ class Focalplane:
         return f"<Focalplane: {len(self)} detectors within {reach:.3g} arcmin of the boresight>"
 
     def _repr_html_(self) -> str:
-        from .data import html_table
-
         def span(values: Floats, scale: float, unit: str) -> str:
             low, high = (f"{v * scale:.4g}" for v in (values.min(), values.max()))
             return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"

@@ -5,53 +5,33 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-from . import registry
+from .components import Registry, fold
 from .errors import ZondaError
-from .registry import Registry, fold
-
-if TYPE_CHECKING:
-    from .scene import Scene
-
-EARTH = 6371e3
-"""Mean radius, m."""
-NEAR = 1e3
-"""m: what stands nearer than this stands at the same site."""
 
 
-def known_elsewhere(names: Registry, name: str) -> tuple[str, str]:
-    """(label, cure) for an unknown site or instrument that is the name of another thing; empty where it is not."""
-    if names is registry.sites:
-        return _of_a_site(name)
-    if names is registry.instruments:
-        return _of_an_instrument(name)
-    return "", ""
-
-
-def _of_a_site(name: str) -> tuple[str, str]:
-    for known, instrument in _made(registry.instruments):
+def for_site(sites: Registry, instruments: Registry, name: str) -> tuple[str, str]:
+    """(label, cure) for an unknown site that is the name of another thing; empty where it is not."""
+    for known, instrument in _made(instruments):
         telescope = instrument.telescope
         if fold(name) in (fold(known), fold(telescope.name)) and telescope.site:
             what = f"'{known}' is an instrument; its telescope {telescope.name}" if fold(name) == fold(known) else telescope.name
             return f"did you mean '{telescope.site}'?", f"{what} stands at {telescope.site}"
-    return _described(registry.sites, name)
+    return _described(sites, name)
 
 
-def _of_an_instrument(name: str) -> tuple[str, str]:
-    made = list(_made(registry.instruments))
+def for_instrument(sites: Registry, instruments: Registry, name: str) -> tuple[str, str]:
+    """As `for_site`, for an unknown instrument."""
+    made = list(_made(instruments))
     mounted = sorted(known for known, i in made if fold(i.telescope.name) == fold(name))
     if mounted:
         return f"did you mean '{mounted[0]}'?", f"{name} is a telescope; instruments on it: {', '.join(mounted)}"
-    site = registry.sites.registered(name)
-    if site in registry.sites:
-        there = sorted(
-            known for known, i in made if i.telescope.site and registry.sites.get(i.telescope.site) == registry.sites.get(site)
-        )
+    site = sites.registered(name)
+    if site in sites:
+        there = sorted(known for known, i in made if i.telescope.site and sites.get(i.telescope.site) == sites.get(site))
         return f"'{site}' is a site", f"instruments that stand there: {', '.join(there)}" if there else ""
-    return _described(registry.instruments, name)
+    return _described(instruments, name)
 
 
 def _described(names: Registry, name: str) -> tuple[str, str]:
@@ -67,23 +47,3 @@ def _made(names: Registry) -> Iterator[tuple[str, Any]]:
     for name in names:
         with suppress(ZondaError):
             yield name, names.create(name)
-
-
-def elsewhere(scene: Scene) -> str:
-    """What to say of a telescope that the scene puts on another site than its own; empty where it does not."""
-    telescope = scene.instrument.telescope
-    try:
-        home = registry.sites.create(telescope.site) if telescope.site else None
-    except ZondaError:  # the site of a plugin that is not installed here
-        home = None
-    if home is None:
-        return ""
-    a, b = (np.array([s.latitude, s.longitude]) for s in (home, scene.site))
-    half = np.sin((a - b) / 2) ** 2
-    distance = 2 * EARTH * float(np.arcsin(np.sqrt(min(1.0, half[0] + np.cos(a[0]) * np.cos(b[0]) * half[1]))))
-    if distance < NEAR:
-        return ""
-    return (
-        f"{telescope.name} stands at {home.name}, {distance / 1e3:.0f} km away: here it looks through the air of "
-        f"{scene.site.name}; write 'site: {telescope.site}' for its own"
-    )

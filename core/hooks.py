@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable
 from functools import lru_cache, wraps
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pluggy
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from .data import Data, Observation
     from .operator import Operator
-    from .pipeline import Pipeline
 
 __all__ = ["Hooks", "PluginWarning", "hookimpl", "manager"]
 
@@ -36,15 +35,22 @@ hookspec = pluggy.HookspecMarker("zonda")
 hookimpl = pluggy.HookimplMarker("zonda")
 
 
+class Steps(Protocol):
+    """What a hook is shown of the `zonda.Pipeline` that runs."""
+
+    name: str
+    operators: list[Operator]
+
+
 class Hooks:
     """The hooks. They must not change what they are given; hook wrappers are not supported."""
 
     @hookspec
-    def zonda_pipeline_start(self, pipeline: Pipeline, data: Data) -> None:
+    def zonda_pipeline_start(self, pipeline: Steps, data: Data) -> None:
         """Before the first operator of a run."""
 
     @hookspec
-    def zonda_pipeline_end(self, pipeline: Pipeline, data: Data) -> None:
+    def zonda_pipeline_end(self, pipeline: Steps, data: Data) -> None:
         """After the last operator of a run."""
 
     @hookspec

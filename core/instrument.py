@@ -16,6 +16,7 @@ from .configuration.parameters import Parameters, named, named_or_written, quant
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
 from .errors import InputError
 from .focalplane import Focalplane
+from .registry import bands, instruments
 from .storage import packed
 
 SPEED_OF_LIGHT = 299792458.0
@@ -38,8 +39,6 @@ class Band(Parameters):
     _table: tuple[NDArray[np.float64], NDArray[np.float64]] = PrivateAttr()
 
     def _as_argument(self) -> str:
-        from .registry import bands
-
         return named_or_written(self, bands)
 
     @model_validator(mode="after")
@@ -185,15 +184,11 @@ class Instrument(Parameters):
     """Where these numbers come from."""
 
     def _as_argument(self) -> str:
-        from .registry import instruments
-
         return named_or_written(self, instruments)
 
     @field_validator("band", mode="before")
     @classmethod
     def _band_by_name(cls, value: Any) -> Any:
-        from .registry import bands
-
         return named(bands, value)
 
     @property

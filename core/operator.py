@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import PrivateAttr
 
 from .configuration.parameters import Parameters
+from .discovery import API_VERSION
 from .knobs import Knob
 
 if TYPE_CHECKING:
@@ -15,9 +16,6 @@ if TYPE_CHECKING:
     from .plan.context import Context
     from .plan.estimate import Estimate, Traits
     from .run.companion import Companion
-
-API_VERSION = 1
-"""Version of the contract below; a plugin written for another one is refused with a message that says so."""
 
 
 class Operator(Parameters):

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from .data import Data, Observation, html_table
+from .data import Data, Observation
 from .errors import PipelineError
 from .faults import faults_named
 from .machine import available_memory, available_threads
+from .notebook import html_table
 from .operator import Operator
 from .run import arguments
 from .run.ahead import Ahead

@@ -1,7 +1,4 @@
-"""What plugins provide: one registry per kind over entry points, lazy and conflict-aware.
-
-Metadata is read once; nothing is imported until a component is used. A plugin that is broken, outdated or doubles
-another is reported, by the name of its distribution, when it is used; the rest works.
+"""What plugins provide: one registry per kind of component.
 
 >>> from zonda.core.registry import operators
 >>> @operators.register                                     # doctest: +SKIP
@@ -10,279 +7,12 @@ another is reported, by the name of its distribution, when it is used; the rest 
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Callable, Iterator
-from importlib import import_module
-from typing import Any, TypeVar, overload
+from functools import partial
 
-from .discovery import RAISED, Found, discover
-from .errors import ZondaError
-
-T = TypeVar("T")
-
-MANY = 24
-"""A list of more names than these is not printed beside the one that is meant."""
-
-SESSION = "this session"
-"""Stands for the distribution of what `Registry.register` was given."""
-
-
-class RegistryError(ZondaError):
-    """A component that cannot be had. ``label`` is a short hint to print under a caret."""
-
-    def __init__(self, message: str, *, label: str = "", place: str = "", cure: str = "") -> None:
-        super().__init__(message, place=place, cure=cure)
-        self.label = label
-
-    def __str__(self) -> str:
-        text = f"{self.place}: {self.message}" if self.place else self.message
-        return "\n  = ".join([f"{text}; {self.label}" if self.label else text, *self.cure.splitlines()])
-
-
-class Registry:
-    """Components of one kind, by name.
-
-    Parameters
-    ----------
-    kind
-        Noun for messages: ``operator``.
-    group
-        Entry-point group: ``zonda.operators``.
-    base
-        ``module:class`` that what is provided must be: a subclass where ``classes``, else an instance. Empty: anything.
-    classes
-        Whether the components are classes (operators) or objects (sites).
-    exact
-        Whether a name must be written as it is registered, as that of a class; else capitals, hyphens, underscores and spaces
-        make no difference (GBT, MUSTANG-2, Green Bank).
-    """
-
-    def __init__(self, kind: str, group: str, base: str = "", *, classes: bool = False, exact: bool = False) -> None:
-        self.kind, self.group, self.base, self.classes, self.exact = kind, group, base, classes, exact
-        self._found: dict[str, list[Found]] | None = None
-        self._loaded: dict[Found, Any] = {}
-        self._registered: dict[str, Any] = {}
-
-    @property
-    def _local(self) -> dict[str, Any]:
-        return self._registered
-
-    @property
-    def _index(self) -> dict[str, list[Found]]:
-        if self._found is None:
-            self._found = {}
-            for found in discover(self.group):
-                self._found.setdefault(found.name, []).append(found)
-        return self._found
-
-    def refresh(self) -> None:
-        """Read the entry points anew (call `zonda.core.discovery.refresh` first); what was registered by hand stays."""
-        self._found = None
-
-    @overload
-    def register(self, component: None = None, *, name: str | None = None) -> Callable[[T], T]: ...
-    @overload
-    def register(self, component: T, *, name: str | None = None) -> T: ...
-    def register(self, component: Any = None, *, name: str | None = None) -> Any:
-        """Add a component from a script or notebook; a decorator, or a plain call. Packages use entry points instead.
-
-        Its name is ``name``, or the component's own ``name``, or its ``__name__``. Registering a name again replaces
-        the component (cells are run twice). Raises `RegistryError` where a plugin provides that name.
-        """
-        if component is None:
-            return lambda c: self.register(c, name=name)
-        own = getattr(component, "name", None)
-        key = name or (own if isinstance(own, str) else None) or getattr(component, "__name__", None)
-        if not key:
-            raise RegistryError(f"this {self.kind} has no name", cure="give one: register(component, name='...')")
-        if taken := self._index.get(key):
-            raise RegistryError(f"{self.kind} '{key}' is already provided by {taken[0].origin}", cure="choose another name")
-        self._registered[key] = component
-        return component
-
-    def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and (name in self._local or bool(self._named(name)))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(sorted({*self._index, *self._local}))
-
-    def __len__(self) -> int:
-        return len({*self._index, *self._local})
-
-    def candidates(self) -> list[Found]:
-        """Everything on offer, by name; what was registered by hand comes from "this session". Imports nothing."""
-        local = [Found(name, _reference(value), SESSION, "") for name, value in self._local.items()]
-        return sorted([f for found in self._index.values() for f in found] + local)
-
-    def suggest(self, name: str) -> str | None:
-        """The nearest name on offer."""
-        folded = {fold(known): known for known in self}
-        near = difflib.get_close_matches(fold(name.rpartition(":")[2]), folded, n=1, cutoff=0.6)
-        return folded[near[0]] if near else None
-
-    def registered(self, name: str) -> str:
-        """The registered name that ``name`` means: itself, or the one that differs from it by what `exact` tells; else ``name``.
-
-        Raises `RegistryError` where several do.
-        """
-        if self.exact or not isinstance(name, str) or name in self._local or self._named(name):
-            return name
-        distribution, colon, short = name.rpartition(":")
-        alike = [known for known in self if fold(known) == fold(short)]
-        if len(alike) > 1 and not self._same(alike):
-            named = " and ".join(f"'{known}'" for known in alike)
-            raise RegistryError(f"{self.kind} '{name}' may be {named}", label="write one of them as it is spelled here")
-        return f"{distribution}{colon}{alike[0]}" if alike else name
-
-    def get(self, name: str) -> Any:
-        """The component called ``name`` or ``distribution:name``, imported now.
-
-        Raises `RegistryError` for a name that is unknown, doubly provided, broken or written for another plugin API.
-        """
-        name = self.registered(name)
-        if name in self._local:
-            return self._check(self._local[name], Found(name, _reference(self._local[name]), SESSION, ""))
-        found = self._named(name)
-        if not found:
-            raise self._unknown(name)
-        if len(found) > 1:
-            raise RegistryError(
-                f"{self.kind} '{name}' is provided by {' and '.join(f.origin for f in found)}",
-                label="write " + " or ".join(f"'{f.qualified}'" for f in found),
-                cure="or uninstall one of them",
-            )
-        return self.load(found[0])
-
-    def create(self, name: str) -> Any:
-        """The object called ``name``: what the entry point names, or what it returns when called without arguments.
-
-        Raises `RegistryError` as `get`, and where the call fails or returns another kind of thing.
-        """
-        name = self.registered(name)
-        component = self.get(name)
-        if not callable(component):
-            return component
-        found = Found(name, _reference(component), SESSION, "") if name in self._local else self._named(name)[0]
-        try:
-            made = component()
-        except RAISED as err:
-            if isinstance(err, ZondaError) and not isinstance(err, ValueError):  # a ParameterError is the plugin's fault
-                raise
-            raise _broken(self.kind, found, err) from err
-        return self._check(made, found, made=True)
-
-    def load(self, found: Found) -> Any:
-        """Import one candidate. Raises `RegistryError` where that fails or it is written for another plugin API."""
-        if found.distribution == SESSION:
-            return self._check(self._local[found.name], found)
-        if found not in self._loaded:
-            try:
-                component = found.load()
-            except RAISED as err:
-                raise _broken(self.kind, found, err) from err
-            self._loaded[found] = self._check(component, found)
-        return self._loaded[found]
-
-    def _same(self, names: list[str]) -> bool:
-        """Whether all ``names`` stand for equal things, as a site and its alias do."""
-        make = self.get if self.classes else self.create
-        try:
-            first, *others = (make(name) for name in names)
-        except ZondaError:
-            return False
-        return all(type(other) is type(first) and other == first for other in others)
-
-    def _unknown(self, name: str) -> RegistryError:
-        from .hints import known_elsewhere
-
-        label, cure = known_elsewhere(self, name)
-        near = None if label else self.suggest(name)
-        names = f"installed: {', '.join(self) or 'none'}; `zonda plugins` lists where each comes from"
-        if (label or near) and len(self) > MANY:
-            names = f"`zonda plugins` lists all {len(self)} {self.kind}s"
-        label = label or (f"did you mean '{near}'?" if near else "not installed")
-        return RegistryError(f"unknown {self.kind} '{name}'", label=label, cure="\n".join(filter(None, (cure, names))))
-
-    def _named(self, name: str) -> list[Found]:
-        distribution, _, short = name.rpartition(":")
-        return [f for f in self._index.get(short, []) if not distribution or f.distribution == distribution]
-
-    def _check(self, component: Any, found: Found, *, made: bool = False) -> Any:
-        from .operator import API_VERSION
-
-        who = f"{self.kind} '{found.name}' from {found.origin}"
-        api = getattr(component, "zonda_api", API_VERSION)
-        if api != API_VERSION:
-            older = not isinstance(api, int) or api < API_VERSION
-            raise RegistryError(
-                f"{who} is written for plugin API {api}; this is API {API_VERSION}",
-                label="outdated plugin" if older else "zonda is outdated",
-                cure=f"pip install -U {found.distribution if older else 'zonda'}",
-            )
-        if self.base and (made or self.classes or not callable(component)):
-            module, _, attribute = self.base.partition(":")
-            base = getattr(import_module(module), attribute)
-            if not (isinstance(component, type) and issubclass(component, base) if self.classes else isinstance(component, base)):
-                noun = f"a subclass of {attribute}" if self.classes else f"a{'n' * (attribute[0] in 'AEIOU')} {attribute}"
-                raise RegistryError(f"{who} is not {noun}", label=f"it is {component!r:.60}", cure=f"mend {found.reference}")
-        return component
-
-
-class Together(Registry):
-    """Several registries of classes seen as one."""
-
-    def __init__(self, kind: str, *parts: Registry) -> None:
-        super().__init__(kind, "", parts[0].base, classes=True, exact=parts[0].exact)
-        self.parts = parts
-
-    @property
-    def _index(self) -> dict[str, list[Found]]:
-        index: dict[str, list[Found]] = {}
-        for part in self.parts:
-            for name, found in part._index.items():
-                index[name] = index.get(name, []) + [f for f in found if f not in index.get(name, [])]
-        return index
-
-    @property
-    def _local(self) -> dict[str, Any]:
-        return {name: value for part in self.parts for name, value in part._local.items()}
-
-    def register(self, component: Any = None, *, name: str | None = None) -> Any:
-        return self.parts[0].register(component, name=name)
-
-
-def fold(name: str) -> str:
-    """``name`` without capitals, hyphens, underscores and spaces."""
-    return re.sub(r"[\s_-]+", "", name).lower()
-
-
-def _reference(component: Any) -> str:
-    thing = component if hasattr(component, "__qualname__") else type(component)
-    return f"{thing.__module__}:{thing.__qualname__}"
-
-
-def _broken(kind: str, found: Found, err: BaseException) -> RegistryError:
-    return RegistryError(
-        f"{kind} '{found.name}' could not be loaded from the plugin {found.origin}",
-        label=_first_words(err),
-        cure=f"this is a fault in {found.distribution} ({found.reference}), not in your pipeline; "
-        "`zonda plugins --check` shows the traceback",
-    )
-
-
-def _first_words(err: BaseException) -> str:
-    """The first line of what an exception says; of pydantic's, which has none to the point, all fields with their mistakes."""
-    from pydantic import ValidationError
-
-    from .configuration.diagnostics import ConfigurationError
-
-    if isinstance(err, ConfigurationError):
-        return "; ".join(diagnostic.message for diagnostic in err.diagnostics)
-    if isinstance(err, ValidationError):
-        return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in err.errors())
-    return f"{type(err).__name__}: {err}".splitlines()[0]
-
+from . import discovery, hints
+from .components import Registry, Together
+from .components import RegistryError as RegistryError
+from .components import fold as fold
 
 operators = Registry("operator", "zonda.operators", "zonda.core.operator:Operator", classes=True, exact=True)
 mapmakers = Registry("mapmaker", "zonda.mapmakers", "zonda.core.operator:Operator", classes=True, exact=True)
@@ -298,6 +28,9 @@ weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.cor
 planning = Registry("planning", "zonda.planning", classes=True, exact=True)
 """By the name of the operator's class: its `core.plan.planning.Planning`."""
 
+sites.hint = partial(hints.for_site, sites, instruments)
+instruments.hint = partial(hints.for_instrument, sites, instruments)
+
 steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
 
@@ -308,8 +41,6 @@ registries = (
 
 def refresh() -> None:
     """Read the entry points of all kinds anew, e.g. after ``pip install`` in a notebook."""
-    from .discovery import refresh as forget
-
-    forget()
+    discovery.refresh()
     for registry in registries:
         registry.refresh()

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BeforeValidator, Field, SerializeAsAny, field_validator
 
 from .configuration.parameters import Parameters, named
 from .configuration.target import Target
 from .configuration.time import Instant
+from .errors import ZondaError
 from .instrument import Instrument
+from .registry import instruments, sites
 from .site import Site
 from .weather import WeatherSource, weather_source
+
+EARTH = 6371e3
+"""Mean radius, m."""
+NEAR = 1e3
+"""m: what stands nearer than this stands at the same site."""
 
 
 class Scene(Parameters):
@@ -34,13 +42,29 @@ class Scene(Parameters):
     @field_validator("site", mode="before")
     @classmethod
     def _site_by_name(cls, value: Any) -> Any:
-        from .registry import sites
-
         return named(sites, value)
 
     @field_validator("instrument", mode="before")
     @classmethod
     def _instrument_by_name(cls, value: Any) -> Any:
-        from .registry import instruments
-
         return named(instruments, value)
+
+
+def elsewhere(scene: Scene) -> str:
+    """What to say of a telescope that the scene puts on another site than its own; empty where it does not."""
+    telescope = scene.instrument.telescope
+    try:
+        home = sites.create(telescope.site) if telescope.site else None
+    except ZondaError:  # the site of a plugin that is not installed here
+        home = None
+    if home is None:
+        return ""
+    a, b = (np.array([s.latitude, s.longitude]) for s in (home, scene.site))
+    half = np.sin((a - b) / 2) ** 2
+    distance = 2 * EARTH * float(np.arcsin(np.sqrt(min(1.0, half[0] + np.cos(a[0]) * np.cos(b[0]) * half[1]))))
+    if distance < NEAR:
+        return ""
+    return (
+        f"{telescope.name} stands at {home.name}, {distance / 1e3:.0f} km away: here it looks through the air of "
+        f"{scene.site.name}; write 'site: {telescope.site}' for its own"
+    )

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from .configuration.parameters import Parameters, named_or_written, quantity
 from .configuration.units import Angle, Metres
+from .registry import sites
 
 
 class Site(Parameters):
@@ -27,6 +28,4 @@ class Site(Parameters):
     """Where these numbers come from."""
 
     def _as_argument(self) -> str:
-        from .registry import sites
-
         return named_or_written(self, sites)

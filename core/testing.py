@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from .configuration.parameters import described
+from .configuration.docstrings import described
 from .configuration.time import Instant
 from .data import STREAMS, Block, Data, Observation
 from .instrument import Band, Instrument, Telescope

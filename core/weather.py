@@ -14,6 +14,7 @@ from .configuration.diagnostics import refusal
 from .configuration.parameters import Parameters
 from .configuration.units import Unit
 from .errors import InputError, ZondaError
+from .registry import weather_sources
 
 if TYPE_CHECKING:
     from .configuration.time import Instant
@@ -175,8 +176,6 @@ def resolve(value: Any) -> tuple[type[WeatherSource], dict[str, Any]]:
     InputError
         Neither a name nor a mapping, or two sources at once.
     """
-    from .registry import weather_sources
-
     given = {"source": value} if isinstance(value, str) else value
     example = "write for example weather: {pwv: 1.2 mm}, {pwv: 25 %}, {file: era5.nc} or {table: profile.csv}"
     if not isinstance(given, dict):

@@ -6,8 +6,8 @@ import json
 import typing
 from pathlib import Path
 
-from zonda.core.configuration.describe import own_doc, written_choices
-from zonda.core.configuration.parameters import described
+from zonda.core.configuration.describe import written_choices
+from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Unit
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.registry import mapmakers, noise_models, operators

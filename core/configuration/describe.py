@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from .parameters import described
+from .docstrings import described, own_doc
 from .target import Target
 from .time import Instant
 from .units import Unit
@@ -26,11 +26,6 @@ _WORDS: dict[Any, str] = {
     Target: "a position such as '05h00m00s +20d00m00s'",
     Instant: "a time such as '2024-11-25T07:00:00Z'",
 }
-
-
-def own_doc(cls: type) -> str:
-    """The docstring as it stands in the class."""
-    return inspect.cleandoc(next((own for c in cls.__mro__ if (own := c.__dict__.get("__doc__")) and isinstance(own, str)), ""))
 
 
 def choices(field: FieldInfo) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from .diagnostics import ConfigurationError, Diagnostic, nearest
-from .parameters import described
+from .docstrings import described
 from .units import Unit
 from .yaml_places import Document, Path, Span
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .. import registry
+from ..components import Registry
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline
@@ -369,7 +370,7 @@ class _Check:
             return None
         return self.validate(source, given, ("weather",), "weather")
 
-    def named(self, given: dict[str, Any], key: str, names: registry.Registry, at: yaml_places.Path) -> bool:
+    def named(self, given: dict[str, Any], key: str, names: Registry, at: yaml_places.Path) -> bool:
         """Put what the name stands for in its place; False where there is no such thing."""
         if not isinstance(given.get(key), str):
             return True

@@ -11,10 +11,11 @@ from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from .. import registry
 from ..campaign.settings import CampaignHeader
+from ..components import Registry
 from ..errors import ZondaError
 from ..operator import Operator
 from ..scene import Scene
-from .describe import own_doc
+from .docstrings import own_doc
 from .pipeline_file import KEYS
 
 _MODE: JsonSchemaMode = "validation"
@@ -77,7 +78,7 @@ def _step(classes: dict[str, type[Operator]], references: Any) -> dict[str, Any]
     return {"anyOf": [whole, {"enum": list(classes)}]}
 
 
-def _name_or(schema: dict[str, Any], names: registry.Registry) -> dict[str, Any]:
+def _name_or(schema: dict[str, Any], names: Registry) -> dict[str, Any]:
     text = {"type": "string", "examples": list(names)}
     described = {"description": schema["description"]} if "description" in schema else {}
     return {"anyOf": [text, {k: v for k, v in schema.items() if k != "description"}], **described}

@@ -119,7 +119,7 @@ class Plan:
         return text(self)
 
     def _repr_html_(self) -> str:
-        from ..data import html_table
+        from ..notebook import html_table
         from .table import rows
 
         return html_table("Plan", [(f"{r['operator']}.{r['effect']}", f"{r['decision']}: {r['what']}") for r in rows(self)])

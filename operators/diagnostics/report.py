@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import PrivateAttr
 
-from zonda.core.configuration.describe import own_doc
-from zonda.core.configuration.parameters import described, quantity
+from zonda.core.configuration.docstrings import described, own_doc
+from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data, Observation
 from zonda.core.operator import Operator

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from zonda.core.configuration.units import Angle
-from zonda.core.data import Data, html_table
+from zonda.core.data import Data
 from zonda.core.errors import PipelineError
+from zonda.core.notebook import html_table
 from zonda.core.operator import Operator
 from zonda.core.run.companion import Companion
 from zonda.core.storage.files import product_path

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.data import html_table
 from zonda.core.errors import InputError
+from zonda.core.notebook import html_table
 from zonda.core.numerics import tangent
 from zonda.core.types import Floats
 

@@ -11,8 +11,9 @@ import pytest
 from zonda.core import discovery, registry
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
+from zonda.core.discovery import API_VERSION
 from zonda.core.hooks import PluginWarning
-from zonda.core.operator import API_VERSION, Operator
+from zonda.core.operator import Operator
 from zonda.core.registry import RegistryError
 from zonda.core.site import Site
 

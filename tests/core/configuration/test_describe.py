@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 import zonda
-from zonda.core.configuration.describe import choices, kind, own_doc, written_choices
+from zonda.core.configuration.describe import choices, kind, written_choices
+from zonda.core.configuration.docstrings import own_doc
 from zonda.core.registry import steps
 
 

@@ -1,0 +1,87 @@
+"""Docstrings of classes of parameters and of their fields, read from the source when somebody asks."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import linecache
+import re
+import sys
+import textwrap
+import tokenize
+from itertools import pairwise, takewhile
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+_places: dict[type, tuple[str, int, dict[str, Any]]] = {}
+"""Where the class statements stand: file, line, globals of the module."""
+_documented: dict[type, dict[str, str]] = {}
+
+
+def remember_place(cls: type) -> None:
+    """Remember where the class statement of ``cls`` stands; called while the class is made."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__") != cls.__module__:
+        frame = frame.f_back  # through pydantic's metaclass, to where the class statement stands
+    _places[cls] = (frame.f_code.co_filename, frame.f_lineno, frame.f_globals)
+
+
+def own_doc(cls: type) -> str:
+    """The docstring as it stands in the class."""
+    return inspect.cleandoc(next((own for c in cls.__mro__ if (own := c.__dict__.get("__doc__")) and isinstance(own, str)), ""))
+
+
+def described(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields of ``model``, with their docstrings as descriptions.
+
+    These are read from the source when somebody asks, not when the class is made (pydantic's ``use_attribute_docstrings``):
+    that takes a third of a second for the classes of a run, which asks for none.
+    """
+    for name, field in model.model_fields.items():
+        if field.description is None:
+            nearest = next((own for cls in model.__mro__ if name in (own := _docstrings(cls))), {})
+            field.description = nearest.get(name) or None
+    return model.model_fields
+
+
+def _docstrings(cls: type) -> dict[str, str]:
+    """The docstring of each attribute that the class itself annotates, empty where it has none."""
+    if cls not in _places:
+        return {}
+    if cls not in _documented:
+        file, line, module = _places[cls]
+        _documented[cls] = _of_class(linecache.getlines(file, module)[line - 1 :], cls.__name__)
+    return _documented[cls]
+
+
+def _of_class(lines: list[str], name: str) -> dict[str, str]:
+    """As `_docstrings`, from lines that begin with the class statement or its decorators."""
+    for block in (_by_indentation, inspect.getblock):  # the second reads tokens: slow, and never wrong
+        try:
+            statement = ast.parse(textwrap.dedent("".join(block(lines)))).body[0]
+        except (SyntaxError, IndexError, ValueError, tokenize.TokenError):  # the file has changed meanwhile
+            continue
+        if isinstance(statement, ast.ClassDef) and statement.name == name:
+            found = {}
+            for one, after in pairwise([*statement.body, ast.Pass()]):
+                if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
+                    text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else None
+                    found[one.target.id] = inspect.cleandoc(text) if isinstance(text, str) else ""
+            return found
+    return {}
+
+
+def _by_indentation(lines: list[str]) -> list[str]:
+    """The class statement and what is indented more, but for the methods behind the last annotation.
+
+    It may end too early, within brackets or texts.
+    """
+    indent = len(lines[0]) - len(lines[0].lstrip())
+    head = len(list(takewhile(lambda line: not line.lstrip().startswith("class "), lines))) + 1
+    body = list(takewhile(lambda line: not line.strip() or len(line) - len(line.lstrip()) > indent, lines[head:]))
+    inner = next((line[: len(line) - len(line.lstrip())] for line in body if line.strip()), "")
+    last = max((k for k, line in enumerate(body) if re.match(rf"{inner}[A-Za-z_]\w* *:", line)), default=0)
+    methods = next((k for k in range(last, len(body)) if re.match(rf"{inner}(@|def |async |class )", body[k])), len(body))
+    return [*lines[:head], *body[:methods]]
