@@ -30,6 +30,8 @@ BOLTZMANN = 1.380649e-23
 """J / K (SI, exact)."""
 T_CMB = 2.72548
 """K (Fixsen 2009, ApJ 707, 916)."""
+LEAST_TRANSMISSION = 1e-6
+"""Band transmission below which samples are not calibrated: they are flagged as opaque, and say nothing of the noise."""
 
 SURFACE_BRIGHTNESS_UNITS = ("Jy/pixel", "Jy/beam", "MJy/sr")
 """Units of specific intensity: their conversion needs the source's spectral index."""

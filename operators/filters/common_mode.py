@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -33,18 +33,12 @@ from pydantic import Field, model_validator
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
-from zonda.core.knobs import Knob
-from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
 from . import focal_plane_mean
-from .gram import MOST_COPIED, Gram, Usable
+from .gram import Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
-
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate, Traits
 
 OF_THE_SKY = frozenset({"sky", "transmission"})
 """Streams of which a detector in order may see nothing. All see the air."""
@@ -67,7 +61,6 @@ class CommonModeFilter(Operator):
     prepares_ahead: ClassVar[bool] = True
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
-    knobs: ClassVar[tuple[Knob, ...]] = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
 
     modes: int = Field(1, ge=1, le=100)
     """How many modes to remove."""
@@ -92,18 +85,6 @@ class CommonModeFilter(Operator):
     def prepare(self, observation: Observation) -> Modes:
         """Empty modes, filled by `measure`."""
         return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
-
-    def memory(self, observation: Observation) -> int:
-        """Series over the scan: one for each step of the iteration, or what `focal_plane_mean` adds up; the copy of one tile."""
-        n_det, n_samp = observation.n_detectors, observation.n_samples
-        if self.method == "mean":
-            return 8 * 8 * n_samp + 100 * n_det
-        copy = min(8 * n_det * min(TILE_SAMPLES, n_samp), MOST_COPIED)
-        return 8 * (20 + 8 * self.modes) * n_samp + 200 * n_det + copy
-
-    def sweeps(self, observation: Observation) -> int:
-        """One reading for the mean; the singular modes want the stream whole."""
-        return 1 if self.method == "mean" else 0
 
     def measure(self, stream: Stream, state: Modes) -> None:
         """Find the modes. Raises PipelineError where float32 cannot carry the remainder."""
@@ -221,18 +202,6 @@ class CommonModeFilter(Operator):
                 place=place,
                 cure="set precision: float64",
             )
-
-    def traits(self, observation: Observation) -> Traits:
-        """It removes what is common."""
-        from zonda.core.plan.estimate import Traits
-
-        return Traits(removes_common=observation.n_detectors > 1)
-
-    def estimate(self, context: Context) -> Estimate:
-        """Residual of the modes."""
-        from .estimate import common_mode_estimate
-
-        return common_mode_estimate(self, context)
 
     def exec(self, block: Block, state: Modes) -> None:
         """Equation (1) on one block."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,9 @@ from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
-from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 
 from .brick_wall import HighpassPlan, plan_highpass
-
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate, Traits
 
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
@@ -42,7 +37,6 @@ class HighpassFilter(Operator):
     prepares_ahead: ClassVar[bool] = True
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
-    knobs: ClassVar[tuple[Knob, ...]] = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
     frequency: Hertz = quantity("0.08 Hz", gt=0)
     """Cut: everything slower is removed."""
@@ -101,22 +95,6 @@ class HighpassFilter(Operator):
     def _left(self) -> str:
         """What is removed from a short scan."""
         return ONLY_A_LINE if self.degree else ONLY_THE_MEAN
-
-    def memory(self, observation: Observation) -> int:
-        """Spline weights; where the full DCT is used, the polynomials and what they are made from."""
-        return 120 * observation.n_samples
-
-    def traits(self, observation: Observation) -> Traits:
-        """What passes."""
-        from .estimate import highpass_traits
-
-        return highpass_traits(self, observation)
-
-    def estimate(self, context: Context) -> Estimate:
-        """Knots of the coarse series."""
-        from .estimate import highpass_estimate
-
-        return highpass_estimate(self, context)
 
     def exec(self, block: Block, state: tuple[HighpassPlan, NDArray[np.intp]]) -> None:
         """Filter the block's rows in place."""

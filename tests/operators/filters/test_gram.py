@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from zonda.core.data import Stream
+from zonda.core.plan.planning import planning_of
 from zonda.operators.filters import gram
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.gram import MOST_COPIED, SHORTEST_TILE, Gram, near_the_mean, tile_length
@@ -102,8 +103,8 @@ def test_copies_at_one_time_are_what_there_is_room_for(bench, tmp_path, monkeypa
 def test_the_copy_is_announced(bench):
     """`CommonModeFilter.memory` has one copy; more are made where there is room for them."""
     for n_det in (300, 9000, 50_000):
-        few, many = (CommonModeFilter().memory(bench.observation(n_det, n)) for n in (64, 4096))
+        few, many = (planning_of(CommonModeFilter()).memory(bench.observation(n_det, n)) for n in (64, 4096))
         length = tile_length(n_det, 4)
         assert few >= 4 * n_det * min(64, length)
         assert many >= 4 * n_det * length
-    assert CommonModeFilter(method="mean").memory(bench.observation(9000, 4096)) < 2_000_000
+    assert planning_of(CommonModeFilter(method="mean")).memory(bench.observation(9000, 4096)) < 2_000_000

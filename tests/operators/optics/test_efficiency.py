@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import zonda
+from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.smooth import SmoothField
-from zonda.operators.optics.efficiency import OPAQUE, Efficiency, _spline, quotient
+from zonda.operators.optics.efficiency import Efficiency
+from zonda.operators.optics.quotient import _spline, quotient
 
 from ...scenes import camera
 
@@ -140,7 +142,7 @@ def test_opaque_detector_is_flagged_and_finite(bench, streams):
     smooth["transmission"] = SmoothField(weights, smooth["transmission"].coefficients, 64, N)
     run = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=smooth)
     assert np.flatnonzero(run.observations[0].detector_flags).tolist() == [3]
-    assert run.tally["Efficiency", f"detectors flagged: band transmission below {OPAQUE:g}"] == "1"
+    assert run.tally["Efficiency", f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}"] == "1"
     assert np.isfinite(run.signal).all()
     clear = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=fields())
     others = np.arange(N_DET) != 3

@@ -1,0 +1,118 @@
+"""Planning of the filters: bounds, coarser forms, costs and memory (`core.plan`)."""
+
+from __future__ import annotations
+
+import math
+
+from zonda.core.data import Observation
+from zonda.core.knobs import Knob
+from zonda.core.numerics.tiles import TILE_SAMPLES
+from zonda.core.plan.context import LEAKS, Context
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.planning import Planning
+
+from .common_mode import CommonModeFilter
+from .gram import MOST_COPIED
+from .highpass import HighpassFilter
+
+LANCZOS = 0.5e-9
+"""Seconds per sample of one Lanczos step, which reads the stream once."""
+
+START = 1e-3
+"""Residual of the first vector, the detectors' mean."""
+
+
+class HighpassPlanning(Planning[HighpassFilter]):
+    """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
+
+    of = HighpassFilter
+    knobs = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
+
+    def traits(self, observation: Observation) -> Traits:
+        """A brick wall; a scan shorter than one cycle loses only a line."""
+        frequency = self.operator.frequency
+        cut = frequency if observation.duration * frequency >= 1 else 0.0
+        return Traits(response=lambda f: float(f >= cut))
+
+    def memory(self, observation: Observation) -> int:
+        """Spline weights; where the full DCT is used, the polynomials and what they are made from."""
+        return 120 * observation.n_samples
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost, and what fewer knots would save and err by."""
+        o, cut, full_q = context.first, self.operator.frequency, self.operator.oversampling
+        knots = full_q * cut * o.duration
+        cost = Cost(fixed=0.01, per_time=5e-8, per_sample=2e-9 + 2e-8 * knots / o.n_samples)
+        choices = [full(f"{full_q:g} knots per cycle of the cut")]
+        near = LEAKS * context.weighted(lambda f: min((f / cut) ** 4, 1.0), 0.0, cut)
+        text = "1.5 sqrt(int_0^f_cut S (f / f_cut)^8 df) x (q^-4 + q_full^-4), q knots per cycle of the cut"
+        for q in (q for q in (16.0, 12.0, 8.0) if q < full_q):
+            share = q**-4 + full_q**-4
+            bound = context.bound(near * share, 1 / cut, common=True)
+            bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
+            saved = 2e-8 * (knots - q * cut * o.duration) * o.n_detectors * len(context.observations)
+            settings = {"oversampling": q}
+            choices.append(Choice("coarse", f"{q:g} knots per cycle", settings, bound=bound, formula=text, seconds=saved))
+        size = context.bound(context.fluctuation, o.duration, common=True)
+        effect = Effect(
+            "high-pass decimation", tuple(choices), size, "rms of the stream: its low part removed wrongly altogether"
+        )
+        left_in = {m: size[m] + context.mean_emission for m in size}
+        return Estimate((effect,), cost, left_in | context.sky_error(1.0))
+
+
+class CommonModePlanning(Planning[CommonModeFilter]):
+    """Residual of the modes.
+
+    A residual r turns the mode by at most r sigma_1^2 / (sigma_1^2 - sigma_2^2) <= r / (1 - gap^2), a mode that is determined
+    having sigma_2 <= gap sigma_1: equation (2) of `common_mode`, Davis & Kahan (1970).
+    """
+
+    of = CommonModeFilter
+    knobs = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
+
+    def traits(self, observation: Observation) -> Traits:
+        """It removes what is common."""
+        return Traits(removes_common=observation.n_detectors > 1)
+
+    def memory(self, observation: Observation) -> int:
+        """Series over the scan: one for each step of the iteration, or the sums of `focal_plane_mean`; the copy of one tile."""
+        n_det, n_samp = observation.n_detectors, observation.n_samples
+        if self.operator.method == "mean":
+            return 8 * 8 * n_samp + 100 * n_det
+        copy = min(8 * n_det * min(TILE_SAMPLES, n_samp), MOST_COPIED)
+        return 8 * (20 + 8 * self.operator.modes) * n_samp + 200 * n_det + copy
+
+    def sweeps(self, observation: Observation) -> int:
+        """One reading for the mean; the singular modes need the whole stream."""
+        return 1 if self.operator.method == "mean" else 0
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost, and what larger residuals would save and err by."""
+        modes, tightest, svd = self.operator.modes, self.operator.residual, self.operator.method == "svd"
+        count = steps(tightest, modes, context) if svd else 1.0
+        cost = Cost(fixed=0.01, per_sample=0.4e-9 + LANCZOS * count)
+        slow = 1 / context.cut if context.cut > 0 else context.first.duration
+        size = context.bound(context.passed, slow, common=True)
+        without = size | context.sky_error(1.0)
+        if not svd:
+            return Estimate((), cost, without)
+        choices = [full(f"residual {tightest:g}")]
+        text = "rms of the stream behind the high-pass filter x residual / (1 - gap^2)"
+        for residual in (r for r in (1e-4, 1e-3, 1e-2) if r > tightest):
+            share = math.sqrt(modes) * (residual + tightest) / (1 - self.operator.gap**2)
+            bound = context.bound(share * context.passed, slow, common=True) | {"psd": 2 * share + share**2}
+            bound |= context.sky_error(share)
+            saved = LANCZOS * (count - steps(residual, modes, context)) * context.samples
+            settings = {"residual": residual}
+            choices.append(Choice("coarse", f"residual {residual:g}", settings, bound=bound, formula=text, seconds=saved))
+        effect = Effect("common-mode residual", tuple(choices), size, "rms of the stream: no common mode removed at all")
+        return Estimate((effect,), cost, without)
+
+
+def steps(residual: float, modes: int, context: Context) -> int:
+    """Steps that a residual takes: each lessens it by the square of the ratio of the noise's singular values to the mode's."""
+    n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
+    common = max((context.passed / LEAKS) ** 2 - noise**2, 0.0) if context.cut > 0 else context.fluctuation**2
+    shrink = min(noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30), 0.5)
+    return modes + max(1, math.ceil(math.log(residual / START) / math.log(shrink)))
