@@ -25,6 +25,11 @@ checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
 metrics = Registry("metric", "zonda.metrics", classes=True)  # classes, or functions of `Data`: core.accuracy.metrics
 weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True)
 
+sections = Registry(
+    "section of pipeline files", "zonda.sections", "zonda.core.configuration.section:Section", classes=True, exact=True
+)
+"""By the key in a pipeline file."""
+
 planning = Registry("planning", "zonda.planning", classes=True, exact=True)
 """By the name of the operator's class: its `core.plan.planning.Planning`."""
 
@@ -35,7 +40,7 @@ steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
 
 registries = (
-    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics, planning,
+    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics, planning, sections,
 )  # fmt: skip
 
 

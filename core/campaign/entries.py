@@ -7,16 +7,11 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..configuration import overrides
-from ..configuration.diagnostics import Diagnostic
 from ..configuration.time import Instant
 from ..errors import InputError
 from .settings import MOST_TASKS, Campaign, Nights
-
-if TYPE_CHECKING:
-    from ..configuration.yaml_places import Document
 
 TURN = 86400.0 / 1.00273781191135448
 """Length of one turn of the Earth against the stars, s: 86400 / (d ERA / d UT1) (IAU 2000, Capitaine et al. 2000), after which
@@ -104,17 +99,9 @@ def setting(key: str, value: Any) -> str:
     return f"{key}={json.dumps(value)}"
 
 
-def number_of(campaign: Campaign, nights: int = 1) -> int:
-    """Number of entries, ``nights`` being what the nights come to."""
-    sizes = [len(v) for v in campaign.grid.values()]
-    return math.prod(sizes) * max(1, len(campaign.observations)) * nights * campaign.realizations
-
-
 def _points(campaign: Campaign) -> Iterator[dict[str, Any]]:
     """Values of grid and observations."""
     listed: list[dict[str, Any]] = [{"observation": k, **entry} for k, entry in enumerate(campaign.observations)] or [{}]
-    if number_of(campaign) > MOST_TASKS:
-        raise InputError(f"a campaign of {number_of(campaign)} entries", cure=f"make its axes shorter: at most {MOST_TASKS}")
     for entry in listed:
         for point in itertools.product(*campaign.grid.values()):
             yield {**entry, **dict(zip(campaign.grid, point, strict=True))}
@@ -150,51 +137,3 @@ def _combined(campaign: Campaign, axis: str, values: dict[str, Any]) -> bool:
 
 def _plain(combination: tuple[tuple[str, Any], ...]) -> Any:
     return tuple((k, json.dumps(v, sort_keys=True)) for k, v in combination)
-
-
-def mistakes(
-    document: Document, campaign: Campaign, keys: list[str], check: Callable[[Document], list[Diagnostic]]
-) -> list[Diagnostic]:
-    """What is wrong with the keys and values of ``grid`` and ``observations``, each at its place in the file.
-
-    ``check``: what is wrong with a document; each value is put where it would go and checked there.
-    """
-    found: list[Diagnostic] = []
-    refused: set[str] = set()
-    grid: list[list[tuple[str, tuple[Any, ...]]]] = [
-        [(key, ("campaign", "grid", key, k))] for key, values in campaign.grid.items() for k in range(len(values))
-    ]
-    listed = [[(key, ("campaign", "observations", k, key)) for key in entry] for k, entry in enumerate(campaign.observations)]
-    for together in [*grid, *listed]:
-        changed, wrong = document.copy(), False
-        for key, path in together:
-            span = document.mark(path[:3] if path[1] == "grid" else path).start
-            if key in refused:
-                wrong = True
-            elif key.split(".")[0] in REFUSED:
-                found.append(Diagnostic(f"'{key}' cannot change from one entry to the next", span, "", REFUSED_WHY))
-                refused.add(key)
-            elif unknown := overrides.put(changed, key, document.sub(path), span, keys):
-                found += unknown
-                refused.add(key)
-            wrong |= key in refused
-        found += [] if wrong else check(changed)
-    return found
-
-
-def missing_above(mistake: Diagnostic, document: Document, campaign: Campaign) -> Diagnostic:
-    """A key that the pipeline lacks, told at its place among the axes, where it is one of them; any other mistake as it is."""
-    paths: dict[str, tuple[Any, ...]] = {key: ("campaign", "grid", key) for key in campaign.grid}
-    for k, entry in enumerate(campaign.observations):
-        paths = {key: ("campaign", "observations", k, key) for key in entry} | paths
-    for key, path in paths.items():
-        if mistake.message == f"the pipeline needs '{key}'":
-            here = document.sub(path).value
-            first = setting(key, here[0] if path[1] == "grid" and isinstance(here, list) else here).partition("=")[2]
-            cure = f"write '{key}: {first}' at the top level too: the file is checked with it, and each entry puts its own there"
-            return Diagnostic(f"the axis '{key}' changes what the pipeline does not have", document.mark(path).start, "", cure)
-    return mistake
-
-
-REFUSED = ("version", "name", "description", "requires", "outputs", "campaign", "runs", "operators")
-REFUSED_WHY = "an axis is a key of the scene (seed, site, instrument, time, target, weather), precision, or a step's parameter"

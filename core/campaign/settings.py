@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from ..configuration.parameters import Parameters
-from ..configuration.pipeline_file import Header
 from ..configuration.time import Instant
 
 Engine = Literal["serial", "processes", "mpi", "dask"]
@@ -117,20 +116,3 @@ class Campaign(Parameters):
     def combines(self, axis: str) -> bool:
         """Whether maps are co-added over an axis."""
         return self.combine == "all" or axis in self.combine
-
-
-def at_least(campaign: dict[str, Any]) -> int:
-    """Number of entries that ``campaign:`` as it was written comes to, whatever else may be wrong with it."""
-    grid, given, nights = (campaign.get(key) for key in ("grid", "observations", "nights"))
-    sizes = [len(values) for values in grid.values() if isinstance(values, list)] if isinstance(grid, dict) else []
-    sizes.append(len(given) if isinstance(given, list) else 1)
-    counts = [nights.get("count") if isinstance(nights, dict) else nights, campaign.get("realizations")]
-    return math.prod(max(1, n) for n in [*sizes, *(n for n in counts if isinstance(n, int))])
-
-
-class CampaignHeader(Header):
-    """Top level of a pipeline file that has a campaign."""
-
-    campaign: Campaign | None = None
-    """Many observations of this pipeline as tasks: a grid or a list of sites, times, seeds or steps' parameters, nights,
-    realizations; and the engine that works on them."""

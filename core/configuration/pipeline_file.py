@@ -73,7 +73,7 @@ class Header(Parameters):
     budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
     """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
     campaign: Any = None
-    """None; the header of a file with a campaign is a `core.campaign.settings.CampaignHeader`."""
+    """None; a file with a campaign has the header of its `Section`."""
     outputs: Path | None = None
     """Folder for products, relative to the working directory; where absent, out/<name>."""
 
@@ -231,11 +231,8 @@ class _Check:
         if header is not None:
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
-            from ..campaign import entries
-
-            self.mistakes = [entries.missing_above(m, self.document, header.campaign) for m in self.mistakes]
-            if not self.mistakes:
-                self.mistakes += entries.mistakes(self.document, header.campaign, KEYS, self.without_campaign)
+            section = registry.sections.get("campaign")
+            self.mistakes = section.mistakes(self.document, header.campaign, self.mistakes, self.without_campaign)
         if scene is not None and not self.mistakes and self.target_of_map:
             scene = self.targeted(scene, [s.operator for s in steps if s is not None])
         if self.mistakes:
@@ -256,9 +253,7 @@ class _Check:
             at = self.document.mark(("operators",)).start
             self.wrong(f"a pipeline of {len(items or [])} steps", at, "", f"write at most {MOST_STEPS}")
         if isinstance(campaign, dict) and not many:
-            from ..campaign.settings import MOST_TASKS, at_least
-
-            many = at_least(campaign) > MOST_TASKS  # the header's own check has said so
+            many = registry.sections.get("campaign").too_large(campaign)  # the header's own check has said so
         if many:
             raise ConfigurationError(without_meant(self.mistakes), self.name)
 
@@ -286,9 +281,8 @@ class _Check:
         """The class that the header is checked against."""
         if self.tree.get("campaign") is None:
             return Header
-        from ..campaign.settings import CampaignHeader
-
-        return CampaignHeader
+        header: type[Header] = registry.sections.get("campaign").header
+        return header
 
     def without_campaign(self, document: Document) -> list[Diagnostic]:
         """What is wrong with a document but for its campaign."""

@@ -10,7 +10,6 @@ from pydantic.errors import PydanticInvalidForJsonSchema
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from .. import registry
-from ..campaign.settings import CampaignHeader
 from ..components import Registry
 from ..errors import ZondaError
 from ..operator import Operator
@@ -33,11 +32,12 @@ def json_schema() -> dict[str, Any]:
             continue
         classes[found.qualified if twice else found.name] = operator
     weather = _weather()
-    wanted: list[type[BaseModel]] = [CampaignHeader, Scene, *dict.fromkeys([*classes.values(), *weather.values()])]
+    top: type[BaseModel] = registry.sections.get("campaign").header
+    wanted: list[type[BaseModel]] = [top, Scene, *dict.fromkeys([*classes.values(), *weather.values()])]
     models = [(model, _MODE) for model in wanted]
     references, definitions = models_json_schema(models, ref_template="#/$defs/{model}")
     defs = definitions.get("$defs", {})
-    header, scene = (defs.pop(references[model, _MODE]["$ref"].rpartition("/")[2]) for model in (CampaignHeader, Scene))
+    header, scene = (defs.pop(references[model, _MODE]["$ref"].rpartition("/")[2]) for model in (top, Scene))
     properties = header["properties"] | scene["properties"]
     for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
         properties[kind] = _name_or(properties[kind], names)

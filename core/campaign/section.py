@@ -1,0 +1,93 @@
+"""``campaign:`` of a pipeline file: what it holds, and what is wrong with its axes, each mistake at its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from ..configuration import overrides
+from ..configuration.diagnostics import Diagnostic
+from ..configuration.pipeline_file import KEYS, Header
+from ..configuration.section import Section
+from .entries import setting
+from .settings import MOST_TASKS, Campaign
+
+if TYPE_CHECKING:
+    from ..configuration.yaml_places import Document
+
+
+class CampaignHeader(Header):
+    """Top level of a pipeline file that has a campaign."""
+
+    campaign: Campaign | None = None
+    """Many observations of this pipeline as tasks: a grid or a list of sites, times, seeds or steps' parameters, nights,
+    realizations; and the engine that works on them."""
+
+
+class CampaignSection(Section):
+    """What pipeline files ask about their key ``campaign``."""
+
+    header = CampaignHeader
+
+    @staticmethod
+    def too_large(value: Any) -> bool:
+        """Whether ``campaign:`` as it was written comes to more entries than allowed, whatever else is wrong with it."""
+        grid, given, nights = (value.get(key) for key in ("grid", "observations", "nights"))
+        sizes = [len(values) for values in grid.values() if isinstance(values, list)] if isinstance(grid, dict) else []
+        sizes.append(len(given) if isinstance(given, list) else 1)
+        counts = [nights.get("count") if isinstance(nights, dict) else nights, value.get("realizations")]
+        return math.prod(max(1, n) for n in [*sizes, *(n for n in counts if isinstance(n, int))]) > MOST_TASKS
+
+    @staticmethod
+    def mistakes(
+        document: Document, value: Campaign, known: list[Diagnostic], check: Callable[[Document], list[Diagnostic]]
+    ) -> list[Diagnostic]:
+        """See `Section.mistakes`. The axes are checked only in a file without other mistakes."""
+        return [_at_axis(mistake, document, value) for mistake in known] or _mistakes(document, value, check)
+
+
+def _mistakes(document: Document, campaign: Campaign, check: Callable[[Document], list[Diagnostic]]) -> list[Diagnostic]:
+    """What is wrong with the keys and values of ``grid`` and ``observations``, each at its place in the file.
+
+    ``check`` lists the mistakes of a document; each value is put where it would go and checked there.
+    """
+    found: list[Diagnostic] = []
+    refused: set[str] = set()
+    grid: list[list[tuple[str, tuple[Any, ...]]]] = [
+        [(key, ("campaign", "grid", key, k))] for key, values in campaign.grid.items() for k in range(len(values))
+    ]
+    listed = [[(key, ("campaign", "observations", k, key)) for key in entry] for k, entry in enumerate(campaign.observations)]
+    for together in [*grid, *listed]:
+        changed, wrong = document.copy(), False
+        for key, path in together:
+            span = document.mark(path[:3] if path[1] == "grid" else path).start
+            if key in refused:
+                wrong = True
+            elif key.split(".")[0] in REFUSED:
+                found.append(Diagnostic(f"'{key}' cannot change from one entry to the next", span, "", REFUSED_WHY))
+                refused.add(key)
+            elif unknown := overrides.put(changed, key, document.sub(path), span, KEYS):
+                found += unknown
+                refused.add(key)
+            wrong |= key in refused
+        found += [] if wrong else check(changed)
+    return found
+
+
+def _at_axis(mistake: Diagnostic, document: Document, campaign: Campaign) -> Diagnostic:
+    """A key that the pipeline lacks and an axis names: the mistake at the place of the axis; any other mistake as it is."""
+    paths: dict[str, tuple[Any, ...]] = {key: ("campaign", "grid", key) for key in campaign.grid}
+    for k, entry in enumerate(campaign.observations):
+        paths = {key: ("campaign", "observations", k, key) for key in entry} | paths
+    for key, path in paths.items():
+        if mistake.message == f"the pipeline needs '{key}'":
+            here = document.sub(path).value
+            first = setting(key, here[0] if path[1] == "grid" and isinstance(here, list) else here).partition("=")[2]
+            cure = f"write '{key}: {first}' at the top level too: the file is checked with it, and each entry puts its own there"
+            return Diagnostic(f"the axis '{key}' changes what the pipeline does not have", document.mark(path).start, "", cure)
+    return mistake
+
+
+REFUSED = ("version", "name", "description", "requires", "outputs", "campaign", "runs", "operators")
+REFUSED_WHY = "an axis is a key of the scene (seed, site, instrument, time, target, weather), precision, or a step's parameter"
