@@ -133,7 +133,7 @@ def implied_error(layer, ratio: float) -> tuple[float, float]:
 
 
 def structure_of(layer, r):
-    from zonda.operators.atmosphere.covariance import beam_structure
+    from zonda.operators.atmosphere.turbulence.covariance import beam_structure
 
     if layer.aperture:
         return layer.aperture.structure(r, layer.outer_scale)
@@ -141,8 +141,8 @@ def structure_of(layer, r):
 
 
 def covariance() -> None:
-    from zonda.operators.atmosphere.beams import Aperture
-    from zonda.operators.atmosphere.turbulence import FIDELITIES, Turbulence
+    from zonda.operators.atmosphere.turbulence.beams import Aperture
+    from zonda.operators.atmosphere.turbulence.lattice import FIDELITIES, Turbulence
 
     ratios = (1e-3, 0.06, 1.0, 30.0, 100.0, 1e3, 1e4, 1e6)
     print("Gaussian footprint; r0 / sigma:", *(f"{r:g}" for r in ratios), sep="\t")

@@ -11,17 +11,17 @@ from time import perf_counter
 
 LOAD = """
 import numpy, zonda.core.site, zonda.core.registry, zonda.core.configuration.time
-from zonda.operators.atmosphere import weather, absorption
+from zonda.operators.atmosphere.weather import absorption, profiles
 from time import perf_counter
 site = zonda.core.registry.sites.create("chajnantor")
 when = zonda.core.configuration.time.Instant.parse("2022-08-01T23:00")
 start = perf_counter()
-weather.profile(site, when)
+profiles.profile(site, when)
 first = perf_counter()
 absorption.absorption_table()
 table = perf_counter()
 for hour in range(100):
-    weather.profile(site, when.shifted(3600 * hour))
+    profiles.profile(site, when.shifted(3600 * hour))
 print(first - start, table - first, (perf_counter() - table) / 100)
 """
 
@@ -35,7 +35,7 @@ def main() -> None:
         print(f"{name:40s} {1e3 * min(float(v) for v in values):8.2f} ms")
 
     from zonda.core.registry import instruments, sites
-    from zonda.operators.atmosphere.weather_summary import water_by_month
+    from zonda.operators.atmosphere.weather.summary import water_by_month
 
     start = perf_counter()
     water_by_month(sites.create("chajnantor"))

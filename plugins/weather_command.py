@@ -68,9 +68,9 @@ def show(
     from zonda.core import registry, weather
     from zonda.core.configuration.units import Unit
     from zonda.core.storage.files import atomic_path, product_path
-    from zonda.operators.atmosphere import weather_summary as summary
-    from zonda.operators.atmosphere.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
-    from zonda.operators.atmosphere.weather_sources import air_of
+    from zonda.operators.atmosphere.weather import summary
+    from zonda.operators.atmosphere.weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
+    from zonda.operators.atmosphere.weather.sources import air_of
 
     place, when = _place(site), _instant(time)
     given = {key: value for key, value in (("pwv", pwv), ("file", file), ("table", table)) if value is not None}
@@ -111,7 +111,7 @@ def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
     Needs a (free) key and the package cdsapi: pip install 'zonda[weather]', then https://cds.climate.copernicus.eu/how-to-api.
     """
     from zonda.core.storage.files import atomic_path
-    from zonda.operators.atmosphere.era5_fetch import retrieve
+    from zonda.operators.atmosphere.weather.era5_fetch import retrieve
 
     place, when = _place(site), _instant(time)
     with atomic_path(output) as temporary:

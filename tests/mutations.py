@@ -14,7 +14,8 @@ import pytest
 
 from zonda.core.data import Block, Observation
 from zonda.core.run import block_maker
-from zonda.operators.atmosphere import band, covariance, turbulence
+from zonda.operators.atmosphere.turbulence import covariance, lattice
+from zonda.operators.atmosphere.weather import bands
 from zonda.operators.filters import brick_wall, common_mode
 from zonda.operators.maps import bin_map
 from zonda.operators.noise import pink, white
@@ -47,33 +48,33 @@ def difference_of_covariances(patch: Patch) -> None:
 
 
 def weights_that_do_not_sum_to_one(patch: Patch) -> None:
-    kriging = turbulence._kriging
-    patch.setattr(turbulence, "_kriging", lambda *of: kriging(*of) * np.float32(1 - 1e-3))
+    kriging = lattice._kriging
+    patch.setattr(lattice, "_kriging", lambda *of: kriging(*of) * np.float32(1 - 1e-3))
 
 
 def transmission_of_the_mean_opacity(patch: Patch) -> None:
     def mean_first(self: Any, slant: Any) -> Any:
         opacity = float(np.average(slant.sum(axis=0), weights=self._weight))
-        return float(np.sum(self._weight * band.emission(slant, self._source))), -opacity, -opacity
+        return float(np.sum(self._weight * bands.emission(slant, self._source))), -opacity, -opacity
 
-    patch.setattr(band._BandTransfer, "_at", mean_first)
+    patch.setattr(bands._BandTransfer, "_at", mean_first)
 
 
 def exponentials_before_logarithms(patch: Patch) -> None:
     def underflowing(self: Any, slant: Any) -> Any:
         passed = self._weight * np.exp(-slant.sum(axis=0))
-        emitted = float(np.sum(self._weight * band.emission(slant, self._source)))
+        emitted = float(np.sum(self._weight * bands.emission(slant, self._source)))
         with np.errstate(divide="ignore"):
             return emitted, float(np.log(passed.sum())), float(np.log(np.sum(passed * self._cmb)))
 
-    patch.setattr(band._BandTransfer, "_at", underflowing)
+    patch.setattr(bands._BandTransfer, "_at", underflowing)
 
 
 def differences_by_subtraction(patch: Patch) -> None:
     def subtracted(self: Any, which: int, pwv: Any, dpwv: Any, elevation: Any) -> Any:
         return self._evaluate(which, np.add(pwv, dpwv), elevation) - self._evaluate(which, pwv, elevation)
 
-    patch.setattr(band.BandAtmosphere, "_difference", subtracted)
+    patch.setattr(bands.BandAtmosphere, "_difference", subtracted)
 
 
 def highpass_without_detrending(patch: Patch) -> None:

@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from zonda.operators.atmosphere.covariance import beam_correlation
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 if not (BENCHMARKS / "peers.py").exists():

@@ -353,9 +353,9 @@ def test_clocks_that_jump_change_nothing(here: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "bytes", "text", "other"])
 @pytest.mark.parametrize("name", ["absorption", "climatology"])
 def test_damaged_package_data(name: str, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from zonda.operators.atmosphere import absorption, weather
+    from zonda.operators.atmosphere.weather import absorption, profiles
 
-    module, key = {"absorption": (absorption, "TABLE"), "climatology": (weather, "CLIMATOLOGY")}[name]
+    module, key = {"absorption": (absorption, "TABLE"), "climatology": (profiles, "CLIMATOLOGY")}[name]
     data = getattr(module, key).read_bytes()
     path = tmp_path / f"{name}.npz"
     if damage == "other":
@@ -370,20 +370,20 @@ def test_damaged_package_data(name: str, damage: str, tmp_path: Path, monkeypatc
         if name == "absorption":
             absorption.AbsorptionTable(path)
         else:
-            for place in weather.climatologies():
-                weather.coefficients(place)
+            for place in profiles.climatologies():
+                profiles.coefficients(place)
 
-    weather.climatologies.cache_clear()
-    weather.coefficients.cache_clear()
+    profiles.climatologies.cache_clear()
+    profiles.coefficients.cache_clear()
     try:
         if name == "climatology" and damage == "other":
-            assert weather.climatologies() == ("something",)  # whole, but not ours: the site's is said not to exist
+            assert profiles.climatologies() == ("something",)  # whole, but not ours: the site's is said not to exist
             return
         with pytest.raises(InputError) as caught:
             read()
     finally:
-        weather.climatologies.cache_clear()
-        weather.coefficients.cache_clear()
+        profiles.climatologies.cache_clear()
+        profiles.coefficients.cache_clear()
     assert str(path) in str(caught.value)
     assert "reinstall" in caught.value.cure
 

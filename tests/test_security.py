@@ -42,7 +42,7 @@ ALLOWED = {
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
     ("core/storage/packed.py", "import_module"): "gzip, bz2, lzma, uncompresspy, from tables in the same file",
     ("core/storage/hdf5_files.py", "subprocess.run"): "zonda itself, as a child; no shell; the file's path is one argument",
-    ("operators/atmosphere/era5_fetch.py", "import_module"): "cdsapi, by its name, when the user asks to fetch",
+    ("operators/atmosphere/weather/era5_fetch.py", "import_module"): "cdsapi, by its name, when the user asks to fetch",
     ("operators/diagnostics/artist.py", "import_module"): "names from a table in the same file",
     ("operators/diagnostics/artist.py", "pickle.load"): "between parent and child, through pipes that nobody else has",
     ("operators/diagnostics/artist.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
@@ -154,7 +154,7 @@ def test_a_soft_link_stays_in_the_file(tmp_path: Path) -> None:
 
 def test_a_table_of_air_is_numbers_only(tmp_path: Path) -> None:
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.profile_table import read_table
+    from zonda.operators.atmosphere.weather.table import read_table
 
     (tmp_path / "air.csv").write_text(
         "height [m], pressure [hPa], temperature [K], relative humidity [%]\n__import__('os'), 1, 2, 3\n"

@@ -6,7 +6,7 @@ Needs `pip install am-python==0.8.0` (Linux x86_64; am 14.0 by S. Paine, SAO) at
 
 Each entry is a single-layer am model at one pressure and temperature, its opacity divided by the column density. Water is
 computed at a vanishing and at a high mixing ratio, because its self-broadening makes the cross-section linear in the mixing
-ratio; `zonda.operators.atmosphere.absorption` interpolates. The monochromatic opacity is averaged in cells of 0.5 GHz.
+ratio; `zonda.operators.atmosphere.weather.absorption` interpolates. The monochromatic opacity is averaged in cells of 0.5 GHz.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def ozone_ratios(temperature: NDArray[np.float64]) -> NDArray[np.uint8]:
 
     The parts hold the same frequencies at all pressures: those sorted by the opacity of the standard atmosphere's ozone.
     """
-    from zonda.operators.atmosphere.standard_atmosphere import ozone
+    from zonda.operators.atmosphere.weather.standard_atmosphere import ozone
 
     column = f"column o3 hydrostatic {OZONE}"
     fine = np.array([fine_opacity(p, t, column, CELL / 64) / p for p, t in zip(PRESSURE, temperature, strict=True)])

@@ -1,4 +1,4 @@
-"""Make `operators/atmosphere/data/spline_error.npz`: equation (2) of `zonda.operators.atmosphere.nodes` on its grid.
+"""Make `operators/atmosphere/data/spline_error.npz`: equation (2) of `zonda.operators.atmosphere.turbulence.nodes` on its grid.
 
 python benchmarks/atmosphere_data/tabulate_spline_error.py operators/atmosphere/data/spline_error.npz
 """
@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 
-from zonda.operators.atmosphere.nodes import spline_table
+from zonda.operators.atmosphere.turbulence.nodes import spline_table
 
 if __name__ == "__main__":
     log_q, log_g = spline_table()

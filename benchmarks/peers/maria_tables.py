@@ -12,8 +12,8 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.site import Site
-from zonda.operators.atmosphere.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather_sources import air_of
+from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
+from zonda.operators.atmosphere.weather.sources import air_of
 
 PWV = 1e-3 * np.array([0, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50])
 ELEVATION = np.radians([10, 20, 30, 40, 50, 60, 70, 80, 90])

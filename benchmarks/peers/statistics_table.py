@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal.windows import blackmanharris
 
-from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
 
 BANDS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Hz."""

@@ -15,8 +15,8 @@ from zonda_atmosphere import observation
 import zonda
 from zonda.core.data import Block
 from zonda.core.instrument import SPEED_OF_LIGHT
-from zonda.operators.atmosphere.beams import GAUSSIAN_FWHM, widened
 from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.atmosphere.turbulence.beams import GAUSSIAN_FWHM, widened
 
 OUTER_SCALE = 1000 / math.sqrt(5 / 3)
 """m: maria's layers have r0 = 1000 m in its definition, sqrt(2 nu) times ours."""

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.types import Floats
 
-from .geometry import axes, crossing, rays, tracks
+from .turbulence.geometry import axes, crossing, rays, tracks
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
 
-    from .estimate import Air
     from .layers import AtmosphereLayers
+    from .planning import Air
 
 INSTANTS, CANDIDATES, HITS, WAVES = 4000, 48, 160, 160
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, SmoothField, spline_coefficients
 from zonda.core.types import AnyFloats
 
-from .nodes import Nodes
 from .response import Response
-from .sampling import TIMES_AT_ONCE, Layers
+from .turbulence.nodes import Nodes
+from .turbulence.sampling import TIMES_AT_ONCE, Layers
 
 Water = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
 """(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""

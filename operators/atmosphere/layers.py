@@ -32,28 +32,28 @@ from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from . import weather
-from .absorption import AbsorptionTable
-from .band import BandAtmosphere
-from .beams import GAUSSIAN_FWHM, Aperture, rayleigh_distance, widened
 from .fluctuations import AtNodes, OfDetectors, times
-from .geometry import Track, axes_at, rays, tracks
-from .lines_of_sight import LinesOfSight
-from .nodes import LayerModel, times_with_margin
 from .path_delay import delay_per_vapour
-from .plan import Plan, make_plan
-from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
+from .resolution import Plan, make_plan
 from .response import Response
-from .sampling import Drifting, Layers
-from .turbulence import Turbulence
-from .weather_sources import air_of, on_the_ground
+from .turbulence.beams import GAUSSIAN_FWHM, Aperture, rayleigh_distance, widened
+from .turbulence.geometry import Track, axes_at, rays, tracks
+from .turbulence.lattice import Turbulence
+from .turbulence.lines_of_sight import LinesOfSight
+from .turbulence.nodes import LayerModel, times_with_margin
+from .turbulence.sampling import Drifting, Layers
+from .weather import profiles
+from .weather.absorption import AbsorptionTable
+from .weather.bands import BandAtmosphere
+from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
+from .weather.sources import air_of, on_the_ground
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate, Traits
 
-    from .weather import Profile
+    from .weather.profiles import Profile
 
 LOG_NORMAL_FROM = 0.15
 """PWV rms from which y is exp(s g - s^2 var(g) / 2) - 1, so that water stays positive (below, 1 + y < 0 takes 6.7 sigma)."""
@@ -149,7 +149,7 @@ class AtmosphereLayers(Operator):
         Knob("layers", (5, 10, 20), "thin sheets for a continuous atmosphere", redraws=True),
     )
 
-    pwv: Metres | None = Field(None, gt=0, le=weather.PWV_MAX)
+    pwv: Metres | None = Field(None, gt=0, le=profiles.PWV_MAX)
     """Mean precipitable water vapour at zenith; where absent, that of the scene's `weather` (by default the climatology's median
     for the date and hour). A scene whose weather gives another PWV is refused: it would be given twice."""
     pwv_rms: Fraction = quantity("0.5 %", ge=0, le=1)
@@ -347,13 +347,13 @@ class AtmosphereLayers(Operator):
 
     def traits(self, observation: Observation) -> Traits:
         """rms of the fluctuation."""
-        from .estimate import atmosphere_traits
+        from .planning import atmosphere_traits
 
         return atmosphere_traits(self, observation)
 
     def estimate(self, context: Context) -> Estimate:
         """Layers, their resolution, the spectrum of the air, slopes with elevation."""
-        from .estimate import atmosphere_estimate
+        from .planning import atmosphere_estimate
 
         return atmosphere_estimate(self, context)
 
@@ -380,7 +380,7 @@ class AtmosphereLayers(Operator):
         if key not in self._air:
             profile = air_of(self._source, observation.site, time, observation.seed, self.pwv)
             rise = math.exp(7 * self._log_width(1.0)) if self.pwv_rms >= LOG_NORMAL_FROM else 1 + 8 * self.pwv_rms
-            largest = min((self.pwv or profile.pwv) * max(rise, 1.05), weather.PWV_MAX)
+            largest = min((self.pwv or profile.pwv) * max(rise, 1.05), profiles.PWV_MAX)
             self._air[key] = profile, BandAtmosphere(band, profile, largest, self._table())
         return self._air[key]
 
@@ -430,14 +430,14 @@ class AtmosphereLayers(Operator):
     def _check_range(self, scale: float, variance: float, pwv: float) -> None:
         """Refuse water whose distribution the table would cut."""
         most = pwv * (1 + float(self._water(np.array([CERTAIN * math.sqrt(variance)]), scale, variance)[0]))
-        if most > weather.PWV_MAX:
-            least = math.log(max(weather.PWV_MAX / pwv, 1.0))
+        if most > profiles.PWV_MAX:
+            least = math.log(max(profiles.PWV_MAX / pwv, 1.0))
             width = CERTAIN - math.sqrt(max(CERTAIN**2 - 2 * least, 0.0))
-            fits = (weather.PWV_MAX / pwv - 1) / CERTAIN
+            fits = (profiles.PWV_MAX / pwv - 1) / CERTAIN
             fits = fits if fits < LOG_NORMAL_FROM else math.sqrt(math.expm1(width**2))
             raise InputError(
                 f"a PWV of {pwv * 1e3:.3g} mm with a rms of {self.pwv_rms:.3g} of it reaches {most * 1e3:.3g} mm at {CERTAIN:g} "
-                f"sigma; the limit is {weather.PWV_MAX * 1e3:.0f} mm",
+                f"sigma; the limit is {profiles.PWV_MAX * 1e3:.0f} mm",
                 place=self.label,
                 cure=f"lower pwv_rms to {fits:.1%} or less, or the PWV",
             )

@@ -20,8 +20,8 @@ import numpy as np
 
 from zonda.core.types import Floats
 
-from .band import BandAtmosphere
-from .radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
+from .weather.bands import BandAtmosphere
+from .weather.radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
 
 ERROR = 1e-5
 """Largest error of f / y, of the largest |f / y|."""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.operators.atmosphere.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather_summary import HOURS, MONTHS, QUANTILES, WaterByMonth, pwv_steps
+from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
+from zonda.operators.atmosphere.weather.summary import HOURS, MONTHS, QUANTILES, WaterByMonth, pwv_steps
 
 from .canvas import DPI, SEQUENCE
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from zonda.core.instrument import Band
-    from zonda.operators.atmosphere.weather import Profile
+    from zonda.operators.atmosphere.weather.profiles import Profile
 
 LOWEST, HIGHEST = 1e9, 1000e9
 """Hz: what the absorption table holds, and the spectra show."""

@@ -124,7 +124,7 @@ class SaveTOD(Operator):
 
     def _weather(self, data: Data, observation: Observation) -> GroundWeather | None:
         """That of the scene, where no step made an atmosphere of it."""
-        from zonda.operators.atmosphere.weather_sources import air_of, on_the_ground
+        from zonda.operators.atmosphere.weather.sources import air_of, on_the_ground
 
         scene = data.scene
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from zonda.core.checks import Family
-from zonda.operators.atmosphere import covariance
+from zonda.operators.atmosphere.turbulence import covariance
 
 from .cases import FAR, NEAR, OVERLAP
 

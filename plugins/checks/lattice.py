@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.checks import Family, Measured
-from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
-from zonda.operators.atmosphere.turbulence import FIDELITIES, Turbulence
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
+from zonda.operators.atmosphere.turbulence.lattice import FIDELITIES, Turbulence
 
 from .cases import BLOCKS, FAR, OVERLAP, STRIP
 from .scenes import differing, largest, unrefused

@@ -11,11 +11,11 @@ import numpy as np
 
 from zonda.core.checks import Family, Measured
 from zonda.core.instrument import Band
-from zonda.operators.atmosphere.absorption import absorption_table
-from zonda.operators.atmosphere.band import BandAtmosphere
 from zonda.operators.atmosphere.layers import AtmosphereLayers
-from zonda.operators.atmosphere.profile_table import read_table
-from zonda.operators.atmosphere.weather import Profile, profile
+from zonda.operators.atmosphere.weather.absorption import absorption_table
+from zonda.operators.atmosphere.weather.bands import BandAtmosphere
+from zonda.operators.atmosphere.weather.profiles import Profile, profile
+from zonda.operators.atmosphere.weather.table import read_table
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.white import WhiteNoise

@@ -12,13 +12,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import ROOT, fuzz, guided_by, scratch, told
 
-with guided_by("zonda.operators.io", "zonda.operators.atmosphere.era5", "scipy.io._netcdf"):
+with guided_by("zonda.operators.io", "zonda.operators.atmosphere.weather.era5", "scipy.io._netcdf"):
     import numpy as np
 
     from zonda.core.configuration.time import Instant
     from zonda.core.errors import ZondaError
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.era5 import read_era5
+    from zonda.operators.atmosphere.weather.era5 import read_era5
     from zonda.operators.io import toast_hdf5
     from zonda.operators.io.save_tod import save_tod
     from zonda.operators.io.time_ordered_data import TimeOrderedData

@@ -10,14 +10,14 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import ROOT, fuzz, guided_by, scratch, told
 
-with guided_by("zonda.operators.atmosphere.profile_table", "zonda.core.instrument", "zonda.core.accuracy.store"):
+with guided_by("zonda.operators.atmosphere.weather.table", "zonda.core.instrument", "zonda.core.accuracy.store"):
     import numpy as np
 
     from zonda.core.accuracy.store import read
     from zonda.core.errors import ZondaError
     from zonda.core.instrument import Band
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.profile_table import read_table
+    from zonda.operators.atmosphere.weather.table import read_table
 
 FILE = scratch(".txt")
 SITE = Site(name="here", latitude="40.6 deg", longitude="10.1 deg", altitude="500 m")

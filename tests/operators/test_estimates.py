@@ -9,8 +9,8 @@ import zonda
 from zonda.core.data import Data
 from zonda.core.instrument import Band
 from zonda.core.plan.context import Context, Coverage
-from zonda.operators.atmosphere.band import BandAtmosphere, _BandTransfer
-from zonda.operators.atmosphere.estimate import _slope, air
+from zonda.operators.atmosphere.planning import _slope, air
+from zonda.operators.atmosphere.weather.bands import BandAtmosphere, _BandTransfer
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.noise.estimate import difference, psd_error
 from zonda.operators.noise.one_over_f import power_law_filter
@@ -227,8 +227,8 @@ def test_one_frequency_and_no_ozone(sky):
 @pytest.mark.parametrize("speed", [3.0, 30.0])
 def test_what_of_the_air_is_faster_than_a_frequency(speed):
     """The spectrum of exp(-(v t)^2 / 4 e), by a numerical transform, against the share erfc(2 pi f sqrt(e) / v)."""
-    from zonda.operators.atmosphere.estimate import Air
-    from zonda.operators.atmosphere.nodes import LayerModel
+    from zonda.operators.atmosphere.planning import Air
+    from zonda.operators.atmosphere.turbulence.nodes import LayerModel
 
     model = LayerModel(1.0, 1000.0, 1000.0, 500.0, 40.0)
     a = Air(None, None, 1e-3, [None], [model], [1.0], 1.0, 1.0, (0.7, 0.8), [np.array([[speed], [0.0]])])

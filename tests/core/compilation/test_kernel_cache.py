@@ -408,7 +408,7 @@ def test_every_kernel_is_kept_this_way():
     for registry in (operators, mapmakers):
         for name in registry:
             registry.get(name)
-    for name in ("zonda.operators.atmosphere.era5", "zonda.operators.pointing.transform"):
+    for name in ("zonda.operators.atmosphere.weather.era5", "zonda.operators.pointing.transform"):
         import_module(name)
     found = {
         id(value): value

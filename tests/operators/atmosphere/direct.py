@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from zonda.operators.atmosphere.turbulence import Turbulence
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
 Floats = NDArray[np.float64]
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 import zonda
-from zonda.operators.atmosphere.covariance import beam_structure
 from zonda.operators.atmosphere.layers import beam_sigma
+from zonda.operators.atmosphere.turbulence.covariance import beam_structure
 
 HEIGHT, ELEVATION, P, SEEDS = 2000.0, 50.0, 0.02, 30
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.operators.atmosphere.covariance import beam_correlation
 from zonda.operators.atmosphere.layers import beam_sigma
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation
 
 HEIGHT, SPEED, P = 1500.0, 8.0, 0.02
 

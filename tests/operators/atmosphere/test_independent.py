@@ -18,7 +18,7 @@ import zonda
 from zonda.core.data import Observation
 from zonda.core.instrument import Band
 from zonda.core.numerics.random import lattice_normals, stream_key
-from zonda.operators.atmosphere.turbulence import Turbulence
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
 from .test_layers import PWV, instrument, observe, quaternions
 

@@ -18,13 +18,14 @@ from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.run.blocks import cut
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-from zonda.operators.atmosphere import fluctuations, plan, sampling
-from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
+from zonda.operators.atmosphere import fluctuations, resolution
 from zonda.operators.atmosphere.fluctuations import AtNodes, OfDetectors
-from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
 from zonda.operators.atmosphere.layers import AtmosphereLayers, Wind, _model, _turbulence, beam_sigma
-from zonda.operators.atmosphere.nodes import differential_rms
-from zonda.operators.atmosphere.turbulence import Turbulence
+from zonda.operators.atmosphere.turbulence import sampling
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
+from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, tracks
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
+from zonda.operators.atmosphere.turbulence.nodes import differential_rms
 
 _spec = importlib.util.spec_from_file_location("direct", Path(__file__).with_name("direct.py"))
 assert _spec
@@ -703,7 +704,7 @@ def test_wide_field_per_detector_evaluation_agrees_with_direct_evaluation() -> N
 
 
 def test_layers_take_steps_of_their_own_within_the_same_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan, "PAYS_FROM", 0)
+    monkeypatch.setattr(resolution, "PAYS_FROM", 0)
     camera = instrument(detectors=61, field="10 deg", diameter="6 m")
     op = operator(layers=4, lowest="300 m", tolerance="1 %")
     o = swept(50.0, 180 + 12 * np.sin(2 * np.pi * np.arange(3000) / 6000), camera)

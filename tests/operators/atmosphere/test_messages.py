@@ -11,7 +11,7 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.errors import ZondaError
-from zonda.operators.atmosphere.geometry import tracks
+from zonda.operators.atmosphere.turbulence.geometry import tracks
 
 from .test_layers import instrument, observe, operator, swept
 

@@ -16,11 +16,11 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal.windows import blackmanharris
 from scipy.special import erfc
 
-from zonda.operators.atmosphere.beams import widened
-from zonda.operators.atmosphere.covariance import NU, beam_correlation, beam_structure, mixture
-from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
 from zonda.operators.atmosphere.layers import beam_sigma
-from zonda.operators.atmosphere.turbulence import Turbulence
+from zonda.operators.atmosphere.turbulence.beams import widened
+from zonda.operators.atmosphere.turbulence.covariance import NU, beam_correlation, beam_structure, mixture
+from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, tracks
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
 from .test_layers import instrument, layers_of, observe, operator, quaternions, water
 

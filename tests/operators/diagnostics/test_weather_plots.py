@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from zonda.core import registry, weather
 from zonda.core.configuration.time import Instant
-from zonda.operators.atmosphere.absorption import absorption_table
-from zonda.operators.atmosphere.weather_sources import air_of
-from zonda.operators.atmosphere.weather_summary import water_by_month
+from zonda.operators.atmosphere.weather.absorption import absorption_table
+from zonda.operators.atmosphere.weather.sources import air_of
+from zonda.operators.atmosphere.weather.summary import water_by_month
 from zonda.operators.diagnostics.weather_plots import LINES, plot_spectrum, spread, weather_figure
 
 

@@ -23,13 +23,13 @@ from zonda.core.numerics.radiation import T_CMB, rayleigh_jeans
 from zonda.core.numerics.stretches import stretches
 
 from .absorption import AbsorptionTable, CrossSections
+from .profiles import PWV_MAX, check_pwv
 from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission
-from .weather import PWV_MAX, check_pwv
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
 
-    from .weather import Profile
+    from .profiles import Profile
 
 Array = NDArray[np.float64]
 

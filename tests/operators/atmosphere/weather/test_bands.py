@@ -9,10 +9,10 @@ from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.site import Site
-from zonda.operators.atmosphere.absorption import absorption_table
-from zonda.operators.atmosphere.band import BandAtmosphere, _cell_weights, _chebyshev
-from zonda.operators.atmosphere.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather import profile
+from zonda.operators.atmosphere.weather.absorption import absorption_table
+from zonda.operators.atmosphere.weather.bands import BandAtmosphere, _cell_weights, _chebyshev
+from zonda.operators.atmosphere.weather.profiles import profile
+from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 
 PWV = 7.7e-3
 

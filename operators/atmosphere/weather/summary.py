@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 
-from .band import BandAtmosphere
-from .weather import PWV_MAX, Profile, profile
+from .bands import BandAtmosphere
+from .profiles import PWV_MAX, Profile, profile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

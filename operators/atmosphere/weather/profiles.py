@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-CLIMATOLOGY = Path(__file__).parent / "data" / "climatology.npz"
+CLIMATOLOGY = Path(__file__).parent.parent / "data" / "climatology.npz"
 
 LEVELS = 61
 """Heights of a profile."""

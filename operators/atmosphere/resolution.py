@@ -14,9 +14,8 @@ from zonda.core.data import Observation
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.types import Floats
 
-from .band import BandAtmosphere
-from .geometry import Track, axes, axes_at, crossing, rays
-from .nodes import (
+from .turbulence.geometry import Track, axes, axes_at, crossing, rays
+from .turbulence.nodes import (
     GRIDS,
     LayerModel,
     Nodes,
@@ -30,7 +29,8 @@ from .nodes import (
     time_error_within,
     times_with_margin,
 )
-from .radiative_transfer import ELEVATION_MAX
+from .weather.bands import BandAtmosphere
+from .weather.radiative_transfer import ELEVATION_MAX
 
 SMALLEST_DIFFERENCE = 1e-5
 """Share of the fluctuation that must differ between detectors for the tolerance to be judged by it."""

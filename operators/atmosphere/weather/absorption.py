@@ -19,7 +19,7 @@ from zonda.core.storage.files import own_data
 
 Array = NDArray[np.float64]
 
-TABLE = Path(__file__).parent / "data" / "absorption.npz"
+TABLE = Path(__file__).parent.parent / "data" / "absorption.npz"
 
 MIXING_RATIO_HIGH = 0.02
 """Volume mixing ratio of the table's second water cross-section."""

@@ -32,7 +32,7 @@ from zonda.core.types import Floats
 from .beams import Aperture
 from .covariance import mixture
 
-SPLINE_TABLE = Path(__file__).parent / "data" / "spline_error.npz"
+SPLINE_TABLE = Path(__file__).parent.parent / "data" / "spline_error.npz"
 
 LARGEST_STEP = 2048
 """Samples; see `core.numerics.tiles`."""

@@ -38,7 +38,7 @@ from zonda.core.data import Observation
 from zonda.core.errors import PointingError
 from zonda.core.types import Floats
 
-from .radiative_transfer import EARTH_RADIUS
+from ..weather.radiative_transfer import EARTH_RADIUS
 
 FLAT = 0.02
 """Largest relative error of squared separations up to which one transverse plane serves a whole scan."""

@@ -15,10 +15,10 @@ from zonda.core.weather import Column, GroundWeather, WeatherSource
 
 from .era5 import read_era5
 from .humidity import saturation_pressure
-from .profile_table import read_table
+from .profiles import Profile, check_pwv, climatology_column, on_heights
 from .radiative_transfer import VAPOUR_GAS_CONSTANT
 from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, standard_column
-from .weather import Profile, check_pwv, climatology_column, on_heights
+from .table import read_table
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant

@@ -7,11 +7,11 @@ import pytest
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.site import Site
-from zonda.operators.atmosphere import weather
-from zonda.operators.atmosphere.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather import climatologies, coefficients, harmonics, profile
+from zonda.operators.atmosphere.weather import profiles
+from zonda.operators.atmosphere.weather.profiles import climatologies, coefficients, harmonics, profile
+from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 NOVEMBER = Instant.parse("2024-11-25T07:00:00Z")
 
 
@@ -100,7 +100,7 @@ def test_profile_goes_from_the_ground_to_45_km_and_is_physical():
 
 def test_layers_converge(monkeypatch):
     got = spectrum(profile(site(), NOVEMBER, 7.7e-3).layers, math.pi / 2, low=78e9, high=108e9).brightness.mean()
-    monkeypatch.setattr(weather, "LEVELS", 481)
+    monkeypatch.setattr(profiles, "LEVELS", 481)
     fine = spectrum(profile(site(), NOVEMBER, 7.7e-3).layers, math.pi / 2, low=78e9, high=108e9).brightness.mean()
     assert got == pytest.approx(fine, abs=0.04)
 
@@ -142,7 +142,7 @@ def test_every_climatology_gives_air():
     for name in climatologies():
         ground = float(coefficients(name)["height"][0, 0])
         air = profile(site(name, max(ground, 0.0)), NOVEMBER)
-        assert 0 < air.pwv < weather.PWV_MAX
+        assert 0 < air.pwv < profiles.PWV_MAX
         assert np.isfinite(spectrum(air.layers, math.pi / 2).brightness).all()
 
 
@@ -168,16 +168,16 @@ def test_ice_sheets_have_their_inversion_in_winter(name):
 
 
 def test_water_has_one_width_below_its_median_and_another_above():
-    law = weather.WaterDistribution(10e-3, 0.6, 0.4)
+    law = profiles.WaterDistribution(10e-3, 0.6, 0.4)
     half = 0.6744897501960817  # quartile of the normal law
     assert law.at(0.25) == pytest.approx(10e-3 * math.exp(-0.6 * half), rel=1e-3)
     assert law.at(0.75) == pytest.approx(10e-3 * math.exp(0.4 * half), rel=1e-3)
     assert law.sigma == pytest.approx(0.5)
-    assert weather.WaterDistribution(40e-3, 0.3, 0.9).at(1 - 1e-12) <= weather.PWV_MAX
+    assert profiles.WaterDistribution(40e-3, 0.3, 0.9).at(1 - 1e-12) <= profiles.PWV_MAX
 
 
 def test_data_are_small():
-    assert sum(path.stat().st_size for path in weather.CLIMATOLOGY.parent.glob("*.npz")) < 3e6
+    assert sum(path.stat().st_size for path in profiles.CLIMATOLOGY.parent.glob("*.npz")) < 3e6
 
 
 def test_bad_requests_name_cause_and_cure():
@@ -200,9 +200,9 @@ def test_the_mean_of_a_layer_where_the_vapour_pressure_does_not_change():
     exact = r0 * 900.0 * math.log(900.0 / 700.0) / 200.0
     for power in (-1.0, -1.0 + 1e-12, -1.0 - 1e-9):
         mixing_ratio = np.array([r0, r0 * (700.0 / 900.0) ** power])
-        assert weather._layer_mean(pressure, mixing_ratio)[0] == pytest.approx(exact, rel=1e-9)
+        assert profiles._layer_mean(pressure, mixing_ratio)[0] == pytest.approx(exact, rel=1e-9)
     # another power against the trapezium rule over 1e4 parts, whose error is 1e-9 here
     p = np.linspace(700.0, 900.0, 10_001)
     mixing_ratio = np.array([r0, r0 * (700.0 / 900.0) ** 3.0])
     mean = np.trapezoid(r0 * (p / 900.0) ** 3.0, p) / 200.0
-    assert weather._layer_mean(pressure, mixing_ratio)[0] == pytest.approx(mean, rel=1e-8)
+    assert profiles._layer_mean(pressure, mixing_ratio)[0] == pytest.approx(mean, rel=1e-8)

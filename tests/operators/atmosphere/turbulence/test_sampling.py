@@ -16,15 +16,15 @@ from zonda.core.errors import ZondaError
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.numerics.smooth import SPLINE_MARGIN, spline_coefficients
 from zonda.core.site import Site
-from zonda.operators.atmosphere.band import BandAtmosphere
-from zonda.operators.atmosphere.geometry import axes, crossing, rays, tracks
-from zonda.operators.atmosphere.lines_of_sight import LinesOfSight
 from zonda.operators.atmosphere.response import Response, airmass
-from zonda.operators.atmosphere.sampling import Drifting, Layers
-from zonda.operators.atmosphere.turbulence import Turbulence
-from zonda.operators.atmosphere.weather_sources import air_of
+from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, tracks
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
+from zonda.operators.atmosphere.turbulence.lines_of_sight import LinesOfSight
+from zonda.operators.atmosphere.turbulence.sampling import Drifting, Layers
+from zonda.operators.atmosphere.weather.bands import BandAtmosphere
+from zonda.operators.atmosphere.weather.sources import air_of
 
-_spec = importlib.util.spec_from_file_location("direct", Path(__file__).with_name("direct.py"))
+_spec = importlib.util.spec_from_file_location("direct", Path(__file__).parents[1] / "direct.py")
 assert _spec
 assert _spec.loader
 direct = importlib.util.module_from_spec(_spec)
@@ -121,7 +121,7 @@ def test_layers_are_those_of_the_lattice_at_the_positions(kind: str, spacing: in
 
 
 def test_a_scan_that_sweeps_over_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from zonda.operators.atmosphere import sampling
+    from zonda.operators.atmosphere.turbulence import sampling
 
     monkeypatch.setattr(sampling, "CELLS_IN_ALL", 1e4)
     o = observation(*SCANS["cone"])
@@ -209,7 +209,7 @@ def test_the_polynomials_hold_near_the_zenith_and_the_horizon(field: str, elevat
 
 
 def test_what_no_polynomial_follows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from zonda.operators.atmosphere import lines_of_sight as module
+    from zonda.operators.atmosphere.turbulence import lines_of_sight as module
 
     o = observation(*SCANS["far"], samples=400)
     monkeypatch.setattr(module, "_DEGREES", (4,))  # of 35 deg, which wants 20

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from zonda.operators.atmosphere.covariance import beam_correlation, mixture
-from zonda.operators.atmosphere.nodes import (
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, mixture
+from zonda.operators.atmosphere.turbulence.nodes import (
     LARGEST_STEP,
     LayerModel,
     candidate_steps,

@@ -12,12 +12,12 @@ from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.site import Site
-from zonda.operators.atmosphere.absorption import TABLE, AbsorptionTable, CrossSections, absorption_table
-from zonda.operators.atmosphere.band import _BandTransfer
-from zonda.operators.atmosphere.radiative_transfer import EARTH_RADIUS, Layers, emission, spectrum
-from zonda.operators.atmosphere.weather import profile
+from zonda.operators.atmosphere.weather.absorption import TABLE, AbsorptionTable, CrossSections, absorption_table
+from zonda.operators.atmosphere.weather.bands import _BandTransfer
+from zonda.operators.atmosphere.weather.profiles import profile
+from zonda.operators.atmosphere.weather.radiative_transfer import EARTH_RADIUS, Layers, emission, spectrum
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 WINDOWS = ((30, 50), (75, 115), (125, 175), (200, 310), (330, 365), (390, 420), (600, 720), (780, 900))
 ZENITH = math.pi / 2
 

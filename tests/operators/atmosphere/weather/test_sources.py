@@ -17,9 +17,9 @@ from zonda.core.errors import InputError, ZondaError
 from zonda.core.registry import sites, weather_sources
 from zonda.core.site import Site
 from zonda.core.weather import PWV_MAX, Column, Pwv, WeatherSource
-from zonda.operators.atmosphere import humidity, standard_atmosphere
-from zonda.operators.atmosphere.weather import WaterDistribution, profile
-from zonda.operators.atmosphere.weather_sources import Climatology, Era5, Standard, Table, air_of
+from zonda.operators.atmosphere.weather import humidity, standard_atmosphere
+from zonda.operators.atmosphere.weather.profiles import WaterDistribution, profile
+from zonda.operators.atmosphere.weather.sources import Climatology, Era5, Standard, Table, air_of
 
 _spec = importlib.util.spec_from_file_location("era5_files", Path(__file__).with_name("era5_files.py"))
 files = importlib.util.module_from_spec(_spec)
@@ -476,7 +476,7 @@ def test_fetch_asks_for_the_cells_around_the_site(monkeypatch, tmp_path):
     import sys
     import types
 
-    from zonda.operators.atmosphere.era5_fetch import request, retrieve
+    from zonda.operators.atmosphere.weather.era5_fetch import request, retrieve
 
     asked = request(sites.create("llano_de_chajnantor"), Instant.parse("2022-08-01T23:30"), 2)
     assert asked["area"] == [-23.0, -68.0, -23.25, -67.75]
@@ -534,7 +534,7 @@ def test_water_that_an_inversion_cannot_hold_is_cut_and_said():
     assert text is None or "cut to saturation at" in text
     column = Climatology().column(sites.create("amundsen_scott"), Instant.parse("2024-07-01T00:00Z"))
     wetter = dataclasses.replace(column, h2o=column.h2o * 3)
-    from zonda.operators.atmosphere.weather import on_heights
+    from zonda.operators.atmosphere.weather.profiles import on_heights
 
     made = on_heights(wetter, sites.create("amundsen_scott"))
     assert "levels of the inversion, which takes" in said(made, "water near the ground")

@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from zonda.operators.atmosphere.covariance import (
+from zonda.operators.atmosphere.turbulence.covariance import (
     NU,
     beam_correlation,
     beam_structure,

@@ -11,11 +11,11 @@ from scipy.interpolate import make_interp_spline
 from scipy.special import j1
 
 from zonda.core.errors import ZondaError
-from zonda.operators.atmosphere.beams import Aperture
-from zonda.operators.atmosphere.covariance import beam_structure, correlation, structure
 from zonda.operators.atmosphere.layers import AtmosphereLayers
-from zonda.operators.atmosphere.nodes import LayerModel
-from zonda.operators.atmosphere.turbulence import Turbulence
+from zonda.operators.atmosphere.turbulence.beams import Aperture
+from zonda.operators.atmosphere.turbulence.covariance import beam_structure, correlation, structure
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
+from zonda.operators.atmosphere.turbulence.nodes import LayerModel
 
 Floats = NDArray[np.float64]
 OUTER_SCALE = 500.0
@@ -115,7 +115,7 @@ def test_edge_taper_is_for_tapered_beams() -> None:
 
 @pytest.mark.parametrize("parameters", [{"beam": "top_hat"}, {"beam": "tapered"}, {"beam": "tapered", "edge_taper": 20.0}])
 def test_the_operator_takes_the_footprint(parameters: dict[str, Any]) -> None:
-    from .test_layers import expected_variance, instrument, observe, operator, water
+    from ..test_layers import expected_variance, instrument, observe, operator, water
 
     # Same air, another footprint: fluctuations alike, but not the same; a bigger variance behind the smaller footprint.
     camera = instrument(detectors=7, field="1 arcmin", diameter="50 m")

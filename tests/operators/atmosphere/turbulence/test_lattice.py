@@ -11,9 +11,9 @@ from scipy.signal import fftconvolve
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import lattice_normals
-from zonda.operators.atmosphere import turbulence
-from zonda.operators.atmosphere.covariance import beam_correlation, beam_structure
-from zonda.operators.atmosphere.turbulence import FIDELITIES, Turbulence
+from zonda.operators.atmosphere.turbulence import lattice
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
+from zonda.operators.atmosphere.turbulence.lattice import FIDELITIES, Turbulence
 
 LAGS = (0, 1, 2, 5, 20, 130, 400)
 DIRECTIONS = ((0, 1), (1, 0), (1, 1))  # along, across and diagonal
@@ -196,4 +196,4 @@ def test_extremes_that_are_accepted_are_finite(outer_scale: float, sigma: float)
 def test_a_region_of_one_point_far_away() -> None:
     layer = Turbulence(1, outer_scale=500.0, sigma=21.0)
     assert layer.region(10**12, 10**12 + 1, -(10**12), -(10**12) + 1).shape == (1, 1)
-    assert turbulence.PREFILTER == 10
+    assert lattice.PREFILTER == 10

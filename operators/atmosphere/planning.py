@@ -22,12 +22,12 @@ from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, add
 from zonda.core.types import Floats
 
 from .averaging import shares
-from .band import BandAtmosphere, _BandTransfer
-from .geometry import Track, axes, crossing, rays, tracks
-from .nodes import LayerModel, differential_rms, some
-from .plan import make_plan
-from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
-from .turbulence import FIDELITIES
+from .resolution import make_plan
+from .turbulence.geometry import Track, axes, crossing, rays, tracks
+from .turbulence.lattice import FIDELITIES
+from .turbulence.nodes import LayerModel, differential_rms, some
+from .weather.bands import BandAtmosphere, _BandTransfer
+from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation

@@ -25,8 +25,8 @@ from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline
 from zonda.core.types import Floats
 
 from .geometry import Track, rim
+from .lattice import Field, Turbulence
 from .lines_of_sight import LinesOfSight
-from .turbulence import Field, Turbulence
 
 _Key = tuple[int, tuple[int, int, int, int]]
 

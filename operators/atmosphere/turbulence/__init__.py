@@ -1,0 +1,1 @@
+"""Turbulent layers: covariance, lattice, beams, geometry, sampling, nodes."""

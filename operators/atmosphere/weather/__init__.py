@@ -1,0 +1,1 @@
+"""Weather: sources of profiles, absorption, radiative transfer, passbands."""
