@@ -33,6 +33,8 @@ sections = Registry(
 planning = Registry("planning", "zonda.planning", classes=True, exact=True)
 """By the name of the operator's class: its `core.plan.planning.Planning`."""
 
+products = Registry("product", "zonda.products", "zonda.core.product:Product", classes=True, exact=True)
+
 sites.hint = partial(hints.for_site, sites, instruments)
 instruments.hint = partial(hints.for_instrument, sites, instruments)
 
@@ -40,7 +42,8 @@ steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
 
 registries = (
-    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics, planning, sections,
+    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics, planning,
+    products, sections,
 )  # fmt: skip
 
 

@@ -188,7 +188,8 @@ def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A system maps 64 kB around every page that is touched: short pieces of many rows would map the whole stream."""
-    from zonda.core.run.streams import Ledger, Store, columns, forget_pages
+    from zonda.core.run.streams import Ledger, Store, columns
+    from zonda.core.stream import forget_pages
 
     def mapped() -> int:
         return int(Path("/proc/self/statm").read_text().split()[2]) * os.sysconf("SC_PAGE_SIZE")

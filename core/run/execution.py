@@ -26,6 +26,7 @@ from ..errors import PipelineError
 from ..machine import resident_memory
 from ..numerics.smooth import SmoothField
 from ..operator import Operator
+from ..stream import forget_pages
 from ..types import AnyFloats
 from .ahead import Ahead, reach
 from .block_maker import BlockMaker
@@ -34,7 +35,7 @@ from .frozen import Frozen
 from .layout import Layout, read
 from .repeated import Repeated
 from .settings import Settings, Timer
-from .streams import Ledger, Source, Stage, Store, StreamMadeAgain, forget_pages
+from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
 from .whole import WholeStream, knows_means, may_have_means, means_of
 
 

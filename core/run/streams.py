@@ -14,7 +14,6 @@ N samples of b bytes, D [B/s] the disk's rate, k the number of readings beyond t
 
 from __future__ import annotations
 
-import mmap
 import os
 import shutil
 import tempfile
@@ -264,13 +263,6 @@ def _reserve(handle: int, size: int) -> None:
         os.posix_fallocate(handle, 0, size)
     else:
         os.ftruncate(handle, size)
-
-
-def forget_pages(array: AnyFloats) -> None:
-    """Take the pages of a spilled stream out of this process's memory; the file keeps them."""
-    pages = getattr(array, "_mmap", None)
-    if pages is not None and hasattr(mmap, "MADV_DONTNEED"):
-        pages.madvise(mmap.MADV_DONTNEED)
 
 
 def columns(array: AnyFloats, samples: slice) -> AnyFloats:

@@ -1,0 +1,81 @@
+"""Blocks: rectangles of detectors x samples, on which operators work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .numerics.smooth import SmoothField
+from .observation import Observation
+from .types import AnyFloats
+
+STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
+"""Streams that zonda's own operators make in every block: the components, and their calibrated sum. Their only use is to be read
+by a later operator of the same run."""
+
+
+@dataclass
+class Block:
+    """A rectangle of detectors x samples of one observation, on which `Operator.exec` works.
+
+    Attributes
+    ----------
+    observation
+        The scan it belongs to. Read only inside ``exec``.
+    detectors, samples
+        Absolute ranges (slices with start and stop, step None).
+    detdata
+        Named streams, each (n_det_block, n_samp_block) of `dtype`, C-contiguous. The signal components are `sky`
+        (main-beam sky signal above the atmosphere), `atmosphere` (fluctuation of the emission about its mean, before
+        efficiency), `transmission` (relative fluctuation of e^-tau about its mean), `white` and `pink` (at the detector),
+        all K_RJ but `transmission`; `signal` is the calibrated sum.
+    means
+        What must be added to a stream in float64 to have all of it, by stream name: the smooth mean emission. A step that does
+        not say that it knows of means (`Operator.knows_means`) finds none here: its streams are whole.
+    dtype
+        float32 or float64: the type of every stream. Where a mean was added for a step that does not know of means, float64.
+    """
+
+    observation: Observation
+    detectors: slice
+    samples: slice
+    detdata: dict[str, AnyFloats] = field(default_factory=dict)
+    means: dict[str, SmoothField] = field(default_factory=dict)
+    dtype: type[np.floating[Any]] = np.float32
+    buffers: dict[str, AnyFloats] = field(default_factory=dict, repr=False)
+    """Memory reused from block to block; `exec` must not keep a stream beyond the call."""
+    places: dict[str, AnyFloats] = field(default_factory=dict, repr=False)
+    """Where the executor wants a stream to be made, so that it need not be copied there."""
+    again: bool = False
+    """These samples were worked on before, and are made again because the streams do not fit in memory: an operator makes the
+    same bits and counts nothing (what it tells ``observation.tally`` is thrown away)."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.detectors.stop - self.detectors.start, self.samples.stop - self.samples.start
+
+    def new(self, name: str, *, zero: bool = True) -> AnyFloats:
+        """Stream ``name``, made of zeros when it is not there yet; or of anything (not ``zero``), to be overwritten."""
+        if name not in self.detdata:
+            self.detdata[name] = self.places[name] if name in self.places else self.buffer(name, self.shape)
+            if zero:
+                self.detdata[name].fill(0)
+        return self.detdata[name]
+
+    def buffer(self, name: str, shape: tuple[int, int]) -> AnyFloats:
+        """An uninitialized array of `dtype`, reused between blocks under this name."""
+        size = shape[0] * shape[1]
+        held = self.buffers.get(name)
+        if held is None or held.size < size or held.dtype != self.dtype:
+            held = self.buffers[name] = np.empty(size, self.dtype)
+        return held[:size].reshape(shape)
+
+    def total(self, name: str) -> NDArray[np.float64]:
+        """Stream plus its mean, float64: (n_det_block, n_samp_block). A copy."""
+        whole = self.detdata[name].astype(np.float64)
+        if name in self.means:
+            whole += self.means[name].evaluate(self.detectors, self.samples)
+        return whole

@@ -1,0 +1,200 @@
+"""One continuous scan: where the telescope looks, with what, and what is known of its data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .flags import EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
+from .focalplane import Focalplane
+from .intervals import Intervals, runs
+from .notebook import html_table
+from .numerics.random import stream_key
+from .numerics.smooth import SmoothField
+from .tally import Tally
+from .types import AnyFloats
+
+if TYPE_CHECKING:
+    from .configuration.time import Instant
+    from .instrument import Instrument
+    from .site import Site
+    from .weather import GroundWeather
+
+
+@dataclass
+class Observation:
+    """One continuous scan.
+
+    Attributes
+    ----------
+    name, index
+        Unique name and position in `Data.observations`.
+    start
+        Exact start instant.
+    seconds
+        (n_samp,) float64, increasing, seconds since ``start``: when each sample is taken. They need not be a perfect comb:
+        pointing and atmosphere follow them, noise and filters count samples (see `jitter`).
+    sample_rate
+        Hz; of the comb that comes nearest to ``seconds``.
+    boresight_azel, boresight_radec
+        (n_samp, 4) float64 quaternions (x, y, z, w), exactly TOAST's: Rz(lon) Ry(pi/2 - lat) Rz(psi), lon = -az for azel.
+    centre
+        ICRS (ra, dec) [rad] of the scan's target without its per-scan offset: the default map centre.
+    flags, detector_flags
+        (n_samp,) and (n_det,) uint8, bits of `core.flags`; most of them mean: do not use (`good_samples`, `good_detectors`).
+    intervals
+        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`). Default: all is *scanning*.
+    weather
+        At the telescope; None: the air of this scan is not known.
+    smooth
+        Slowly varying float64 fields: ``atmosphere`` (mean emission at the detector before efficiency, K_RJ) and
+        ``transmission`` (band-mean e^-tau at the mean PWV), each a `SmoothField`. Set by operators in ``configure``, so that the
+        levels which follow from them are known before any step is prepared.
+    detdata
+        (n_det, n_samp) arrays that an output asked to keep.
+    expected_load
+        Tells the atmosphere's mean emission [K_RJ] and transmission in the middle of the scan, before ``smooth`` is known; None:
+        there is no atmosphere.
+    expected_net
+        Tells what (n_det,) ``focalplane.net`` will be about, before it is resolved; None: what it is now.
+    resolved
+        What operators resolved for one another (noise levels). It outlives the main run: companion runs use the same.
+    components
+        Names of the streams that the steps of the run in progress make before there is a signal: ``sky``, ``white`` ...
+    tally
+        What was counted or approximated.
+    output
+        Folder (Path) for files that are written while the scan runs (see `Data.output`).
+    """
+
+    name: str
+    index: int
+    site: Site
+    instrument: Instrument
+    focalplane: Focalplane
+    start: Instant
+    seconds: NDArray[np.float64]
+    sample_rate: float
+    boresight_azel: NDArray[np.float64]
+    boresight_radec: NDArray[np.float64]
+    centre: tuple[float, float]
+    seed: int
+    flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    detector_flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    intervals: Intervals = field(default_factory=dict)
+    weather: GroundWeather | None = None
+    smooth: dict[str, SmoothField] = field(default_factory=dict)
+    detdata: dict[str, AnyFloats] = field(default_factory=dict)
+    resolved: dict[str, Any] = field(default_factory=dict)
+    tally: Tally = field(default_factory=Tally)
+    output: Any = None
+    expected_load: Callable[[], tuple[float, float]] | None = None
+    expected_net: Callable[[], AnyFloats] | None = None
+    components: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        if not self.flags.size:
+            self.flags = np.zeros(self.n_samples, np.uint8)
+        if not self.detector_flags.size:
+            self.detector_flags = np.zeros(self.n_detectors, np.uint8)
+        if not self.intervals:
+            self.intervals = {"scanning": runs(np.ones(self.n_samples, bool), self.seconds)}
+
+    @property
+    def n_samples(self) -> int:
+        return len(self.seconds)
+
+    @property
+    def n_detectors(self) -> int:
+        return len(self.focalplane)
+
+    @property
+    def good_samples(self) -> NDArray[np.bool_]:
+        """(n_samp,) True where no flag excludes the sample."""
+        return good(self.flags, EXCLUDE_SAMPLE)
+
+    @property
+    def good_detectors(self) -> NDArray[np.bool_]:
+        """(n_det,) True where no flag excludes the detector."""
+        return good(self.detector_flags, EXCLUDE_DETECTOR)
+
+    @property
+    def duration(self) -> float:
+        """n_samples / sample_rate, s."""
+        return self.n_samples / self.sample_rate
+
+    @property
+    def departures(self) -> NDArray[np.float64]:
+        """(n_samp,) s by which samples are later than a comb of `sample_rate` with the same mean; zeros for a perfect one."""
+        late = self.seconds - (self.seconds[0] + np.arange(self.n_samples) / self.sample_rate)
+        return np.asarray(late - late.mean(), np.float64) if late.any() else late
+
+    @cached_property
+    def jitter(self) -> float:
+        """rms of `departures`, s."""
+        late = self.departures
+        return float(np.sqrt(np.mean(late * late)))
+
+    def seconds_at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """`seconds` at sample numbers, which go on at `sample_rate` beyond the ends of the scan."""
+        inside = np.clip(index, 0, self.n_samples - 1)
+        return np.asarray(self.seconds[inside] + (index - inside) / self.sample_rate, np.float64)
+
+    def key(self, *names: str | int) -> NDArray[np.uint32]:
+        """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""
+        return stream_key(self.seed, "observation", self.index, *names)
+
+    def detector_key(self, *names: str | int) -> NDArray[np.uint32]:
+        """As `key`, for what belongs to the detectors: noise, gains. Another instrument or another band has numbers of its own.
+
+        The atmosphere is keyed without them: all bands of one seed look through the same.
+        """
+        return self.key(*self.instrument.identity, *names)
+
+    def derotate(self, which: str) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
+        """(lon, lat, psi) of ``boresight_azel`` or ``boresight_radec`` [rad]; for azel lon = -azimuth."""
+        x, y, z, w = getattr(self, which).T
+        lat = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
+        lon = np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
+        psi = np.arctan2(2 * (y * z + w * x), -2 * (x * z - w * y))
+        return lon % (2 * np.pi), lat, psi
+
+    @property
+    def azimuth(self) -> AnyFloats:
+        """(n_samp,) rad, north through east, 0 to 2 pi."""
+        return (-self.derotate("boresight_azel")[0]) % (2 * np.pi)
+
+    @property
+    def elevation(self) -> AnyFloats:
+        """(n_samp,) rad."""
+        x, y, z, w = self.boresight_azel.T
+        return np.asarray(np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x)), np.float64)
+
+    @property
+    def ra(self) -> AnyFloats:
+        """(n_samp,) rad, ICRS."""
+        return self.derotate("boresight_radec")[0]
+
+    @property
+    def dec(self) -> AnyFloats:
+        """(n_samp,) rad, ICRS."""
+        return self.derotate("boresight_radec")[1]
+
+    def __repr__(self) -> str:
+        return f"<Observation {self.name}: {self.n_detectors} detectors x {self.n_samples} samples at {self.sample_rate:g} Hz>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("instrument", self.instrument.name),
+            ("site", self.site.name),
+            ("start", str(self.start)),
+            ("duration", f"{self.duration:.1f} s at {self.sample_rate:g} Hz"),
+            ("detectors", self.n_detectors),
+            ("elevation", f"{np.degrees(self.elevation.min()):.2f} to {np.degrees(self.elevation.max()):.2f} deg"),
+        ]
+        return html_table(f"Observation {self.name}", rows)

@@ -1,0 +1,38 @@
+"""Partial products: what a step adds up from observation to observation, until `Operator.finalize` makes products of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+
+class Product(ABC):
+    """Something that observations add to: sums in pixels, spectra, lists of files.
+
+    `Operator.collect` hands one observation's share to `Data.add`, `Operator.finalize` takes the sum with `Data.take`. A campaign
+    adds up the shares of its tasks without knowing the operator: what crosses from one process to another are `arrays`. Its
+    class is then found by its name in the registry (entry-point group ``zonda.products``).
+    """
+
+    zonda_api: ClassVar[int] = 1
+
+    @abstractmethod
+    def __iadd__(self, other: Self) -> Self:
+        """Add what later observations made. Raises PipelineError where the two cannot be added up."""
+
+    @abstractmethod
+    def arrays(self) -> Mapping[str, Any]:
+        """All of it as plain values (numbers, texts, lists and mappings of these) and numpy arrays."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, arrays: Mapping[str, Any]) -> Self:
+        """What `arrays` gave, put together again."""
+
+    def minus(self, parts: Sequence[Self]) -> Self:
+        """That of a remainder: this one is of the whole signal, ``parts`` are those of the signals that are taken from it.
+
+        Only asked of steps that are linear, and act on all signals (`core.mapmaker`).
+        """
+        raise NotImplementedError

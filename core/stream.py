@@ -1,0 +1,103 @@
+"""Streams: the samples of whole observations, as steps that measure read them."""
+
+from __future__ import annotations
+
+import mmap
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .numerics.smooth import SmoothField
+from .numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from .observation import Observation
+from .types import AnyFloats
+
+
+@dataclass
+class Stream:
+    """A named stream of one whole observation, between two segments.
+
+    Attributes
+    ----------
+    array
+        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file. A stream that is made again
+        when it is read (`core.run.streams`) has none: it is read by `sweep`.
+    means
+        What must be added in float64 to have all of it, see `Block.means`.
+    threads
+        Threads an operator's ``measure`` may use.
+    room
+        Bytes that it may take for a while, beyond what `Operator.memory` said.
+    """
+
+    name: str
+    observation: Observation
+    array: AnyFloats
+    means: dict[str, SmoothField]
+    threads: int
+    room: int = 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        n_det, n_samp = self.array.shape
+        return n_det, n_samp
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """float32 or float64."""
+        return self.array.dtype
+
+    def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+        """(detectors, samples, result) of ``work(detectors, samples, part)`` over blocks that cover the stream once.
+
+        ``work`` is called from several threads and must not change or keep the part. Results come in an order in which no
+        detector's samples and no sample's detectors are ever out of order, whatever the blocks and threads: what is added up
+        tile by tile (`core.numerics.tiles`) has the same bits.
+        """
+        n_det, n_samp = self.shape
+        blocks = [
+            (slice(d, min(d + SWEEP_DETECTORS, n_det)), slice(t, min(t + SWEEP_SAMPLES, n_samp)))
+            for d in range(0, n_det, SWEEP_DETECTORS)
+            for t in range(0, n_samp, SWEEP_SAMPLES)
+        ]
+
+        def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
+            result = work(detectors, samples, self.array[detectors, samples])
+            forget_pages(self.array)
+            return detectors, samples, result
+
+        return in_order(one, blocks, self.threads)
+
+
+SWEEP_DETECTORS, SWEEP_SAMPLES = 4 * TILE_DETECTORS, 32 * TILE_SAMPLES
+"""What is read at a time of a stream that is kept."""
+
+
+def in_order(work: Callable[..., Any], items: Iterable[tuple[Any, ...]], threads: int) -> Iterator[Any]:
+    """Results of ``work(*item)``, in order, made on several threads that run ahead by at most two items each."""
+    if threads == 1:
+        yield from (work(*item) for item in items)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        pending: deque[Future[Any]] = deque()
+        try:
+            for item in items:
+                pending.append(pool.submit(work, *item))
+                if len(pending) > 2 * threads:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def forget_pages(array: AnyFloats) -> None:
+    """Take the pages of a spilled stream out of this process's memory; the file keeps them."""
+    pages = getattr(array, "_mmap", None)
+    if pages is not None and hasattr(mmap, "MADV_DONTNEED"):
+        pages.madvise(mmap.MADV_DONTNEED)
