@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from .errors import OutputError
 from .operator import Operator
+from .storage.files import check_output_folder
 
 if TYPE_CHECKING:
-    from .data import Data
+    from pathlib import Path
+
+    from .data import Data, Observation
 
 Progress = Literal["pointing", "scan", "run", "runs"]
 
@@ -23,3 +27,12 @@ class Output(Operator):
     def watch(self, data: Data, done: Progress) -> None:
         """Called once the telescope is pointed, after every scan, and when all scans are through: time to begin, in the
         background, with what `finalize` will do, as far as it depends on products that will not change."""
+
+
+def output_folder(of: Data | Observation, place: str) -> Path:
+    """The output folder of a run, which is there and can be written to; raises `OutputError` where it is not."""
+    if of.output is None:
+        raise OutputError(
+            "there is no output folder", place=place, cure="give one: zonda run --output FOLDER, or run(scene, output=...)"
+        )
+    return check_output_folder(of.output)

@@ -5,8 +5,9 @@ import pytest
 
 import zonda
 from zonda.core import cli
+from zonda.core.numerics.angles import ARCSEC
 from zonda.core.numerics.projection import rotation_matrices
-from zonda.operators.diagnostics.transfer_function import ARCSEC, compare, window_of
+from zonda.operators.diagnostics.transfer_function import compare, window_of
 
 CUT = 0.08  # Hz
 HIGHPASS = zonda.HighpassFilter(frequency=f"{CUT} Hz")

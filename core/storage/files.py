@@ -28,6 +28,10 @@ _CURES = {
 }
 
 
+MOST_AT_ONCE = 4
+"""Files that are written at a time."""
+
+
 def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:
     """The `OutputError` that tells the user what an operating-system error on ``path`` means and how to mend it.
 

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-ARCMIN = np.pi / 180 / 60
-
 COLOURS = {
     "signal": "#000000",
     "atmosphere": "#0072B2",

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.types import AnyFloats
 
 from .sky_axes import SkyAxes
-
-FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,12 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.early import take
-from zonda.core.operator import Operator
-from zonda.core.storage.files import atomic_path, product_path
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.map_view import MapView, maps_of, noise_sources
+from zonda.core.output import Output, Progress, output_folder
+from zonda.core.storage.files import MOST_AT_ONCE, atomic_path, product_path
 from zonda.core.types import AnyFloats
-from zonda.operators.io.map_view import MapView, maps_of, noise_sources
-from zonda.operators.io.save_map import MOST_AT_ONCE, output_folder
 from zonda.operators.maps.image import Image
-from zonda.operators.maps.map_product import MapProduct
 
 from .artist import Artist
 from .flat_map import FlatMap
@@ -54,7 +53,7 @@ LARGEST = 1500
 """Pixels of an image's longer side in a picture; larger images are thinned out."""
 
 
-class Plots(Operator):
+class Plots(Output):
     """Draw what the run made and write it as PNG files to the output folder.
 
     ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``, ``power_spectra.png``, ``tod.png``,
@@ -66,7 +65,6 @@ class Plots(Operator):
 
     optional: ClassVar[frozenset[str]] = frozenset({"map", "spectrum", "time_streams", "transfer_function"})
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
-    at_end: ClassVar[bool] = True
 
     smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = "beam"
     """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a Gaussian of this FWHM, or not."""
@@ -86,7 +84,7 @@ class Plots(Operator):
             with suppress(OSError):
                 self._artist = take(Artist)
 
-    def watch(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+    def watch(self, data: Data, done: Progress) -> None:
         """Begin with the pictures of what will not change any more."""
         if self._artist is not None:
             for drawing in _drawings(data, self.style()):

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.numerics.angles import ARCMIN
 from zonda.core.types import AnyFloats
 
-from .canvas import ARCMIN, CHARACTER, COLOURS, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
+from .canvas import CHARACTER, COLOURS, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
 from .map_layout import map_axes
 from .map_plots import plot_coverage, plot_map
 

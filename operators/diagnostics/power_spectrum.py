@@ -16,8 +16,8 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation, Tally
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
-from zonda.operators.io.streams import StreamsAsked
 
 from .series import Spectrum
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from html import escape
 from importlib import resources
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -18,9 +18,8 @@ from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data, Observation
-from zonda.core.operator import Operator
+from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import write_text
-from zonda.operators.io.save_map import output_folder
 
 from .plot_operators import Picture, Plots, pictures
 from .report_results import angle, class_of, flux_density, has_white_noise, results
@@ -36,7 +35,7 @@ LONG = 12
 """Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files, in one cell."""
 
 
-class Report(Operator):
+class Report(Output):
     """Write ``report.html``: the pictures, what was simulated, with which seed and versions, what was counted and approximated.
 
     The page needs no other file and no network. Acts after all runs: put it last, so that it knows of the files before it.
@@ -48,7 +47,6 @@ class Report(Operator):
         {"pictures", "map_file", "tod_file", "map", "spectrum", "time_streams", "transfer_function"}
     )
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
-    at_end: ClassVar[bool] = True
 
     central_diameter: Angle = quantity("1 arcmin", gt=0)
     """Diameter of the circle about the map's centre in which the noise is stated."""
@@ -65,7 +63,7 @@ class Report(Operator):
 
         return Estimate((), Cost(once=0.1, bytes=10e6, kernel="python"))
 
-    def watch(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+    def watch(self, data: Data, done: Progress) -> None:
         """Write what no later step changes while the last pictures are drawn."""
         if done == "runs":
             self._known = None

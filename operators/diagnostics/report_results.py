@@ -11,12 +11,12 @@ import numpy as np
 
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
+from zonda.core.maps.map_view import maps_of, noise_figures
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.operator import Operator
-from zonda.operators.io.map_view import maps_of, noise_figures
 
 if TYPE_CHECKING:
-    from zonda.operators.maps.map_product import MapProduct
+    from zonda.core.maps.map_product import MapProduct
 
 
 def brightness(kelvin: float) -> str:

@@ -11,8 +11,8 @@ from pydantic import Field
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
-from zonda.operators.io.streams import StreamsAsked
 
 from .series import TimeStream
 

@@ -31,24 +31,24 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
+from zonda.core.maps.map_product import MapProduct
 from zonda.core.notebook import html_table
-from zonda.core.operator import Operator
+from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
+from zonda.core.output import Output
 from zonda.core.run.companion import Companion
+from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
-from zonda.operators.io.ecsv import Column, write_ecsv
-from zonda.operators.maps.map_product import FWHM_PER_SIGMA, MapProduct
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
 
-ARCSEC = math.pi / 648000
 NO_POWER = 1e-12
 """Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
 
 
-class TransferFunction(Operator):
+class TransferFunction(Output):
     """Measure the share of each angular scale of the sky that the filters leave in the map.
 
     The map of the sky alone is compared with the same map binned without filters: the ratio of their cross spectrum to the
@@ -59,7 +59,6 @@ class TransferFunction(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
     provides: ClassVar[frozenset[str]] = frozenset({"transfer_function"})
-    at_end: ClassVar[bool] = True
 
     modes: Literal["sky", "full"] = "sky"
     """Singular modes of the sky alone (`sky`: the paper's noiseless run), or of the complete data, applied to it (`full`)."""

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Data
+from zonda.core.maps.map_view import MapView
 from zonda.core.numerics import tangent
 from zonda.core.storage.files import atomic_path
 from zonda.core.storage.fits_image import BLOCK, Cards, image_pieces
-
-from .map_view import MapView
 
 _MEANING = {
     "signal": "brightness",

@@ -13,22 +13,19 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
-from zonda.core.operator import Operator
-from zonda.core.storage.files import check_output_folder, product_path
+from zonda.core.maps.map_view import MapView, NoiseFigure, maps_of, noise_figures, noise_sources
+from zonda.core.output import Output, output_folder
+from zonda.core.storage.files import MOST_AT_ONCE, product_path
 from zonda.core.storage.fits_image import Cards
 
 from .map_file import Provenance, write_map
-from .map_view import MapView, NoiseFigure, maps_of, noise_figures, noise_sources
 
 if TYPE_CHECKING:
     from zonda.core.plan.context import Context
     from zonda.core.plan.estimate import Estimate
 
-MOST_AT_ONCE = 4
-"""Files that are written at a time."""
 
-
-class SaveMap(Operator):
+class SaveMap(Output):
     """Write every map of the main and companion runs to the output folder.
 
     ``map.fits``, ``noiseless_map.fits`` ...: the signal in the primary HDU (K_RJ), then HITS, WEIGHTS, NOISE and, where it was
@@ -41,7 +38,6 @@ class SaveMap(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
     provides: ClassVar[frozenset[str]] = frozenset({"map_file"})
-    at_end: ClassVar[bool] = True
 
     central_diameter: Angle = quantity("1 arcmin", gt=0)
     """Diameter of the circle about the target in which the noise map's rms is taken."""
@@ -83,20 +79,6 @@ class SaveMap(Operator):
         with ThreadPoolExecutor(at_once, "SaveMap") as pool:  # the disk takes most of the time
             written = [pool.submit(write_map, path, view, about, cards.get(path)) for path, view in views.items()]
         data.products["map_file"] = [file.result() for file in written]
-
-
-def output_folder(data: Data, place: str) -> Path:
-    """The run's output folder, there and writable; `OutputError` otherwise."""
-    if data.output is None:
-        raise no_output_folder(place)
-    return check_output_folder(data.output)
-
-
-def no_output_folder(place: str) -> OutputError:
-    """The error of a step that writes where nothing says whereto."""
-    return OutputError(
-        "there is no output folder", place=place, cure="give one: zonda run --output FOLDER, or run(scene, output=...)"
-    )
 
 
 def noise_cards(figures: list[NoiseFigure], diameter: float) -> Cards:

@@ -16,11 +16,11 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, OutputError
 from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
 from zonda.core.operator import Operator
-from zonda.core.storage.files import atomic_path, check_output_folder, discard, product_path, publish, temporary_sibling
+from zonda.core.output import output_folder
+from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
+from zonda.core.stream_names import StreamsAsked
 
 from . import fits_table, toast_hdf5
-from .save_map import no_output_folder, output_folder
-from .streams import StreamsAsked
 from .time_ordered_data import TimeOrderedData
 
 if TYPE_CHECKING:
@@ -77,10 +77,8 @@ class SaveTOD(Operator):
         return Estimate((), Cost(0.1, 0.0, 6e-9 * len(self.streams or ["signal"])))
 
     def prepare(self, observation: Observation) -> _State:
-        if observation.output is None:
-            raise no_output_folder(self.label)
         module = _FORMATS[self.format]
-        folder = check_output_folder(observation.output)
+        folder = output_folder(observation, self.label)
         stem = f"tod_{observation.name}" if self.label == "SaveTOD" else f"tod_{self.label}_{observation.name}"
         path = product_path(folder, stem, module.SUFFIX)
         if path.is_dir():

@@ -20,13 +20,13 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Data, Observation, percent
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.projection import pixel_matrix, share_outside
 from zonda.core.numerics.stretches import untouched
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
-from .map_product import MapProduct
 from .sums import (
     DATA,
     FLAGGED,

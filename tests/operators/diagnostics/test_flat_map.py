@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from zonda.core.maps.map_product import MapProduct
 from zonda.operators.diagnostics.pictures import Style, draw_coverage, draw_input
 from zonda.operators.diagnostics.plot_operators import _flat, _input
 from zonda.operators.maps.grid import tangent_wcs
-from zonda.operators.maps.map_product import MapProduct
 
 ARCSEC = np.pi / 648000
 

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from zonda.core.errors import OutputError
+from zonda.core.maps.map_product import MapProduct
 from zonda.operators.diagnostics import canvas, pictures
 from zonda.operators.diagnostics.plot_operators import Plots, _flat
 from zonda.operators.diagnostics.plots import map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
@@ -23,7 +24,6 @@ from zonda.operators.diagnostics.power_spectrum import Spectrum
 from zonda.operators.diagnostics.sky_axes import SkyAxes
 from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
 from zonda.operators.maps.image import Image
-from zonda.operators.maps.map_product import MapProduct
 
 ARCSEC = np.pi / 648000
 ARCMIN = 60 * ARCSEC
@@ -498,7 +498,7 @@ def test_a_healpix_map_is_drawn(data):
 def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
     import healpy as hp
 
-    from zonda.operators.io.map_view import MapView
+    from zonda.core.maps.map_view import MapView
 
     nside = 512
     pixels = np.sort(hp.query_disc(nside, hp.ang2vec(266.0, -29.0, lonlat=True), np.radians(1.0)))
@@ -522,7 +522,7 @@ def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
 def test_a_healpix_map_of_half_the_sky_is_drawn():
     import healpy as hp
 
-    from zonda.operators.io.map_view import MapView
+    from zonda.core.maps.map_view import MapView
 
     pixels = np.sort(hp.query_disc(32, hp.ang2vec(10.0, -60.0, lonlat=True), np.radians(100.0)))
     centre = (np.radians(10.0), np.radians(-60.0))

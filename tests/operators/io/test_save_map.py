@@ -12,9 +12,9 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import OutputError, PipelineError
+from zonda.core.maps.map_product import MapProduct
 from zonda.operators.io import map_file
 from zonda.operators.io.save_map import SaveMap
-from zonda.operators.maps.map_product import MapProduct
 
 ARCSEC = np.pi / 648000
 

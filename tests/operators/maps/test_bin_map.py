@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 import zonda
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.numerics.angles import ARCMIN
 from zonda.core.numerics.projection import directions, frame_rotation
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
-from zonda.operators.maps.map_product import ARCMIN
 
 ARCSEC = np.radians(1 / 3600)
 N_DET, N = 19, 4500
@@ -456,7 +456,7 @@ def test_pixels_far_from_the_centre_are_smaller_and_hold_less_of_a_beam():
     """A pixel of a tangent plane at the distance c from the centre covers cos(c)^3 of the middle one's part of the sky."""
     from astropy.wcs import WCS
 
-    from zonda.operators.maps.map_product import MapProduct
+    from zonda.core.maps.map_product import MapProduct
 
     wcs = WCS(naxis=2)
     wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [75.0, 20.0], [21, 21], [-1.0, 1.0]

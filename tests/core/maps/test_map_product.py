@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.angles import ARCMIN
 from zonda.operators.maps.grid import tangent_wcs
-from zonda.operators.maps.map_product import ARCMIN, MapProduct
 
 ARCSEC = np.pi / 648000
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.types import AnyFloats
-from zonda.operators.maps.map_product import MapProduct
+from ..types import AnyFloats
+from .map_product import MapProduct
 
 PLANES = ("signal", "hits", "weights", "noise", "half_difference")
 """Planes a map product may have; `signal` always, but for a map of hits alone."""

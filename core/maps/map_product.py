@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.errors import InputError
-from zonda.core.notebook import html_table
-from zonda.core.numerics import tangent
-from zonda.core.types import Floats
+from ..errors import InputError
+from ..notebook import html_table
+from ..numerics import tangent
+from ..numerics.angles import ARCMIN, FWHM_PER_SIGMA
+from ..types import Floats
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
-    from zonda.core.numerics.tangent import TangentWcs
-    from zonda.core.storage.fits_image import Cards
+    from ..numerics.tangent import TangentWcs
+    from ..storage.fits_image import Cards
 
-ARCMIN = math.pi / 180 / 60
-FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
 SMALL = 1 << 20
 """Pixels of a map whose distances from the centre are kept."""
 
