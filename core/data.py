@@ -40,29 +40,27 @@ class Data:
     threads: int = 1
     """Threads that the run may use."""
 
-    partial: dict[tuple[str, str], Product] = field(default_factory=dict)
-    """What steps have added up so far, by signal and label."""
+    partial: dict[str, Product] = field(default_factory=dict)
+    """What steps have added up so far, by label."""
     layouts: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     """By label: what all observations have in common (the grid of a map), as plain values and arrays; ``fixed: True`` says
     that further observations cannot change it. `Operator.observe` makes it, or extends what earlier parts of a campaign made."""
     laid_out: bool = False
     """The layouts are those of all parts of a campaign: `Operator.observe` takes them as they are."""
 
-    def add(self, label: str, product: Product, signal: str = "signal") -> None:
+    def add(self, label: str, product: Product) -> None:
         """Add an observation's share to the partial product of a step."""
-        if (signal, label) not in self.partial:
-            self.partial[signal, label] = product
-            return
-        whole = self.partial[signal, label]
+        whole = self.partial.setdefault(label, product)
         if type(whole) is not type(product):
             cure = "a step adds up products of one class"
             raise PipelineError(f"added a {type(product).__name__} to a {type(whole).__name__}", place=label, cure=cure)
-        whole += product
-        self.partial[signal, label] = whole
+        if whole is not product:
+            whole += product
+            self.partial[label] = whole
 
-    def take(self, label: str) -> dict[str, Any]:
-        """The partial products of a step, by signal; they are not held here any longer."""
-        return {signal: self.partial.pop((signal, who)) for signal, who in [*self.partial] if who == label}
+    def take(self, label: str) -> Any:
+        """The partial product of a step, None where it has none; it is not held here any longer."""
+        return self.partial.pop(label, None)
 
     def product(self, name: str) -> str:
         """The key of a product of the run in progress."""

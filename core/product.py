@@ -30,9 +30,9 @@ class Product(ABC):
     def of(cls, arrays: Mapping[str, Any]) -> Self:
         """What `arrays` gave, put together again."""
 
-    def minus(self, parts: Sequence[Self]) -> Self:
-        """That of a remainder: this one is of the whole signal, ``parts`` are those of the signals that are taken from it.
+    def subtract(self, name: str, parts: Sequence[str]) -> None:
+        """Make that of the signal ``name``: that of ``signal`` minus those of the signals ``parts``, all of which are in it.
 
-        Only asked of steps that are linear, and act on all signals (`core.mapmaker`).
+        Only asked of products of map makers (`core.mapmaker`) that are linear.
         """
         raise NotImplementedError
