@@ -6,12 +6,7 @@ chooses folders alone). Where a future numba has another inside, kernels are kep
 
 from __future__ import annotations
 
-import warnings
-
-CHANGED = (ImportError, AttributeError, TypeError)
-"""What a numba whose inside has changed raises."""
-
-_told: list[str] = []
+from .without_cache import CHANGED, left_to_numba
 
 
 def keep() -> None:
@@ -32,16 +27,3 @@ def share(polite: bool = False) -> None:
         kernel_cache.share(polite)
     except CHANGED as error:
         left_to_numba(error)
-
-
-def left_to_numba(error: BaseException) -> None:
-    """Say once why zonda's cache is not used."""
-    import numba
-
-    if not _told:
-        _told.append(str(error))
-        warnings.warn(
-            f"zonda cannot keep compiled code itself with numba {numba.__version__} ({error}): numba's own cache is "
-            "used, or kernels are compiled in every run; do not begin several first runs at once",
-            stacklevel=3,
-        )

@@ -35,7 +35,7 @@ from numba.core.serialize import dumps
 
 from ..storage import user_cache
 from ..storage.own_files import ForeignFile, own_folder, read_own
-from .keep_kernels import CHANGED, left_to_numba
+from .without_cache import CHANGED, left_to_numba
 
 FORMAT = 3
 _DIGEST = 16

@@ -12,18 +12,13 @@ direction lies in the opposite hemisphere and has no pixel.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..errors import InputError
 from ..types import Floats
-from .stretches import stretches, untouched
-
-if TYPE_CHECKING:
-    from astropy.wcs import WCS
-
-    from .tangent import TangentWcs
+from .chunks import chunks, empty
 
 GALACTIC = (
     (-0.05487565771259163, -0.8734370519556159, -0.48383507361671546),
@@ -31,6 +26,26 @@ GALACTIC = (
     (-0.8676661375596576, -0.19807633727300053, 0.4559838136873016),
 )
 """The rotation from ICRS to Galactic coordinates as astropy makes it, which takes half a second to import."""
+
+
+class Wcs(Protocol):
+    """What is asked of world coordinates: those of `astropy.wcs.WCS` and of `core.numerics.tangent.TangentWcs`."""
+
+    @property
+    def naxis(self) -> int:
+        """Number of axes."""
+
+    @property
+    def has_distortion(self) -> bool:
+        """Whether it is more than a projection."""
+
+    @property
+    def wcs(self) -> Any:
+        """FITS's parameters: crval, crpix, ctype, lng, lat, lonpole."""
+
+    @property
+    def pixel_scale_matrix(self) -> Floats:
+        """(2, 2) deg per pixel."""
 
 
 def rotation_matrices(quaternions: Floats) -> Floats:
@@ -41,7 +56,7 @@ def rotation_matrices(quaternions: Floats) -> Floats:
 def _rotations(quaternions: Floats) -> Floats:
     """As `rotation_matrices`, (3, 3, n): each element lies in one piece."""
     found = np.empty((3, 3, len(quaternions)))
-    for s in stretches(len(quaternions)):
+    for s in chunks(len(quaternions)):
         x, y, z, w = _normalized(quaternions[s])
         found[0, 0, s], found[0, 1, s], found[0, 2, s] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
         found[1, 0, s], found[1, 1, s], found[1, 2, s] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
@@ -51,8 +66,8 @@ def _rotations(quaternions: Floats) -> Floats:
 
 def boresights(quaternions: Floats) -> Floats:
     """Unit vectors (3, n) that boresight quaternions (n, 4) look at: the last column of `rotation_matrices`."""
-    found = untouched((3, len(quaternions)))
-    for s in stretches(len(quaternions)):
+    found = empty((3, len(quaternions)))
+    for s in chunks(len(quaternions)):
         x, y, z, w = _normalized(quaternions[s])
         found[0, s], found[1, s], found[2, s] = 2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)
     return found
@@ -77,7 +92,7 @@ def frame_rotation(frame: str) -> Floats:
     return _rotation_into(frame, frame, "frame")
 
 
-def wcs_frame_rotation(wcs: WCS | TangentWcs) -> Floats:
+def wcs_frame_rotation(wcs: Wcs) -> Floats:
     """Matrix (3, 3) from ICRS directions to directions in the frame of ``wcs``."""
     if (frame := getattr(wcs, "frame", None)) is not None:
         return frame_rotation(frame)
@@ -102,7 +117,7 @@ def _rotation_into(frame: Any, called: str, place: str) -> Floats:
     return matrix
 
 
-def pixel_matrix(wcs: WCS | TangentWcs) -> Floats:
+def pixel_matrix(wcs: Wcs) -> Floats:
     """Matrix P (3, 3): an ICRS direction d has the 0-based pixel (x, y) = ((P d)_0, (P d)_1) / (P d)_2.
 
     ``wcs`` is a two-dimensional celestial TAN WCS; CRPIX, CDELT (signs too), PC/CD, LONPOLE, the order of the axes and
@@ -138,7 +153,7 @@ def share_outside(scans: Iterable[tuple[Floats, Floats, Floats]], matrix: Floats
     return beyond / looked if looked else 0.0
 
 
-def central(wcs: WCS | TangentWcs) -> Floats:
+def central(wcs: Wcs) -> Floats:
     """`pixel_matrix` for directions in the frame of ``wcs`` itself."""
     lng, lat = wcs.wcs.lng, wcs.wcs.lat
     lon0, lat0 = np.radians([wcs.wcs.crval[lng], wcs.wcs.crval[lat]])
@@ -154,7 +169,7 @@ def central(wcs: WCS | TangentWcs) -> Floats:
     return np.vstack([pixel, centre])
 
 
-def homographies(quaternions: Floats, wcs: WCS | TangentWcs) -> Floats:
+def homographies(quaternions: Floats, wcs: Wcs) -> Floats:
     """Equation (1): coefficients h (n, 9) float64 for boresight quaternions (n, 4) in ICRS and a TAN image.
 
     A detector at focal-plane offsets (xi, eta) looks at R(q) (-eta, -xi, 1) (TOAST's boresight frame). Pixels are
@@ -162,8 +177,8 @@ def homographies(quaternions: Floats, wcs: WCS | TangentWcs) -> Floats:
     Each coefficient lies in one piece (Fortran's order).
     """
     matrix = pixel_matrix(wcs)
-    h = untouched((9, len(quaternions)))
-    for s in stretches(len(quaternions)):
+    h = empty((9, len(quaternions)))
+    for s in chunks(len(quaternions)):
         turn = _rotations(quaternions[s])
         for row in range(3):
             for column, (sign, axis) in enumerate(((-1, 1), (-1, 0), (1, 2))):

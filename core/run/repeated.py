@@ -13,7 +13,7 @@ import numpy as np
 
 from ..data import Block, Observation, Tally
 from ..errors import PipelineError
-from ..numerics.stretches import untouched
+from ..numerics.chunks import empty
 from ..operator import Operator
 from ..types import AnyFloats
 from .forecast import spares
@@ -74,7 +74,7 @@ class Repeated:
 
     def begin(self, shape: tuple[int, int], settings: Settings) -> None:
         """Take memory; ``settings`` knows of it."""
-        self._arrays = {(who, name): untouched(shape, settings.dtype) for who, names in self.names.items() for name in names}
+        self._arrays = {(who, name): empty(shape, settings.dtype) for who, names in self.names.items() for name in names}
         settings.kept += self._arrays.values()
 
     def record(self, label: str, block: Block) -> None:

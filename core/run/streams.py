@@ -27,8 +27,8 @@ import numpy as np
 
 from ..data import Observation, Stream
 from ..errors import OutputError, PipelineError
+from ..numerics.chunks import empty
 from ..numerics.smooth import SmoothField
-from ..numerics.stretches import untouched
 from ..types import AnyFloats
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ class Store:
             self._spare[:] = alike[1:]
             if not alike:
                 self._spare.clear()
-            array = alike[0] if alike else untouched(shape, kind)
+            array = alike[0] if alike else empty(shape, kind)
         else:
             array = self._file(name, shape, kind)
         self._live[id(array)] = array

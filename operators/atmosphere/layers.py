@@ -27,8 +27,8 @@ from zonda.core.data import Block, Data, Observation, Tally
 from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.knobs import Knob
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
@@ -522,7 +522,7 @@ def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
 
 def _check_pointing(observation: Observation) -> None:
     quaternions, lowest = observation.boresight_azel, 1.0
-    for some in stretches(observation.n_samples):
+    for some in chunks(observation.n_samples):
         x, y, *_ = part = quaternions[some].T
         if not np.isfinite(part).all():
             bad = np.flatnonzero(~np.isfinite(quaternions).all(axis=1))

@@ -26,8 +26,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.smooth import product
-from zonda.core.numerics.stretches import stretches, untouched
 from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.numerics.transforms import cosine_transform, fast_length
 from zonda.core.types import AnyFloats
@@ -200,7 +200,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     third = (2 / knots) ** 2 / 3
     raw = np.array([np.ones_like(t), t, t * t - third, t**3 - 3 * third * t])[: degree + 1]
     spread = np.zeros_like(raw)
-    for some in stretches(n):
+    for some in chunks(n):
         cell, weights = _around(some, n, knots)
         time = (np.arange(some.start, some.stop) + 0.5) * (2 / n) - 1
         edges = np.flatnonzero(np.diff(cell, prepend=-1))  # of the knots' intervals
@@ -254,8 +254,8 @@ def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
 
 def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]) -> AnyFloats:
     """See `HighpassPlan.weights`."""
-    found: AnyFloats = untouched((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
-    for some in stretches(first.size * GROUP):
+    found: AnyFloats = empty((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
+    for some in chunks(first.size * GROUP):
         cell, weights = _around(some, n, knots)
         weights[:, max(n - some.start, 0) :] = 0.0
         part = slice(some.start // GROUP, some.stop // GROUP)

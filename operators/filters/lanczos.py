@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from zonda.core.numerics.stretches import stretches, untouched
+from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.types import Floats
 
 from .gram import Gram, directions, near_the_mean
@@ -129,7 +129,7 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
 
 def _combined(shares: Floats, times: list[Floats]) -> Floats:
     """Sums (k, n_samp) of series with their ``shares`` (k, m)."""
-    found = untouched((len(shares), times[0].size))
-    for some in stretches(times[0].size):
+    found = empty((len(shares), times[0].size))
+    for some in chunks(times[0].size):
         found[:, some] = shares @ np.array([series[some] for series in times])
     return found

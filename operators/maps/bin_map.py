@@ -21,8 +21,8 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Data, Observation, percent
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.chunks import empty
 from zonda.core.numerics.projection import pixel_matrix, share_outside
-from zonda.core.numerics.stretches import untouched
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
 
@@ -398,9 +398,9 @@ class BinMap(Operator):
         grid = self._grid
         assert grid is not None
         n, unit = grid.n_pixels, self._variance if self.weights == "inverse_variance" else 1.0
-        hits, signal, weight, noise = (untouched((n, 1), kind).reshape(n) for kind in (np.int64, float, float, float))
+        hits, signal, weight, noise = (empty((n, 1), kind).reshape(n) for kind in (np.int64, float, float, float))
         half = (
-            untouched((n, 1), float).reshape(n)
+            empty((n, 1), float).reshape(n)
             if self.half_difference and len(halves.scans) >= 2 and self.contents == "all"
             else None
         )

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
-from zonda.core.numerics.stretches import stretches
 from zonda.core.numerics.tangent import TangentWcs
 from zonda.core.types import Floats
 
@@ -108,7 +108,7 @@ def covering_extent(observations: Sequence[Observation], centre: tuple[float, fl
     matrix = pixel_matrix(tangent_wcs(centre, 1.0, (1, 1), frame))
     half = np.zeros(2)
     for observation in observations:
-        for some in stretches(observation.n_samples):
+        for some in chunks(observation.n_samples):
             half = np.maximum(half, _extent(observation, some, matrix))
     return float(half[0]), float(half[1])
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from zonda.core.compilation.columns import prefetch
 from zonda.core.errors import PipelineError
-from zonda.core.numerics.stretches import untouched
+from zonda.core.numerics.chunks import empty
 from zonda.core.types import Floats
 
 from .grid import Grid, TangentGrid
@@ -151,7 +151,7 @@ class Halves:
     """Sums of the even and of the odd observations, in their order."""
 
     def __init__(self, n_pixels: int) -> None:
-        self.sums = untouched((2 * n_pixels, 4), np.int64).reshape(2, n_pixels, 4)
+        self.sums = empty((2 * n_pixels, 4), np.int64).reshape(2, n_pixels, 4)
         self.scans: list[str] = []
         self.rates: set[float] = set()
         """Hz: of the scans."""

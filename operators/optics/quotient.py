@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.smooth import SmoothField, interpolating
-from zonda.core.numerics.stretches import stretches, untouched
 from zonda.core.types import Floats
 
 AT_ONCE = 4096
@@ -38,7 +38,7 @@ def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> t
         known = _ratio(above, below, step, rows)
         tolerance = TOLERANCE * max(float(np.abs(known[np.isin(rows, use), 1:-1]).max(initial=0.0)), 1e-30)
         nodes = above.weights.astype(np.float64)
-        fits = [np.linalg.lstsq(nodes[rows], known[:, part], rcond=1e-12)[0] for part in stretches(known.shape[1])]
+        fits = [np.linalg.lstsq(nodes[rows], known[:, part], rcond=1e-12)[0] for part in chunks(known.shape[1])]
         field, error = fitted(nodes, np.concatenate(fits, axis=1))
         if not error <= tolerance:
             _, size, fit = np.linalg.svd(known, full_matrices=False)
@@ -63,9 +63,9 @@ def _representatives(weights: NDArray[np.floating], use: NDArray[np.intp]) -> ND
 def _ratio(above: SmoothField, below: SmoothField, step: int, rows: NDArray[np.intp]) -> Floats:
     """The quotient for the detectors ``rows`` at the coarse times; in the first and last column, its slopes at the ends."""
     one, other, high, low = above.weights[rows], below.weights[rows], knots_of(above, step), knots_of(below, step)
-    found = untouched((len(rows), low.shape[1] + 2))
+    found = empty((len(rows), low.shape[1] + 2))
     ratio, ends = found[:, 1:-1], [0, -1]
-    for part in stretches(low.shape[1]):
+    for part in chunks(low.shape[1]):
         np.divide(one @ high[:, part], np.maximum(other @ low[:, part], LEAST_TRANSMISSION), out=ratio[:, part])
     bottom = other @ low[:, ends]
     slope = one @ _end_slopes(above, step) - ratio[:, ends] * (other @ _end_slopes(below, step)) * (bottom > LEAST_TRANSMISSION)
@@ -79,7 +79,7 @@ def _error(field: SmoothField, above: SmoothField, below: SmoothField, step: int
     worst = 0.0
     for detectors in parts(len(use)):
         one, other, fitted = (f.weights[use[detectors]] for f in (above, below, field))
-        for part in stretches(middle.shape[1]):
+        for part in chunks(middle.shape[1]):
             exact = (one @ top[:, part]) / np.maximum(other @ bottom[:, part], LEAST_TRANSMISSION)
             worst = max(worst, float(np.abs(fitted @ middle[:, part] - exact).max(initial=0.0)))
     return worst

@@ -13,7 +13,7 @@ from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSp
 from zonda.core.errors import PointingError
 from zonda.core.flags import TURNAROUND
 from zonda.core.intervals import Intervals, runs
-from zonda.core.numerics.stretches import stretches
+from zonda.core.numerics.chunks import chunks
 from zonda.core.types import Floats
 
 from .base import Pointing
@@ -81,7 +81,7 @@ class PointingBackAndForth(Pointing):
                 cure="lower throw, or choose a lower elevation",
             )
         found = series(3, len(seconds))
-        for some in stretches(len(seconds)):
+        for some in chunks(len(seconds)):
             x, _ = self.path(seconds[some])
             found[some] = unit_vectors(longitude - (x + offset[0]) / math.cos(elevation), np.full(len(x), elevation))
         return found
@@ -96,7 +96,7 @@ class PointingBackAndForth(Pointing):
         A throw goes from the middle of a turnaround to that of the next (the parameter `throw` is the length of a *scan*)."""
         cycle = self.throw / self.speed + self.turnaround
         turning, first, throw = np.empty((3, len(seconds)), bool)
-        for some in stretches(len(seconds)):
+        for some in chunks(len(seconds)):
             t = seconds[some]
             turning[some] = self.in_turnaround(t)
             first[some] = np.floor(t / cycle) % 2 == 0

@@ -18,8 +18,8 @@ from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
 from zonda.core.errors import PointingError
 from zonda.core.intervals import Intervals
 from zonda.core.knobs import Knob
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.random import normals, stream_key
-from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
@@ -115,7 +115,7 @@ class Pointing(Operator):
     def directions(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
         """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the scan."""
         found = series(3, len(seconds))
-        for some in stretches(len(seconds)):
+        for some in chunks(len(seconds)):
             if target.frame == "horizontal":
                 x, y = self.path(seconds[some])
                 found[some] = _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from zonda.core.errors import PointingError
-from zonda.core.numerics.stretches import stretches, untouched
+from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.types import Floats
 
 from .earth_orientation import orientation
@@ -118,7 +118,7 @@ class CelestialTransform:
     def horizontal(self, icrs: Floats, seconds: Floats) -> Floats:
         """Directions (n, 3) north, west, up of ICRS unit vectors (n, 3) or (3,) at ``seconds`` (n,)."""
         out = np.empty((len(seconds), 3))
-        for part in stretches(len(seconds)):
+        for part in chunks(len(seconds)):
             now = self._interpolated(seconds[part])
             observed = _observed(icrs if icrs.ndim == 1 else icrs[part], now)
             out[part] = rotate(self._rotation(now, seconds[part]), observed)
@@ -127,7 +127,7 @@ class CelestialTransform:
     def icrs(self, horizontal: Floats, seconds: Floats) -> Floats:
         """ICRS unit vectors (n, 3) of horizontal directions (n, 3) or (3,) at ``seconds`` (n,)."""
         out = np.empty((len(seconds), 3))
-        for part in stretches(len(seconds)):
+        for part in chunks(len(seconds)):
             now = self._interpolated(seconds[part])
             turn = conjugate(self._rotation(now, seconds[part]))
             out[part] = _natural(rotate(turn, horizontal if horizontal.ndim == 1 else horizontal[part]), now)
@@ -140,7 +140,7 @@ class CelestialTransform:
         """
         n, upright = len(seconds), Upright()
         azel, radec = series(4, n), series(4, n)
-        for part in stretches(n):
+        for part in chunks(n):
             now = self._interpolated(seconds[part])
             turn = conjugate(self._rotation(now, seconds[part]))
             observed = rotate(turn, horizontal[part])
@@ -155,7 +155,7 @@ class CelestialTransform:
         """
         n, upright = len(seconds), Upright()
         horizontal, azel, radec = (series(k, n) for k in (3, 4, 4))
-        for part in stretches(n):
+        for part in chunks(n):
             now = self._interpolated(seconds[part])
             turn = self._rotation(now, seconds[part])
             natural = icrs(seconds[part])
@@ -298,7 +298,7 @@ def _near_identity(matrix: Floats) -> Floats:
 
 def series(components: int, n: int) -> Floats:
     """Room for vectors or quaternions (n, components)."""
-    return untouched((components, n)).T
+    return empty((components, n)).T
 
 
 def multiply(a: Floats, b: Floats) -> Floats:

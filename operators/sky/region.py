@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights
-from zonda.core.numerics.stretches import stretches
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def region(observation: Observation, step: float, reach: float, disc: Disc | Non
 def _on_plane(observation: Observation, axes: Floats, disc: Disc | None, around: float) -> Any:
     """Chunks of (x, y, theta) [tan rad west, tan rad north, rad] of the boresight where it comes ``around`` the map."""
     boresight = observation.boresight_radec
-    for some in stretches(observation.n_samples):
+    for some in chunks(observation.n_samples):
         d = boresights(boresight[some])
         if disc is not None:
             d = d[:, disc.centre @ d >= np.cos(min(disc.radius + around, np.pi))]

@@ -20,8 +20,8 @@ from zonda.core.configuration.units import Angle, Kelvin
 from zonda.core.data import Block, Data, Observation, percent
 from zonda.core.errors import InputError
 from zonda.core.knobs import Knob
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_matrices, share_outside
-from zonda.core.numerics.stretches import stretches
 from zonda.core.operator import Operator
 from zonda.core.storage.fits_image import Cards
 from zonda.core.types import Floats
@@ -494,7 +494,7 @@ def _reaches(observation: Observation, working: Working, widest: float) -> bool:
 def _cosines(observation: Observation, centre: Floats) -> tuple[float, float]:
     """The least and the largest cosine between the boresight and a direction (3,)."""
     boresight, n = observation.boresight_radec, observation.n_samples
-    parts = [centre @ boresights(boresight[some]) for some in stretches(n)]
+    parts = [centre @ boresights(boresight[some]) for some in chunks(n)]
     return min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)
 
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import T_CMB, rayleigh_jeans
-from zonda.core.numerics.stretches import stretches
 
 from .absorption import AbsorptionTable, CrossSections
 from .profiles import PWV_MAX, check_pwv
@@ -185,7 +185,7 @@ class BandAtmosphere:
     def _contract(self, which: int, basis: Array, elevation: Array) -> Array:
         """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the number of threads."""
         y, found, along = self._y(elevation).ravel(), np.empty(elevation.size), self._coefficients[which]
-        for some in stretches(len(y)):
+        for some in chunks(len(y)):
             one, other = basis[:, some] if basis.shape[1] > 1 else basis, _chebyshev(y[some], along.shape[1])
             found[some] = np.sum(np.einsum("ij,in->jn", along, one) * other, axis=0)
         return found.reshape(elevation.shape)

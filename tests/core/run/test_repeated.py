@@ -12,7 +12,7 @@ from tests.core.run.test_execution import CHAIN, Demean, Level, Sink, Source, ob
 from tests.core.run.test_forecast import labelled
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
-from zonda.core.numerics import stretches
+from zonda.core.numerics import chunks
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.planner import plan
 from zonda.core.run import repeated
@@ -149,10 +149,10 @@ def test_memory_that_the_system_refuses_is_a_memory_error(monkeypatch):
     def refused(*given, **named):
         raise OSError(errno.ENOMEM, "Cannot allocate memory")
 
-    monkeypatch.setattr(stretches.mmap, "mmap", refused)
-    assert stretches.untouched((2, stretches.LARGE), np.float32).shape == (2, stretches.LARGE)
+    monkeypatch.setattr(chunks.mmap, "mmap", refused)
+    assert chunks.empty((2, chunks.LARGE), np.float32).shape == (2, chunks.LARGE)
     with pytest.raises(MemoryError):
-        stretches.untouched((1 << 31, 1 << 26), np.float32)
+        chunks.empty((1 << 31, 1 << 26), np.float32)
 
 
 def test_a_plan_counts_the_copied_step_once_and_the_memory(monkeypatch):

@@ -14,7 +14,7 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
-from zonda.core.numerics import stretches
+from zonda.core.numerics import chunks
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.site import Site
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
@@ -126,7 +126,7 @@ def test_bits_do_not_depend_on_the_stretch(scan: Any, target: str, monkeypatch: 
     parsed, seconds = Target.parse(target), np.arange(5000) / 20.0
     transform = CelestialTransform(GREEN_BANK, START, 250.0)
     whole = scan._track(transform, parsed, (1e-4, 2e-4), seconds)
-    monkeypatch.setattr(stretches, "STRETCH", 777)
+    monkeypatch.setattr(chunks, "CHUNK", 777)
     parts = scan._track(transform, parsed, (1e-4, 2e-4), seconds)
     assert np.array_equal(whole.horizontal, parts.horizontal)
     assert np.array_equal(whole.azel, parts.azel)

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import spline_filter1d
 
+from zonda.core.numerics.chunks import CHUNK, LARGE, chunks, empty
 from zonda.core.numerics.smooth import REACH, interpolating
-from zonda.core.numerics.stretches import LARGE, STRETCH, stretches, untouched
 
 
-@pytest.mark.parametrize("n", [0, 1, STRETCH - 1, STRETCH, STRETCH + 1, 5 * STRETCH + 7])
-def test_stretches_are_all_instants_in_order(n: int) -> None:
-    parts = stretches(n)
-    assert [k for part in parts for k in (part.start, part.stop)] == sorted([0, n] + 2 * [*range(STRETCH, n, STRETCH)]) * (n > 0)
+@pytest.mark.parametrize("n", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 5 * CHUNK + 7])
+def test_chunks_are_all_instants_in_order(n: int) -> None:
+    parts = chunks(n)
+    assert [k for part in parts for k in (part.start, part.stop)] == sorted([0, n] + 2 * [*range(CHUNK, n, CHUNK)]) * (n > 0)
 
 
 @pytest.mark.parametrize("bytes_", [0, 48, LARGE, LARGE + 24])
-def test_untouched_is_an_array_like_any_other(bytes_: int) -> None:
-    found = untouched((3, bytes_ // 24))
+def test_empty_is_an_array_like_any_other(bytes_: int) -> None:
+    found = empty((3, bytes_ // 24))
     assert not found.any()
     found[...] = 7.0
     assert found.shape == (3, bytes_ // 24)
