@@ -1,7 +1,7 @@
-"""Checks: hard cases of the arithmetic, measured on the machine at hand against a reference and a limit.
+"""Checks of numerical accuracy: figures measured on this machine against a reference and a limit.
 
-One source for the tests (`tests/test_hard_cases.py`), the published page (`docs/stability.md`) and `zonda doctor`. A package
-adds a `Family` of its own under the entry-point group ``zonda.checks``:
+`zonda doctor` runs those that are registered; with `tests/checks/` they make up the tests (`tests/test_hard_cases.py`) and the
+published page (`docs/stability.md`). A package adds a `Family` of its own under the entry-point group ``zonda.checks``:
 
     checks = Family("receiver")
 
@@ -50,8 +50,6 @@ class Check:
         Largest figure that passes; 0: exactly nothing.
     unit
         Of the figure and the limit; empty: a ratio or a count.
-    quick
-        Whether `zonda doctor` runs it.
     measure
         Returns the figure reached.
     """
@@ -62,7 +60,6 @@ class Check:
     reference: str
     limit: float
     unit: str
-    quick: bool
     measure: Callable[[], Measured]
 
     def run(self) -> Result:
@@ -111,7 +108,7 @@ class Family:
         self._checks: list[Check] = []
 
     def add(
-        self, case: Case, *, reference: str, limit: float, unit: str = "", quick: bool = True
+        self, case: Case, *, reference: str, limit: float, unit: str = ""
     ) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
         """Decorator: add a function that returns the figure; the first paragraph of its docstring says what it measures."""
 
@@ -120,7 +117,7 @@ class Family:
             if not what:
                 raise ValueError(f"the check {function.__name__} has no docstring")
             name = f"{self.name}.{function.__name__}"
-            self._checks.append(Check(case, name, what, reference, limit, unit, quick, function))
+            self._checks.append(Check(case, name, what, reference, limit, unit, function))
             return function
 
         return added

@@ -1,24 +1,29 @@
-"""Write docs/stability.md from the checks' own output: python docs/make_stability.py (a test holds the two together)."""
+"""Write docs/stability.md from the output of the checks: python docs/make_stability.py (a test compares the two)."""
 
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
-from zonda.core.checks import Check, Result, measure, registered
-from zonda.plugins.checks.cases import MATRIX
+from zonda.core.checks import Result, measure, registered
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tests.checks import matrix
+from tests.checks.cases import MATRIX
 
 PAGE = Path(__file__).with_name("stability.md")
+DOCTOR = {check.name for check in registered()}
 
-HEAD = """# The hard cases
+HEAD = """# Numerical stability
 
-What the arithmetic reaches where naive code fails: one table for each row of the stability matrix, made by
-`docs/make_stability.py` from the checks in `plugins/checks/`, which are also the tests (`tests/test_hard_cases.py`) and what
-`zonda doctor` runs on your machine (those marked *quick*; `--all` for all). Covariances are *implied* ones, computed from the
-algorithm's weights, not sampled. A limit of 0 means exactly. Figures vary a little from CPU to CPU.
+The numerical accuracy that zonda reaches in cases where naive code fails: one table per case. `docs/make_stability.py` makes this
+page from the checks of `zonda doctor` (`plugins/checks/`) and those in `tests/checks/`; `tests/test_hard_cases.py` runs them
+all. `zonda doctor` repeats those marked *in doctor* on your machine, in about half a minute. Covariances are the *implied*
+ones, computed from the weights of the algorithm, not sampled. A limit of 0 means exact. Figures vary a little from CPU to CPU.
 
-A package adds checks of its own under the entry-point group `zonda.checks` (see `core/checks.py`). That the safeguards are
-needed is shown by `tests/test_mutations.py`, which breaks them one at a time and finds a check that fails.
+Packages add checks of their own under the entry-point group `zonda.checks` (see `core/checks.py`). `tests/test_mutations.py`
+breaks the safeguards one at a time and verifies that a check fails.
 """
 
 
@@ -27,21 +32,16 @@ def page(results: list[Result]) -> str:
     lines = [HEAD]
     for case in MATRIX:
         lines += [f"## {_text(case.text)}", "", f"Accepted: {_text(case.acceptance)}.", ""]
-        lines += ["| check | reference | limit | reached | |", "|---|---|---|---|---|"]
+        lines += ["| check | reference | limit | reached | in doctor | remark |", "|---|---|---|---|---|---|"]
         lines += [_row(r) for r in results if r.check.case is case] + [""]
     return "\n".join(lines)
-
-
-def published() -> list[Check]:
-    """The checks of the matrix, in the order of its rows."""
-    return [check for case in MATRIX for check in registered() if check.case is case]
 
 
 def rows(text: str) -> dict[str, tuple[str, str, str, str]]:
     """By name: what, reference, limit and figure of a page."""
     found = {}
     for line in text.splitlines():
-        if match := re.match(r"\| `(\S+)`: (.*) \| (.*) \| (.*) \| (.*) \| .*\|$", line):
+        if match := re.match(r"\| `(\S+)`: (.*) \| (.*) \| (.*) \| (.*) \| .* \| .*\|$", line):
             name, *cells = match.groups()
             found[name] = tuple(cells)
     return found
@@ -49,8 +49,8 @@ def rows(text: str) -> dict[str, tuple[str, str, str, str]]:
 
 def _row(result: Result) -> str:
     check = result.check
-    marks = " ".join(part for part in ("quick" if check.quick else "", result.remark and f"({_text(result.remark)})") if part)
-    return f"| `{check.name}`: {_text(check.what)} | {_text(check.reference)} | {result.accepted} | {result.reached} | {marks} |"
+    cells = [f"`{check.name}`: {_text(check.what)}", _text(check.reference), result.accepted, result.reached]
+    return f"| {' | '.join(cells)} | {'yes' if check.name in DOCTOR else ''} | {_text(result.remark)} |"
 
 
 def _text(text: str) -> str:
@@ -58,4 +58,4 @@ def _text(text: str) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(list(measure(published()))), encoding="utf-8")
+    PAGE.write_text(page(list(measure(matrix()))), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""``zonda doctor``: the quick half of the stability matrix, on this machine.
+"""``zonda doctor``: self-test of numerical accuracy on this machine.
 
 Only click is imported with this module.
 """
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option("--all", "everything", is_flag=True, help="Also what takes longer: the whole published table.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def doctor(everything: bool, as_json: bool) -> None:
-    """Check this machine: its arithmetic, and what the hard cases reach on it.
+def doctor(as_json: bool) -> None:
+    """Self-test of numerical accuracy on this machine.
 
-    Prints the figures of docs/stability.md as measured here. Exit status 1 where one is beyond its limit. The first run after
+    Checks the arithmetic, libraries and compiled code of this machine, in about half a minute, against references and limits; all
+    rows of the stability matrix are in docs/stability.md. Exit status 1 if a figure exceeds its limit. The first run after
     installation also compiles, which takes a minute.
     """
     from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
@@ -31,8 +31,7 @@ def doctor(everything: bool, as_json: bool) -> None:
     from .checks.cases import MACHINE
     from .checks.machine import description
 
-    chosen = [check for check in registered() if check.quick or everything]
-    chosen.sort(key=lambda check: check.case is not MACHINE)  # what the others rest on comes first
+    chosen = sorted(registered(), key=lambda check: check.case is not MACHINE)  # the others depend on the machine: it comes first
     about = description()
     results: list[Result] = []
     if not as_json:
@@ -70,5 +69,5 @@ def _row(result: Result) -> dict[str, Any]:
     return {
         "name": check.name, "case": check.case.text, "what": check.what, "reference": check.reference, "limit": check.limit,
         "figure": result.figure if math.isfinite(result.figure) else None, "unit": check.unit, "passed": result.passed,
-        "remark": result.remark, "seconds": round(result.seconds, 3), "quick": check.quick,
+        "remark": result.remark, "seconds": round(result.seconds, 3),
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Every row of the stability matrix: the checks that `zonda doctor` and docs/stability.md show."""
+"""Every row of the stability matrix: the checks of `zonda doctor` and those of tests/checks, which docs/stability.md shows."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from zonda.core import registry
 from zonda.core.checks import Case, Check, Family, Result, registered
 from zonda.core.cli import main
 from zonda.plugins.checks import covariance, machine
-from zonda.plugins.checks.cases import MACHINE, MATRIX
+from zonda.plugins.checks.cases import MACHINE
+
+from .checks import matrix
+from .checks.cases import MATRIX
 
 ROOT = Path(__file__).parents[1]
 GIVEN = ROOT.parent / "shared" / "hard_cases.md"
-CHECKS = [check for check in registered() if check.case in MATRIX]
+CHECKS = matrix()
 
 FACTOR = 10
 """Figures vary by CPU; published and measured ones differ by less than this, or both are below limit / FACTOR."""
@@ -49,7 +52,7 @@ def test_the_rows_are_those_given() -> None:
 
 def test_every_row_has_a_check_and_names_are_unique() -> None:
     assert {check.case for check in CHECKS} == set(MATRIX)
-    names = [check.name for check in registered()]
+    names = [check.name for check in [*CHECKS, *machine.checks]]
     assert len(set(names)) == len(names)
 
 
@@ -65,7 +68,7 @@ def page_maker() -> ModuleType:
 
 def test_the_page_says_what_is_measured() -> None:
     maker = page_maker()
-    results = [result(check) for check in maker.published()]
+    results = [result(check) for check in CHECKS]
     published, now = maker.rows(maker.PAGE.read_text()), maker.rows(maker.page(results))
     assert len(now) == len(results)
     why = "run python docs/make_stability.py"
@@ -148,7 +151,7 @@ def test_a_third_party_adds_checks() -> None:
 
 
 def some(*figures: float) -> list[Check]:
-    return [Check(MACHINE, f"f.c{k}", "what", "reference", 1.0, "", True, lambda f=f: f) for k, f in enumerate(figures)]
+    return [Check(MACHINE, f"f.c{k}", "what", "reference", 1.0, "", lambda f=f: f) for k, f in enumerate(figures)]
 
 
 @pytest.mark.parametrize(("figures", "status"), [((0.5, 0.0), 0), ((0.5, 2.0), 1), ((math.nan,), 1)])
@@ -167,21 +170,14 @@ def test_doctor(
     assert {"numpy", "cpu", "threads", "free memory"} <= set(found["machine"])
 
 
-def test_doctor_runs_the_quick_half_and_the_machine(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    every = registered()
-    ran: list[str] = []
-
-    def noted(checks: list[Check]) -> list[Result]:
-        ran.extend(check.name for check in checks)
-        return []
-
-    monkeypatch.setattr(core_checks, "measure", noted)
+def test_doctor_measures_what_is_registered_the_machine_first(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ran: list[Check] = []
+    monkeypatch.setattr(core_checks, "measure", lambda checks: ran.extend(checks) or [])
     assert main(["doctor", "--json"]) == 0
-    assert sorted(ran) == sorted(check.name for check in every if check.quick)
-    assert [check.case for check in every if not check.quick]
-    ran.clear()
-    assert main(["doctor", "--json", "--all"]) == 0
-    assert len(ran) == len(every)
+    assert sorted(check.name for check in ran) == sorted(check.name for check in registered())
+    assert [check.case is MACHINE for check in ran] == sorted((check.case is MACHINE for check in ran), reverse=True)
     capsys.readouterr()
 
 

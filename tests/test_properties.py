@@ -18,8 +18,10 @@ import zonda
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
 from zonda.core.operator import Operator
-from zonda.plugins.checks import determinism, scenes
+from zonda.plugins.checks import scenes
 from zonda.plugins.checks.scenes import camera, differing, scan, sky_file
+
+from .checks import determinism as campaigns
 
 few = settings(max_examples=3, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 seeds = st.integers(0, 2**62)
@@ -195,7 +197,7 @@ def test_workers_change_no_bit_of_a_campaign(workers: int) -> None:
     from concurrent.futures import ThreadPoolExecutor
 
     with TemporaryDirectory() as folder, ThreadPoolExecutor(workers) as executor:
-        assert determinism._campaign(Path(folder) / "out", executor, workers) == determinism._campaign_once()
+        assert campaigns._campaign(Path(folder) / "out", executor, workers) == campaigns._campaign_once()
 
 
 def whitened(stream: np.ndarray) -> np.ndarray:

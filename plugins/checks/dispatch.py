@@ -63,9 +63,7 @@ def baseline() -> dict[str, str]:
     return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NPY_DISABLE_CPU_FEATURES": numpy}
 
 
-@checks.add(
-    DISPATCH, reference="the same scene without vector instructions", limit=10, unit="x 2^-20 of the largest value", quick=False
-)
+@checks.add(DISPATCH, reference="the same scene without vector instructions", limit=10, unit="x 2^-20 of the largest value")
 def another_instruction_set() -> Measured:
     """largest difference of a filtered map, over float32's rounding of the streams it is made of; the same hits"""
     with TemporaryDirectory() as folder:

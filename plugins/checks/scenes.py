@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +14,6 @@ from pydantic import PrivateAttr
 
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
-from zonda.core.errors import ZondaError
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
@@ -130,19 +129,6 @@ def sky_file(values: AnyFloats, pixel: float = 1.0) -> Iterator[Path]:
         path = Path(folder) / "sky.fits"
         image.writeto(path)
         yield path
-
-
-def unrefused(attempts: list[tuple[Callable[[], Any], str]]) -> tuple[int, str]:
-    """How many of the attempts do not end in an error a user can mend whose text has the words; what they were."""
-    missed = []
-    for attempt, words in attempts:
-        try:
-            attempt()
-        except (ZondaError, ValueError) as err:
-            if words in str(err):
-                continue
-        missed.append(words)
-    return len(missed), ", ".join(missed)
 
 
 def largest(*figures: float) -> float:

@@ -11,8 +11,9 @@ from zonda.core.operator import Operator
 from zonda.operators.io.save_tod import load_tod
 from zonda.operators.noise.level import rms_of_inverse
 from zonda.operators.noise.white import WhiteNoise
-from zonda.plugins.checks.noise import levels, over_stated
 from zonda.plugins.checks.scenes import camera
+
+from ...checks.noise import levels, over_stated
 
 DETECTOR = {"net": "1 mK s(1/2)", "reference": "detector"}
 

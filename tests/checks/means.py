@@ -10,9 +10,9 @@ import zonda
 from zonda.core.checks import Family, Measured
 from zonda.core.data import Block
 from zonda.core.operator import Operator
+from zonda.plugins.checks.scenes import camera, scene
 
 from .cases import MEAN
-from .scenes import camera, scene
 
 checks = Family("means")
 

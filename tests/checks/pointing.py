@@ -9,87 +9,29 @@ from typing import Any
 
 import numpy as np
 
-from zonda.core.checks import Family, Measured
+from zonda.core.checks import Family
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
 from zonda.core.numerics.projection import rotation_matrices
-from zonda.core.site import Site
-from zonda.core.types import Floats
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.stare import PointingStare
 from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
+from zonda.plugins.checks.numerics import ERROR, SITES, angle, erfa_horizontal
+from zonda.plugins.checks.scenes import camera, differing, largest, scene
 
 from .cases import SPHERE, TIME
-from .scenes import camera, differing, largest, scene
 
 checks = Family("pointing")
 
-SITES = (
-    Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m"),
-    Site(name="South Pole", latitude="-90 deg", longitude="0 deg", altitude="2835 m"),
-    Site(name="equator", latitude="0 deg", longitude="200 deg"),
-)
 WHEN = Instant.parse("2024-11-25T07:00:00.123456789Z")
-ERROR = 1e-9
-"""rad."""
-
-
-def erfa_horizontal(sky: Floats, start: Instant, seconds: Floats, site: Site) -> Floats:
-    """Horizontal directions (n, 3) north, west, up of ICRS unit vectors (n, 3), from UTC calendar dates."""
-    import erfa
-
-    when = [Instant(start.nanoseconds + round(s * 1e9)).datetime for s in seconds]
-    below = np.array([(start.nanoseconds + round(s * 1e9)) % 1000 for s in seconds])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)  # leap seconds of dates to come are unknown
-        second = np.array([t.second + t.microsecond / 1e6 for t in when]) + below / 1e9
-        fields = (np.array([getattr(t, name) for t in when]) for name in ("year", "month", "day", "hour", "minute"))
-        utc1, utc2 = erfa.dtf2d("UTC", *fields, second)
-        earth = orientation(utc1 - 2400000.5 + utc2)
-        azimuth, zenith, *_ = erfa.atco13(
-            np.arctan2(sky[:, 1], sky[:, 0]), np.arctan2(sky[:, 2], np.hypot(sky[:, 0], sky[:, 1])), 0.0, 0.0, 0.0, 0.0,
-            utc1, utc2, earth.ut1_utc, site.longitude, site.latitude, site.altitude, earth.x, earth.y, 0.0, 0.0, 0.0, 1.0,
-        )  # fmt: skip
-    return unit_vectors(-azimuth, np.pi / 2 - zenith)
-
-
-def angle(a: Floats, b: Floats) -> float:
-    """Largest angle between directions (n, 3), rad."""
-    return float(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)).max())
 
 
 def _observe(operator: Any, **more: Any) -> tuple[Observation, Data]:
     data = Data(scene(camera(7), **{"site": SITES[0], "time": WHEN, **more}))
     operator.observe(data)
     return data.observations[0], data
-
-
-@checks.add(TIME, reference="ERFA eraAtco13 at each instant", limit=ERROR, unit="rad")
-def over_a_day() -> float:
-    """pointing error at 300 instants of a day in 1985, 2024 and 2027 (1.8e9 s), three sites, all over the sky"""
-    rng, worst = np.random.default_rng(1), 0.0
-    for site in SITES:
-        for year in (1985, 2024, 2027):
-            start = Instant.parse(f"{year}-01-15T07:00:00.123456789Z")
-            seconds = np.round(rng.uniform(0, 86400, 300), 6)
-            sky = unit_vectors(rng.uniform(0, 2 * np.pi, 300), np.arcsin(rng.uniform(-1, 1, 300)))
-            transform = CelestialTransform(site, start, 86400.0)
-            worst = largest(worst, angle(transform.horizontal(sky, seconds), erfa_horizontal(sky, start, seconds, site)))
-    return worst
-
-
-@checks.add(TIME, reference="the same instant reached from another start", limit=ERROR, unit="rad")
-def exact_start() -> Measured:
-    """pointing error between start + dt and a start dt later, near 1.8e9 s"""
-    worst, sky = 0.0, unit_vectors(np.array([2.0]), np.array([0.3]))
-    for shift in (1, 999, 123_456_789, 499_999_999_999):
-        early = Instant.parse("2027-01-15T03:04:05.678901234Z")
-        late = Instant(early.nanoseconds + shift)
-        one = CelestialTransform(SITES[0], early, 500.0).horizontal(sky, np.array([shift / 1e9]))
-        worst = largest(worst, angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1))))
-    return worst, "0.24 us, the rounding of 1.8e9 s in float64, would be 1.7e-11 rad"
 
 
 @checks.add(TIME, reference="ERFA across 2016-12-31T23:59:60", limit=ERROR, unit="rad")

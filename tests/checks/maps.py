@@ -12,9 +12,10 @@ from zonda.core.types import Floats
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.sky.skymap import SkyMap
+from zonda.plugins.checks.scenes import differing, largest, run, scan, sky_file
 
 from .cases import DECADES, PIXELS
-from .scenes import differing, largest, run, scan, sky_file, unrefused
+from .scenes import unrefused
 
 checks = Family("maps")
 

@@ -14,14 +14,15 @@ import zonda
 from zonda.core.checks import Family, Measured
 from zonda.core.data import Observation
 from zonda.core.errors import ZondaError
-from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.random import stream_key
 from zonda.core.registry import noise_models
 from zonda.operators.noise.one_over_f import PowerLawFilter, power_law_filter
 from zonda.operators.noise.pink import Streams
 from zonda.operators.noise.white import WhiteNoise
+from zonda.plugins.checks.scenes import camera, largest
 
 from .cases import BANDS, LEVEL, PINK
-from .scenes import camera, largest, unrefused
+from .scenes import unrefused
 
 checks = Family("noise")
 
@@ -39,7 +40,7 @@ def spectrum() -> Measured:
     return _spectrum_error(law, 1e-5, 1.0), f"stated {law.error:.2g}"
 
 
-@checks.add(PINK, reference="f^-slope", limit=0.08, quick=False)
+@checks.add(PINK, reference="f^-slope", limit=0.08)
 def spectrum_to_lower_frequencies() -> float:
     """largest relative error of the PSD, 10 poles, f_min from 1e-8 to 0.3 f_s, slopes 0.5 to 3"""
     laws = [(f, s) for f in (1e-8, 1e-5, 1e-2, 0.3) for s in (0.5, 1.0, 2.0, 3.0)]
@@ -47,16 +48,6 @@ def spectrum_to_lower_frequencies() -> float:
 
 
 @checks.add(PINK, reference="integral of the PSD", limit=4.5, unit="standard errors")
-def first_sample() -> Measured:
-    """variance of the very first sample of 20000 detectors"""
-    law, n = power_law_filter(1e-3, 1.0, 8), 20_000
-    streams, out = Streams(law, stream_key(5, "a"), stream_key(5, "b")), np.zeros((20_000, 1), np.float32)
-    streams.add(0, 0, out)
-    ratio = float((out.astype(np.float64) ** 2).mean()) / law.variance
-    return abs(ratio - 1) / math.sqrt(2 / n), f"{ratio:.4f} of theory"
-
-
-@checks.add(PINK, reference="integral of the PSD", limit=4.5, unit="standard errors", quick=False)
 def a_week() -> Measured:
     """variance of the last day of a week at 10 Hz, f_min 1 mHz, 16 detectors
 
@@ -75,7 +66,7 @@ def a_week() -> Measured:
     return abs(total / law.variance - 1) / error, f"{total / law.variance:.4f} of theory, standard error {error:.4f}"
 
 
-@checks.add(PINK, reference="no correlation", limit=5, unit="standard errors", quick=False)
+@checks.add(PINK, reference="no correlation", limit=5, unit="standard errors")
 def no_period() -> float:
     """correlation of a first stretch of 200000 samples with the second, and with the seventh: no period, no wrap"""
     law, n_det, day = power_law_filter(1e-2, 1.0, 8), 16, 200_000
@@ -89,24 +80,6 @@ def no_period() -> float:
     power = law.response(f) / law.gain / law.variance
     error = math.sqrt(2 * float(np.trapezoid(power**2, f)) / (day * n_det))  # Bartlett: sum of rho^2 over lags
     return largest(*(float(abs((days[0] * other).mean())) / error for other in days[1:]))
-
-
-@checks.add(PINK, reference="the same filter in float64", limit=1e-3)
-def float32_states() -> float:
-    """rms error of float32 states over the rms, f_min from 1e-8 to 1e-5 f_s, slopes 1 to 3"""
-    from scipy.signal import lfilter
-
-    worst, n = 0.0, 1 << 14
-    for f_min, slope in ((1e-5, 1.0), (1e-8, 1.0), (1e-7, 2.0), (1e-5, 3.0)):
-        law = power_law_filter(f_min, slope, 8)
-        out = np.zeros((16, n), np.float32)
-        Streams(law, stream_key(7, "a"), stream_key(7, "b")).add(0, 0, out)
-        exact = normals(stream_key(7, "a"), 0, 16 * n).reshape(n, 16).T.astype(np.float64)
-        first = law.start @ normals(stream_key(7, "b"), 0, 8 * 16).reshape(8, 16)
-        for q, z, s in zip(law.poles, law.zeros, first, strict=True):
-            exact, _ = lfilter([1, z - 1], [1, q - 1], exact, axis=1, zi=((z - q) * s)[:, None])
-        worst = largest(worst, float((out - exact).std() / exact.std()))
-    return worst
 
 
 @checks.add(PINK, reference="an error with a cure", limit=0, unit="not refused")
@@ -226,7 +199,7 @@ operators:
 """
 
 
-@checks.add(LEVEL, reference="the NET of the run, which is simulated", limit=0.02, quick=False)
+@checks.add(LEVEL, reference="the NET of the run, which is simulated", limit=0.02)
 def planned() -> float:
     """largest relative difference of the noise of a sample that a plan states, at the detector and background-limited, 850 GHz"""
     worst = 0.0

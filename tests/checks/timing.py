@@ -18,10 +18,11 @@ from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing.recorded import PointingRecorded
 from zonda.operators.pointing.stare import PointingStare
 from zonda.operators.pointing.transform import unit_vectors
+from zonda.plugins.checks.numerics import ERROR, SITES, angle, erfa_horizontal
+from zonda.plugins.checks.scenes import TARGET, camera, scene
 
 from .cases import TIME
-from .pointing import ERROR, SITES, WHEN, angle, erfa_horizontal
-from .scenes import TARGET, camera, scene
+from .pointing import WHEN
 
 checks = Family("timing")
 

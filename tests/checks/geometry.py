@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from zonda.core.checks import Family
 from zonda.core.data import Observation
 from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.plugins.checks.scenes import largest, run, scan
 
 from .cases import STRIP, WIND
-from .scenes import largest, run, scan
 
 checks = Family("geometry")
 

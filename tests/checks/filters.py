@@ -8,22 +8,18 @@ from zonda.core.checks import Family, Measured
 from zonda.core.errors import PipelineError, ZondaError
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
-from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing.stare import PointingStare
 from zonda.operators.sky.skymap import SkyMap
+from zonda.plugins.checks.numerics import N_DET, WHITE, N, ten_million, without_modes
+from zonda.plugins.checks.scenes import differing, run, scan, sky_file
 
 from .cases import DEAD, DECADES, PARTIAL, TIME
-from .scenes import differing, run, scan, sky_file
 
 checks = Family("filters")
-
-WHITE = 1.7e-3 * 10.0
-"""K: rms of a sample at 100 Hz."""
-N_DET, N = 37, 5000
 
 
 def _sky(common: float = 0.3, gradient: float = 0.03, white: float = WHITE) -> Floats:
@@ -35,11 +31,6 @@ def _sky(common: float = 0.3, gradient: float = 0.03, white: float = WHITE) -> F
     place = rng.uniform(-1, 1, (2, N_DET))
     shared = common * np.outer(1 + 0.02 * place[0], series[0]) + gradient * (place.T @ series[1:])
     return np.asarray(shared + white * rng.standard_normal((N_DET, N)))
-
-
-def _without_modes(a: Floats, modes: int) -> Floats:
-    u, s, v = np.linalg.svd(a, full_matrices=False)
-    return np.asarray(a - (u[:, :modes] * s[:modes]) @ v[:modes])
 
 
 @checks.add(DECADES, reference="the same run without an atmosphere", limit=1e-3)
@@ -58,41 +49,14 @@ def transfer() -> float:
     return float(abs(under - bare)[hit].max() / abs(bare[hit]).max())
 
 
-@checks.add(DECADES, reference="numpy's SVD", limit=1e-8, unit="K")
-def common_mode_of_ten_million() -> float:
-    """what a common mode 1e7 times the signal leaves behind in float64"""
-    a = _ten_million()
-    data = run([CommonModeFilter(residual=1e-11)], scan(N_DET, N), a, keep=("signal",))
-    return float(abs(data.observations[0].detdata["signal"] - _without_modes(a, 1)).max())
-
-
 @checks.add(DECADES, reference="an error that names precision: float64", limit=0, unit="not refused")
 def common_mode_in_float32() -> int:
     """a common mode 1e7 times the signal in float32"""
     try:
-        run([CommonModeFilter()], scan(N_DET, N), _ten_million(), precision="float32")
+        run([CommonModeFilter()], scan(N_DET, N), ten_million(), precision="float32")
     except PipelineError as err:
         return int("precision: float64" not in str(err))
     return 1
-
-
-def _ten_million() -> Floats:
-    t, rng = np.arange(N), np.random.default_rng(8)
-    signal = 1e-6 * np.array([np.exp(-0.5 * ((t - 1000 - 70 * d) / 20.0) ** 2) for d in range(N_DET)])
-    return np.asarray(10 * np.cumsum(rng.standard_normal(N)) / np.sqrt(N) + signal)
-
-
-@checks.add(DECADES, reference="nothing", limit=0.01)
-def elevation_drift() -> Measured:
-    """what a 15 K drift with curvature leaves anywhere in a scan, over the rms of the white noise"""
-    u = np.linspace(0, 1, 51600)
-    drift = 15 * (u + 0.1 * u**2 + 0.03 * u**3 + 0.005 * u**4)
-    left = drift[None].copy()
-    plan_highpass(len(u), 0.08 / 100, HighpassFilter().degree, 24.0).apply(left)
-    spectrum = np.fft.rfft(drift - drift.mean())
-    spectrum[: int(0.08 / 100 * len(u)) + 1] = 0
-    periodic = float(abs(np.fft.irfft(spectrum, len(u))).max())
-    return float(abs(left).max()) / WHITE, f"a periodic brick wall leaves {periodic / WHITE:.0f}"
 
 
 @checks.add(TIME, reference="the scan without gap", limit=0.2)
@@ -122,7 +86,7 @@ def useless_detectors() -> Measured:
     data = run([CommonModeFilter()], scan(N_DET, N), spoilt, keep=("signal",))
     flagged = np.flatnonzero(data.observations[0].detector_flags).tolist()
     good = np.setdiff1d(np.arange(N_DET), bad)
-    left, expected = data.observations[0].detdata["signal"][good], _without_modes(a[good], 1)
+    left, expected = data.observations[0].detdata["signal"][good], without_modes(a[good], 1)
     error = float(np.linalg.norm(left - expected) / np.linalg.norm(expected))
     return error if flagged == bad else np.inf, f"flagged {flagged}"
 

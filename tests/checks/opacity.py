@@ -20,9 +20,10 @@ from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
+from zonda.plugins.checks.scenes import SITE, START, camera, largest, run, scan
 
 from .cases import BAND, OPAQUE, WATER
-from .scenes import SITE, START, camera, largest, run, scan, unrefused
+from .scenes import unrefused
 
 checks = Family("opacity")
 
