@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, PrivateAttr
@@ -42,10 +42,6 @@ from .plots import Track
 from .series import Spectrum, TimeStream
 from .sky_axes import SkyAxes
 from .transfer_function import Transfer
-
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
 
 __all__ = ["Picture", "Plots", "pictures"]
 
@@ -91,12 +87,6 @@ class Plots(Output):
                 settled = drawing.settled == "at once" or (done == "run" and drawing.settled != "") or done == "runs"
                 if settled and drawing.key not in self._begun:
                     self._begun[drawing.key] = self._artist.submit(drawing.function, *drawing.arguments())
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        from zonda.core.plan.estimate import Cost, Estimate
-
-        return Estimate((), Cost(once=1.2, bytes=150e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,6 @@ from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
 
 from .series import Spectrum
-
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
 
 StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
 
@@ -138,12 +134,6 @@ class PowerSpectrum(Operator):
     segment: Seconds = quantity("128 s", gt=0)
     """Length of Welch's segments (at most the scan): the inverse of the frequency resolution. Shortened to a number of samples
     that has no prime factor above 5."""
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        from zonda.core.plan.estimate import Cost, Estimate
-
-        return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.detectors / context.first.n_detectors) * 14))
 
     def prepare(self, observation: Observation) -> _State:
         usable = np.flatnonzero(observation.good_detectors)

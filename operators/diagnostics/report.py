@@ -26,8 +26,6 @@ from .report_results import angle, class_of, flux_density, has_white_noise, resu
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
 
 _WIDE = 1000
 """Pictures wider than this many pixels take a whole row."""
@@ -56,12 +54,6 @@ class Report(Output):
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        from zonda.core.plan.estimate import Cost, Estimate
-
-        return Estimate((), Cost(once=0.1, bytes=10e6, kernel="python"))
 
     def watch(self, data: Data, done: Progress) -> None:
         """Write what no later step changes while the last pictures are drawn."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field
@@ -15,10 +15,6 @@ from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
 
 from .series import TimeStream
-
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
 
 
 class TimeStreams(Operator):
@@ -50,12 +46,6 @@ class TimeStreams(Operator):
                 place=self.label,
                 cure="choose another one",
             )
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        from zonda.core.plan.estimate import Cost, Estimate
-
-        return Estimate((), Cost(0.005))
 
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:

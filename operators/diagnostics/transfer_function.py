@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +39,6 @@ from zonda.core.run.companion import Companion
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
-
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
 
 NO_POWER = 1e-12
 """Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
@@ -87,12 +83,6 @@ class TransferFunction(Output):
         """The sky alone through the filters, and without them."""
         modes: Literal["own", "full"] = "full" if self.modes == "full" else "own"
         return Companion(only=["sky"], modes=modes), Companion(only=["sky"], modes=modes, filters="none")
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost, without that of the two runs."""
-        from zonda.core.plan.estimate import Cost, Estimate
-
-        return Estimate((), Cost(once=0.15, bytes=20e6, kernel="python"))
 
     def finalize(self, data: Data) -> None:
         """Compare the two maps. Raises PipelineError where there is none, or none that can be compared."""

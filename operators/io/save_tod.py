@@ -24,8 +24,6 @@ from . import fits_table, toast_hdf5
 from .time_ordered_data import TimeOrderedData
 
 if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
     from zonda.core.weather import GroundWeather
 
 _FORMATS: dict[str, Any] = {"hdf5": toast_hdf5, "fits": fits_table}
@@ -69,12 +67,6 @@ class SaveTOD(Operator):
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        from zonda.core.plan.estimate import Cost, Estimate
-
-        return Estimate((), Cost(0.1, 0.0, 6e-9 * len(self.streams or ["signal"])))
 
     def prepare(self, observation: Observation) -> _State:
         module = _FORMATS[self.format]

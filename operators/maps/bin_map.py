@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,11 +45,6 @@ from .sums import (
     add_list,
 )
 
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate, Traits
-
-
 STRETCH = 1 << 15
 """Pixels whose maps are made at a time: what is only used for a moment stays in the cache."""
 
@@ -75,7 +70,6 @@ class BinMap(Operator):
     knows_means: ClassVar[bool] = True
     prepares_ahead: ClassVar[bool] = True
     product_only: ClassVar[bool] = True
-    lighter: ClassVar[str] = "choose a larger pixel or a smaller width"
 
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Side of a pixel."""
@@ -251,24 +245,6 @@ class BinMap(Operator):
         good = observation.good_samples.astype(np.uint8)
         return Binning(self._grid, self._grid.pointing(observation), good, weight, noise, alike, self._spare)
 
-    def memory(self, observation: Observation) -> int:
-        """Sums of two threads, their total, two halves, the product; and the pointing, twice while it is laid out."""
-        return 128 * self._n_pixels() + 150 * observation.n_samples
-
-    def traits(self, observation: Observation) -> Traits:
-        """Size of the pixels, and the weights."""
-        from zonda.core.plan.estimate import Traits
-
-        side = math.sqrt(4 * math.pi / (12 * self.nside**2)) if self.nside else self.pixel
-        return Traits(pixel=side, weighs=self.weights == "inverse_variance" and self.contents == "all")
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        from zonda.core.plan.estimate import Cost, Estimate
-
-        n = self._n_pixels()
-        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9, bytes=n * 8.0 * 4 * 4))
-
     def exec(self, block: Block, state: Binning) -> None:
         """Add one block to this thread's sums."""
         sums, dropped, largest = state.of_thread()
@@ -309,7 +285,7 @@ class BinMap(Operator):
         """Add this observation to the even or the odd scans' sums."""
         key = data.product(f"{self.label} sums")
         if key not in data.products:
-            data.products[key] = Halves(self._n_pixels())
+            data.products[key] = Halves(self.n_pixels)
         binned, dropped = data.products[key].add(observation, state, self.label)
         tally = observation.tally
         every = observation.n_detectors * observation.n_samples
@@ -334,7 +310,7 @@ class BinMap(Operator):
         """Add sums: exact, so that their order does not matter but for which scans are even."""
         key = data.product(f"{self.label} sums")
         if key not in data.products:
-            data.products[key] = Halves(self._n_pixels())
+            data.products[key] = Halves(self.n_pixels)
         data.products[key].merge(part, self.label)
         self._variance_unknown |= bool(part["variance_unknown"])
 
@@ -362,7 +338,9 @@ class BinMap(Operator):
         """Not where the noise is that of the samples' scatter, which is not linear."""
         return self.noise == "net"
 
-    def _n_pixels(self) -> int:
+    @property
+    def n_pixels(self) -> int:
+        """Pixels of the grid that `observe` made."""
         assert self._grid is not None
         return self._grid.n_pixels
 

@@ -1,0 +1,72 @@
+"""Planning of spectra, pictures and reports: what they read and what they cost."""
+
+from __future__ import annotations
+
+from zonda.core.data import Observation
+from zonda.core.plan.context import Context
+from zonda.core.plan.estimate import Cost, Estimate, Traits
+from zonda.core.plan.planning import Planning
+
+from .plot_operators import Plots
+from .power_spectrum import PowerSpectrum
+from .report import Report
+from .time_streams import TimeStreams
+from .transfer_function import TransferFunction
+
+
+class PlotsPlanning(Planning[Plots]):
+    """A cost for the whole run."""
+
+    of = Plots
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        return Estimate((), Cost(once=1.2, bytes=150e6, kernel="python"))
+
+
+class ReportPlanning(Planning[Report]):
+    """A cost for the whole run, without that of the pictures."""
+
+    of = Report
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        return Estimate((), Cost(once=0.1, bytes=10e6, kernel="python"))
+
+
+class TransferFunctionPlanning(Planning[TransferFunction]):
+    """A cost for the whole run, without that of the two signals that it compares."""
+
+    of = TransferFunction
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        return Estimate((), Cost(once=0.15, bytes=20e6, kernel="python"))
+
+
+class PowerSpectrumPlanning(Planning[PowerSpectrum]):
+    """It reads the streams; its cost is that of the detectors it looks at."""
+
+    of = PowerSpectrum
+
+    def traits(self, observation: Observation) -> Traits:
+        """It reads the streams as they are."""
+        return Traits(reads_streams=True)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.operator.detectors / context.first.n_detectors) * 14))
+
+
+class TimeStreamsPlanning(Planning[TimeStreams]):
+    """It reads the streams; its cost is small."""
+
+    of = TimeStreams
+
+    def traits(self, observation: Observation) -> Traits:
+        """It reads the streams as they are."""
+        return Traits(reads_streams=True)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        return Estimate((), Cost(0.005))

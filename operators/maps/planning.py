@@ -1,0 +1,34 @@
+"""Planning of the map makers: what other steps need to know of the map, its cost and its memory."""
+
+from __future__ import annotations
+
+import math
+
+from zonda.core.data import Observation
+from zonda.core.plan.context import Context
+from zonda.core.plan.estimate import Cost, Estimate, Traits
+from zonda.core.plan.planning import Planning
+
+from .bin_map import BinMap
+
+
+class BinMapPlanning(Planning[BinMap]):
+    """The cost grows with the samples, the memory with the pixels."""
+
+    of = BinMap
+    smaller = "choose a larger pixel or a smaller width"
+
+    def traits(self, observation: Observation) -> Traits:
+        """Size of the pixels, and the weights."""
+        step = self.operator
+        side = math.sqrt(4 * math.pi / (12 * step.nside**2)) if step.nside else step.pixel
+        return Traits(pixel=side, weighs=step.weights == "inverse_variance" and step.contents == "all")
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        n = self.operator.n_pixels
+        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9, bytes=n * 8.0 * 4 * 4))
+
+    def memory(self, observation: Observation) -> int:
+        """Sums of two threads, their total, two halves, the product; and the pointing, twice while it is laid out."""
+        return 128 * self.operator.n_pixels + 150 * observation.n_samples
