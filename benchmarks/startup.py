@@ -57,7 +57,7 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
     from zonda.core.run.execution import Execution
 
     mark("import zonda, numpy, numba, pydantic")
-    after(remembered, "outcome", "plan")
+    after(remembered, "summary", "plan")
     usual = Execution.run
 
     def run(self: Any, data: Any, *arguments: Any) -> None:

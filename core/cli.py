@@ -261,8 +261,7 @@ def run(
             command=_command(pipelines, settings, keep, drop, no_prune),
         )  # fmt: skip
         return
-    from .plan.outcome import line
-    from .plan.remembered import outcome
+    from .plan import remembered
     from .run.first_look import first_look
     from .storage.files import check_output_folder, write_text
     from .storage.lock import lock
@@ -289,8 +288,8 @@ def run(
 
         check_free(folder)
     helper.begin()
-    made = outcome(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
-    click.echo(line(made), err=True)
+    made = remembered.summary(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, memory=memory)
+    click.echo(str(made), err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
     command = _command(pipelines, settings, keep, drop, no_prune, only)

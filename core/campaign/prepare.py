@@ -72,7 +72,6 @@ def job(
     """
     from zonda import __version__
 
-    from ..plan import table
     from ..plan.planner import plan
     from ..run.first_look import first_look
 
@@ -107,7 +106,7 @@ def job(
                     groups[entry.settings, share] = len(pipelines)
                     planned_files.append(made.apply(file))
                     pipelines.append(planned_files[-1].resolved_yaml())
-                    plans.append(tuple(tuple(map(str, row)) for row in table.short(made)))
+                    plans.append(tuple(tuple(map(str, row)) for row in made.summary.short))
                     files |= _files(planned_files[-1])
                 planned.append((number, entry, groups[entry.settings, share]))
             looks = [Look(group, entry.seed, entry.time, about(entry)) for _, entry, group in planned]

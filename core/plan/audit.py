@@ -13,30 +13,29 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from ..configuration.pipeline_file import PipelineFile, Step
-from ..data import Data, Observation
+from ..configuration.pipeline_file import PipelineFile
 from ..errors import PipelineError
-from ..focalplane import Focalplane
-from ..operator import Operator
 from ..run.companion import Companion
-from .context import DEEP, Context
-from .cost import calibrate
-from .estimate import Choice, Cost, add
-from .planner import Decided, Plan, plan
+from .context import Context
+from .coverage import DEEP
+from .decide import Decided
+from .estimate import Choice, add
+from .planner import plan
+from .result import Plan
+from .slices import SECONDS, sliced
 from .structure import Structure
 from .whole import NAME
 
 PARTS = 8
 """Parts of the slice whose scatter gives the standard error."""
 
-SECONDS, SHORTEST = 60.0, 8.0
-"""Longest slice, and the shortest before detectors are left out, s."""
+SHORTEST = 8.0
+"""Shortest slice before detectors are left out, s."""
 
 COST = 20.0
 """CPU seconds [reference machine] that an audit may take, all its runs: the slice is chosen by it."""
@@ -50,41 +49,6 @@ GIVEN = "sky_given"
 
 ROUNDING = 1e-6
 """Of the stream's rms: differences below are float32 arithmetic in another order, not the effect."""
-
-
-class Slice(Operator):
-    """Keep the first samples of the first observations, and every so many detectors: random numbers are addressed, not drawn in
-    order, so that all runs over a slice see the same."""
-
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    observations: int = Field(1, ge=1)
-    """How many are kept."""
-    seconds: float = Field(SECONDS, gt=0)
-    """How long they last, s."""
-    every: int = Field(1, ge=1)
-    """Every so many detectors are kept, the outermost four too."""
-
-    def observe(self, data: Data) -> None:
-        """Cut."""
-        data.observations[:] = [_cut(o, self.seconds, self.every) for o in data.observations[: self.observations]]
-
-
-def _cut(o: Observation, seconds: float, every: int) -> Observation:
-    n = min(o.n_samples, max(1, round(seconds * o.sample_rate)))
-    o = dataclasses.replace(
-        o, seconds=o.seconds[:n], boresight_azel=o.boresight_azel[:n], boresight_radec=o.boresight_radec[:n], flags=o.flags[:n]
-    )
-    if every == 1:
-        return o
-    plane = o.focalplane
-    outer = [int(f(v)) for v in (plane.xi, plane.eta) for f in (np.argmin, np.argmax)]
-    kept = np.unique(np.r_[np.arange(0, len(plane), every), outer])
-    chosen = {f.name: _taken(getattr(plane, f.name), kept) for f in dataclasses.fields(plane)}
-    return dataclasses.replace(o, focalplane=Focalplane(**chosen), detector_flags=o.detector_flags[kept])
-
-
-def _taken(values: Any, index: NDArray[np.intp]) -> Any:
-    return values[index] if isinstance(values, np.ndarray) else [values[k] for k in index]
 
 
 @dataclass(frozen=True)
@@ -220,23 +184,6 @@ def audit(
     return Audit(tuple(rows), words)
 
 
-def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, every: int = 1) -> PipelineFile:
-    """The same pipeline over a slice, without what writes or draws, with a run of the sky alone."""
-    steps: list[Step] = []
-    for step in file.steps:
-        o = step.operator
-        if o.at_end or o.main_run_only:
-            continue
-        if "boresight" not in o.provides and steps and "boresight" in steps[-1].operator.provides:
-            steps.append(Step("Slice", Slice(seconds=seconds, observations=observations, every=every)))
-        steps.append(step)
-    sky = any("sky" in s.operator.provides for s in steps) and any(
-        s.operator.provides & {"atmosphere", "white", "pink"} for s in steps
-    )
-    runs = {"sky_alone": Companion(only=["sky"])} if sky else {}
-    return dataclasses.replace(file, steps=tuple(steps), header=file.header.model_copy(update={"runs": runs}))
-
-
 def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]:
     """The white noise of a map pixel of the slice: as the plan states it, and as it is where the hits are those of the deep part.
 
@@ -270,21 +217,6 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
     squares = [float(p.mean()) for p in np.array_split(noise[seen] ** 2 * hits[seen] / deep, PARTS)]
     within = HEADLINE if made.context.coverage and made.context.coverage.exact else ROUGH
     return [Checked("white noise", "of the plan", "map_rms", made.noise[1], _rms(squares), _rms_error(squares), within=within)]
-
-
-def measured(file: PipelineFile, labels: Sequence[str], seconds: float = 5.0) -> dict[str, Cost]:
-    """Cost of operators that state none, from a slice that is run twice (the first run compiles). What writes is not run."""
-    part = sliced(file, seconds)
-    part = dataclasses.replace(part, header=part.header.model_copy(update={"runs": {}}))
-    for _ in range(2):
-        data = part.pipeline().run(part.scene(), threads=1)
-    samples = sum(o.n_detectors * o.n_samples for o in data.observations)
-    found: dict[str, Cost] = {}
-    for label in labels:
-        used = sum(s for who, _, s in data.provenance["timings"] if who == label)
-        if used > 0:
-            found[label] = Cost(per_sample=used / samples / calibrate()["stream"])
-    return found
 
 
 def _on_slice(d: Decided, stated: dict[str, Decided]) -> Decided | None:

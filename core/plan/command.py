@@ -40,9 +40,9 @@ def plan(
     ensure_cache()
     from ..configuration.pipeline_file import load
     from ..run.first_look import first_look
-    from . import table
     from .only import only as alone
     from .planner import plan as make
+    from .result import as_dict
 
     file = load(pipeline, settings)
     if file.header.campaign is not None:
@@ -58,7 +58,7 @@ def plan(
     if not audit:
         import json
 
-        click.echo(json.dumps(table.as_dict(made), indent=2) if as_json else table.text(made))
+        click.echo(json.dumps(as_dict(made), indent=2) if as_json else str(made))
         return
     from .audit import audit as compare
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -11,25 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data import Data, Observation
-from ..numerics.projection import rotation_matrices
+from ..data import Observation
 from ..operator import Operator
-from ..pipeline import Pipeline
 from ..scene import Scene
 from .estimate import Traits
-from .planning import planning_of
-from .structure import STREAMS, Structure, selected
-
-DEEP = 0.9
-"""Quantile of the hits over the covered map: its deeper part has the least noise, so what holds there holds everywhere."""
-
-CELLS, POINTS, DETECTORS = 32, 8192, 96
-"""Hits are counted on CELLS x CELLS cells from at most about POINTS instants of all scans and DETECTORS detectors of each; in
-pixels where no more samples than that are taken."""
-
-
-LOOKED_AT = 4
-"""Observations whose levels of noise are looked at, apart from those at the extremes of elevation."""
 
 INSTANTS = 64
 """Nodes of a smooth field that are looked at, at most."""
@@ -45,7 +30,7 @@ class Coverage:
     Attributes
     ----------
     hits
-        Samples per pixel in the deep part of the map (quantile `DEEP`).
+        Samples per pixel in the deep part of the map (quantile `coverage.DEEP`).
     pixel
         Side of a pixel, rad.
     speed
@@ -249,61 +234,6 @@ class Context:
         return {"peak": share * self.peak, "transfer": share}
 
 
-def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
-    """Point the telescope and gather what the bounds need. ``pipeline`` is the planner's own copy."""
-    operators = [o for o in pipeline.operators if o.label in structure.operators]
-    data = Data(scene=scene)
-    for operator in operators:
-        if not (operator.at_end or operator.main_run_only):
-            operator.observe(data)
-    shown = _some(data.observations)
-    for observation in shown:
-        for operator in operators:
-            operator.configure(observation)
-    runs = selected(pipeline, structure)
-    streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.main_run_only))
-    context = Context(scene, data.observations, operators, runs, kept_streams=streams)
-    context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
-    context.depth = _depth(operators, shown, context)
-    pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
-    if pixels:
-        context.coverage = cover(data.observations, min(pixels))
-    context.metrics = _metrics(pipeline, structure, context)
-    return context
-
-
-def _some(observations: Sequence[Observation]) -> list[Observation]:
-    """The first, the last, those at the lowest and at the highest elevation, and up to `LOOKED_AT` between them."""
-    evenly = np.linspace(0, len(observations) - 1, min(LOOKED_AT, len(observations))).astype(int)
-    low = min(range(len(observations)), key=lambda k: float(observations[k].elevation.min()))
-    high = max(range(len(observations)), key=lambda k: float(observations[k].elevation.max()))
-    return [observations[k] for k in sorted({*evenly.tolist(), low, high})]
-
-
-def _depth(operators: Sequence[Operator], observations: Sequence[Observation], context: Context) -> Depth:
-    """See `Depth`. The quietest detector of all scans is noted in the traits."""
-    makers = [o for o in operators if context.traits[o.label].noise > 0]
-    if not makers:
-        return Depth(0.0, 0.0)
-    variances, numbers = [], []
-    quietest = dict.fromkeys((o.label for o in makers), math.inf)
-    for observation in observations:
-        total = np.zeros(observation.n_detectors)
-        for operator in makers:
-            found = planning_of(operator).traits(observation)
-            total += found.noise**2 if found.each is None else found.each**2
-            quietest[operator.label] = min(quietest[operator.label], found.noise)
-        variances.append(total)
-        numbers.append(np.full(len(total), float(observation.n_samples)))
-    for label, level in quietest.items():
-        context.traits[label] = replace(context.traits[label], noise=level)
-    variance, number = np.concatenate(variances), np.concatenate(numbers)
-    sample = math.sqrt(float(number @ variance / number.sum()))
-    weighs = any(t.weighs for t in context.traits.values()) and bool((variance > 0).all())
-    weighed = math.sqrt(float(number.sum() / (number @ (1 / variance)))) if weighs else sample
-    return Depth(sample, weighed)
-
-
 def _calibrated_mean(o: Observation) -> NDArray[np.float64]:
     """(n_det,) largest mean emission of a scan behind the calibration, K."""
     emission, transmission = o.smooth.get("atmosphere"), o.smooth.get("transmission")
@@ -323,87 +253,3 @@ def _largest(weights: NDArray[Any], coefficients: NDArray[Any]) -> NDArray[Any]:
     evenly = np.linspace(0, nodes - 1, min(INSTANTS, nodes)).astype(int)
     at = np.r_[evenly, np.argmax(weights.mean(axis=0) @ coefficients)]
     return np.asarray((weights @ coefficients[:, at]).max(axis=1))
-
-
-def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> frozenset[str]:
-    found = set()
-    if context.coverage is not None:
-        found |= {"map_rms", "peak"}
-        made = set().union(*(o.provides for o in context.operators)) & STREAMS
-        if made <= {"sky", "signal"} or any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
-            found.add("transfer")
-    if any(o.main_run_only for o in context.operators) or context.coverage is None:
-        found |= {"tod", "psd"}
-    return frozenset(found)
-
-
-def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
-    """Hits per pixel of side ``pixel`` [rad] and scan speed, from a thinned set of instants and detectors."""
-    points: list[NDArray[np.float64]] = []
-    weights: list[NDArray[np.float64]] = []
-    speeds: list[NDArray[np.float64]] = []
-    passed: list[NDArray[np.float64]] = []
-    centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
-    number, most = max(POINTS // len(observations), 64), DETECTORS
-    if exact := sum(o.n_samples * o.n_detectors for o in observations) <= POINTS * DETECTORS:
-        number, most = (max(sizes) for sizes in zip(*((o.n_samples, o.n_detectors) for o in observations), strict=True))
-    for o in observations:
-        times = np.unique(np.linspace(0, o.n_samples - 1, min(number, o.n_samples)).astype(int))
-        rows = np.unique(np.linspace(0, o.n_detectors - 1, min(most, o.n_detectors)).astype(int))
-        turn = centre.T @ rotation_matrices(o.boresight_radec[times])
-        plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
-        looking = turn @ plane  # (time, 3, detector)
-        front = looking[:, 2] > 0.1
-        points.append(np.array([looking[:, 0][front] / looking[:, 2][front], looking[:, 1][front] / looking[:, 2][front]]))
-        weights.append(np.full(points[-1].shape[1], o.n_samples * o.n_detectors / (len(times) * len(rows))))
-        passage = np.full(len(times), float(o.n_samples))  # samples that a detector takes to cross a pixel, at these instants
-        if o.n_samples > 1:
-            at = times[:-1]
-            ends = rotation_matrices(o.boresight_radec[np.stack([at, at + 1], 1).ravel()])[:, :, 2].reshape(-1, 2, 3)
-            speeds.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * o.sample_rate)
-            crossing = o.sample_rate * pixel / np.maximum(np.append(speeds[-1], speeds[-1][-1:]), 1e-12)
-            passage = np.clip(crossing, 1.0, passage)
-        looked = np.maximum(passage * len(times) / o.n_samples, 1.0)
-        share = np.stack([1 / looked, o.n_samples * o.n_detectors / (len(times) * len(rows)) / passage])
-        passed.append(np.broadcast_to(share[:, :, None], (2, len(times), len(rows)))[:, front])
-    where, weight = np.concatenate(points, axis=1), np.concatenate(weights)
-    speed = float(np.median(np.concatenate(speeds))) if speeds else 0.0
-    if exact:
-        index = np.floor(where / pixel).astype(np.int64)
-        index -= index.min(axis=1, keepdims=True)
-        _, each = np.unique(index[0] * (index[1].max() + 1) + index[1], return_counts=True)
-        return Coverage(max(float(np.quantile(each, DEEP)), 1.0), pixel, speed, exact)
-    reach = np.maximum(np.ptp(where, axis=1), pixel)
-    cells = np.maximum(1, np.minimum(CELLS, np.floor(reach / pixel))).astype(int)
-    low = where.min(axis=1)
-    side = np.maximum(np.ptp(where, axis=1) / cells, 1e-15)
-    column, row = (np.minimum(((where[k] - low[k]) / side[k]).astype(np.int64), cells[k] - 1) for k in (0, 1))
-    cell = column * cells[1] + row
-    covered = _covered(where, cell, pixel, max(float(side[0] * side[1]) / pixel**2, 1.0), np.concatenate(passed, axis=1))
-    counts = np.bincount(cell, weight, len(covered))
-    hits = counts[covered > 0] / covered[covered > 0]
-    return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed)
-
-
-def _covered(
-    where: NDArray[np.float64], cell: NDArray[np.int64], pixel: float, most: float, passages: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Pixels in each cell that samples fall in, of ``most`` in it, from some points ``where`` (2, n) that fall in u of them.
-
-    ``passages`` (2, n): what each point counts of the passages through pixels that were looked at, and of all there are. Passages
-    fall in u = P (1 - exp(-n / P)) of P pixels if they do so at random: P follows from those that were looked at, and then the
-    pixels that all of them fall in. Few passages, each through a pixel of its own, do not tell P: it is the whole cell.
-    """
-    number = int(cell.max()) + 1
-    index = np.floor(where / pixel).astype(np.int64)
-    index -= index.min(axis=1, keepdims=True)
-    one = (cell * (index[0].max() + 1) + index[0]) * (index[1].max() + 1) + index[1]
-    _, first = np.unique(one, return_index=True)
-    u = np.bincount(cell[first], minlength=number).astype(np.float64)
-    looked, whole = (np.maximum(np.bincount(cell, some, number), np.minimum(u, 1.0)) for some in passages)
-    pixels = np.minimum(u, most)
-    for _ in range(50):
-        pixels = np.minimum(u / np.maximum(-np.expm1(-looked / np.maximum(pixels, 1e-9)), 1e-9), most)
-    pixels = np.where(looked <= 1.02 * u, most, pixels)
-    covered = np.maximum(-pixels * np.expm1(-whole / np.maximum(pixels, 1e-9)), np.minimum(u, most))
-    return np.asarray(np.where(u > 0, np.maximum(covered, 1.0), 0.0), np.float64)

@@ -20,8 +20,8 @@ from ..run.settings import Settings
 from ..storage import user_cache
 from .context import Context
 from .estimate import Cost
-from .outcome import Prediction
 from .planning import planning_of
+from .summary import Prediction
 
 REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
 """Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""

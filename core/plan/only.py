@@ -12,7 +12,8 @@ from ..configuration.diagnostics import nearest
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..errors import ZondaError
 from ..run.companion import Companion
-from .outcome import same_labels
+from .figures import kelvin
+from .summary import same_labels
 
 if TYPE_CHECKING:
     from .estimate import Traits
@@ -69,8 +70,6 @@ def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:
 
 def _warn_of_levels(whole: PipelineFile, alone: PipelineFile, labels: Sequence[str], components: Sequence[str]) -> None:
     """Say which of the steps ``labels`` make their component at another level alone than in the whole scene."""
-    from .planner import kelvin
-
     there, here = _traits(whole), _traits(alone)
     for label in labels:
         before, after = (math.hypot(t[label].loudest, t[label].rms) for t in (there, here))
@@ -86,7 +85,7 @@ def _warn_of_levels(whole: PipelineFile, alone: PipelineFile, labels: Sequence[s
 
 def _traits(file: PipelineFile) -> Mapping[str, Traits]:
     """What the planner knows of each step, by label."""
-    from .context import look
+    from .look import look
     from .structure import Structure
 
     pipeline = file.pipeline()

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..configuration.pipeline_file import PipelineFile
 from ..discovery import HOST, discover, normalized
@@ -21,14 +21,15 @@ from ..machine import available_memory, available_threads
 from ..program import fingerprint
 from ..storage import user_cache
 from ..versions import versions
-from .outcome import Outcome, Prediction
+from .summary import PlanSummary
 
 KIND = "plan"
+SUMMARY = TypeAdapter(PlanSummary)
 FOREIGN = ("operators", "mapmakers", "noise_models", "spectra", "weather_sources")
 """Groups of entry points whose components decide what a plan says."""
 
 
-def outcome(
+def summary(
     file: PipelineFile,
     *,
     keep: Sequence[str] = (),
@@ -36,25 +37,19 @@ def outcome(
     prune_all: bool = True,
     threads: int | None = None,
     memory: int | None = None,
-) -> Outcome:
-    """What `plan` finds, from memory where it is there. Arguments and errors as of `plan`."""
+) -> PlanSummary:
+    """The summary of `plan`, from the cache where it is there. Arguments and errors as of `plan`."""
     options = {"keep": list(keep), "drop": list(drop), "prune_all": prune_all, "threads": threads or available_threads()}
     key = _key(file, options)
     ceilings = [memory] if memory else _about(available_memory())
     for ceiling in ceilings if key else ():
-        found = _read(user_cache.recall(KIND, {**(key or {}), "memory": ceiling}))
-        if found is not None:
-            return found
+        with suppress(ValidationError):
+            return SUMMARY.validate_python(user_cache.recall(KIND, {**(key or {}), "memory": ceiling}))
     from .planner import plan
-    from .table import short
 
-    made = plan(file, keep=keep, drop=drop, prune_all=prune_all, threads=threads, memory=memory)
-    fresh = Outcome(made.operators, made.structure.runs, made.settings(), short(made), made.prediction, made.unpruned)
+    fresh = plan(file, keep=keep, drop=drop, prune_all=prune_all, threads=threads, memory=memory).summary
     if key:
-        value = {**asdict(fresh), **{k: list(getattr(fresh, k)) for k in ("operators", "runs")}}
-        value |= {"short": [list(row) for row in fresh.short]}
-        value |= {"prediction": _plain(fresh.prediction), "unpruned": _plain(fresh.unpruned)}
-        user_cache.remember(KIND, {**key, "memory": ceilings[0]}, value)
+        user_cache.remember(KIND, {**key, "memory": ceilings[0]}, SUMMARY.dump_python(fresh, mode="json"))
     return fresh
 
 
@@ -62,20 +57,6 @@ def _about(memory: int) -> list[str]:
     """Free memory to a power of two, and the other that is as near: it says where streams fit, no more, and it fluctuates."""
     power = math.log2(memory)
     return [f"about 2^{k}" for k in sorted({round(power - 0.4), round(power + 0.4)}, key=lambda k: abs(k - power))]
-
-
-def _plain(prediction: Prediction) -> dict[str, Any]:
-    return {**asdict(prediction), "unknown": list(prediction.unknown), "bytes": float(prediction.bytes)}
-
-
-def _read(value: Any) -> Outcome | None:
-    """The outcome that was remembered; None where it is not one."""
-    try:
-        predictions = [Prediction(**{**value[k], "unknown": tuple(value[k]["unknown"])}) for k in ("prediction", "unpruned")]
-        rows = [(str(a), str(b), str(c), str(d)) for a, b, c, d in value["short"]]
-        return Outcome(tuple(value["operators"]), tuple(value["runs"]), dict(value["settings"]), rows, *predictions)
-    except (TypeError, KeyError, ValueError):
-        return None
 
 
 def _key(file: PipelineFile, options: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import ZondaError
-from .context import Context, look
+from .context import Context
 from .estimate import Bound, Choice, Effect, Estimate, add, full
+from .look import look
 from .planning import planning_of
 from .structure import Structure
 

@@ -13,13 +13,16 @@ from zonda.core import cli
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
-from zonda.core.plan import table
+from zonda.core.plan import decide as deciding
 from zonda.core.plan.audit import audit
 from zonda.core.plan.budget import Limits, limits
-from zonda.core.plan.context import Context, Coverage, cover
-from zonda.core.plan.cost import Prediction
+from zonda.core.plan.context import Context, Coverage
+from zonda.core.plan.coverage import cover
+from zonda.core.plan.decide import Decided
 from zonda.core.plan.estimate import Choice, Effect, full
-from zonda.core.plan.planner import Decided, _decide, kelvin
+from zonda.core.plan.figures import kelvin
+from zonda.core.plan.result import as_dict
+from zonda.core.plan.summary import Prediction
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
 
@@ -37,13 +40,9 @@ def made(file):
 # ---- choosing
 
 
-def decide(effects, allowed, seconds=10.0, **options):
-    context = Context(None, [], [], {}, metrics=frozenset(allowed))  # type: ignore[arg-type]
-    now = Prediction({"A": seconds}, 0.0, factors={"stream": 1.0})
-    settings = {"kept": set(), "forced": set(), "prune_all": True} | options
-    found = _decide([Decided("A", e, 0) for e in effects], settings["kept"], settings["forced"], allowed, now, context,
-                    settings["prune_all"])  # fmt: skip
-    return {d.effect.name: d for d in found}
+def decide(effects, allowed, **options):
+    now = Prediction({"A": 10.0}, 0.0, factors={"stream": 1.0})
+    return {d.effect.name: d for d in deciding.decide([Decided("A", e) for e in effects], allowed, now, **options)}
 
 
 def effect(name, *coarser):
@@ -206,10 +205,10 @@ def test_the_table_and_json(made):
     shown = str(made)
     for words in ("noise: ", "budget for map_rms", "AtmosphereLayers  ", "  layer 3  ", "not simulated", "of CPU time and"):
         assert words in shown
-    data = json.loads(json.dumps(table.as_dict(made)))
+    data = json.loads(json.dumps(as_dict(made)))
     assert len(data["effects"]) == len(made.decided)
     assert data["prediction"]["cpu_seconds"] > 0
-    assert all(len(row) == 4 for row in table.short(made))
+    assert all(len(row) == 4 for row in made.summary.short)
     covered = {d.effect.name for d in made.decided}
     assert covered >= {
         "layer 0", "detector nodes and time steps", "turbulence lattice", "spectral resolution", "ozone", "refraction",

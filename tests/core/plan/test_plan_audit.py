@@ -11,8 +11,9 @@ import pytest
 
 import zonda
 from zonda.core import cli
-from zonda.core.plan.audit import SECONDS, SHORTEST, Audit, Checked, _compare, _Result, audit, extent, sliced
+from zonda.core.plan.audit import SHORTEST, Audit, Checked, _compare, _Result, audit, extent
 from zonda.core.plan.estimate import Choice
+from zonda.core.plan.slices import SECONDS, sliced
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
 SET = [a for s in SHORT for a in ("--set", s)]

@@ -6,13 +6,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 import zonda
 from zonda.core.configuration import locate
-from zonda.core.plan import planner, remembered, table
-from zonda.core.plan.outcome import line
+from zonda.core.plan import planner, remembered
 from zonda.core.plan.planner import plan
-from zonda.core.plan.remembered import outcome
+from zonda.core.plan.remembered import summary
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
 
@@ -40,42 +40,42 @@ def no_planning(monkeypatch):
 
 def test_the_same_as_planned(file, no_planning):
     made = plan(file)
-    first = outcome(file)
+    first = summary(file)
     no_planning()
-    again = outcome(file)
+    again = summary(file)
     assert again == first
-    assert again.short == table.short(made)
+    assert again.short == made.summary.short
     assert again.apply(file).resolved_yaml() == made.apply(file).resolved_yaml()
-    assert line(again).startswith("about ")
+    assert str(again).startswith("about ")
 
 
 def test_what_it_depends_on_makes_it_anew(file, tmp_path, no_planning, monkeypatch):
-    outcome(file)
+    summary(file)
     no_planning()
     changes = [
-        lambda: outcome(file, drop=["poles"]),
-        lambda: outcome(file, prune_all=False),
-        lambda: outcome(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "seed=1"])),
-        lambda: outcome(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "AtmosphereLayers.pwv=3 mm"])),
+        lambda: summary(file, drop=["poles"]),
+        lambda: summary(file, prune_all=False),
+        lambda: summary(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "seed=1"])),
+        lambda: summary(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "AtmosphereLayers.pwv=3 mm"])),
     ]
     for change in changes:
         with pytest.raises(RuntimeError, match="planned again"):
             change()
-    outcome(file)
+    summary(file)
     monkeypatch.setattr(remembered, "fingerprint", lambda: "another program")
     with pytest.raises(RuntimeError, match="planned again"):
-        outcome(file)
+        summary(file)
     monkeypatch.undo()
 
 
 def test_a_changed_input_map(file, tmp_path, no_planning):
     import os
 
-    outcome(file)
+    summary(file)
     no_planning()
     os.utime(tmp_path / "data" / "merging_cluster.fits", (1, 1))
     with pytest.raises(RuntimeError, match="planned again"):
-        outcome(file)
+        summary(file)
 
 
 def test_an_input_map_of_other_content_and_the_same_size_and_time(file, tmp_path, no_planning):
@@ -83,7 +83,7 @@ def test_an_input_map_of_other_content_and_the_same_size_and_time(file, tmp_path
 
     path = tmp_path / "data" / "merging_cluster.fits"
     before = path.stat()
-    outcome(file)
+    summary(file)
     no_planning()
     content = bytearray(path.read_bytes())
     content[-4000] ^= 1
@@ -91,12 +91,13 @@ def test_an_input_map_of_other_content_and_the_same_size_and_time(file, tmp_path
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert (path.stat().st_mtime_ns, path.stat().st_size) == (before.st_mtime_ns, before.st_size)
     with pytest.raises(RuntimeError, match="planned again"):
-        outcome(file)
+        summary(file)
 
 
 @pytest.mark.parametrize("value", [None, [], {}, {"operators": 1}, {"operators": [], "runs": [], "settings": {}, "short": [[1]]}])
 def test_foreign_memories_count_as_none(value):
-    assert remembered._read(value) is None
+    with pytest.raises(ValidationError):
+        remembered.SUMMARY.validate_python(value)
 
 
 def test_others_operators_are_not_remembered(file, monkeypatch):
@@ -109,12 +110,12 @@ def test_others_operators_are_not_remembered(file, monkeypatch):
 def test_free_memory_may_fluctuate_about_a_limit(file, no_planning, monkeypatch):
     """Only between powers of two whose middle it is near; a quarter of it is another case."""
     monkeypatch.setattr(remembered, "available_memory", lambda: int(2**33.45))
-    first = outcome(file)
+    first = summary(file)
     no_planning()
     for power in (33.0, 33.45, 33.55):
         monkeypatch.setattr(remembered, "available_memory", lambda power=power: int(2**power))
-        assert outcome(file) == first
+        assert summary(file) == first
     for power in (31.5, 34.0):
         monkeypatch.setattr(remembered, "available_memory", lambda power=power: int(2**power))
         with pytest.raises(RuntimeError, match="planned again"):
-            outcome(file)
+            summary(file)

@@ -1,17 +1,15 @@
-"""What a run takes from a plan: a run whose plan is remembered imports this, and not the planner."""
+"""What a run takes from a plan. A run whose plan is remembered imports this module, not the planner."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from .planner import Plan
+from .figures import duration
 
 
 @dataclass(frozen=True)
@@ -33,8 +31,8 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a run takes from a `planner.Plan`; attributes as there.
+class PlanSummary:
+    """What a run takes from a plan (`result.Plan.summary`).
 
     Attributes
     ----------
@@ -43,7 +41,7 @@ class Outcome:
     settings
         Changed parameters by operator.
     short
-        Rows for headers and the report (`table.short`).
+        Rows for headers and the report (`result.short`).
     """
 
     operators: tuple[str, ...]
@@ -54,8 +52,15 @@ class Outcome:
     unpruned: Prediction
 
     def apply(self, file: PipelineFile) -> PipelineFile:
-        """See `planner.Plan.apply`."""
+        """The pipeline that is run: an ordinary one, with parameters changed and operators left out."""
         return apply(file, self.operators, self.runs, self.settings)
+
+    def __str__(self) -> str:
+        p, u = self.prediction, self.unpruned
+        words = f"about {duration(p.total)} of CPU time and {p.bytes / 1e9:.2g} GB"
+        if u.total - p.total > 0.01 * u.total:
+            words += f" (everything on: {duration(u.total)}, {u.bytes / 1e9:.2g} GB)"
+        return words + (f", not counting {', '.join(p.unknown)}" if p.unknown else "")
 
 
 def apply(
@@ -81,21 +86,3 @@ def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
         same = new.label == label
         named.append(step if same else Step(step.key, step.operator.model_copy(update={"name": label})))
     return named
-
-
-def line(plan: Plan | Outcome) -> str:
-    """The prediction in one line."""
-    p, u = plan.prediction, plan.unpruned
-    words = f"about {duration(p.total)} of CPU time and {p.bytes / 1e9:.2g} GB"
-    if u.total - p.total > 0.01 * u.total:
-        words += f" (everything on: {duration(u.total)}, {u.bytes / 1e9:.2g} GB)"
-    if p.unknown:
-        words += f", not counting {', '.join(p.unknown)}"
-    return words
-
-
-def duration(seconds: float) -> str:
-    """In s, min or h."""
-    if seconds < 120:
-        return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,88 @@
+"""What planning looks at before it decides: the pointed scans, the noise of the steps, the coverage of the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..data import Data, Observation
+from ..operator import Operator
+from ..pipeline import Pipeline
+from ..scene import Scene
+from .context import Context, Depth
+from .coverage import cover
+from .planning import planning_of
+from .structure import STREAMS, Structure, selected
+
+LOOKED_AT = 4
+"""Observations whose levels of noise are looked at, apart from those at the extremes of elevation."""
+
+
+def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
+    """Point the telescope and gather what the bounds need. ``pipeline`` is the planner's own copy."""
+    operators = [o for o in pipeline.operators if o.label in structure.operators]
+    data = Data(scene=scene)
+    for operator in operators:
+        if not (operator.at_end or operator.main_run_only):
+            operator.observe(data)
+    shown = _some(data.observations)
+    for observation in shown:
+        for operator in operators:
+            operator.configure(observation)
+    runs = selected(pipeline, structure)
+    streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.main_run_only))
+    context = Context(scene, data.observations, operators, runs, kept_streams=streams)
+    context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
+    context.depth = _depth(operators, shown, context)
+    pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
+    if pixels:
+        context.coverage = cover(data.observations, min(pixels))
+    context.metrics = _metrics(pipeline, structure, context)
+    return context
+
+
+def _some(observations: Sequence[Observation]) -> list[Observation]:
+    """The first, the last, those at the lowest and at the highest elevation, and up to `LOOKED_AT` between them."""
+    evenly = np.linspace(0, len(observations) - 1, min(LOOKED_AT, len(observations))).astype(int)
+    low = min(range(len(observations)), key=lambda k: float(observations[k].elevation.min()))
+    high = max(range(len(observations)), key=lambda k: float(observations[k].elevation.max()))
+    return [observations[k] for k in sorted({*evenly.tolist(), low, high})]
+
+
+def _depth(operators: Sequence[Operator], observations: Sequence[Observation], context: Context) -> Depth:
+    """See `Depth`. The quietest detector of all scans is noted in the traits."""
+    makers = [o for o in operators if context.traits[o.label].noise > 0]
+    if not makers:
+        return Depth(0.0, 0.0)
+    variances, numbers = [], []
+    quietest = dict.fromkeys((o.label for o in makers), math.inf)
+    for observation in observations:
+        total = np.zeros(observation.n_detectors)
+        for operator in makers:
+            found = planning_of(operator).traits(observation)
+            total += found.noise**2 if found.each is None else found.each**2
+            quietest[operator.label] = min(quietest[operator.label], found.noise)
+        variances.append(total)
+        numbers.append(np.full(len(total), float(observation.n_samples)))
+    for label, level in quietest.items():
+        context.traits[label] = replace(context.traits[label], noise=level)
+    variance, number = np.concatenate(variances), np.concatenate(numbers)
+    sample = math.sqrt(float(number @ variance / number.sum()))
+    weighs = any(t.weighs for t in context.traits.values()) and bool((variance > 0).all())
+    weighed = math.sqrt(float(number.sum() / (number @ (1 / variance)))) if weighs else sample
+    return Depth(sample, weighed)
+
+
+def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> frozenset[str]:
+    found = set()
+    if context.coverage is not None:
+        found |= {"map_rms", "peak"}
+        made = set().union(*(o.provides for o in context.operators)) & STREAMS
+        if made <= {"sky", "signal"} or any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
+            found.add("transfer")
+    if any(o.main_run_only for o in context.operators) or context.coverage is None:
+        found |= {"tod", "psd"}
+    return frozenset(found)
