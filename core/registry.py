@@ -7,7 +7,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
+from typing import Any
 
 from . import discovery, hints
 from .components import Registry, Together
@@ -45,6 +48,26 @@ registries = (
     operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics, planning,
     products, sections,
 )  # fmt: skip
+
+
+def steps_that(test: Callable[[Any], bool]) -> list[str]:
+    """Installed operators whose class passes ``test``. Imports them all: for messages only."""
+    found = []
+    for name in steps:
+        with suppress(RegistryError):  # a broken plugin is another message's
+            if test(steps.get(name)):
+                found.append(name)
+    return found
+
+
+def makers(what: str) -> list[str]:
+    """Installed operators that provide ``what`` and do not need it themselves."""
+
+    def makes(step: Any) -> bool:
+        provides, requires = (n if isinstance(n, frozenset) else frozenset() for n in (step.provides, step.requires))
+        return what in provides - requires  # a property says nothing before there is an operator
+
+    return steps_that(makes)
 
 
 def refresh() -> None:

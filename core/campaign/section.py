@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..configuration import overrides
 from ..configuration.diagnostics import Diagnostic
-from ..configuration.pipeline_file import KEYS, Header
+from ..configuration.header import KEYS, Header
 from ..configuration.section import Section
 from .entries import setting
 from .settings import MOST_TASKS, Campaign

@@ -15,7 +15,7 @@ from ..errors import ZondaError
 from ..operator import Operator
 from ..scene import Scene
 from .docstrings import own_doc
-from .pipeline_file import KEYS
+from .header import KEYS
 
 _MODE: JsonSchemaMode = "validation"
 

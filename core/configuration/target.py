@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
@@ -209,6 +209,15 @@ class Target:
         ]
         pair = {"type": "array", "items": {"type": "string"}, "minItems": 2, "maxItems": 2}
         return {"anyOf": [{"type": "string"}, *pairs, pair], "examples": _EXAMPLES}
+
+
+@runtime_checkable
+class WithMap(Protocol):
+    """A step with a map of the sky, whose centre ``target: map`` stands for."""
+
+    def map_centre(self) -> Target:
+        """The middle of the map. Raises InputError where it has none of its own."""
+        ...
 
 
 def _radians(value: Any, name: str, *, hours: bool, wrap: bool = False) -> float:

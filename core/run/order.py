@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 from ..operator import Operator
+from ..registry import makers
 from ..sky_signal import place_of_signal
 
 
@@ -61,17 +61,3 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
     if operators and not any("boresight" in o.provides | o.requires for o in operators):
         problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step, e.g. PointingDaisy"))
     return problems
-
-
-def makers(what: str) -> list[str]:
-    """Installed operators that provide ``what`` and do not need it themselves. Imports them all: for messages only."""
-    from ..registry import RegistryError, steps
-
-    found = []
-    for name in steps:
-        with suppress(RegistryError):  # a broken plugin is another message's
-            operator = steps.get(name)
-            provides, requires = (n if isinstance(n, frozenset) else frozenset() for n in (operator.provides, operator.requires))
-            if what in provides - requires:  # a property says nothing before there is an operator
-                found.append(name)
-    return found

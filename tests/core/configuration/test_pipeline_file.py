@@ -576,17 +576,17 @@ def test_schema_describes_every_parameter(toys: Any) -> None:
 
 def test_more_steps_than_anybody_writes_are_refused_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 20 000 written steps not one value is built; of those that an alias multiplies no step is looked at."""
-    from zonda.core.configuration import pipeline_file, yaml_places
+    from zonda.core.configuration import pipeline_file, steps, yaml_places
 
     with monkeypatch.context() as patch:
         patch.setattr(yaml_places._Reader, "build", lambda *a: pytest.fail("a value was built"))
         with pytest.raises(pipeline_file.ConfigurationError, match=r"(?s)operators has more than 1000 items.*1 \| operators:\n"):
             pipeline_file.parse("operators:\n" + "  - BinMap: {pixel: 2 arcsec}\n" * 20_000)
 
-    monkeypatch.setattr(pipeline_file._Check, "step", lambda *a: pytest.fail("a step was looked at"))
-    steps = ", ".join(["A"] * 1001)
+    monkeypatch.setattr(steps, "_step", lambda *a: pytest.fail("a step was looked at"))
+    many = ", ".join(["A"] * 1001)
     with pytest.raises(pipeline_file.ConfigurationError, match=r"(?s)a pipeline of 1001 steps.*write at most 1000"):
-        pipeline_file.parse(f"x-steps: &many [{steps}]\noperators: *many\n")
+        pipeline_file.parse(f"x-steps: &many [{many}]\noperators: *many\n")
 
 
 def test_a_list_of_a_thousand_steps_is_not_too_long() -> None:
@@ -603,9 +603,9 @@ def test_a_list_of_a_thousand_steps_is_not_too_long() -> None:
 
 def test_a_campaign_too_large_is_refused_before_a_step_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     from zonda.core.campaign import entries
-    from zonda.core.configuration import pipeline_file
+    from zonda.core.configuration import pipeline_file, steps
 
-    monkeypatch.setattr(pipeline_file._Check, "step", lambda *a: pytest.fail("a step was made"))
+    monkeypatch.setattr(steps, "_step", lambda *a: pytest.fail("a step was made"))
     monkeypatch.setattr(entries, "Entry", lambda *a: pytest.fail("an entry was made"))
     axis = ", ".join(map(str, range(430)))
     text = f"operators: [A, B]\ncampaign:\n  grid:\n    seed: [{axis}]\n    time: [{axis}]\n    target: [{axis}]\n"

@@ -1,0 +1,66 @@
+"""The top level of a pipeline file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from ..plan.budget import Limits
+from ..run.companion import Companion
+from ..scene import Scene
+from .parameters import Parameters, quantity
+from .units import Fraction
+
+
+class Accuracy(Parameters):
+    """What the knobs are chosen for."""
+
+    target: Fraction = Field(gt=0, le=1)
+    """Largest error of the metric."""
+    metric: str = "map_rms"
+    """A metric of `zonda accuracy`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _target_alone(cls, value: Any) -> Any:
+        return value if isinstance(value, dict | Accuracy) else {"target": value}
+
+
+class Header(Parameters):
+    """Top level of a pipeline file, without its scene and its operators."""
+
+    version: Literal[1] = 1
+    """Version of this file format."""
+    name: str = Field("", pattern=r"^$|^[A-Za-z0-9][\w .+-]*$")
+    """Shown in products; where absent, the file's name without suffix."""
+    description: str = ""
+    """One line for `zonda pipelines`."""
+    requires: list[str] = Field(default_factory=list)
+    """Packages and versions this file needs, as pip writes them, e.g. zonda-toltec>=1.2."""
+    runs: dict[str, Companion] = Field(default_factory=dict)
+    """Companion runs, e.g. noiseless: {only: [sky]} or source_free: {without: [sky]}."""
+    precision: Literal["float32", "float64"] = "float32"
+    """Type of the time streams."""
+    accuracy: Accuracy | None = None
+    """Error that the result may have from its approximations, e.g. 1 %, or {target: 1 %, metric: peak}: `zonda run` then takes
+    the cheapest setting of the knobs that a stored front of `zonda accuracy` shows to meet it, else the tightest."""
+    budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
+    """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
+    campaign: Any = None
+    """None; a file with a campaign has the header of its `Section`."""
+    outputs: Path | None = None
+    """Folder for products, relative to the working directory; where absent, out/<name>."""
+
+    @field_validator("outputs")
+    @classmethod
+    def _a_path(cls, value: Path | None) -> Path | None:
+        if value is not None and "\0" in str(value):
+            raise ValueError("a folder's name cannot hold a null character")
+        return value
+
+
+SCENE_KEYS = tuple(Scene.model_fields)
+KEYS = ["version", "name", "description", "requires", "seed", "site", "instrument", "time", "target", "weather"]
+KEYS += [key for key in (*SCENE_KEYS, *Header.model_fields) if key not in KEYS] + ["operators"]

@@ -1,0 +1,128 @@
+"""What a pipeline file says, once it is checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from zonda import __version__
+
+from ..errors import ZondaError
+from ..operator import Operator
+from ..pipeline import Pipeline
+from ..run.companion import Companion
+from ..scene import Scene
+from . import yaml_places
+from .header import KEYS, Header
+
+
+@dataclass(frozen=True)
+class Step:
+    """One operator and the name it goes by in the file."""
+
+    key: str
+    operator: Operator
+
+
+@dataclass(frozen=True)
+class PipelineFile:
+    """A checked pipeline file.
+
+    Attributes
+    ----------
+    header
+        Name, description, companion runs, precision, folder for products.
+    parameters
+        The scene's parameters as the file gives them: names of site and instrument, or their definitions.
+    steps
+        The operators, in order.
+    place
+        The file's path, or what else the text was called.
+    """
+
+    header: Header
+    parameters: dict[str, Any]
+    steps: tuple[Step, ...]
+    place: str
+    _scene: Scene
+
+    @property
+    def operators(self) -> list[Operator]:
+        """The operators, in order."""
+        return [step.operator for step in self.steps]
+
+    @property
+    def runs(self) -> dict[str, Companion]:
+        """Companion runs by name."""
+        return self.header.runs
+
+    @property
+    def output(self) -> Path:
+        """Folder for products."""
+        assert self.header.outputs is not None  # filled in by `parse`
+        return self.header.outputs
+
+    def scene(self) -> Scene:
+        """What exists: site, instrument, time, target, seed."""
+        return self._scene
+
+    def pipeline(self) -> Pipeline:
+        """What is done: a new `Pipeline` of the operators."""
+        header = self.header
+        return Pipeline(
+            self.operators, runs=header.runs, name=header.name, description=header.description, precision=header.precision
+        )
+
+    def resolved_yaml(self) -> str:
+        """The file with every default filled in, which loads again to the same thing.
+
+        Site and instrument stay names where they were names; what the names stand for is written under ``x-resolved``.
+        """
+        header = self.header.model_dump(mode="json")
+        header["runs"] = {name: run.model_dump(mode="json", exclude_none=True) for name, run in self.runs.items()}
+        if self.header.campaign is None:
+            del header["campaign"]
+        else:
+            header["campaign"] = self.header.campaign.model_dump(mode="json", exclude_none=True)
+        scene = self._scene.model_dump(mode="json")
+        for kind in ("site", "instrument"):  # each as its own class, with all its fields
+            scene[kind] = getattr(self._scene, kind).model_dump(mode="json")
+        named = {kind: scene[kind] for kind in ("site", "instrument") if isinstance(self.parameters[kind], str)}
+        values = header | scene | {kind: self.parameters[kind] for kind in named}
+        tree = {key: values[key] for key in KEYS if key in values}
+        tree["operators"] = [{step.key: _filled(step.operator)} for step in self.steps]
+        if named:
+            tree["x-resolved"] = named
+        return f"# zonda {__version__}: every default filled in\n{yaml_places.dump(tree)}"
+
+    def __repr__(self) -> str:
+        return f"<PipelineFile {self.place}: {' > '.join(step.key for step in self.steps)}>"
+
+
+def _filled(operator: Operator) -> dict[str, Any]:
+    """All parameters of an operator, but for those that do not apply beside the others.
+
+    Left out are parameters that are absent (None) by default and in fact, and defaults that the operator refuses when they
+    are written down (e.g. the ordering of HEALPix pixels for a map that is not HEALPix).
+    """
+    model, fields = type(operator), type(operator).model_fields
+    values = operator.model_dump(mode="json")
+    values = {k: v for k, v in values.items() if v is not None or (k in fields and fields[k].get_default() is not None)}
+    if _accepts(model, values):
+        return values
+    kept = set(operator.model_fields_set)
+    for name in values:
+        if _accepts(model, {k: v for k, v in values.items() if k in kept or k == name}):
+            kept.add(name)
+    return {k: v for k, v in values.items() if k in kept}
+
+
+def _accepts(model: type[Operator], values: dict[str, Any]) -> bool:
+    try:
+        model.model_validate(values)
+    except (ValidationError, ZondaError):
+        return False
+    return True
