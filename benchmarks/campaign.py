@@ -45,18 +45,20 @@ def main(arguments):
     parser.add_argument("--plot", type=Path)
     given = parser.parse_args(arguments)
 
-    from zonda.core.campaign import run as campaign
+    from zonda.core.campaign import calls
+    from zonda.core.campaign.task import Outcome
     from zonda.core.cli import main as zonda
 
     rows = []
-    usual = campaign._outcome
+    usual = calls._result
 
-    def watched(future, task, folder):
-        outcome = usual(future, task, folder)
-        rows.append((time.monotonic(), resident(), outcome.peak, outcome.seconds))
+    def watched(future, folder):
+        outcome = usual(future, folder)
+        if isinstance(outcome, Outcome):
+            rows.append((time.monotonic(), resident(), outcome.peak, outcome.seconds))
         return outcome
 
-    campaign._outcome = watched
+    calls._result = watched
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tiny.yaml"
         path.write_text(YAML.format(tasks=given.tasks))

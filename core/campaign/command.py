@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from .job import Job, Task
     from .log import Row
     from .prepare import Source
-    from .run import Result
     from .settings import Campaign
+    from .work import Result
 
 ENGINES = ("serial", "processes", "mpi", "dask")
 
@@ -227,7 +227,7 @@ def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> 
     done = [(task, row) for task, row in table if row and row.state == "done"]
     samples = sum(task.samples for task, _ in done)
     seconds = sum(row.seconds for _, row in done)
-    lines = [f"{job.name}: {plural(len(job.tasks), 'task')}, {plural(len(job.combinations), 'set')} of products"]
+    lines = [f"{job.name}: {plural(len(job.tasks), 'task')}, {job.sets}"]
     lines += [f"  {state:<8} {number}" for state, number in counts.items() if number or state == "done"]
     share = samples / job.samples if job.samples else 1.0
     rate = f", {samples / seconds:.3g} samples/s of each worker" if seconds else ""

@@ -6,23 +6,19 @@ import contextlib
 import os
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import InputError, OutputError, ZondaError
 from ..storage.files import discard, temporary_sibling, write_text
 from . import log as joblog
 from . import machines, parts
-from .job import FILE, LOG, TASKS, Job, Task, plural
+from .job import FILE, LOG, TASKS, Job, Say, Task, plural
 from .log import Log
-from .task import product_path
 
 RESOLVED = "resolved.yaml"
 
 PART = re.compile(r"\.\d+-[0-9a-f]{8}\.part")
 """In the names of `temporary_sibling`."""
-
-Say = Callable[[str], None]
 
 
 def check_free(folder: Path) -> None:
@@ -84,13 +80,13 @@ def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say, same_
         if task.combination in combined:
             continue
         row, other = rows[task.number], others.get(task.number)
-        digest = parts.digest_of(product_path(folder, task), task.key)
+        digest = parts.digest_of(task.path(folder), task.key)
         if digest is None or (row.state == "done" and digest != row.digest):
             missing.append(task)
             if row.state == "done":
                 lost.append(task)
         elif same_machine and machines.kind((other or row).machine) not in (first, frozenset()):
-            discard(product_path(folder, task))
+            discard(task.path(folder))
             missing.append(task)
             strange.append(task.number)
         elif row.state != "done":

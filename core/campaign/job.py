@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -20,6 +20,10 @@ FILE = "campaign.json"
 LOG = "jobs.sqlite"
 TASKS = "tasks"
 """Folder of partial products and layouts."""
+
+
+Say = Callable[[str], None]
+"""Shows the user a line."""
 
 
 def plural(number: int, noun: str) -> str:
@@ -69,8 +73,12 @@ class Task:
 
     @property
     def product(self) -> str:
-        """Name of its partial product."""
+        """Name of its partial product's file."""
         return f"{self.number:06d}-{self.key[:16]}.npz"
+
+    def path(self, folder: Path) -> Path:
+        """Of its partial product, in the campaign's folder."""
+        return folder / TASKS / self.product
 
 
 @dataclass(frozen=True)
@@ -81,10 +89,6 @@ class Combination:
     folder: str
     layout: str
     """Digest of the layout's file."""
-
-    def layout_file(self, number: int) -> str:
-        """Name of the layout's file."""
-        return f"layout-{number:04d}.npz"
 
 
 @dataclass(frozen=True)
@@ -126,9 +130,18 @@ class Job:
         return sum(task.samples for task in self.tasks)
 
     @property
+    def sets(self) -> str:
+        """``2 sets of products``."""
+        return f"{plural(len(self.combinations), 'set')} of products"
+
+    @property
     def layouts(self) -> dict[int, str]:
         """Digests of the combinations' layouts, by number."""
         return {number: combination.layout for number, combination in enumerate(self.combinations)}
+
+    def incomplete(self, done: Collection[int]) -> set[int]:
+        """Numbers of the combinations of which a task is not among those ``done``."""
+        return {task.combination for task in self.tasks if task.number not in done}
 
     def tasks_of(self, combination: int) -> list[Task]:
         """In the order of the reduction."""
@@ -137,7 +150,7 @@ class Job:
     def write(self, folder: Path) -> None:
         """Into its folder, atomically. Raises `OutputError`."""
         text = json.dumps({"format": FORMAT, **asdict(self)}, indent=None, separators=(",", ":"))
-        write_text(folder / FILE, json.dumps({"digest": _digest(text)}) + "\n" + text + "\n")
+        write_text(folder / FILE, json.dumps({"digest": digest_of_text(text)}) + "\n" + text + "\n")
 
     @classmethod
     def read(cls, folder: Path) -> Job:
@@ -145,7 +158,7 @@ class Job:
         path = folder / FILE
         try:
             head, _, text = path.read_text(encoding="utf-8").partition("\n")
-            if json.loads(head)["digest"] != _digest(text.rstrip("\n")):
+            if json.loads(head)["digest"] != digest_of_text(text.rstrip("\n")):
                 raise ValueError("its checksum is wrong")
             values = json.loads(text)
             if values.pop("format") != FORMAT:
@@ -164,6 +177,11 @@ class Job:
             raise InputError(f"cannot be used: {err}", place=str(path), cure=cure) from None
 
 
+def layout_path(folder: Path, combination: int) -> Path:
+    """File of the layouts of a combination."""
+    return folder / TASKS / f"layout-{combination:04d}.npz"
+
+
 def key_of(version: str, pipeline: str, seed: int, time: int, scans: tuple[int, ...], first: bool, layout: str) -> str:
     """Hash of all that a task's product depends on."""
     parts = [version, pipeline, seed, time, list(scans), first, layout]
@@ -177,8 +195,4 @@ def _inside(folder: str) -> bool:
 
 def digest_of_text(text: str) -> str:
     """BLAKE2b of a text."""
-    return _digest(text)
-
-
-def _digest(text: str) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

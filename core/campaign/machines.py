@@ -6,12 +6,9 @@ import json
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..versions import arithmetic
-
-if TYPE_CHECKING:
-    from .folder import Say
+from .job import Say
 
 WITHOUT_INFLUENCE = frozenset({"processor", "python"})
 """What is recorded, and changes no bit: the model's name (its instructions count), and Python, which computes nothing."""

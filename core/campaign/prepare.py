@@ -13,7 +13,7 @@ from ..errors import InputError, ZondaError
 from ..storage.files import product_path
 from . import parts
 from .entries import Entry, entries
-from .job import TASKS, Combination, Job, Task, digest_of_text, key_of
+from .job import Combination, Job, Task, digest_of_text, key_of, layout_path, plural
 from .settings import MOST_TASKS, Campaign
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def job(
     prune_all: bool = True,
     say: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> Job:
-    """Work out a campaign and write the layouts of its maps to ``folder / TASKS``.
+    """Work out a campaign and write the layouts of its maps to ``folder``.
 
     Entries that differ in more than seed and night are planned one by one. Where n scans are co-added, the budget for the errors
     of the plan is that of one observation divided by sqrt(n): such errors may add up while noise averages down.
@@ -115,8 +115,7 @@ def job(
             need = max([need, *(_need(planned_files[group], data, layouts, folder) for group, data in pointed.items())])
             name, subfolder = _names(source, together[0][1], combinations)
             combination = Combination(name, subfolder, "")
-            path = folder / TASKS / combination.layout_file(len(combinations))
-            digest = parts.write(path, "layout", {"layouts": layouts})
+            digest = parts.write(layout_path(folder, len(combinations)), "layout", {"layouts": layouts})
             combinations.append(dataclasses.replace(combination, layout=digest))
             tasks += _tasks(planned, scans, campaign.task, len(combinations) - 1, digest, pipelines, __version__, len(tasks))
             if len(tasks) > MOST_TASKS:
@@ -147,7 +146,7 @@ def outline(source: Source) -> tuple[str, PipelineFile]:
     first = found[0]
     together = sum(e.combination == first.combination for e in found)
     sets = len({repr(e.combination) for e in found})
-    text = f"campaign of {len(found)} entries, combined into {sets} set{'s' if sets != 1 else ''} of products"
+    text = f"campaign of {len(found)} entries, combined into {plural(sets, 'set')} of products"
     return text, _with_budget(source.load(first.settings), 1 / math.sqrt(together))
 
 
@@ -202,7 +201,7 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
     first = {task.entry: task for task in reversed(job.tasks_of(number))}
     looks = [Look(t.pipeline, t.seed, Instant(t.time), t.about) for t in sorted(first.values(), key=lambda t: t.number)]
     files = [parse(text, name="campaign") for text in job.pipelines]
-    path = folder / TASKS / job.combinations[number].layout_file(number)
+    path = layout_path(folder, number)
     if parts.write(path, "layout", {"layouts": agree(looks, files)[0]}) != job.combinations[number].layout:
         raise InputError(
             "is not what it was",

@@ -19,9 +19,9 @@ from ..errors import ZondaError
 from ..faults import faults_named
 from ..storage.files import check_output_folder
 from . import parts
-from .job import TASKS, Job, Task, plural
+from .job import Job, Task, layout_path, plural
 from .prepare import scene_of
-from .task import _file, _layouts, product_path
+from .task import layouts_in, pipeline_of
 
 if TYPE_CHECKING:
     from ..pipeline import Pipeline
@@ -60,13 +60,13 @@ class Combined:
     error: ZondaError | None = None
 
 
-def combine(folder: str, number: int, digests: Mapping[int, str]) -> Combined:
+def combine(folder: Path, number: int, digests: Mapping[int, str]) -> Combined:
     """Add up one combination's parts, finish its products and write them. Works in any process; errors are told, not raised.
 
     ``digests``: of the tasks' products, by the task's number.
     """
     try:
-        data = combined(Job.read(Path(folder)), Path(folder), number, digests)
+        data = combined(Job.read(folder), folder, number, digests)
     except ZondaError as err:
         return Combined(error=err)
     counts = {(who, what) for who, what, _ in data.tally.counts()}
@@ -79,7 +79,7 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
     combination = job.combinations[number]
     tasks = job.tasks_of(number)
     pipeline, data = _begin(job, folder, number, tasks)
-    leaves = [(product_path(folder, t), t.key, digests[t.number]) for t in tasks]
+    leaves = [(t.path(folder), t.key, digests[t.number]) for t in tasks]
     _add(pipeline, data, _tree(pipeline, data, leaves, lambda leaf: parts.read(*leaf)))
     data.output = check_output_folder(folder / combination.folder)
     for observation in data.observations[1:]:
@@ -92,10 +92,10 @@ def _begin(job: Job, folder: Path, number: int, tasks: Sequence[Task]) -> tuple[
     from ..configuration.time import Instant
 
     first = tasks[0]
-    file = _file(job.pipelines[first.pipeline])
+    file = pipeline_of(job.pipelines[first.pipeline])
     pipeline = file.pipeline()
     combination = job.combinations[number]
-    layouts = _layouts(str(folder / TASKS / combination.layout_file(number)), combination.layout)
+    layouts = layouts_in(layout_path(folder, number), combination.layout)
     for operator in pipeline.operators:
         if operator.label in layouts:
             operator.lay_out(layouts[operator.label])

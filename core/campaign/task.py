@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
 from ..faults import faults_named
 from . import machines, parts
-from .job import TASKS, Task
+from .job import Task, layout_path
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
@@ -34,8 +34,8 @@ class Order:
     ----------
     task, pipeline
         What to do: the task and its planned pipeline as YAML.
-    layout, layout_digest
-        File of the layouts.
+    layout
+        Digest of the layouts' file.
     folder
         The campaign's output folder, as the worker sees it.
     threads, memory
@@ -47,8 +47,7 @@ class Order:
     task: Task
     pipeline: str
     layout: str
-    layout_digest: str
-    folder: str
+    folder: Path
     threads: int | None
     memory: int | None
     version: str
@@ -111,16 +110,6 @@ def perform(order: Order) -> Outcome:
     return Outcome(number, host, time.monotonic() - begin, digest, peak=_peak(), machine=machines.here())
 
 
-def product_path(folder: Path, task: Task) -> Path:
-    """Where a task's partial product is."""
-    return folder / TASKS / task.product
-
-
-def entry_folder(folder: Path, task: Task) -> Path:
-    """Where a task's own files are (time streams): those of one entry together."""
-    return folder / "entries" / f"{task.entry:06d}"
-
-
 class _NotCombined(PipelineError):
     """A product that no operator packs."""
 
@@ -131,14 +120,14 @@ def _run(order: Order) -> str:
     from ..pipeline import Part
     from .prepare import scene_of
 
-    task, folder = order.task, Path(order.folder)
-    file = _file(order.pipeline)
-    layouts = _layouts(order.layout, order.layout_digest)
+    task, folder = order.task, order.folder
+    file = pipeline_of(order.pipeline)
+    layouts = layouts_in(layout_path(folder, task.combination), order.layout)
     part = Part(task.scans, layouts, first=task.before == 0, prefix=f"{task.entry:06d}-")
     pipeline = file.pipeline()
     data = pipeline.run(
         scene_of(file, task.seed, Instant(task.time)),
-        output=entry_folder(folder, task),
+        output=folder / "entries" / f"{task.entry:06d}",  # the time streams of one entry together
         threads=order.threads,
         ceiling=order.memory,
         provenance={"resolved_yaml": order.pipeline},
@@ -160,11 +149,11 @@ def _run(order: Order) -> str:
         # figures of scans of one number share a row, whatever the entry: there may be a million entries
         "figures": [[who, what.removeprefix(part.prefix), text] for who, what, text in tally.figures()],
     }
-    return parts.write(product_path(folder, task), task.key, tree)
+    return parts.write(task.path(folder), task.key, tree)
 
 
 @lru_cache(4)
-def _file(text: str) -> PipelineFile:
+def pipeline_of(text: str) -> PipelineFile:
     """A pipeline, kept by the worker with what its operators remember (maps that were read and convolved)."""
     from ..configuration.pipeline_file import parse
 
@@ -172,9 +161,10 @@ def _file(text: str) -> PipelineFile:
 
 
 @lru_cache(4)
-def _layouts(path: str, digest: str) -> Mapping[str, Any]:
+def layouts_in(path: Path, digest: str) -> Mapping[str, Any]:
+    """The layouts in a file, by label. Raises InputError where it is not the one meant."""
     try:
-        layouts: Mapping[str, Any] = parts.read(Path(path), "layout", digest)["layouts"]
+        layouts: Mapping[str, Any] = parts.read(path, "layout", digest)["layouts"]
     except InputError as err:
         raise InputError(err.message, place=err.place, cure="can this worker see the campaign's folder?") from None
     return layouts

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from zonda.core.campaign import run as campaign
+from zonda.core.campaign import work as campaign
 from zonda.core.campaign.log import Log
 from zonda.core.campaign.task import Outcome, perform
 from zonda.core.errors import InputError

@@ -18,13 +18,13 @@ def test_half_written_files_go_wherever_they_are(tmp_path):
 
 
 def test_a_campaign_that_ends_well_leaves_none(bench, monkeypatch):
-    from zonda.core.campaign import run
+    from zonda.core.campaign.work import Tasks
 
     def leaves(folder):
         (folder / "entries/000000").mkdir(parents=True, exist_ok=True)
         temporary_sibling(folder / "entries/000000/tod.h5").write_text("half")
 
-    flow = run._flow
-    monkeypatch.setattr(run, "_flow", lambda job, folder, *more: (leaves(folder), flow(job, folder, *more))[1])
+    usual = Tasks.run
+    monkeypatch.setattr(Tasks, "run", lambda self, tasks: (leaves(self.folder), usual(self, tasks))[1])
     out = bench.run("{nights: 1}", "--engine", "serial", "--threads", 1)
     assert not list(out.rglob("*.part*"))

@@ -12,7 +12,8 @@ from concurrent.futures import Executor, Future
 import h5py
 import pytest
 
-from zonda.core.campaign import run as campaign
+from zonda.core.campaign import calls, run
+from zonda.core.campaign import work as campaign
 from zonda.core.campaign.engines import Pool, SerialExecutor
 from zonda.core.campaign.job import Job
 from zonda.core.campaign.log import Log, read
@@ -186,7 +187,7 @@ def test_tries_are_bounded_and_resume_goes_on(undisturbed, bench, monkeypatch, c
     assert "it broke" in shown
     monkeypatch.setattr(campaign, "perform", perform)
     before = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
-    monkeypatch.setattr(campaign.shutil, "rmtree", lambda *a, **k: None)
+    monkeypatch.setattr(run.shutil, "rmtree", lambda *a, **k: None)
     monkeypatch.setattr(campaign, "discard", lambda *a: None)
     assert bench.command("resume", out, *SERIAL) == 0
     after = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
@@ -249,17 +250,17 @@ def test_a_campaign_into_the_folder_of_a_plain_run_says_so(undisturbed, bench, c
 
 
 def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypatch):
-    submit, killed = campaign._submit, []
+    submit, killed = calls._submit, []
 
-    def and_kill(pool, order):
-        future = submit(pool, order)
-        if order.task.number == 4 and not killed:
+    def and_kill(pool, function, *arguments):
+        future = submit(pool, function, *arguments)
+        if getattr(arguments[0], "task", None) and arguments[0].task.number == 4 and not killed:
             killed.append(True)
             for process in list(pool.executor._processes.values()):
                 os.kill(process.pid, signal.SIGKILL)
         return future
 
-    monkeypatch.setattr(campaign, "_submit", and_kill)
+    monkeypatch.setattr(calls, "_submit", and_kill)
     out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", 2)
     assert killed
     rows = read(out / "jobs.sqlite")

@@ -1,0 +1,183 @@
+"""Run a campaign's tasks, and combine what they made: each on workers, each noted in the job log."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from .. import hooks
+from ..errors import PipelineError, ZondaError
+from ..storage.files import discard
+from .calls import Lost, Work, carry_out
+from .engines import Pool, engine_failed
+from .folder import clean
+from .job import Job, Task
+from .log import Log
+from .machines import Watch
+from .reduce import Combined, combine
+from .task import Order, Outcome, perform
+
+LOST = "(lost)"
+"""Host of an attempt whose worker was killed."""
+
+
+@dataclass
+class Result:
+    """How a campaign went.
+
+    Attributes
+    ----------
+    tally
+        Of all combinations: rows (combination, who, what, value, whether it is a count).
+    tasks
+        Number of tasks that were run now.
+    seconds
+        Wall time of the tasks; ``samples`` in them.
+    failed
+        Errors of tasks that are given up, by number.
+    """
+
+    folder: Path
+    tally: list[tuple[str, str, str, str, bool]] = field(default_factory=list)
+    tasks: int = 0
+    samples: int = 0
+    seconds: float = 0.0
+    failed: dict[int, str] = field(default_factory=dict)
+
+
+class Tasks(Work[Task, Outcome]):
+    """The tasks of a campaign. ``watch`` compares the machines that they run on."""
+
+    def __init__(self, job: Job, folder: Path, log: Log, pool: Pool, watch: Watch) -> None:
+        self.job, self.folder, self.log, self.pool, self.watch = job, folder, log, pool, watch
+        self.result = Result(folder)
+        self._attempts: dict[int, int] = {}
+        self._claimed: set[int] = set()
+
+    def run(self, tasks: Sequence[Task]) -> Result:
+        """All of these; what was at work when it is interrupted waits again."""
+        self._progress, begin = _Progress(tasks), time.monotonic()
+        try:
+            carry_out(self, tasks, self.pool, self.folder)
+        except BaseException:
+            with contextlib.suppress(Exception):
+                self.log.put_off(self._claimed)
+            if self.pool.stop is not None:
+                clean(self.folder)
+            raise
+        finally:
+            self._progress.end()
+        self.result.seconds = time.monotonic() - begin
+        return self.result
+
+    def together(self) -> contextlib.AbstractContextManager[None]:
+        """See `Work.together`: the disk is waited for once."""
+        return self.log.together()
+
+    def call(self, item: Task) -> tuple[Callable[[Order], Outcome], Order]:
+        """See `Work.call`."""
+        from zonda import __version__
+
+        layout, pipeline = self.job.combinations[item.combination].layout, self.job.pipelines[item.pipeline]
+        folder, pool = self.folder.resolve(), self.pool
+        return perform, Order(item, pipeline, layout, folder, pool.threads, pool.memory, __version__)
+
+    def began(self, items: list[Task]) -> None:
+        """See `Work.began`."""
+        for task in items:
+            self._attempts[task.number] = self._attempts.get(task.number, 0) + 1
+        self._claimed |= {task.number for task in items}
+        self.log.claim(task.number for task in items)
+
+    def ended(self, item: Task, result: Outcome | Lost) -> bool:
+        """Note what became of a task."""
+        number = item.number
+        outcome = Outcome(number, LOST, 0.0, error=str(result)) if isinstance(result, Lost) else result
+        self._claimed.discard(number)
+        if not outcome.error and (error := self.watch.meet(outcome.machine, f"task {number} on {outcome.host}")):
+            discard(item.path(self.folder))
+            outcome = replace(outcome, error=error, final=True, stop=True)
+        self._progress.step(item.samples, bool(outcome.error))
+        if not outcome.error:
+            self.log.done(number, outcome.host, outcome.seconds, outcome.digest, outcome.machine)
+            self.result.tasks += 1
+            self.result.samples += item.samples
+            return False
+        again = not outcome.final and self._attempts[number] <= self.job.retries
+        self.log.failed(number, outcome.host, outcome.seconds, outcome.error, again)
+        if not again:
+            self.result.failed[number] = outcome.error
+            self.stop = self.stop or outcome.stop
+        return again
+
+
+class Combinations(Work[int, Combined]):
+    """The sets of products, by number: pictures and reports take time, and memory that the main process need not hold."""
+
+    def __init__(self, job: Job, folder: Path, log: Log, result: Result) -> None:
+        self.job, self.folder, self.log, self.result = job, folder, log, result
+        self._digests = {row.number: row.digest for row in log.rows()}
+        self._attempts: dict[int, int] = {}
+        self._error: ZondaError | None = None
+
+    def run(self, numbers: Sequence[int], pool: Pool) -> None:
+        """Combine these. Raises the first error, when what was at work has ended."""
+        carry_out(self, numbers, pool, self.folder)
+        if self._error is not None:
+            raise self._error
+
+    def call(self, item: int) -> tuple[Callable[..., Combined], Path, int, dict[int, str]]:
+        """See `Work.call`."""
+        return combine, self.folder.resolve(), item, {t.number: self._digests[t.number] for t in self.job.tasks_of(item)}
+
+    def began(self, items: list[int]) -> None:
+        """See `Work.began`."""
+        for number in items:
+            self._attempts[number] = self._attempts.get(number, 0) + 1
+
+    def ended(self, item: int, result: Combined | Lost) -> bool:
+        """Note that products are written; their parts are not needed any more."""
+        if isinstance(result, Lost):
+            if not engine_failed(result.error):
+                raise result.error
+            if self._attempts[item] <= self.job.retries:
+                return True
+            message = f"the engine failed when it combined the maps: {result}"
+            error: ZondaError | None = PipelineError(message, place=str(self.folder), cure=f"zonda resume {self.folder}")
+        else:
+            error = result.error
+        if error is not None:
+            self._error, self.stop = self._error or error, True
+            return False
+        assert isinstance(result, Combined)
+        combination = self.job.combinations[item]
+        self.log.combine(item, combination.layout)
+        self.result.tally += [(combination.name, *row) for row in result.tally]
+        if not self.job.keep_tasks:
+            for task in self.job.tasks_of(item):
+                discard(task.path(self.folder))
+        return False
+
+
+class _Progress:
+    """Tells the hooks how far it is."""
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        self._hook, self._begin = hooks.manager().hook, time.monotonic()
+        self._all = {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)}
+        self._done = self._made = self._failed = 0
+
+    def step(self, samples: int, failed: bool) -> None:
+        """One attempt more."""
+        self._failed += failed
+        self._done += not failed
+        self._made += 0 if failed else samples
+        seconds = time.monotonic() - self._begin
+        self._hook.zonda_campaign_progress(done=self._done, failed=self._failed, samples=self._made, seconds=seconds, **self._all)
+
+    def end(self) -> None:
+        """No more is coming."""
+        self._hook.zonda_campaign_end()
