@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,20 @@ if TYPE_CHECKING:
     from .instrument import Instrument
     from .site import Site
     from .weather import GroundWeather
+
+
+class WhiteLevel(Protocol):
+    """The level of a step's white noise (`Observation.noise_levels`)."""
+
+    @property
+    def follows_load(self) -> bool:
+        """Whether it depends on the mean emission or transmission of the atmosphere."""
+
+    def sky_net(self, observation: Observation) -> NDArray[np.float64]:
+        """(n_det,) K_RJ sqrt(s) on the sky."""
+
+    def amplitude(self, observation: Observation) -> SmoothField:
+        """rms of one sample at the detector, K_RJ."""
 
 
 @dataclass
@@ -62,8 +76,12 @@ class Observation:
         there is no atmosphere.
     expected_net
         Tells what (n_det,) ``focalplane.net`` will be about, before it is resolved; None: what it is now.
+    noise_levels
+        Levels of the white noise by step, in their order; known once all are configured. Pink noise refers to the last.
+    quoted_net
+        (n_det,) ``focalplane.net`` before a step with white noise set it to what it comes to on the sky; None: there is none.
     resolved
-        What operators resolved for one another (noise levels). It outlives the main run: companion runs use the same.
+        What operators resolved for one another. It outlives the main run: companion runs use the same.
     components
         Names of the streams that the steps of the run in progress make before there is a signal: ``sky``, ``white`` ...
     tally
@@ -90,6 +108,8 @@ class Observation:
     weather: GroundWeather | None = None
     smooth: dict[str, SmoothField] = field(default_factory=dict)
     detdata: dict[str, AnyFloats] = field(default_factory=dict)
+    noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
+    quoted_net: NDArray[np.float64] | None = None
     resolved: dict[str, Any] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
     output: Any = None

@@ -10,6 +10,7 @@ from zonda.core.configuration.describe import written_choices
 from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Unit
 from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.plan.planning import planning_class
 from zonda.core.registry import mapmakers, noise_models, operators
 from zonda.core.site import Site
 
@@ -44,7 +45,7 @@ def page() -> str:
             lines += ["", f"### {cls.__name__}", "", own_doc(cls), ""]
             needs, gives = (", ".join(f"`{n}`" for n in sorted(names)) or "nothing" for names in (cls.requires, cls.provides))
             lines += [f"Requires {needs}; provides {gives}.", "", *table(cls, but="name")]
-            for knob in cls.knobs:
+            for knob in planning_class(cls).knobs or getattr(cls, "knobs", ()):
                 ladder = ", ".join(f"`{value}`" for value in knob.ladder)
                 lines += ["", f"Knob ([accuracy](accuracy.md)): `{knob.parameter}`, {ladder}: {knob.approximates}."]
     lines += ["", "## Noise models", "", "What `model` of `WhiteNoise` takes: a name, or `{name: background_limited, modes: 1}`."]

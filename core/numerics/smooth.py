@@ -134,6 +134,10 @@ class SmoothField:
         """The field times a per-detector factor (n_det,)."""
         return SmoothField(self.weights * np.asarray(per_detector)[:, None], self.coefficients, self.step, self.n_samples)
 
+    def time_mean(self) -> NDArray[np.float64]:
+        """(n_det,) mean over the scan."""
+        return np.asarray(self.weights @ self.coefficients.mean(1), np.float64)
+
     def evaluate(self, detectors: slice, samples: slice, out: AnyFloats | None = None) -> AnyFloats:
         """f at the detectors and samples of a block: (n_det_block, n_samp_block), of ``out``'s dtype or float64.
 

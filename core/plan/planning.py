@@ -68,17 +68,23 @@ class Planning(Generic[O]):
 
 def planning_of(operator: Operator) -> Planning[Any]:
     """The planning of an operator; of one that has none, `Planning` itself."""
-    for cls in type(operator).__mro__:
+    found = planning_class(type(operator))
+    return _Own(operator) if found is Planning and hasattr(operator, "traits") else found(operator)
+
+
+def planning_class(operator: type[Operator]) -> type[Planning[Any]]:
+    """The class that plans the operators of a class; `Planning` itself where there is none."""
+    for cls in operator.__mro__:
         if cls is Operator:
             break
         if cls.__name__ in planning:
             try:
-                found = planning.get(cls.__name__)
+                found: type[Planning[Any]] = planning.get(cls.__name__)
             except RegistryError:
                 continue
             if found.of is cls:
-                return found(operator)  # type: ignore[no-any-return]
-    return _Own(operator) if hasattr(operator, "traits") else Planning(operator)
+                return found
+    return Planning
 
 
 class _Own(Planning[Any]):

@@ -14,8 +14,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.data import Stream
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.stream import Stream
 from zonda.core.types import Floats
 
 Mask = NDArray[np.bool_]

@@ -12,10 +12,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.data import Stream
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.run.streams import columns
+from zonda.core.stream import Stream
 from zonda.core.types import Floats
 
 MOST_COPIED = 100_000_000

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from zonda.core.data import Observation
 from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_SAMPLES
+from zonda.core.observation import Observation
 from zonda.core.plan.context import LEAKS, Context
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning

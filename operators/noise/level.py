@@ -8,56 +8,63 @@ from __future__ import annotations
 
 import copy
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zonda.core.errors import PipelineError
+from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.types import Floats
 
 from .models import FixedNet, NoiseModel
 
 if TYPE_CHECKING:
-    from zonda.core.data import Observation
+    from zonda.core.observation import Observation, WhiteLevel
 
-Array = NDArray[np.float64]
+INSTANTS = 64
+"""Times of a scan at which its transmission is looked at, at most."""
+
+AT_ONCE = 4096
+"""Detectors that are looked at together."""
 
 
 @dataclass
 class NoiseLevel:
-    """NET of one observation's detectors, resolved when first asked for: not before every operator is configured. Thread-safe."""
+    """NET of one observation's detectors, resolved when first asked for: not before every operator is configured."""
 
     model: NoiseModel
-    factors: Array
+    factors: Floats
     """(n_det,) scatter factors, mean 1."""
-    _net: Array | None = None
-    _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
+    _net: Floats | None = None
 
-    def net(self, observation: Observation) -> Array:
-        """(n_det,) K_RJ sqrt(s) referred to ``model.reference``; the value of the first call holds for all runs."""
-        with self._lock:
-            if self._net is None:
-                self._net = self.model.net(observation) * self.factors
-            return self._net
+    @property
+    def follows_load(self) -> bool:
+        """Whether it depends on the mean emission or transmission of the atmosphere."""
+        return self.model.reference != "sky" or not isinstance(self.model, FixedNet)
 
-    def sky_net(self, observation: Observation) -> Array:
+    def net(self, observation: Observation) -> Floats:
+        """(n_det,) K_RJ sqrt(s) referred to ``model.reference``; the value of the first call holds."""
+        if self._net is None:
+            self._net = self.model.net(observation) * self.factors
+        return self._net
+
+    def sky_net(self, observation: Observation) -> Floats:
         """(n_det,) K_RJ sqrt(s) on the sky: a level at the detector divided by zeta <e^-tau>, rms over the scan."""
         if self.model.reference == "sky":
             return self.net(observation)
         calibration = rms_of_inverse(observation.smooth.get("transmission"), observation.n_detectors)
         return self.net(observation) * calibration / observation.focalplane.main_beam_efficiency
 
-    def expected_sky_net(self, observation: Observation) -> Array:
+    def expected_sky_net(self, observation: Observation) -> Floats:
         """About what `sky_net` will be, from ``observation.expected_load``, before operators are configured."""
-        smooth = {}
-        if observation.expected_load is not None and (self.model.reference != "sky" or not isinstance(self.model, FixedNet)):
-            names, n = ("atmosphere", "transmission"), observation.n_detectors
-            for name, value in zip(names, observation.expected_load(), strict=True):
-                smooth[name] = SmoothField.constant(np.full(n, value), observation.n_samples)
         rough = copy.copy(observation)
-        rough.smooth = smooth
+        rough.smooth = {}
+        if observation.expected_load is not None and self.follows_load:
+            for name, value in zip(("atmosphere", "transmission"), observation.expected_load(), strict=True):
+                rough.smooth[name] = SmoothField.constant(np.full(observation.n_detectors, value), observation.n_samples)
         return NoiseLevel(self.model, self.factors).sky_net(rough)
 
     def amplitude(self, observation: Observation) -> SmoothField:
@@ -70,7 +77,42 @@ class NoiseLevel:
         return SmoothField.constant(sigma, observation.n_samples)
 
 
-def scatter_factors(scatter: float, observation: Observation, label: str) -> Array:
+class Amplitude:
+    """The amplitude of noise at the detector, made when the first block asks for it: every step is prepared by then. Thread-safe.
+
+    Parameters
+    ----------
+    label
+        The step that makes the noise.
+    observation
+        With the smooth means that ``level`` was resolved with.
+    factor
+        By which the noise exceeds the level.
+    """
+
+    def __init__(self, label: str, level: WhiteLevel, observation: Observation, factor: float = 1.0) -> None:
+        self.label, self.level, self.factor = label, level, factor
+        self._means, self._lock = dict(observation.smooth), threading.Lock()
+        self._field: SmoothField | None = None
+
+    def of(self, observation: Observation) -> SmoothField:
+        """rms of one sample, K_RJ."""
+        with self._lock:
+            if self._field is None:
+                changed = [name for name, field in observation.smooth.items() if self._means.get(name) is not field]
+                if changed and self.level.follows_load:
+                    raise PipelineError(
+                        f"a step has set the mean {changed[0]} after the noise level that follows from it was resolved",
+                        place=self.label,
+                        cure="set observation.smooth in configure(), or put that step before the noise",
+                    )
+                self._field = self.level.amplitude(observation)
+                if self.factor != 1:
+                    self._field = self._field.scaled(np.full(observation.n_detectors, self.factor))
+            return self._field
+
+
+def scatter_factors(scatter: float, observation: Observation, label: str) -> Floats:
     """Log-normal factors (n_det,) of mean 1 and relative standard deviation ``scatter``; the same in every observation with this
     seed, instrument and band."""
     if scatter == 0:
@@ -81,20 +123,7 @@ def scatter_factors(scatter: float, observation: Observation, label: str) -> Arr
     return np.asarray(np.exp(width * deviates - width**2 / 2))
 
 
-LEVELS, OF_WHITE = "noise levels", "white noise level"
-"""Where `Observation.resolved` has the levels of all white noise by step, and the one that pink noise refers to."""
-
-OPAQUE = 1e-6
-"""Transmission below which samples are not calibrated (`optics.efficiency`), and say nothing of the noise."""
-
-INSTANTS = 64
-"""Times of a scan at which its transmission is looked at, at most."""
-
-AT_ONCE = 4096
-"""Detectors that are looked at together."""
-
-
-def rms_of_inverse(transmission: SmoothField | None, n_detectors: int) -> Array:
+def rms_of_inverse(transmission: SmoothField | None, n_detectors: int) -> Floats:
     """rms over the scan of 1 / <e^-tau> per detector, where it is not opaque (n_det,): what calibration makes of noise."""
     found = np.ones(n_detectors)
     if transmission is None:
@@ -105,30 +134,27 @@ def rms_of_inverse(transmission: SmoothField | None, n_detectors: int) -> Array:
     for start in range(0, n_detectors, AT_ONCE):
         rows = slice(start, start + AT_ONCE)
         passed = transmission.weights[rows].astype(np.float64) @ middle
-        clear = passed >= OPAQUE
-        squares = np.where(clear, 1 / np.maximum(passed, OPAQUE) ** 2, 0.0).sum(axis=1)
+        clear = passed >= LEAST_TRANSMISSION
+        squares = np.where(clear, 1 / np.maximum(passed, LEAST_TRANSMISSION) ** 2, 0.0).sum(axis=1)
         number = clear.sum(axis=1)
-        found[rows] = np.where(number > 0, np.sqrt(squares / np.maximum(number, 1)), 1 / OPAQUE)
+        found[rows] = np.where(number > 0, np.sqrt(squares / np.maximum(number, 1)), 1 / LEAST_TRANSMISSION)
     return found
 
 
 def announce(observation: Observation, label: str, level: NoiseLevel) -> None:
-    """Make the level of a step's white noise known, to pink noise too. A companion run keeps the main run's level."""
-    held: dict[str, NoiseLevel] = observation.resolved.setdefault(LEVELS, {})
-    observation.resolved[OF_WHITE] = held.setdefault(label, level)
+    """Make the level of a step's white noise known, to pink noise too. The first one that a step announces holds."""
+    if observation.quoted_net is None:
+        observation.quoted_net = observation.focalplane.net.copy()
+    observation.noise_levels.setdefault(label, level)
 
 
 def resolve(observation: Observation) -> None:
     """Set ``focalplane.net`` to what all white noise comes to on the sky: levels of several steps add in quadrature."""
-    levels = [level.sky_net(observation) for level in observation.resolved.get(LEVELS, {}).values()]
+    levels = [level.sky_net(observation) for level in observation.noise_levels.values()]
     if levels:
         observation.focalplane.net = levels[0].copy() if len(levels) == 1 else np.sqrt(sum(net**2 for net in levels))
 
 
-def announced(observation: Observation) -> NoiseLevel:
-    """The level of the white noise; the instrument's NET where the pipeline makes none.
-
-    It outlives the main run, so that a companion run without white noise has the same pink noise.
-    """
-    level: NoiseLevel | None = observation.resolved.get(OF_WHITE)
-    return level or NoiseLevel(FixedNet(), np.ones(observation.n_detectors))
+def announced(observation: Observation) -> WhiteLevel:
+    """The level of the white noise; the instrument's NET where the pipeline makes none."""
+    return next(reversed(observation.noise_levels.values()), NoiseLevel(FixedNet(), np.ones(observation.n_detectors)))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -14,20 +12,19 @@ from numba import uint64
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
-from zonda.core.errors import PipelineError
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
-from zonda.core.numerics.smooth import SmoothField, series_into
+from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
 
-from .level import LEVELS, NoiseLevel, announce, resolve, scatter_factors
-from .models import INSTRUMENTS, FixedNet, NoiseModel, noise_model
+from .level import Amplitude, NoiseLevel, announce, resolve, scatter_factors
+from .models import FixedNet, NoiseModel, noise_model
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from zonda.core.data import Block, Data, Observation
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate, Traits
+    from zonda.core.block import Block
+    from zonda.core.data import Data
+    from zonda.core.observation import Observation
     from zonda.core.types import Floats
 
 _SCHEMA = {
@@ -72,79 +69,43 @@ class WhiteNoise(Operator):
 
     def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
         """Say what the level will be about: map makers lay out their sums for it."""
-        model = self.model or FixedNet.of(self.net, self.reference)
         for observation in data.observations:
-            level = NoiseLevel(model, scatter_factors(self.scatter, observation, self.label))
-            observation.expected_net = partial(_expected, level, observation, observation.expected_net)
+            observation.expected_net = partial(_expected, self._level(observation), observation, observation.expected_net)
         return None
 
     def configure(self, observation: Observation) -> None:
         """Announce the level to `PinkNoise` and to other white noise."""
-        observation.resolved.setdefault(INSTRUMENTS, observation.focalplane.net.copy())
-        model = self.model or FixedNet.of(self.net, self.reference)
-        announce(observation, self.label, NoiseLevel(model, scatter_factors(self.scatter, observation, self.label)))
+        announce(observation, self.label, self._level(observation))
 
     def prepare(self, observation: Observation) -> _State:
-        """Stream key; resolves the level."""
+        """Resolve the level."""
         resolve(observation)
-        return _State(observation.resolved[LEVELS][self.label], observation.detector_key(self.label), dict(observation.smooth))
+        amplitude = Amplitude(self.label, observation.noise_levels[self.label], observation)
+        return _State(amplitude, observation.detector_key(self.label))
 
-    def memory(self, observation: Observation) -> int:
-        """Amplitudes at the nodes of the mean emission."""
-        return 200 * observation.n_detectors
-
-    def traits(self, observation: Observation) -> Traits:
-        """White noise of one sample."""
-        from .estimate import white_traits
-
-        return white_traits(observation.resolved[LEVELS][self.label], observation)
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost: there is no coarser form of it."""
-        from zonda.core.plan.estimate import Estimate
-
-        from .estimate import WHITE
-
-        return Estimate((), WHITE)
-
-    def exec(self, block: Block, state: Any) -> None:
+    def exec(self, block: Block, state: _State) -> None:
         """Add noise to ``white``."""
         add = "white" in block.detdata
         out = block.new("white", zero=False)
-        level = self._amplitude(block.observation, state).series(block.detectors, block.samples, out.dtype)
+        level = state.amplitude.of(block.observation).series(block.detectors, block.samples, out.dtype)
         _add_normals(state.key, block.detectors.start, block.samples.start, *level, add, out)
 
-    def collect(self, data: Data, observation: Observation, state: Any) -> None:
+    def collect(self, data: Data, observation: Observation, state: _State) -> None:
         """State the level."""
-        net = 1e3 * state.level.sky_net(observation)
+        level = state.amplitude.level
+        net = 1e3 * level.sky_net(observation)
         text = f"{np.median(net):.4g}" + (f" ({net.min():.4g} to {net.max():.4g})" if net.max() > net.min() else "")
-        varies = self.model is not None or self.reference == "detector"  # with the load, from scan to scan
-        whose = f"{observation.name}: " if varies else ""
+        whose = f"{observation.name}: " if level.follows_load else ""  # differs from scan to scan
         observation.tally.state(self.label, f"{whose}NET on the sky, median (range), mK s^1/2", text)
 
-    def _amplitude(self, observation: Observation, state: _State) -> SmoothField:
-        with state.lock:
-            if state.amplitude is None:
-                changed = [name for name, field in observation.smooth.items() if state.smooth.get(name) is not field]
-                if changed and (self.model is not None or self.reference == "detector"):
-                    raise PipelineError(
-                        f"a step has set the mean {changed[0]} after the noise level that follows from it was resolved",
-                        place=self.label,
-                        cure="set observation.smooth in configure(), or put that step before the noise",
-                    )
-                state.amplitude = state.level.amplitude(observation)
-            return state.amplitude
+    def _level(self, observation: Observation) -> NoiseLevel:
+        model = self.model or FixedNet.of(self.net, self.reference)
+        return NoiseLevel(model, scatter_factors(self.scatter, observation, self.label))
 
 
-@dataclass
-class _State:
-    """Level, key, the smooth means that the level was resolved with; its amplitude, made with the first block."""
-
-    level: NoiseLevel
+class _State(NamedTuple):
+    amplitude: Amplitude
     key: NDArray[np.uint32]
-    smooth: dict[str, SmoothField]
-    amplitude: SmoothField | None = None
-    lock: threading.Lock = field(default_factory=threading.Lock)
 
 
 def _expected(level: NoiseLevel, observation: Observation, others: Callable[[], NDArray[np.floating[Any]]] | None) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zonda.core.data import Observation
+from zonda.core.observation import Observation
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate, Traits
 from zonda.core.plan.planning import Planning

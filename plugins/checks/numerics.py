@@ -16,7 +16,7 @@ from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.noise.one_over_f import power_law_filter
-from zonda.operators.noise.pink import Streams
+from zonda.operators.noise.streams import Streams
 from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
 

@@ -17,7 +17,7 @@ from zonda.core.errors import ZondaError
 from zonda.core.numerics.random import stream_key
 from zonda.core.registry import noise_models
 from zonda.operators.noise.one_over_f import PowerLawFilter, power_law_filter
-from zonda.operators.noise.pink import Streams
+from zonda.operators.noise.streams import Streams
 from zonda.operators.noise.white import WhiteNoise
 from zonda.plugins.checks.scenes import camera, largest
 

@@ -12,8 +12,8 @@ from zonda.core.plan.context import Context, Coverage
 from zonda.operators.atmosphere.planning import _slope, air
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere, _BandTransfer
 from zonda.operators.filters.brick_wall import plan_highpass
-from zonda.operators.noise.estimate import difference, psd_error
 from zonda.operators.noise.one_over_f import power_law_filter
+from zonda.operators.noise.planning import difference, psd_error
 from zonda.operators.pointing.estimate import STEEPEST, pointing_estimate
 from zonda.operators.sky.estimate import CUBIC, chromaticity
 

@@ -5,8 +5,9 @@ from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.registry import noise_models
-from zonda.operators.noise.models import BackgroundLimited, FixedNet, NoiseModel, noise_model
+from zonda.operators.noise.models import FixedNet, NoiseModel, noise_model
 from zonda.operators.noise.white import WhiteNoise
+from zonda.plugins.noise_models import BackgroundLimited
 
 NARROW = Band(name="narrow", low="149.9 GHz", high="150.1 GHz")
 

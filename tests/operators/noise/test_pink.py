@@ -9,7 +9,8 @@ from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.noise.one_over_f import power_law_filter
-from zonda.operators.noise.pink import CHECKPOINT, PinkNoise, Streams
+from zonda.operators.noise.pink import PinkNoise
+from zonda.operators.noise.streams import CHECKPOINT, Streams
 from zonda.operators.noise.white import WhiteNoise
 
 NET = 1.7e-3

@@ -4,8 +4,9 @@ import pytest
 import zonda
 from zonda.core.errors import ZondaError
 from zonda.core.numerics.smooth import SmoothField
-from zonda.operators.noise.models import BackgroundLimited, FixedNet, NoiseModel
+from zonda.operators.noise.models import FixedNet, NoiseModel
 from zonda.operators.noise.white import WhiteNoise
+from zonda.plugins.noise_models import BackgroundLimited
 
 NET = 1.7e-3
 

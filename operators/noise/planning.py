@@ -1,0 +1,182 @@
+"""Planning of the detectors' noise: bounds, coarser forms, costs and memory (`core.plan`)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from zonda.core.errors import ZondaError
+from zonda.core.knobs import Knob
+from zonda.core.numerics.tiles import TILE_DETECTORS
+from zonda.core.observation import Observation, WhiteLevel
+from zonda.core.plan.context import LEAKS, Context
+from zonda.core.plan.estimate import Bound, Choice, Cost, Effect, Estimate, Traits, add, full
+from zonda.core.plan.planning import Planning
+from zonda.core.types import Floats
+
+from .one_over_f import PowerLawFilter
+from .pink import PinkNoise, PinkSpectrum, level_of
+from .streams import CHECKPOINT
+from .white import WhiteNoise
+
+
+class WhitePlanning(Planning[WhiteNoise]):
+    """It has no coarser form."""
+
+    of = WhiteNoise
+
+    def traits(self, observation: Observation) -> Traits:
+        """rms of one calibrated sample of each detector, under the load of ``observation.smooth``."""
+        each = calibrated(observation.noise_levels[self.operator.label], observation)
+        return Traits(noise=float(each.min(initial=np.inf)) if each.size else 0.0, each=each)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        return Estimate((), Cost(per_sample=2e-9, kernel="random"))
+
+    def memory(self, observation: Observation) -> int:
+        """Amplitudes at the nodes of the mean emission."""
+        return 200 * observation.n_detectors
+
+
+class PinkPlanning(Planning[PinkNoise]):
+    """Poles of the recursive filter, and the noise altogether."""
+
+    of = PinkNoise
+    knobs = (
+        Knob("poles", (4, 6, 8, 12, 16), "power law by a filter of few poles (their first states are drawn anew)", redraws=True),
+    )
+
+    def memory(self, observation: Observation) -> int:
+        """Filter states that are kept, and the common part."""
+        kept = -(-observation.n_detectors // TILE_DETECTORS) * (observation.n_samples // CHECKPOINT + 3)
+        common = 12 * observation.n_samples if self.operator.shared > 0 else 0
+        return kept * (4 * TILE_DETECTORS * (self.operator.poles + 3) + 300) + common + 80 * observation.n_detectors
+
+    def traits(self, observation: Observation) -> Traits:
+        """rms of one calibrated sample, and of its part that is faster than a frequency."""
+        spectrum = PinkSpectrum.of(self.operator, observation)
+        if spectrum is None:
+            return Traits()
+        law, amplitude = spectrum.filter(self.operator.poles), self._amplitude(spectrum, observation)
+        rate, rms = observation.sample_rate, amplitude * math.sqrt(law.gain * law.variance)
+        grid = np.geomspace(1e-9, 0.5, 600)
+        power = np.abs(_response(law, grid)) ** 2
+        above = np.append(np.cumsum((np.diff(grid) * (power[1:] + power[:-1]))[::-1])[::-1], 0.0)  # 2 int_f^(1/2) g |H|^2 df
+
+        def faster(frequency: float) -> float:
+            share = float(np.interp(math.log(max(frequency / rate, 1e-9)), np.log(grid), above))
+            return min(amplitude * math.sqrt(share), rms)
+
+        return Traits(rms=rms, faster=faster)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size and its cost; what fewer poles, or no pink noise, would save and err by."""
+        pink, o = self.operator, context.lowest
+        spectrum = PinkSpectrum.of(pink, o)
+        if spectrum is None:
+            return Estimate((), Cost(per_sample=0.3e-9))
+        law, traits = spectrum.filter(pink.poles), self.traits(o)
+        level = self._amplitude(spectrum, o) ** 2 / max(context.noise, 1e-30) ** 2
+        assert traits.faster is not None
+        passed = LEAKS * traits.faster(context.cut) if context.cut > 0 else traits.rms
+        common = pink.shared > 0 and not context.removes_common
+        size = context.bound(passed, correlated=_correlated(law, context), common=common)
+        if context.before_filters:
+            size["tod"] = traits.rms
+        size["psd"] = level * float(law.response(np.array([0.1 / (o.duration * o.sample_rate)]))[0])
+        text = "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R: high-pass filter"
+        cost = pole_cost(pink.poles)
+        choices = [full(f"{pink.poles} poles"), *self._coarser(context, spectrum, level)]
+        if pink.shared == 0 and not context.kept_streams & pink.provides:
+            # a common part would be what a singular mode consists of: it is not dropped
+            saved = cost.seconds(context.times, o.n_detectors) + 0.5e-9 * context.samples
+            choices.append(Choice("dropped", "none", leave_out=True, bound=size, formula=text, seconds=saved))
+        without: Bound = size
+        if pink.shared > 0 and context.removes_common:
+            without = add(size, context.other_modes(pink.label))
+        return Estimate((Effect("poles", tuple(choices), size, text),), cost, without)
+
+    def _coarser(self, context: Context, spectrum: PinkSpectrum, level: float) -> list[Choice]:
+        """Filters of fewer poles; ``level``: of the white noise that they filter, over that of all white noise."""
+        pink, o, choices = self.operator, context.lowest, []
+        law, amplitude = spectrum.filter(pink.poles), self._amplitude(spectrum, o)
+        correlated, common = _correlated(law, context), pink.shared > 0 and not context.removes_common
+        text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
+        seconds = pole_cost(pink.poles).seconds(context.times, o.n_detectors)
+        for poles in (p for p in (12, 8, 4) if p < pink.poles):
+            try:
+                coarse = spectrum.filter(poles)
+            except ZondaError:
+                break
+            power = difference(law, coarse, context, o.sample_rate, o.duration)
+            bound = context.bound(amplitude * math.sqrt(power), correlated=correlated, common=common)
+            if context.before_filters:
+                free = difference(law, coarse, replace(context, traits={}), o.sample_rate, o.duration)
+                bound["tod"] = amplitude * math.sqrt(free)
+            bound["psd"] = psd_error(law, coarse, level)
+            saved = seconds - pole_cost(poles).seconds(context.times, o.n_detectors)
+            choices.append(Choice("coarse", f"{poles} poles", {"poles": poles}, bound=bound, formula=text, seconds=saved))
+        return choices
+
+    def _amplitude(self, spectrum: PinkSpectrum, observation: Observation) -> float:
+        """rms of the white noise that is filtered, in the calibrated stream; of the noisiest detector, K."""
+        return float(np.max(calibrated(level_of(self.operator, observation), observation))) * spectrum.factor
+
+
+def calibrated(level: WhiteLevel, observation: Observation) -> Floats:
+    """(n_det,) rms of one calibrated sample over the scan, K, under the load of its smooth means."""
+    return np.asarray(level.sky_net(observation) * math.sqrt(observation.sample_rate), np.float64)
+
+
+def pole_cost(poles: int) -> Cost:
+    """The kernel takes poles four at a time."""
+    return Cost(fixed=0.01, per_sample=1.7e-9 + 0.75e-9 * math.ceil(poles / 4), kernel="random")
+
+
+def difference(a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float) -> float:
+    """Variance of the difference of two filters' outputs for the same white noise of unit variance, after the filters R.
+
+    2 int_0^(1/2) |sqrt(g_a) H_a - sqrt(g_b) H_b|^2 R^2 df, in logarithmic steps. The stationary first states are drawn
+    independently: what they differ by dies out within 1 / (2 pi f) at a frequency f, which adds
+    2 S(f) R^2 / (2 pi f T) to the integrand's spectrum S.
+    """
+    f = np.geomspace(1e-3 / (duration * rate), 0.5, 4000)
+    delta = np.abs(_response(a, f) - _response(b, f)) ** 2
+    start = 2 * np.abs(_response(a, f)) ** 2 * np.minimum(1.0, 1 / (2 * np.pi * f * rate * duration))
+    passed = np.array([context.response(float(x * rate)) ** 2 for x in f])
+    return float(2 * np.trapezoid((delta + start) * passed, f))
+
+
+def psd_error(a: PowerLawFilter, b: PowerLawFilter, level: float) -> float:
+    """Largest relative error of the spectrum of pink plus white noise; ``level``: of unit responses over white noise."""
+    f = np.geomspace(1e-8, 0.5, 4000)
+    first, second = level * a.response(f), level * b.response(f)
+    return float((np.abs(second - first) / (1 + first)).max())
+
+
+def _response(law: PowerLawFilter, f: Any) -> Any:
+    """sqrt(g) H, complex, of equation (1) of `one_over_f`."""
+    back = np.exp(-2j * np.pi * f)
+    top = np.prod(1 - (1 - law.zeros[:, None]) * back, axis=0)
+    return math.sqrt(law.gain) * top / np.prod(1 - (1 - law.poles[:, None]) * back, axis=0)
+
+
+def _correlated(law: PowerLawFilter, context: Context) -> float:
+    """int |rho| dt over all lags, s, of noise that the high-pass filter has freed of what is slower than its cut.
+
+    rho from the power above the cut f_c, on a grid of f_c / 16 up to 256 f_c: what is faster correlates less.
+    """
+    if context.cut <= 0:
+        return context.first.duration
+    cut, rate = context.cut, context.first.sample_rate
+    n = 4096
+    f = np.arange(n + 1) * cut / 16
+    power = np.where((f >= cut) & (f <= rate / 2), law.response(np.maximum(f, cut) / rate), 0.0)
+    if not power.sum() > 0:
+        return 1 / cut
+    rho = np.fft.irfft(power)
+    return float(np.abs(rho / rho[0]).sum() / (2 * f[-1]))
