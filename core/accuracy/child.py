@@ -89,9 +89,10 @@ def run(request: Request, metric: Metric, seed: int | None, timed: bool) -> tupl
 
 def execute(file: Any, metric: Metric, threads: int | None, timed: bool) -> tuple[Data, bool]:
     """Run a pipeline file without what acts at its end; ``timed``: without the steps that the metric adds, too."""
+    from ..output import Output
     from ..pipeline import Pipeline
 
-    own = [o for o in file.operators if metric.needs_end or not o.at_end]
+    own = [o for o in file.operators if metric.needs_end or not isinstance(o, Output)]
     more = metric.steps(list(own))
     pipeline = Pipeline(own if timed else more, runs=file.runs, name=file.header.name, precision=file.header.precision)
     with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:

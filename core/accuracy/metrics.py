@@ -28,7 +28,7 @@ class Metric:
     says
         What the error is, half a line.
     needs_end
-        True where `measure` reads products of operators that act at the end of a run (``at_end``); they are left out otherwise.
+        True where `measure` reads products of an `Output` (plots, reports); these are left out otherwise.
     """
 
     says: ClassVar[str] = "|m - m0| / |m0|"

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from ..errors import InputError
+from ..output import Output
 from ..plan.planning import planning_of
 from ..storage.files import write_text
 from .front import Point, cheapest
@@ -70,7 +71,7 @@ def fingerprint(file: PipelineFile) -> str:
                 _described(step.operator, {*(k.parameter for k in planning_of(step.operator).knobs), *_length(step.operator)}),
             )
             for step in file.steps
-            if not step.operator.at_end
+            if not isinstance(step.operator, Output)
         ],
     ]
     return hashlib.blake2b(json.dumps(described, sort_keys=True).encode(), digest_size=8).hexdigest()

@@ -93,6 +93,8 @@ class Context:
     """The budget by metric: a coarser form whose bound alone exceeds it need not be looked into."""
     depth: Depth = Depth(0.0, 0.0)
     """The white noise that the run will have."""
+    readers: frozenset[str] = frozenset()
+    """Labels of the operators that make a product of the time streams themselves (`Planning.reads_streams`)."""
     kept_streams: frozenset[str] = frozenset()
     """Streams that some operator saves, measures or draws besides ``signal``."""
 
@@ -166,7 +168,7 @@ class Context:
     def before_filters(self) -> bool:
         """Whether a stream is saved, measured or drawn above a filter: what the filters remove is then in it."""
         filters = [k for k, o in enumerate(self.operators) if self._filters(o.label)]
-        readers = [k for k, o in enumerate(self.operators) if o.main_run_only]
+        readers = [k for k, o in enumerate(self.operators) if o.label in self.readers]
         return bool(filters and readers) and min(readers) < max(filters)
 
     def _filters(self, label: str) -> bool:

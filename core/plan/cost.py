@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..output import Output
 from ..run.forecast import BASE, forecast
 from ..run.repeated import affordable, alike
 from ..run.settings import Settings
@@ -102,11 +103,11 @@ def predict(
         On the reference machine, not on this one.
     """
     factors = dict.fromkeys(REFERENCE, 1.0) if portable else calibrate()
-    late = {o.label for o in context.operators if o.at_end}
+    late = {o.label for o in context.operators if isinstance(o, Output)}
     longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
     own = {o.label: planning_of(o).memory(longest) for o in context.operators}
     held = sum(own.get(label) or cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
-    steps = [o for o in context.operators if not o.at_end and "boresight" not in o.provides]
+    steps = [o for o in context.operators if not isinstance(o, Output) and "boresight" not in o.provides]
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
     acting: dict[str, float] = {label: max(number, 1) for label, number in context.runs.items()}
     copied = {label: names for label, names in alike(steps).items() if acting.get(label, 1) > 1}

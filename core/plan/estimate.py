@@ -138,8 +138,6 @@ class Traits:
         Makes a map in which samples are weighed by the inverse variance of their white noise.
     gain_error
         Scatters the detectors' gains by this relative rms, unknown to the calibration.
-    reads_streams
-        Makes a product of the time streams themselves (spectra, files), in which errors of a sample count.
     """
 
     noise: float = 0.0
@@ -152,7 +150,6 @@ class Traits:
     removes_common: bool = False
     weighs: bool = False
     gain_error: float = 0.0
-    reads_streams: bool = False
 
     @property
     def loudest(self) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..data import Data, Observation
 from ..operator import Operator
+from ..output import Output
 from ..pipeline import Pipeline
 from ..scene import Scene
 from .context import Context, Depth
@@ -24,17 +25,18 @@ LOOKED_AT = 4
 def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
     """Point the telescope and gather what the bounds need. ``pipeline`` is the planner's own copy."""
     operators = [o for o in pipeline.operators if o.label in structure.operators]
+    readers = frozenset(o.label for o in operators if planning_of(o).reads_streams)
     data = Data(scene=scene)
     for operator in operators:
-        if not (operator.at_end or operator.main_run_only):
+        if operator.label not in readers and not isinstance(operator, Output):
             operator.observe(data)
     shown = _some(data.observations)
     for observation in shown:
         for operator in operators:
             operator.configure(observation)
     runs = selected(pipeline, structure)
-    streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.main_run_only))
-    context = Context(scene, data.observations, operators, runs, kept_streams=streams)
+    streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.label in readers))
+    context = Context(scene, data.observations, operators, runs, readers=readers, kept_streams=streams)
     context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(operators, shown, context)
     pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
@@ -83,6 +85,6 @@ def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> froz
         made = set().union(*(o.provides for o in context.operators)) & STREAMS
         if made <= {"sky", "signal"} or any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
             found.add("transfer")
-    if any(o.main_run_only for o in context.operators) or context.coverage is None:
+    if context.readers or context.coverage is None:
         found |= {"tod", "psd"}
     return frozenset(found)

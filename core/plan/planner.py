@@ -12,6 +12,7 @@ from ..configuration.pipeline_file import PipelineFile
 from ..data import Data
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
+from ..output import Output
 from ..pipeline import Pipeline
 from ..run.derived import derivation
 from .budget import limits
@@ -146,7 +147,7 @@ def _everything_on(
     for operator in pipeline.operators:
         known = estimates.get(operator.label)
         if known is None:
-            if not (operator.at_end or operator.main_run_only):
+            if not (isinstance(operator, Output) or planning_of(operator).reads_streams):
                 operator.observe(Data(scene=context.scene, observations=list(context.observations)))
             operator.configure(whole.first)
             known = planning_of(operator).estimate(whole)

@@ -27,12 +27,15 @@ class Planning(Generic[O]):
         The class of the operator; those derived from it inherit its planning.
     knobs
         The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
+    reads_streams
+        It makes a product of the time streams themselves (spectra, files), in which errors of a sample count.
     smaller
         What lessens its `memory`, in a few words (``choose a larger pixel``), for a run that does not fit.
     """
 
     of: ClassVar[type[Operator]]
     knobs: ClassVar[tuple[Knob, ...]] = ()
+    reads_streams: ClassVar[bool] = False
     smaller: ClassVar[str] = ""
 
     def __init__(self, operator: O) -> None:
@@ -92,6 +95,6 @@ class _Own(Planning[Any]):
 
     def __init__(self, operator: Any) -> None:
         super().__init__(operator)
-        self.knobs, self.smaller = operator.knobs, operator.lighter  # type: ignore[misc]
+        self.knobs, self.smaller, self.reads_streams = operator.knobs, operator.lighter, operator.main_run_only  # type: ignore[misc]
         self.traits, self.estimate, self.memory = operator.traits, operator.estimate, operator.memory  # type: ignore[method-assign]
         self.sweeps = operator.sweeps  # type: ignore[method-assign]

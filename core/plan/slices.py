@@ -14,9 +14,11 @@ from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
 from ..focalplane import Focalplane
 from ..operator import Operator
+from ..output import Output
 from ..run.companion import Companion
 from .cost import calibrate
 from .estimate import Cost
+from .planning import planning_of
 
 SECONDS = 60.0
 """Longest slice, s."""
@@ -62,7 +64,7 @@ def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, 
     steps: list[Step] = []
     for step in file.steps:
         o = step.operator
-        if o.at_end or o.main_run_only:
+        if isinstance(o, Output) or planning_of(o).reads_streams:
             continue
         if "boresight" not in o.provides and steps and "boresight" in steps[-1].operator.provides:
             steps.append(Step("Slice", Slice(seconds=seconds, observations=observations, every=every)))

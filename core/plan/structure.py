@@ -13,9 +13,11 @@ from dataclasses import dataclass, field
 
 from .. import data
 from ..operator import Operator
+from ..output import Output
 from ..pipeline import Pipeline
 from ..run.companion import Companion
 from ..run.derived import derivable, derivation
+from .planning import planning_of
 
 STREAMS = frozenset(data.STREAMS)
 
@@ -87,7 +89,7 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
         rows += [Row("", o.label, False, reason) for o in pipeline.selection.steps("") if o.label not in needed[instead]]
         needed[""] = needed.pop(instead)
     acting = set().union(*(set(found) for found in needed.values()))
-    outside = [o for o in pipeline.operators if o.at_end or "boresight" in o.provides]
+    outside = [o for o in pipeline.operators if isinstance(o, Output) or "boresight" in o.provides]
     acting |= {o.label for o in outside}
     nowhere = {r.operator for r in rows if r.run == "" and r.operator and r.operator not in acting}
     rows = [r for r in rows if not (r.run and r.operator in nowhere)]
@@ -103,7 +105,7 @@ def _wanted(pipeline: Pipeline, run: str) -> set[str]:
     """Products of a run that steps at the end read: those that need certain runs in these, the others in all but their own."""
     found: set[str] = set()
     for o in pipeline.operators:
-        if o.at_end and (run in o.runs if o.needs() or run.startswith("_") else True):
+        if isinstance(o, Output) and (run in o.runs if o.needs() or run.startswith("_") else True):
             found |= o.requires | o.optional
     return found
 
@@ -171,8 +173,8 @@ def _not_in_run(pipeline: Pipeline, run: str, steps: Sequence[Operator]) -> list
     rows = []
     for o in pipeline.selection.steps(""):
         if o.label not in taking:
-            why = "belongs to the main run only" if o.main_run_only else f"the run has {_words(pipeline.runs[run])}"
-            if not o.main_run_only and pipeline.runs[run].keeps(o.provides) | ("signal" in o.provides):
+            why = "belongs to the main run only" if planning_of(o).reads_streams else f"the run has {_words(pipeline.runs[run])}"
+            if not planning_of(o).reads_streams and pipeline.runs[run].keeps(o.provides) | ("signal" in o.provides):
                 why = "the run has no filters"
             rows.append(Row(run, o.label, False, why))
     return rows

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from zonda.core.data import Observation
 from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Estimate, Traits
+from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
 
 from .plot_operators import Plots
@@ -48,10 +47,7 @@ class PowerSpectrumPlanning(Planning[PowerSpectrum]):
     """It reads the streams; its cost is that of the detectors it looks at."""
 
     of = PowerSpectrum
-
-    def traits(self, observation: Observation) -> Traits:
-        """It reads the streams as they are."""
-        return Traits(reads_streams=True)
+    reads_streams = True
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
@@ -62,10 +58,7 @@ class TimeStreamsPlanning(Planning[TimeStreams]):
     """It reads the streams; its cost is small."""
 
     of = TimeStreams
-
-    def traits(self, observation: Observation) -> Traits:
-        """It reads the streams as they are."""
-        return Traits(reads_streams=True)
+    reads_streams = True
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from zonda.core.data import Observation
 from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Estimate, Traits
+from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
 
 from .save_map import SaveMap
@@ -25,10 +24,7 @@ class SaveTODPlanning(Planning[SaveTOD]):
     """It reads the streams; its cost is that of writing them."""
 
     of = SaveTOD
-
-    def traits(self, observation: Observation) -> Traits:
-        """It reads the streams as they are."""
-        return Traits(reads_streams=True)
+    reads_streams = True
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""

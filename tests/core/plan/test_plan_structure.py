@@ -6,15 +6,16 @@ import pytest
 
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.operator import Operator
+from zonda.core.output import Output
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.planner import plan
 from zonda.core.plan.structure import prune, selected
 from zonda.core.run.companion import Companion
 
 
-def kind(name, requires=(), provides=(), optional=(), **attributes):
+def kind(name, requires=(), provides=(), optional=(), base=Operator, **attributes):
     sets = {"requires": frozenset(requires), "provides": frozenset(provides), "optional": frozenset(optional)}
-    return type(name, (Operator,), {"__doc__": name, "__module__": __name__, **sets, **attributes})()
+    return type(name, (base,), {"__doc__": name, "__module__": __name__, **sets, **attributes})()
 
 
 POINT = kind("Point", provides={"boresight"})
@@ -27,10 +28,10 @@ MAP = kind("Map", {"signal", "boresight"}, {"map"}, product_only=True)
 HITS = kind("Hits", {"boresight"}, {"map"}, product_only=True)
 SPECTRUM = kind("Spectrum", {"signal"}, {"spectrum"}, product_only=True, main_run_only=True)
 TOD = kind("Tod", {"signal"}, {"tod_file"}, main_run_only=True)
-SAVE = kind("Save", {"map"}, {"map_file"}, at_end=True)
+SAVE = kind("Save", {"map"}, {"map_file"}, base=Output)
 FREEZES = kind("Freezes", {"signal"}, {"signal"}, couples="all", freeze=lambda *a: None, measure_frozen=lambda *a: None)
-TRANSFER = kind("Transfer", {"map"}, {"table"}, at_end=True, needs=lambda self: (Companion(only=["sky"]),))
-FULL = kind("Full", {"map"}, {"table"}, at_end=True, needs=lambda self: (Companion(only=["sky"], modes="full"),))
+TRANSFER = kind("Transfer", {"map"}, {"table"}, base=Output, needs=lambda self: (Companion(only=["sky"]),))
+FULL = kind("Full", {"map"}, {"table"}, base=Output, needs=lambda self: (Companion(only=["sky"], modes="full"),))
 RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
 
 
@@ -155,7 +156,7 @@ def test_what_is_kept_by_name_keeps_the_main_run():
 def test_a_file_with_the_map_that_takes_the_main_runs_place():
     """A run that a step needs beside it, with fewer filters, goes on as a companion."""
     both = Companion(only=["sky"]), Companion(only=["sky"], filters="none")
-    two = kind("Two", {"map"}, {"table"}, at_end=True, needs=lambda self: both)
+    two = kind("Two", {"map"}, {"table"}, base=Output, needs=lambda self: both)
     found, runs, structure = acting(POINT, SKY, AIR, SUM, FILTER, MAP, two)
     assert "Air" not in found
     assert runs == {"_sky_unfiltered"}
