@@ -26,6 +26,7 @@ noise_models = Registry("noise model", "zonda.noise_models")
 spectra = Registry("spectra", "zonda.spectra")
 checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
 metrics = Registry("metric", "zonda.metrics", classes=True)  # classes, or functions of `Data`: core.accuracy.metrics
+ground_weather = Registry("weather on the ground", "zonda.ground_weather")
 weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True)
 
 sections = Registry(
@@ -45,8 +46,8 @@ steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
 
 registries = (
-    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, spectra, checks, metrics, planning,
-    products, sections,
+    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, ground_weather, spectra, checks, metrics,
+    planning, products, sections,
 )  # fmt: skip
 
 

@@ -91,7 +91,7 @@ def show(
         parts.append(summary.band_lines(air, bands, angle))
     click.echo("\n\n".join("\n".join(lines) for lines in parts))
 
-    from zonda.operators.diagnostics.weather_plots import weather_figure
+    from zonda.plugins.weather_plots import weather_figure
 
     path = product_path("out/weather", place.name, ".png") if output is None else output
     _check_suffix(path)

@@ -17,6 +17,7 @@ from zonda.core.errors import InputError, OutputError
 from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
 from zonda.core.operator import Operator
 from zonda.core.output import output_folder
+from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
 from zonda.core.stream_names import StreamsAsked
 
@@ -114,11 +115,9 @@ class SaveTOD(Operator):
 
     def _weather(self, data: Data, observation: Observation) -> GroundWeather | None:
         """That of the scene, where no step made an atmosphere of it."""
-        from zonda.operators.atmosphere.weather.sources import air_of, on_the_ground
-
-        scene = data.scene
         try:
-            return on_the_ground(air_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
+            found: GroundWeather = ground_weather.get("scene")(data.scene)
+            return found
         except InputError as err:
             observation.tally.state(self.label, "weather is not written", str(err).splitlines()[0])
             return None

@@ -22,6 +22,7 @@ from .table import read_table
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
+    from zonda.core.scene import Scene
     from zonda.core.site import Site
 
 
@@ -133,6 +134,11 @@ def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None
         wind_east=float(east),
         wind_north=float(north),
     )
+
+
+def of_scene(scene: Scene) -> GroundWeather:
+    """What instruments at the telescope read in the air of a scene at its start."""
+    return on_the_ground(air_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
 
 
 def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:

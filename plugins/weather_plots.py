@@ -10,8 +10,7 @@ import numpy as np
 
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather.summary import HOURS, MONTHS, QUANTILES, WaterByMonth, pwv_steps
-
-from .canvas import DPI, SEQUENCE
+from zonda.operators.diagnostics.canvas import DPI, SEQUENCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,7 @@ from zonda.core.configuration.time import Instant
 from zonda.operators.atmosphere.weather.absorption import absorption_table
 from zonda.operators.atmosphere.weather.sources import air_of
 from zonda.operators.atmosphere.weather.summary import water_by_month
-from zonda.operators.diagnostics.weather_plots import LINES, plot_spectrum, spread, weather_figure
+from zonda.plugins.weather_plots import LINES, plot_spectrum, spread, weather_figure
 
 
 @pytest.fixture(scope="module")
