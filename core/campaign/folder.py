@@ -12,7 +12,7 @@ from ..errors import InputError, OutputError, ZondaError
 from ..storage.files import discard, temporary_sibling, write_text
 from . import log as joblog
 from . import machines, parts
-from .job import FILE, LOG, TASKS, Job, Say, Task, plural
+from .job import FILE, LOG, TASKS, Job, OtherFormat, Say, Task, plural
 from .log import Log
 
 RESOLVED = "resolved.yaml"
@@ -38,16 +38,17 @@ def make_way(folder: Path) -> None:
 
 
 def finished(folder: Path) -> bool:
-    """Whether all products of the campaign in a folder are written."""
-    if not (folder / LOG).exists():
-        return False
+    """Whether all products of the campaign in a folder are written. Raises `OtherFormat`."""
     try:
-        job, log = Job.read(folder), Log(folder / LOG)
+        job = Job.read(folder)
+        if not (folder / LOG).exists():
+            return False
+        with contextlib.closing(Log(folder / LOG)) as log:
+            return len(log.combined(job.layouts)) == len(job.combinations)
+    except OtherFormat:
+        raise
     except ZondaError:
         return False
-    with contextlib.closing(log), contextlib.suppress(ZondaError):
-        return len(log.combined(job.layouts)) == len(job.combinations)
-    return False
 
 
 def publish(job: Job, folder: Path) -> None:
@@ -113,7 +114,7 @@ def readable(path: Path) -> list[joblog.Row]:
 def open_log(path: Path, job: Job) -> Log:
     """A job log that knows all tasks."""
     log = Log(path)
-    log.begin((task.number, task.samples) for task in job.tasks)
+    log.begin(task.number for task in job.tasks)
     return log
 
 

@@ -15,7 +15,9 @@ from pathlib import Path
 from ..errors import InputError
 from ..storage.files import write_text
 
-FORMAT = 1
+FORMAT = 2
+"""Of a campaign's folder: this file, the job log and the partial products."""
+
 FILE = "campaign.json"
 LOG = "jobs.sqlite"
 TASKS = "tasks"
@@ -29,6 +31,10 @@ Say = Callable[[str], None]
 def plural(number: int, noun: str) -> str:
     """``1 task``, ``2 tasks``."""
     return f"{number} {noun}{'s' if number != 1 else ''}"
+
+
+class OtherFormat(InputError):
+    """A campaign's folder was written by another version of zonda."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +168,9 @@ class Job:
                 raise ValueError("its checksum is wrong")
             values = json.loads(text)
             if values.pop("format") != FORMAT:
-                raise ValueError("it is of another format")
+                what = f"holds a campaign of zonda {values['version']}, whose partial products cannot be used any more"
+                cure = "remove it, choose another output folder, or finish it with that version"
+                raise OtherFormat(what, place=str(folder), cure=cure)
             combinations = tuple(Combination(**c) for c in values.pop("combinations"))
             tasks = tuple(Task(**{**t, "scans": tuple(t["scans"])}) for t in values.pop("tasks"))
             if not all(_inside(c.folder) for c in combinations) or not all(re.fullmatch("[0-9a-f]{32}", t.key) for t in tasks):

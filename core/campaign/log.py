@@ -10,8 +10,9 @@ import errno
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
 from ..storage.files import output_error, writing
@@ -20,6 +21,14 @@ DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """What reading a damaged file may raise; the second from the text of the first."""
 
 STATES = ("waiting", "claimed", "done", "failed")
+
+
+TABLES = (
+    "tasks (number INTEGER PRIMARY KEY, state TEXT NOT NULL, attempts INTEGER NOT NULL, error TEXT NOT NULL, host TEXT NOT NULL, "
+    "seconds REAL NOT NULL, digest TEXT NOT NULL, machine INTEGER NOT NULL)",
+    "combined (number INTEGER PRIMARY KEY, layout TEXT NOT NULL)",
+    "machines (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE)",
+)
 
 
 @dataclass(frozen=True)
@@ -42,12 +51,11 @@ class Row:
     error: str
     host: str
     seconds: float
-    samples: int
     digest: str
-    machine: str = ""
+    machine: str
 
 
-WAITING = Row(-1, "waiting", 0, "", "", 0.0, 0, "")
+WAITING = Row(-1, "waiting", 0, "", "", 0.0, "", "")
 """Of a task that no log knows."""
 
 
@@ -56,28 +64,22 @@ class Log:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with self._told():
+        with self._errors():
             self._db = sqlite3.connect(path, isolation_level=None, timeout=30)
             self._db.execute("PRAGMA journal_mode = DELETE")
-            self._db.execute(
-                "CREATE TABLE IF NOT EXISTS tasks (number INTEGER PRIMARY KEY, state TEXT NOT NULL, attempts INTEGER NOT NULL, "
-                "error TEXT NOT NULL, host TEXT NOT NULL, seconds REAL NOT NULL, samples INTEGER NOT NULL, digest TEXT NOT NULL)"
-            )
-
-            self._db.execute("CREATE TABLE IF NOT EXISTS combined (number INTEGER PRIMARY KEY, layout TEXT NOT NULL)")
-            self._db.execute("CREATE TABLE IF NOT EXISTS machines (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE)")
-            self._db.execute("CREATE TABLE IF NOT EXISTS made_on (number INTEGER PRIMARY KEY, machine INTEGER NOT NULL)")
+            for table in TABLES:
+                self._db.execute(f"CREATE TABLE IF NOT EXISTS {table}")
 
     def check(self) -> None:
         """Raise `InputError` where the file is damaged, also where nobody has read yet."""
-        with self._told():
+        with self._errors():
             found = [str(row[0]) for row in self._db.execute("PRAGMA integrity_check")]
             if found != ["ok"]:
                 raise sqlite3.DatabaseError(found[0])
 
     def combined(self, layouts: Mapping[int, str]) -> set[int]:
         """Combinations whose products are written. ``layouts``: by number, their layouts' digests, which the log must know."""
-        with self._told():
+        with self._errors():
             found: dict[int, str] = dict(self._db.execute("SELECT number, layout FROM combined"))
             if not found.items() <= layouts.items():
                 raise sqlite3.DatabaseError("it names what is no set of products of this campaign")
@@ -85,53 +87,44 @@ class Log:
 
     def combine(self, number: int, layout: str) -> None:
         """A combination's products are written."""
-        with self._transaction():
-            self._db.execute("INSERT OR IGNORE INTO combined VALUES (?, ?)", (number, layout))
+        self._write("INSERT OR IGNORE INTO combined VALUES (?, ?)", [(number, layout)])
 
-    def begin(self, tasks: Iterable[tuple[int, int]]) -> None:
-        """Enter tasks (number, samples) that are not there yet, as waiting."""
-        with self._transaction():
-            self._db.executemany("INSERT OR IGNORE INTO tasks VALUES (?, 'waiting', 0, '', '', 0, ?, '')", tasks)
+    def begin(self, numbers: Iterable[int]) -> None:
+        """Enter tasks that are not there yet, as waiting."""
+        self._write("INSERT OR IGNORE INTO tasks VALUES (?, 'waiting', 0, '', '', 0, '', 0)", ((n,) for n in numbers))
 
     def claim(self, numbers: Iterable[int]) -> None:
         """Tasks are given to workers."""
-        with self._transaction():
-            self._db.executemany(
-                "UPDATE tasks SET state = 'claimed', attempts = attempts + 1 WHERE number = ?", [(n,) for n in numbers]
-            )
+        self._write("UPDATE tasks SET state = 'claimed', attempts = attempts + 1 WHERE number = ?", ((n,) for n in numbers))
 
     def done(self, number: int, host: str, seconds: float, digest: str, machine: str = "") -> None:
         """A task's product is there."""
-        with self._transaction():
-            self._db.execute("DELETE FROM made_on WHERE number = ?", (number,))
-            if machine:
-                self._db.execute("INSERT OR IGNORE INTO machines (text) VALUES (?)", (machine,))
-                self._db.execute("INSERT INTO made_on SELECT ?, id FROM machines WHERE text = ?", (number, machine))
-            self._db.execute(
-                "UPDATE tasks SET state = 'done', host = ?, seconds = ?, digest = ? WHERE number = ?",
-                (host, seconds, digest, number),
+        with self.together():
+            self._write("INSERT OR IGNORE INTO machines (text) VALUES (?)", [(machine,)])
+            self._write(
+                "UPDATE tasks SET state = 'done', host = ?, seconds = ?, digest = ?, "
+                "machine = (SELECT id FROM machines WHERE text = ?) WHERE number = ?",
+                [(host, seconds, digest, machine, number)],
             )
 
     def failed(self, number: int, host: str, seconds: float, error: str, again: bool) -> None:
         """An attempt failed; ``again``: the task waits for another one."""
-        with self._transaction():
-            self._db.execute(
-                "UPDATE tasks SET state = ?, host = ?, seconds = ?, error = ?, digest = '' WHERE number = ?",
-                ("waiting" if again else "failed", host, seconds, error, number),
-            )
+        self._write(
+            "UPDATE tasks SET state = ?, host = ?, seconds = ?, error = ?, digest = '', machine = 0 WHERE number = ?",
+            [("waiting" if again else "failed", host, seconds, error, number)],
+        )
 
     def put_off(self, numbers: Iterable[int], error: str = "") -> None:
         """Tasks wait again, with all their attempts before them. ``error``: why, where that is worth telling."""
-        with self._transaction():
-            self._db.executemany(
-                "UPDATE tasks SET state = 'waiting', attempts = 0, digest = '', error = CASE WHEN ?1 = '' THEN error ELSE ?1 END "
-                "WHERE number = ?2",
-                [(error, n) for n in numbers],
-            )
+        self._write(
+            "UPDATE tasks SET state = 'waiting', attempts = 0, digest = '', machine = 0, "
+            "error = CASE WHEN ?1 = '' THEN error ELSE ?1 END WHERE number = ?2",
+            ((error, n) for n in numbers),
+        )
 
     def rows(self) -> list[Row]:
         """All tasks, in order."""
-        with self._told():
+        with self._errors():
             return _rows(self._db)
 
     def close(self) -> None:
@@ -141,15 +134,10 @@ class Log:
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
         """Write what the body says at once, when it ends: the disk is waited for once."""
-        with self._transaction():
-            yield
-
-    @contextlib.contextmanager
-    def _transaction(self) -> Iterator[None]:
         if self._db.in_transaction:
             yield
             return
-        with self._told():
+        with self._errors():
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -159,8 +147,12 @@ class Log:
                 raise
             self._db.execute("COMMIT")
 
+    def _write(self, statement: str, rows: Iterable[tuple[Any, ...]]) -> None:
+        with self.together():
+            self._db.executemany(statement, rows)
+
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _errors(self) -> Iterator[None]:
         try:
             with writing(self.path):
                 yield
@@ -193,24 +185,13 @@ def damaged(path: Path, err: Exception) -> InputError:
 
 
 def _rows(database: sqlite3.Connection) -> list[Row]:
-    columns = "number, state, attempts, error, host, seconds, samples, digest"
-    machines = _machines(database)
-    found = [Row(*values) for values in database.execute(f"SELECT {columns} FROM tasks ORDER BY number")]
-    found = [replace(row, machine=machines.get(row.number, "")) if row.state == "done" else row for row in found]
-    kinds = (int, str, int, str, str, float | int, int, str, str)
+    columns = "number, state, attempts, error, host, seconds, digest, COALESCE(text, '')"
+    query = f"SELECT {columns} FROM tasks LEFT JOIN machines ON id = machine ORDER BY number"
+    found = [Row(*values) for values in database.execute(query)]
+    kinds = (int, str, int, str, str, float | int, str, str)
     if any(row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found):
         raise sqlite3.DatabaseError("it holds what is no state of a task")
     return found
-
-
-def _machines(database: sqlite3.Connection) -> dict[int, str]:
-    """By task; of a log that an older zonda wrote, none."""
-    try:
-        return dict(database.execute("SELECT number, text FROM made_on JOIN machines ON id = machine"))
-    except sqlite3.OperationalError as err:
-        if "no such table" in str(err):
-            return {}
-        raise
 
 
 def _error(err: Exception, path: Path) -> Exception:

@@ -128,7 +128,7 @@ def share(
         discard(path)
         log, rows = Log(path), {}
     with contextlib.closing(log):
-        log.begin((task.number, task.samples) for task in mine)
+        log.begin(task.number for task in mine)
         missing = []
         for task in mine:
             digest = parts.digest_of(task.path(folder), task.key)

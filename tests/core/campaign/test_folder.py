@@ -1,6 +1,9 @@
 """What a killed worker leaves."""
 
+import pytest
+
 from zonda.core.campaign.folder import clean
+from zonda.core.campaign.job import FILE, digest_of_text
 from zonda.core.storage.files import temporary_sibling
 
 
@@ -28,3 +31,17 @@ def test_a_campaign_that_ends_well_leaves_none(bench, monkeypatch):
     monkeypatch.setattr(Tasks, "run", lambda self, tasks: (leaves(self.folder), usual(self, tasks))[1])
     out = bench.run("{nights: 1}", "--engine", "serial", "--threads", 1)
     assert not list(out.rglob("*.part*"))
+
+
+@pytest.mark.parametrize("command", ["resume", "status", "run"])
+def test_the_folder_of_an_older_version_is_refused(bench, undisturbed, capsys, command):
+    _, _, text = (undisturbed / FILE).read_text().rstrip().partition("\n")
+    text = text.replace('"format":2', '"format":1', 1)
+    out = bench.new()
+    out.mkdir()
+    (out / FILE).write_text(f'{{"digest": "{digest_of_text(text)}"}}\n{text}\n')
+    arguments = [bench.file(bench.CAMPAIGN), "--output", out] if command == "run" else [out]
+    assert bench.command(command, *arguments) == 2
+    assert f"error: {out}: holds a campaign of zonda" in (said := capsys.readouterr().err)
+    assert "choose another output folder" in said
+    assert [p.name for p in out.iterdir() if not p.name.startswith(".")] == [FILE]

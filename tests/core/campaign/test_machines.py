@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 
 import pytest
 
@@ -105,21 +104,9 @@ def test_the_campaign_s_word_can_be_taken_back(bench, moving, capsys):
     assert "another kind of machine" in capsys.readouterr().err
 
 
-def test_a_log_of_an_older_version(tmp_path):
-    path = tmp_path / "jobs.sqlite"
-    log = joblog.Log(path)
-    log.begin([(0, 1)])
-    log.done(0, "h", 1.0, "d")
-    log.close()
-    with sqlite3.connect(path) as database:
-        database.execute("DROP TABLE machines")
-        database.execute("DROP TABLE made_on")
-    assert [(row.state, row.machine) for row in joblog.read(path)] == [("done", "")]
-
-
 def test_a_task_that_is_put_off_has_no_machine(tmp_path):
     log = joblog.Log(tmp_path / "jobs.sqlite")
-    log.begin([(0, 1), (1, 1)])
+    log.begin([0, 1])
     for number in (0, 1):
         log.done(number, "h", 1.0, "d", '{"cpu": "a"}')
     log.put_off([1])

@@ -364,7 +364,7 @@ def test_an_operator_that_cannot_be_combined_is_named(bench, monkeypatch, capsys
 
 def test_every_transition_is_in_the_log(tmp_path):
     log = Log(tmp_path / "jobs.sqlite")
-    log.begin([(0, 10), (1, 20)])
+    log.begin([0, 1])
     log.claim([0, 1])
     assert [(r.state, r.attempts) for r in log.rows()] == [("claimed", 1)] * 2
     log.failed(0, "h", 1.0, "no", again=True)
