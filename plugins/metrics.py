@@ -47,6 +47,7 @@ from numpy.typing import NDArray
 from zonda.core.accuracy.metrics import Metric
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.operator import Operator
@@ -55,7 +56,6 @@ from zonda.core.types import Floats
 from zonda.operators.diagnostics.series import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
-from zonda.operators.maps.image import Image
 
 COVERED = 0.1
 """Share of the 99th percentile of the hits from which a pixel counts as covered."""

@@ -22,7 +22,7 @@ KERNELS = (
     "0.5 zonda.core.numerics.smooth _lines f8:2C f8:2C i8 f4:2C",
     "2.7 zonda.operators.noise.streams _filter u4:1C i8 i8 i8 f4:2C f4:1C f4:1C i8 f4:2C i8 f4:1C f4:1C f4:1C b1 f4:2C",
     "1.7 zonda.operators.sky.sampling _point f8:2C f8:2C i8 i8 f8:1C f4:3C f8:3C f4:2C i4:2C",
-    "3.3 zonda.operators.sky.sampling _sample f4:3C f8:3C f4:2C i4:2C f4:1C f4:1C i8:1C f4:1C i8 u1:2C f4:1C b1 f4:2C",
+    "3.3 zonda.operators.sky.sampling add_splines f4:3C f8:3C f4:2C i4:2C f4:1C f4:1C i8:1C f4:1C i8 u1:2C f4:1C b1 f4:2C",
     "0.2 zonda.core.numerics.smooth _evaluate f4:2C i8 f4:1C i8 f4:2C",
     "0.8 zonda.operators.noise.white _add_normals u4:1C i8 i8 f4:2C i8 f4:1C b1 f4:2C",
     "1.4 zonda.operators.optics.efficiency _calibrate f4:2C f4:2C f4:2C f4:2C f4:2C i8:1C f4:2C f4:1C f4:2C f4:1C f4:2C b1 f4:2C",

@@ -17,12 +17,12 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.early import take
+from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.map_view import MapView, maps_of, noise_sources
 from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, atomic_path, product_path
 from zonda.core.types import AnyFloats
-from zonda.operators.maps.image import Image
 
 from .artist import Artist
 from .flat_map import FlatMap

@@ -17,7 +17,6 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
 from zonda.core.errors import PointingError
 from zonda.core.intervals import Intervals
-from zonda.core.knobs import Knob
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.operator import Operator
@@ -32,8 +31,6 @@ from .transform import CelestialTransform, Track, series, unit_vectors
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
 
 SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
 """By `Pointing.check`: scans of a step, and instants of all of them."""
@@ -63,9 +60,6 @@ class Pointing(Operator):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    knobs: ClassVar[tuple[Knob, ...]] = (
-        Knob("interpolation_error", (0.1, 0.01, 1e-3, 1e-4), "celestial transformation interpolated between nodes in time"),
-    )
 
     target: Target | None = None
     """Centre of the scans; the scene's target where absent."""
@@ -133,12 +127,6 @@ class Pointing(Operator):
 
     def state(self, observation: Observation) -> None:
         """Tell the tally what else should be known of this scan."""
-
-    def estimate(self, context: Context) -> Estimate:
-        """What the pointing carries exactly, and what it leaves out."""
-        from .estimate import pointing_estimate
-
-        return pointing_estimate(self, context)
 
     def _on_the_sky(self, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
         """ICRS unit vectors (n, 3) of a `path` about a celestial target."""

@@ -17,7 +17,6 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
 from zonda.core.errors import InputError, PointingError
 from zonda.core.intervals import part
-from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
@@ -30,8 +29,6 @@ from .transform import CelestialTransform, unit_vectors
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
-    from zonda.core.plan.context import Context
-    from zonda.core.plan.estimate import Estimate
 
 MOST_CHECKED = 100_000
 """Samples of a scan that `zonda check` looks at."""
@@ -58,9 +55,6 @@ class PointingRecorded(Operator):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    knobs: ClassVar[tuple[Knob, ...]] = (
-        Knob("interpolation_error", (0.1, 0.01, 1e-3, 1e-4), "celestial transformation interpolated between nodes in time"),
-    )
 
     file: InputPath
     """HDF5, FITS table or CSV."""
@@ -123,12 +117,6 @@ class PointingRecorded(Operator):
                 observation.tally.state(self.label, what, text)
         for text in sampled.warnings():
             warnings.warn(f"{self.label}: {text}", stacklevel=2)
-
-    def estimate(self, context: Context) -> Estimate:
-        """As of other pointing steps."""
-        from .estimate import pointing_estimate
-
-        return pointing_estimate(self, context)
 
     def _read(self) -> tuple[Recording, Comb]:
         recording = read(self.file, self.clock, self.flag_mask)

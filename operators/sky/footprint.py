@@ -11,6 +11,7 @@ import numpy as np
 from zonda.core.configuration.target import Target
 from zonda.core.errors import InputError
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
+from zonda.core.numerics.sphere import angle_between, angles, unit_vectors
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import opened
 from zonda.core.storage.fits_image import read_image
@@ -59,8 +60,7 @@ class Footprint:
     @property
     def target(self) -> Target:
         """Its centre, to 1e-9 deg: as somebody would write it."""
-        x, y, z = self.centre
-        ra, dec = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+        ra, dec = np.degrees(angles(self.centre))
         return Target.parse(f"{ra:.9f} deg {dec:.9f} deg")
 
 
@@ -103,11 +103,11 @@ def extent(wcs: Any, turn: Floats, shape: tuple[int, int]) -> tuple[Disc | None,
     x, y = np.meshgrid(np.linspace(0, nx - 1, LATTICE), np.linspace(0, ny - 1, LATTICE))
     lon, lat = np.radians(wcs.wcs_pix2world([[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0).T)
     lon, lat = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
-    rays = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1) @ turn
+    rays = unit_vectors(lon, lat) @ turn
     middle, known = rays[0], np.isfinite(rays.sum(axis=1))
     if not known[0]:
         return None, False
-    radius = float(np.arccos(np.clip(rays[known] @ middle, -1, 1)).max(initial=0.0)) * (1 + 2 / LATTICE)
+    radius = float(angle_between(rays[known], middle).max(initial=0.0)) * (1 + 2 / LATTICE)
     return Disc(middle, min(radius, np.pi)), bool(known.all())
 
 
@@ -126,10 +126,10 @@ def _header(path: Path, wanted: int | str | None, place: str) -> tuple[Any, tupl
 def off_the_map(found: Footprint, centre: tuple[float, float], label: str) -> str:
     """What to say of a scan about ``centre``, ICRS (ra, dec) [rad], that is not on the map; empty where it is."""
     ra, dec = centre
-    direction = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    direction = unit_vectors(ra, dec)
     if found.holds(direction):
         return ""
-    away = np.degrees(np.arccos(np.clip(direction @ found.centre, -1, 1)))
+    away = np.degrees(angle_between(direction, found.centre))
     return (
         f"{label}: the target {position(ra, dec)} is not on the input map, whose centre, {position(*found.target.icrs())}, is "
         f"{away:.3g} deg away; `target: map` looks there"

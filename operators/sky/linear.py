@@ -13,32 +13,13 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 from numba import int32, uint64
-from numpy.typing import NDArray
 
-from zonda.core.types import AnyFloats
-
-from .sampling import CHUNK, CONSTANTS, Chunks, count_covered, locate, misses, span_on_grid
-
-
-def sample_linear(
-    chunks: Chunks,
-    xi: NDArray[np.float64],
-    eta: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    values: AnyFloats,
-    covered: NDArray[np.uint8],
-    out: AnyFloats,
-    over: bool = False,
-) -> tuple[int, int]:
-    """As `sampling.sample`, from the grid's ``values`` (ny, nx). Samples within two points of its border are left as they are."""
-    kind = out.dtype.type
-    of_map = rows, values.reshape(-1), values.shape[1], covered, CONSTANTS.astype(kind)
-    beyond, behind = _sample(*chunks, xi.astype(kind), eta.astype(kind), *of_map, over, out)
-    return int(beyond), int(behind)
+from .sampling import CHUNK, count_covered, locate, misses, span_on_grid
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _sample(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out):  # type: ignore[no-untyped-def]
+def add_lines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out):  # type: ignore[no-untyped-def]
+    """As `sampling.add_splines`, from the grid's values. Samples within two points of its border are left as they are."""
     place = np.empty(CHUNK, np.int32)
     u, v = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
     beyond, behind = 0, 0

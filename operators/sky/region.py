@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights
+from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def region(observation: Observation, step: float, reach: float, disc: Disc | Non
         The scan goes further from its centre than a gnomonic projection serves, or the box has too many points.
     """
     around = float(np.arctan(observation.focalplane.radius)) + reach
-    axes = _axes(*observation.centre)
+    axes = local_axes(*observation.centre)
     boxes, furthest = [], 0.0
     for x, y, theta in _on_plane(observation, axes, disc, around):
         furthest = max(furthest, float(theta.max(initial=0.0)))
@@ -122,17 +123,6 @@ def _on_plane(observation: Observation, axes: Floats, disc: Disc | None, around:
         theta = np.arccos(np.clip(depth, -1, 1))
         front = theta < WIDEST  # others end in an error
         yield -east[front] / depth[front], north[front] / depth[front], theta
-
-
-def _axes(ra: float, dec: float) -> Floats:
-    """(3, 3) rows: the direction at (ra, dec), east and north there."""
-    return np.array(
-        [
-            [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)],
-            [-np.sin(ra), np.cos(ra), 0.0],
-            [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)],
-        ]
-    )
 
 
 def _snapped(low: Floats, high: Floats) -> tuple[int, int, int, int]:

@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
+from zonda.core.numerics.projection import frame_rotation, pixel_matrix, wcs_frame_rotation
+from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.types import Floats
 
 from .inputs import HealpixMap, WcsMap
 from .region import MARGIN, TILE
 
-Tell = Callable[[int, int], None]
-"""Told how many points of all are done."""
+Progress = Callable[[int, int], None]
+"""Called with the number of points that are done, and of all."""
 
 NEIGHBOURS = 24
 """HEALPix pixels in each local fit: two rings and a few more."""
@@ -38,7 +39,7 @@ class _Block:
     d: Floats
 
 
-def _blocks(target: Any, tiles: NDArray[np.bool_] | None, tell: Tell, thin: int = 1) -> Iterator[_Block]:
+def _blocks(target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1) -> Iterator[_Block]:
     """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True, where given.
 
     ``thin``: every so manieth point along each axis only.
@@ -46,7 +47,7 @@ def _blocks(target: Any, tiles: NDArray[np.bool_] | None, tell: Tell, thin: int 
     nx, ny = target.pixel_shape
     to_sky = np.linalg.inv(pixel_matrix(target)).T
     total, done = nx * ny if tiles is None else int(tiles.sum()) * TILE**2, 0
-    tell(0, total)
+    progress(0, total)
     for first in range(0, ny, BLOCK):
         for left in range(0, nx, BLOCK):
             y, x = (k.ravel() for k in np.mgrid[first : min(first + BLOCK, ny) : thin, left : min(left + BLOCK, nx) : thin])
@@ -58,18 +59,18 @@ def _blocks(target: Any, tiles: NDArray[np.bool_] | None, tell: Tell, thin: int 
             rays = np.stack([x, y, np.ones(y.size)], axis=1) @ to_sky
             yield _Block(y, x, rays / np.linalg.norm(rays, axis=1, keepdims=True))
             done += y.size * thin * thin
-            tell(min(done, total), total)
+            progress(min(done, total), total)
 
 
-def nothing(done: int, total: int) -> None:
-    """Tell nobody."""
+def no_progress(done: int, total: int) -> None:
+    """Report to nobody."""
 
 
 # ------------------------------------------------------------------------------------------------------------ images
 
 
 def resample_image(
-    image: WcsMap, target: Any, tiles: NDArray[np.bool_] | None = None, tell: Tell = nothing, per_area: bool = False
+    image: WcsMap, target: Any, tiles: NDArray[np.bool_] | None = None, progress: Progress = no_progress, per_area: bool = False
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """(values, covered) of an image on the TAN grid ``target``, by cubic B-splines. NaN-free: not covered is 0.
 
@@ -87,7 +88,7 @@ def resample_image(
     nx, ny = target.pixel_shape
     values, covered = np.zeros((ny, nx)), np.zeros((ny, nx), bool)
     coordinates = _coordinates(image)
-    for block in _blocks(target, tiles, tell):
+    for block in _blocks(target, tiles, progress):
         x, y, inside = _on_image(image, coordinates, block.d)
         if not inside.any():
             continue
@@ -141,8 +142,8 @@ def _coordinates(image: WcsMap) -> Callable[[Floats], tuple[Floats, Floats]]:
             return lambda d: _by_astropy(image.wcs, d)
 
     def found(d: Floats) -> tuple[Floats, Floats]:
-        x, y, z = np.moveaxis(d @ turn.T, -1, 0)
-        return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+        lon, lat = np.degrees(angles(d @ turn.T))
+        return lon % 360.0, lat
 
     return found
 
@@ -182,8 +183,7 @@ def pixel_areas(wcs: Any, rows: NDArray[np.int64], columns: NDArray[np.int64]) -
         x, y = np.meshgrid(columns.astype(np.float64), rows[some].astype(np.float64))
 
         def ray(dx: float, dy: float, x: Floats = x, y: Floats = y) -> Floats:
-            lon, lat = (np.radians(c) for c in from_pixels(wcs, x + dx, y + dy))
-            return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=2)
+            return unit_vectors(*np.radians(from_pixels(wcs, x + dx, y + dy)))
 
         h = 0.25
         across, along = ray(h, 0.0) - ray(-h, 0.0), ray(0.0, h) - ray(0.0, -h)
@@ -202,7 +202,7 @@ def from_pixels(wcs: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def resample_healpix(
-    sky: HealpixMap, target: Any, tiles: NDArray[np.bool_] | None = None, tell: Tell = nothing
+    sky: HealpixMap, target: Any, tiles: NDArray[np.bool_] | None = None, progress: Progress = no_progress
 ) -> tuple[Floats, NDArray[np.bool_], int]:
     """(values, covered, poor) of a HEALPix map on the TAN grid ``target``. A grid point is covered where its HEALPix pixel is.
 
@@ -214,14 +214,12 @@ def resample_healpix(
     import healpy
     from scipy.spatial import cKDTree
 
-    from zonda.core.numerics.projection import frame_rotation
-
     to_frame, matrix = frame_rotation(sky.frame), pixel_matrix(target)
     nx, ny = target.pixel_shape
     values, covered, poor = np.zeros((ny, nx)), np.zeros((ny, nx), bool), 0
     if len(sky.values) < NEIGHBOURS:
         return values, covered, poor
-    for block in _blocks(target, tiles, tell):
+    for block in _blocks(target, tiles, progress):
         own = healpy.vec2pix(sky.nside, *(block.d @ to_frame.T).T, nest=sky.nest)
         seen = _slots(sky, own)[1]
         near = _near(sky, block.d[seen] @ to_frame.T) if seen.any() else np.zeros(0, np.int64)
@@ -292,22 +290,18 @@ def extremes(source: WcsMap | HealpixMap, target: Any, tiles: NDArray[np.bool_] 
     import healpy
 
     found: list[Floats] = []
-    if isinstance(source, WcsMap):
-        coordinates = _coordinates(source)
-        for block in _blocks(target, tiles, nothing, thin=16):
+    coordinates = _coordinates(source) if isinstance(source, WcsMap) else None
+    for block in _blocks(target, tiles, no_progress, thin=16):
+        if isinstance(source, HealpixMap):
+            d = block.d @ frame_rotation(source.frame).T
+            there = _slots(source, healpy.vec2pix(source.nside, *d.T, nest=source.nest))[1]
+            if there.any():
+                found.append(source.values[_near(source, d[there])])
+        elif coordinates:
             x, y, inside = _on_image(source, coordinates, block.d)
             if inside.any():
                 rows, columns = _under(source, x[inside], y[inside])
                 found.append(source.values[np.ix_(rows, columns % source.values.shape[1])].ravel())
-    else:
-        from zonda.core.numerics.projection import frame_rotation
-
-        to_frame = frame_rotation(source.frame)
-        for block in _blocks(target, tiles, nothing, thin=16):
-            own = healpy.vec2pix(source.nside, *(block.d @ to_frame.T).T, nest=source.nest)
-            there = _slots(source, own)[1]
-            if there.any():
-                found.append(source.values[_near(source, block.d[there] @ to_frame.T)])
     if not found:
         return 0.0, 0.0
     return min(float(v.min()) for v in found), max(float(v.max()) for v in found)

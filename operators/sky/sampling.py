@@ -11,7 +11,8 @@ place within 256 samples: 3 roundings of 6e-8 of that offset, 5e-4 pixel (1e-4 o
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -24,16 +25,27 @@ from zonda.core.types import AnyFloats
 CHUNK = 256
 """Samples that share a coordinate origin; divides `TILE_SAMPLES`, so chunks are absolute."""
 
-
 Chunks = tuple[AnyFloats, NDArray[np.float64], AnyFloats, NDArray[np.int32]]
 """What `pointing` returns."""
 
+CONSTANTS = np.array([1 / 6, 2 / 3, 0.5, 1.0, 2.0, 1e6, 0.0])
+"""In the type of the samples: numba takes a number in the source for a float64."""
+
+
+class Rows(NamedTuple):
+    """The detectors of one beam."""
+
+    numbers: NDArray[np.intp]
+    """(n,) rows of the block's stream."""
+    xi: NDArray[np.float64]
+    """(n,) focal-plane offsets."""
+    eta: NDArray[np.float64]
+
 
 def sample(
+    kernel: Callable[..., tuple[int, int]],
     chunks: Chunks,
-    xi: NDArray[np.float64],
-    eta: NDArray[np.float64],
-    rows: NDArray[np.int64],
+    rows: Rows,
     coefficients: AnyFloats,
     covered: NDArray[np.uint8],
     out: AnyFloats,
@@ -43,12 +55,12 @@ def sample(
 
     Parameters
     ----------
+    kernel
+        `add_splines`, or `linear.add_lines`.
     chunks
         `pointing` for the samples of ``out``, of its type.
-    xi, eta
-        (n_rows,) focal-plane offsets of the detectors at ``rows`` of ``out``.
     coefficients
-        (ny, nx) cubic B-spline coefficients of ``out``'s type, C order, fewer than 2^31.
+        (ny, nx) of ``out``'s type, C order, fewer than 2^31: cubic B-spline coefficients, or values for `linear.add_lines`.
     covered
         (ny, nx) 1 where the input map has data, or (0, 0): everywhere within its bounds.
     over
@@ -58,13 +70,9 @@ def sample(
     in both numbers.
     """
     kind = out.dtype.type
-    of_map = rows, coefficients.reshape(-1), coefficients.shape[1], covered, CONSTANTS.astype(kind)
-    beyond, behind = _sample(*chunks, xi.astype(kind), eta.astype(kind), *of_map, over, out)
+    of_map = rows.numbers, coefficients.reshape(-1), coefficients.shape[1], covered, CONSTANTS.astype(kind)
+    beyond, behind = kernel(*chunks, rows.xi.astype(kind), rows.eta.astype(kind), *of_map, over, out)
     return int(beyond), int(behind)
-
-
-CONSTANTS = np.array([1 / 6, 2 / 3, 0.5, 1.0, 2.0, 1e6, 0.0])
-"""In the type of the samples: numba takes a number in the source for a float64."""
 
 
 def pointing(
@@ -144,7 +152,8 @@ def _point(quaternions, matrix, ny, nx, bounds, h, box, limits, ones):  # type: 
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _sample(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out):  # type: ignore[no-untyped-def]
+def add_splines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out):  # type: ignore[no-untyped-def]
+    """The work of `sample`, from cubic B-spline coefficients."""
     place, at = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
     u, v, found = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
     weights = np.zeros((8, CHUNK), out.dtype)

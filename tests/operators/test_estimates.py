@@ -9,13 +9,14 @@ import zonda
 from zonda.core.data import Data
 from zonda.core.instrument import Band
 from zonda.core.plan.context import Context, Coverage
+from zonda.core.plan.planning import planning_of
 from zonda.operators.atmosphere.planning import _slope, air
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere, _BandTransfer
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.operators.noise.planning import difference, psd_error
-from zonda.operators.pointing.estimate import STEEPEST, pointing_estimate
-from zonda.operators.sky.estimate import CUBIC, chromaticity
+from zonda.operators.pointing.planning import STEEPEST
+from zonda.operators.sky.planning import CUBIC, chromaticity
 
 FWHM = 8.0
 SIGMA = FWHM / math.sqrt(8 * math.log(2))
@@ -48,7 +49,7 @@ def test_sample_integration(context):
     """A point source seen for a while in passing, against an instant: the loss of its peak."""
     o = context.first
     speed, fwhm = context.coverage.speed, float(o.focalplane.fwhm.min())
-    rows = {e.name: e for e in pointing_estimate(zonda.PointingDaisy(), context).effects}
+    rows = {e.name: e for e in planning_of(zonda.PointingDaisy()).estimate(context).effects}
     length = speed / o.sample_rate / fwhm * FWHM
     x = np.linspace(-length / 2, length / 2, 10001)
     loss = 1 - np.trapezoid(gaussian(x), x) / length
@@ -58,7 +59,7 @@ def test_sample_integration(context):
 
 
 def test_sky_rotation_and_reach(context):
-    rows = {e.name: e for e in pointing_estimate(zonda.PointingDaisy(), context).effects}
+    rows = {e.name: e for e in planning_of(zonda.PointingDaisy()).estimate(context).effects}
     psi = np.unwrap(context.first.derotate("boresight_radec")[2])
     radius = context.first.focalplane.radius
     moved = 2 * math.sin((psi.max() - psi.min()) / 2) * radius  # of the outermost detector
@@ -71,7 +72,7 @@ def test_sky_rotation_and_reach(context):
 
 def test_differential_refraction(context):
     """Bennett's formula, which the bound does not use, over the elevations of the scan and the field."""
-    rows = {e.name: e for e in pointing_estimate(zonda.PointingDaisy(), context).effects}
+    rows = {e.name: e for e in planning_of(zonda.PointingDaisy()).estimate(context).effects}
 
     def bennett(elevation):
         h = np.degrees(elevation)

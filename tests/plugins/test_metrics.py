@@ -9,10 +9,10 @@ from astropy.wcs import WCS
 from zonda.core import registry
 from zonda.core.accuracy import metrics
 from zonda.core.errors import InputError
+from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.operators.diagnostics.power_spectrum import Spectrum
-from zonda.operators.maps.image import Image
 
 ARCSEC = np.pi / 648000
 PIXEL, FWHM = 4.0, 12.0  # arcsec

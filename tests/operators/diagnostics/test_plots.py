@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from zonda.core.errors import OutputError
+from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.operators.diagnostics import canvas, pictures
 from zonda.operators.diagnostics.plot_operators import Plots, _flat
@@ -23,7 +24,6 @@ from zonda.operators.diagnostics.png import png_of
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 from zonda.operators.diagnostics.sky_axes import SkyAxes
 from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
-from zonda.operators.maps.image import Image
 
 ARCSEC = np.pi / 648000
 ARCMIN = 60 * ARCSEC

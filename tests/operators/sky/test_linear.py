@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zonda.operators.sky.estimate import LINEAR
+from zonda.operators.sky.planning import LINEAR
 from zonda.operators.sky.skymap import SkyMap
 
 ARCSEC = np.pi / 648000

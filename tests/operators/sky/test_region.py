@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from zonda.core.errors import InputError
+from zonda.core.plan.planning import planning_of
 from zonda.operators.sky import region as regions
 from zonda.operators.sky.region import TILE, Disc, region, tangent_wcs
 from zonda.operators.sky.resample import resample_healpix, resample_image
@@ -58,7 +59,7 @@ def test_a_small_map_under_a_wide_scan_asks_for_a_small_grid(made, save):
     values[127:129, 127:129] = 1.0
     scan = strip(made, 26.0, fwhm=9.0)
     operator = SkyMap(file=save(values, header))
-    assert max(operator._working(scan).shape) < 1500
+    assert max(operator.grid(scan).shape) < 1500
     got = made.look(operator, scan)
     assert got.max() > 0.05
     assert scan.tally.get("SkyMap", "samples outside the input map") > 0.9 * scan.n_samples
@@ -86,10 +87,10 @@ def test_tiles_and_blocks_change_nothing(made, save, tmp_path, monkeypatch, kind
     monkeypatch.setattr(regions, "SPARSE", 1.0)
     some = SkyMap(file=path)
     parts = made.look(some, scan)
-    assert not some._working(scan).tiles.all()
+    assert not some.grid(scan).tiles.all()
     monkeypatch.setattr(regions, "SPARSE", 0.0)
     every = SkyMap(file=path)
-    assert every._working(scan).tiles is None
+    assert every.grid(scan).tiles is None
     # MARGIN points beyond the beam: 0.27^16 = 8e-10 of what is left out there; HEALPix: 1e-9 of the polynomials' rounding
     np.testing.assert_allclose(parts, made.look(every, scan), atol=1e-8)
 
@@ -103,37 +104,37 @@ def test_blocks_are_told(made, save, tmp_path, kind):
     target = tangent_wcs(*CENTRE, (-512, 512, -512, 512), ARCMIN)
     if kind == "healpix":
         healpy.write_map(tmp_path / "h.fits", np.ones(12 * 16**2), coord="C", column_units="K_RJ", dtype=np.float64)
-        resample_healpix(read_map(tmp_path / "h.fits"), target, tell=lambda done, total: told.append((done, total)))
+        resample_healpix(read_map(tmp_path / "h.fits"), target, progress=lambda done, total: told.append((done, total)))
     else:
         header = made.tan_header((18, 36), ra=0.0, dec=0.0, cdelt=(-36000.0, 36000.0))
         header["CTYPE1"], header["CTYPE2"] = "RA---CAR", "DEC--CAR"
         image = read_map(save(np.ones((18, 36)), header))
-        resample_image(image, target, tell=lambda done, total: told.append((done, total)))
+        resample_image(image, target, progress=lambda done, total: told.append((done, total)))
     assert [done for done, _ in told] == [k * 512**2 for k in range(5)]
     assert {total for _, total in told} == {1024**2}
 
 
 def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
     """Memory, bounds and costs come from the grid's shape; cost grows with the points that are worked on."""
-    from zonda.operators.sky import skymap
+    from zonda.operators.sky import brightness
 
     healpy.write_map(tmp_path / "h.fits", np.full(12 * 64**2, 2.0), coord="C", column_units="K_RJ", dtype=np.float64)
 
     def refuse(*arguments):
         raise AssertionError("interpolated")
 
-    monkeypatch.setattr(skymap, "resample_healpix", refuse)
+    monkeypatch.setattr(brightness, "resample_healpix", refuse)
     operator = SkyMap(file=tmp_path / "h.fits")
     small, wide = strip(made, 5.0, fwhm=3600.0), strip(made, 60.0, fwhm=3600.0)
-    assert operator.traits(wide).peak == pytest.approx(2.0)
-    assert operator.memory(wide) > operator.memory(small) > 0
-    assert operator._working(wide).seconds > 2 * operator._working(small).seconds > 0
+    assert planning_of(operator).traits(wide).peak == pytest.approx(2.0)
+    assert planning_of(operator).memory(wide) > planning_of(operator).memory(small) > 0
+    assert operator.grid(wide).seconds > 2 * operator.grid(small).seconds > 0
 
 
 def test_the_progress_bar_hears_of_interpolation_and_its_end(made, tmp_path, monkeypatch):
     healpy.write_map(tmp_path / "h.fits", np.full(12 * 64**2, 2.0), coord="C", column_units="K_RJ", dtype=np.float64)
     told = []
-    monkeypatch.setattr(SkyMap, "_teller", lambda self, what: lambda done, total: told.append((what, done, total)))
+    monkeypatch.setattr(SkyMap, "_progress", lambda self, what: lambda done, total: told.append((what, done, total)))
     SkyMap(file=tmp_path / "h.fits").prepare(strip(made, fwhm=3600.0))
     assert {what for what, _, _ in told} == {"interpolating h.fits"}
     assert told[0][1] == 0

@@ -9,7 +9,7 @@ from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import to_kelvin_rj
-from zonda.operators.sky.placement import tangent_areas
+from zonda.operators.sky.brightness import tangent_areas
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.region import tangent_wcs
 from zonda.operators.sky.resample import pixel_areas, resample_healpix

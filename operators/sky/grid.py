@@ -1,4 +1,4 @@
-"""The grid on which a map is worked on: its own pixels, or a TAN grid of what a scan reaches; laid out before it is made."""
+"""The grid on which a map is convolved: its own pixels, or a TAN grid of what a scan reaches; laid out before it is filled."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.numerics.projection import wcs_frame_rotation
+from zonda.core.numerics.chunks import chunks
+from zonda.core.numerics.projection import boresights, frame_rotation, rotation_matrices, wcs_frame_rotation
+from zonda.core.numerics.sphere import angle_between, unit_vectors
+from zonda.core.types import Floats
 
+from .beam import REACH, SIGMA
 from .footprint import extent
 from .inputs import HealpixMap, WcsMap
 from .region import Disc, region, tangent_wcs
@@ -28,13 +32,13 @@ PER_POINT = {"image": 1.5e-6, "healpix": 2.5e-5}
 
 
 @dataclass(frozen=True)
-class Working:
-    """Where the map of ``source`` is worked on.
+class Grid:
+    """Where the map of ``source`` is convolved.
 
     Attributes
     ----------
     key
-        Of what is made there.
+        Of what is computed there.
     wcs
         TAN, two-dimensional.
     shape
@@ -44,7 +48,7 @@ class Working:
     resampled
         False: on the pixels of the file.
     points
-        How many are worked on.
+        How many are filled.
     """
 
     key: tuple[Hashable, ...]
@@ -61,6 +65,26 @@ class Working:
         ny, nx = self.shape
         return 8 * ny * nx + (ny * nx if self.resampled else 0)
 
+    def reached(self, observation: Observation, widest: float) -> bool:
+        """Whether any detector of an observation comes within a beam of FWHM ``widest`` [rad] of the map."""
+        ny, nx = self.shape
+        corners = [[-0.5, -0.5], [-0.5, ny - 0.5], [nx - 0.5, -0.5], [nx - 0.5, ny - 0.5], [(nx - 1) / 2, (ny - 1) / 2]]
+        lon, lat = np.radians(self.wcs.celestial.wcs_pix2world(corners, 0).T)
+        if not np.isfinite([lon, lat]).all():
+            return True
+        *rim, centre = unit_vectors(lon, lat)
+        radius = float(angle_between(np.array(rim), centre).max())
+        boresight = observation.boresight_radec
+        cosine = max(float((centre @ boresights(boresight[some])).max()) for some in chunks(observation.n_samples))
+        nearest = float(np.arccos(np.clip(cosine, -1, 1))) - float(np.arctan(observation.focalplane.radius))
+        return bool(nearest <= radius + REACH * SIGMA * widest)
+
+    def behind(self, quaternions: Floats, xi: Floats, eta: Floats) -> int:
+        """Samples more than 90 deg from the tangent point, of detectors at offsets (n_det,) about boresights (n, 4)."""
+        tangent = unit_vectors(*np.radians(self.wcs.wcs.crval))
+        along = np.einsum("nij,i->nj", rotation_matrices(quaternions), tangent)  # the tangent point in the boresight's frame
+        return int((along @ np.array([-eta, -xi, np.ones(len(xi))]) <= 0).sum())
+
     @property
     def interpolation(self) -> float:
         """Seconds on the reference machine to bring the map onto the grid."""
@@ -73,16 +97,16 @@ class Working:
         return (PER_VALUE * size if size > LARGE else 0.0) + self.interpolation
 
 
-def on_own_pixels(source: WcsMap, wcs: Any, key: tuple[Hashable, ...]) -> Working:
-    """Of a TAN image."""
+def own_pixels(source: WcsMap, wcs: Any, key: tuple[Hashable, ...]) -> Grid:
+    """The grid of a TAN image."""
     shape = (source.values.shape[0], source.values.shape[1])
-    return Working((*key, "image", tuple(wcs.wcs.crval)), source, wcs, shape, None, False, source.values.size)
+    return Grid((*key, "image", tuple(wcs.wcs.crval)), source, wcs, shape, None, False, source.values.size)
 
 
-def on_a_grid(
+def tangent_grid(
     source: WcsMap | HealpixMap, observation: Observation, beam: tuple[float, float], key: tuple[Hashable, ...], place: str
-) -> Working:
-    """About an observation: of the part of the map that its detectors reach.
+) -> Grid:
+    """A grid about an observation, of the part of the map that its detectors reach.
 
     ``beam``: its reach, and the step that it needs [rad]. Raises InputError as `region.region`.
     """
@@ -93,12 +117,13 @@ def on_a_grid(
     ra, dec = observation.centre
     wcs = tangent_wcs(ra, dec, found.box, step)
     tiles = None if found.tiles is None else found.tiles.tobytes()
-    return Working((*key, "grid", ra, dec, step, found.box, tiles), source, wcs, found.shape, found.tiles, True, found.points)
+    return Grid((*key, "grid", ra, dec, step, found.box, tiles), source, wcs, found.shape, found.tiles, True, found.points)
 
 
 def _disc(source: WcsMap | HealpixMap) -> Disc | None:
+    """A circle that holds a map; None: it may be anywhere."""
     if isinstance(source, HealpixMap):
-        return None if source.pixels is None else _disc_of_pixels(source)
+        return _disc_of_pixels(source)
     try:
         turn = wcs_frame_rotation(source.wcs) if source.turn is None else source.turn
     except InputError:  # FK4 is no rotation of ICRS
@@ -109,8 +134,6 @@ def _disc(source: WcsMap | HealpixMap) -> Disc | None:
 
 def _disc_of_pixels(source: HealpixMap) -> Disc | None:
     import healpy
-
-    from zonda.core.numerics.projection import frame_rotation
 
     if source.pixels is None or not len(source.pixels):
         return None
@@ -124,7 +147,7 @@ def _disc_of_pixels(source: HealpixMap) -> Disc | None:
 
 
 def pixel_side(source: WcsMap | HealpixMap) -> float:
-    """rad"""
+    """Side of a pixel, rad."""
     if isinstance(source, HealpixMap):
         return float(np.sqrt(np.pi / 3) / source.nside)
     return float(np.radians(np.sqrt(abs(np.linalg.det(source.wcs.pixel_scale_matrix)))))

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+from ..types import Floats
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
-    from zonda.core.storage.fits_image import Cards
+    from ..storage.fits_image import Cards
 
 
 @dataclass
@@ -28,7 +27,7 @@ class Image:
         Unit of ``values``, e.g. ``K_RJ``.
     """
 
-    values: NDArray[np.float64]
+    values: Floats
     header: Cards | Header
     unit: str = "K_RJ"
 

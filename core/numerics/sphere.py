@@ -1,0 +1,35 @@
+"""Directions on the sphere: unit vectors of longitudes and latitudes, and back. All angles in rad."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..types import Floats
+
+
+def unit_vectors(longitude: Any, latitude: Any) -> Floats:
+    """(..., 3) directions of spherical coordinates; the longitude of a horizontal one is minus its azimuth."""
+    c = np.cos(latitude)
+    axes = np.broadcast_arrays(c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude))
+    vectors: Floats = np.stack(axes, axis=-1)
+    return vectors
+
+
+def angles(vectors: Floats) -> tuple[Floats, Floats]:
+    """(longitude, latitude) of directions (..., 3); the longitude from -pi to pi."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+
+
+def local_axes(longitude: float, latitude: float) -> Floats:
+    """(3, 3) rows: the direction at a point, east and north there."""
+    east = [-np.sin(longitude), np.cos(longitude), 0.0]
+    north = [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
+    return np.array([unit_vectors(longitude, latitude), east, north])
+
+
+def angle_between(a: Floats, b: Floats) -> Floats:
+    """Between unit vectors (..., 3) and one (3,)."""
+    return np.asarray(np.arccos(np.clip(a @ b, -1, 1)))

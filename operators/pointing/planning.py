@@ -1,0 +1,127 @@
+"""Planning of the pointing: bounds on what it leaves out or carries exactly (`core.plan`).
+
+A shift delta of the beam changes a point source by at most 1.43 delta / FWHM of its peak, the steepest slope of a Gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from zonda.core.data import Observation
+from zonda.core.knobs import Knob
+from zonda.core.operator import Operator
+from zonda.core.plan.context import Context
+from zonda.core.plan.estimate import Cost, Effect, Estimate, full, not_simulated
+from zonda.core.plan.planning import Planning
+
+from .base import Pointing
+from .limits import Moved
+from .recorded import PointingRecorded
+from .samples_per_beam import Sampled
+
+MOTION = Moved.SAID + Sampled.SAID
+"""How entries of the tally begin that are about the telescope's motion."""
+
+STEEPEST = math.sqrt(8 * math.log(2)) * math.exp(-0.5)
+"""Largest slope of a Gaussian beam, in peaks per FWHM."""
+
+REFRACTIVITY = 2.9e-4
+"""Of air at sea level, for radio waves in dry air: refraction is N cot(elevation) rad. Moist air adds up to a third."""
+
+INSTANTS = 4096
+"""Of a scan that are looked at for its extremes."""
+
+ABERRATION = 1.0e-4
+"""v / c of the Earth's orbit and rotation."""
+
+
+class PointingPlanning(Planning[Pointing | PointingRecorded]):
+    """Refraction, aberration, rotation of the field, sampling in time, precision."""
+
+    of: ClassVar[type[Operator]] = Pointing
+    knobs = (Knob("interpolation_error", (0.1, 0.01, 1e-3, 1e-4), "celestial transformation interpolated between nodes in time"),)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Each effect by the shift of the beam that it makes."""
+        o, error = context.first, self.operator.interpolation_error
+        fwhm, radius = float(o.focalplane.fwhm.min()), o.focalplane.radius
+        speed = context.coverage.speed if context.coverage else _speed(o)
+
+        def shift(delta: float) -> dict[str, float]:
+            return context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
+
+        rotation = max(_rotation(x) for x in context.observations) * radius
+        smear = (speed / o.sample_rate) ** 2 / 24 * 8 * math.log(2) / fwhm**2
+        resolution = float(np.spacing(o.seconds[-1])) * speed
+        effects = (
+            not_simulated(
+                "refraction", "the pointing model takes out its mean", shift(_bend(context)),
+                "1.43 / FWHM x 1.33 N cosec^2(el) x throw in elevation: what a constant correction leaves",
+            ),
+            Effect("aberration", (full("exact"),), shift(ABERRATION * _extent(context)),
+                   "1.43 / FWHM x v/c x reach of the scan; a shift common to all is in the target's coordinates"),
+            not_simulated("aberration across the field", "scale of the focal plane", shift(ABERRATION * radius),
+                          "1.43 / FWHM x v/c x radius of the field"),
+            Effect("sky rotation", (full("exact"),), shift(rotation),
+                   "1.43 / FWHM x rotation during a scan x radius of the field"),
+            Effect("pointing interpolation", (full(f"within {error:g} of a beam"),), shift(error * fwhm),
+                   "1.43 x interpolation_error"),
+            not_simulated("sample integration", "samples are instants", context.sky_error(smear),
+                          "(v / f_s)^2 8 ln 2 / (24 FWHM^2): loss of a point source's peak along the scan"),
+            *(Effect(what, (full("checked"),), {}, text) for _, what, text in o.tally if what.startswith(MOTION)),
+            Effect("time stamps", (full("float64 seconds since the start"),), shift(resolution),
+                   "1.43 / FWHM x spacing of float64 at the scan's end x speed"),
+        )  # fmt: skip
+        return Estimate(effects, Cost(fixed=0.01, per_time=0.5e-6, bytes=200.0 * context.times, kernel="python"))
+
+
+class RecordedPlanning(PointingPlanning):
+    """As of other pointing steps."""
+
+    of: ClassVar[type[Operator]] = PointingRecorded
+
+
+def _bend(context: Context) -> float:
+    """Differential refraction [rad] over the elevations of all scans and the field."""
+    o = context.first
+    reached = [_thin(x).elevation for x in context.observations]
+    throw = max(float(np.ptp(e)) for e in reached) + 2 * o.focalplane.radius
+    pressure = math.exp(-o.site.altitude / 8000)
+    return 1.33 * REFRACTIVITY * pressure / math.sin(min(float(e.min()) for e in reached)) ** 2 * throw
+
+
+def _thin(o: Observation) -> Observation:
+    """At most `INSTANTS` of it, evenly taken: none of what is bounded changes between them by more than a part in 1000."""
+    at = np.unique(np.linspace(0, o.n_samples - 1, min(INSTANTS, o.n_samples)).astype(int))
+    return replace(
+        o, seconds=o.seconds[at], boresight_azel=o.boresight_azel[at], boresight_radec=o.boresight_radec[at], flags=o.flags[at]
+    )
+
+
+def _rotation(o: Observation) -> float:
+    """Turn of the focal plane on the sky during a scan, rad."""
+    psi = np.unwrap(_thin(o).derotate("boresight_radec")[2])
+    return float(np.ptp(psi))
+
+
+def _extent(context: Context) -> float:
+    """Largest distance of the boresight from the first centre, and the field's radius, rad."""
+    ra, dec = context.first.centre
+    worst = 0.0
+    for o in context.observations:
+        there, lat, _ = _thin(o).derotate("boresight_radec")
+        cosine = np.sin(dec) * np.sin(lat) + np.cos(dec) * np.cos(lat) * np.cos(there - ra)
+        worst = max(worst, float(np.arccos(np.clip(cosine, -1, 1)).max()))
+    return worst + context.first.focalplane.radius
+
+
+def _speed(o: Observation) -> float:
+    """Median speed of the boresight on the sky, rad/s."""
+    if o.n_samples < 2:
+        return 0.0
+    step = np.hypot(np.diff(o.dec), np.diff(np.unwrap(o.ra)) * np.cos(o.dec[1:]))
+    return float(np.median(step)) * o.sample_rate

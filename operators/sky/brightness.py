@@ -1,0 +1,182 @@
+"""A map on its grid in K_RJ, averaged over a band."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.maps.image import Image
+from zonda.core.numerics.projection import pixel_matrix
+from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.types import Floats
+
+from .grid import Grid
+from .inputs import HealpixMap, WcsMap
+from .limits import check_brightness
+from .resample import Progress, from_pixels, pixel_areas, resample_healpix, resample_image
+
+if TYPE_CHECKING:
+    from zonda.core.instrument import Band
+
+CHECKED = 2**22
+"""Pixels of which it is looked up whether they are on the sky."""
+BRIGHT = 1e4
+"""K_RJ, averaged over a beam, above which a map's unit is doubted: the Sun has 6000 K."""
+ZEROED = "pixels of the input map that are NaN or infinite, taken as zero"
+LOST = "bright pixels of the input map beyond its projection, whose flux is lost"
+POOR = "grid points whose neighbours determine no third-order fit, taken as their mean"
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """From the unit of a map to K_RJ.
+
+    Attributes
+    ----------
+    factor
+        K_RJ per unit, (ny, nx) where pixels differ; K_RJ sr per unit where ``per_area``: then each pixel is divided by its own
+        solid angle while it is resampled.
+    typical
+        K_RJ per unit, at the median pixel where pixels differ.
+    text
+        For the tally.
+    """
+
+    factor: float | Floats
+    per_area: bool
+    typical: float
+    text: str
+
+
+def conversion(grid: Grid, band: Band, spectral_index: float) -> Conversion:
+    """Averaged over ``band``. Raises InputError as `core.numerics.radiation.to_kelvin_rj`."""
+    source = grid.source
+    total = to_kelvin_rj(source.unit, band, 1.0, spectral_index, source.beam_solid_angle)
+    factor: float | Floats = total
+    if source.unit != "Jy/pixel":
+        return Conversion(factor, False, total, f"{total:.6g} K_RJ per {source.unit}")
+    per_area = False
+    if isinstance(source, HealpixMap):
+        area = np.pi / (3 * source.nside**2)
+        factor = total / area
+    elif grid.resampled:
+        area, per_area = float(np.nanmedian(pixel_areas(source.wcs, *(_some(n) for n in source.values.shape)))), True
+    else:
+        areas = tangent_areas(pixel_matrix(grid.wcs), grid.shape)
+        area, factor = float(np.nanmedian(areas)), total / areas
+    text = f"{total / area:.6g} K_RJ per Jy/pixel at the median pixel, {area:.6g} sr"
+    return Conversion(factor, per_area, total / area, text)
+
+
+def _some(length: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, length - 1, min(length, 65)).astype(np.int64))
+
+
+def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
+    """Solid angles (ny, nx) [sr] of the pixels of a TAN grid with `pixel_matrix` ``matrix``.
+
+    With H its inverse, a pixel p = (x, y, 1) looks along H p, and dOmega = |det H| / |H p|^3 dx dy.
+    """
+    inverse = np.linalg.inv(matrix)
+    y, x = np.mgrid[0.0 : shape[0], 0.0 : shape[1]]
+    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ inverse.T
+    return np.asarray(abs(np.linalg.det(inverse)) / np.linalg.norm(rays, axis=2) ** 3)
+
+
+@dataclass(frozen=True)
+class Brightness:
+    """A map in K_RJ on its grid.
+
+    Attributes
+    ----------
+    key
+        Of the grid.
+    values
+        (ny, nx).
+    covered
+        (ny, nx), or (0, 0): everywhere.
+    notes, counts
+        What was chosen, and what was taken for something else, for the tally.
+    """
+
+    key: tuple[Hashable, ...]
+    values: Floats
+    covered: NDArray[np.bool_]
+    wcs: Any
+    notes: dict[str, str]
+    counts: dict[str, int]
+
+    @property
+    def nbytes(self) -> int:
+        return self.values.nbytes + self.covered.nbytes
+
+    def image(self, label: str) -> Image:
+        """As a product for pictures and comparisons; NaN where nothing is known. ``label``: the operator's."""
+        header = self.wcs.to_header(relax=True)
+        header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
+        values = np.where(self.covered, self.values, np.nan) if self.covered.size else self.values
+        return Image(values, header, "K_RJ")
+
+
+def on_own_pixels(grid: Grid, found: Conversion, scale: float, place: str) -> Brightness:
+    """The values of a TAN image times ``scale``. Raises InputError where it is brighter than anything."""
+    source = grid.source
+    values = source.values * found.factor * scale
+    check_brightness(values, place)
+    pixel = np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0) * 3600
+    notes = {
+        **source.notes,
+        "input map": f"TAN, {grid.shape[1]} x {grid.shape[0]} pixels of {pixel[0]:.6g} x {pixel[1]:.6g} arcsec",
+        "conversion": found.text,
+    }
+    return Brightness(grid.key, values, np.zeros((0, 0), bool), grid.wcs, notes, {ZEROED: source.zeroed})
+
+
+def interpolated(grid: Grid, found: Conversion, scale: float, outside: float, place: str, progress: Progress) -> Brightness:
+    """A map of another projection on a TAN grid; ``outside`` where it has no data. Raises as `on_own_pixels`."""
+    source, wcs = grid.source, grid.wcs
+    least_and_largest = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
+    check_brightness(least_and_largest * (found.typical * scale), place)
+    counts = {ZEROED: source.zeroed}
+    if isinstance(source, HealpixMap):
+        kind = f"HEALPix of nside {source.nside}"
+        values, covered, counts[POOR] = resample_healpix(source, wcs, grid.tiles, progress)
+    else:
+        kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
+        values, covered = resample_image(source, wcs, grid.tiles, progress, found.per_area)
+        counts[LOST] = _lost(source)
+    progress(0, 0)
+    step = abs(float(wcs.wcs.cdelt[1])) * 3600
+    part = f", of which {grid.points / values.size:.0%} is reached" if grid.tiles is not None else ""
+    notes = {
+        **source.notes,
+        "input map": f"{kind}, interpolated (third order) onto a TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of "
+        f"{step:.6g} arcsec about the observation{part}; its error falls with the third power of the input's pixel size",
+        "conversion": found.text,
+    }
+    mask = np.zeros((0, 0), bool) if covered.all() else covered
+    return Brightness(grid.key, np.where(covered, values * (found.factor * scale), outside), mask, wcs, notes, counts)
+
+
+def _lost(image: WcsMap) -> int:
+    """How many bright pixels in Jy/pixel lie beyond the projection, where there is no sky; of `CHECKED` and more an estimate."""
+    if image.unit != "Jy/pixel":
+        return 0
+    step = int(np.ceil(np.sqrt(image.values.size / CHECKED)))
+    y, x = np.nonzero(image.values[::step, ::step])
+    lon, lat = from_pixels(image.wcs, x.astype(np.float64) * step, y.astype(np.float64) * step)
+    return int(np.count_nonzero(~(np.isfinite(lon) & np.isfinite(lat)))) * step * step
+
+
+def too_bright(peak: float, conversion: str) -> str:
+    """What to say of a sky whose brightness in the beam is up to ``peak`` [K_RJ]; empty where that is possible."""
+    if peak <= BRIGHT:
+        return ""
+    return (
+        f"in the beam the sky is as bright as {peak:.3g} K_RJ, and the Sun has 6000 K; is the map's unit right ({conversion}), "
+        "or are its pixels counts? `unit` replaces the header's, `scale` multiplies the map"
+    )

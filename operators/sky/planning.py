@@ -1,0 +1,127 @@
+"""Planning of the sky: bounds, coarser forms, costs and memory (`core.plan`)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from zonda.core.data import Observation
+from zonda.core.instrument import Band
+from zonda.core.knobs import Knob
+from zonda.core.plan.context import Context
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full, not_simulated
+from zonda.core.plan.planning import Planning
+
+from .brightness import conversion
+from .grid import Grid
+from .resample import extremes
+from .skymap import SkyMap
+
+CUBIC = 3e-3
+"""Largest error of cubic B-splines on 4 points per FWHM, of a point source's peak (`SkyMap`)."""
+
+COORDINATES = 5e-4 / 4
+"""Error of float32 coordinates, beams (`sampling`)."""
+
+LINEAR = 1.1 * 2 * 8 * math.log(2) / 12
+"""Times n^-2: error of linear sampling on n points per FWHM, of a point source's peak: 1.1 h^2 / 12 (|f_xx| + |f_yy|)."""
+
+FASTER = 1.6e-9
+"""Seconds per sample that linear sampling saves."""
+
+CONVOLUTION = 1.2e-6
+"""Seconds per point of the grid that the convolution takes."""
+
+
+def chromaticity(band: Band) -> float:
+    """Relative change of a point source's peak where FWHM ~ 1 / nu: |<(nu / nu_0)^2> - 1| over the band."""
+    nu, t = band.frequency, band.transmission
+    return abs(float(np.trapezoid(t * (nu / band.centre) ** 2, nu) / np.trapezoid(t, nu)) - 1)
+
+
+class SkyPlanning(Planning[SkyMap]):
+    """Beam, sampling, chromaticity."""
+
+    of = SkyMap
+    knobs = (
+        Knob("pixels_per_fwhm", (2, 3, 4, 6, 8), "sky interpolated between points"),
+        Knob("interpolation", ("linear", "cubic"), "sky linear between points, not by cubic splines"),
+    )
+
+    def memory(self, observation: Observation) -> int:
+        """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""
+        widths, _ = self.operator.beams(observation)
+        grid = self.operator.grid(observation)
+        return (5 + 2 * len(widths)) * grid.nbytes + (grid.source.nbytes if grid.resampled else 0)
+
+    def traits(self, observation: Observation) -> Traits:
+        """Largest brightness of the map before the beam."""
+        sky, grid, band = self.operator, self.operator.grid(observation), observation.instrument.band
+        if not grid.reached(observation, self._widest(observation)):
+            return Traits(peak=abs(sky.outside))
+        if not grid.resampled:
+            return Traits(peak=float(np.nanmax(np.abs(sky.sky(grid, band).values - sky.outside), initial=0.0)))
+        factor = sky.scale * conversion(grid, band, sky.spectral_index).typical
+        return Traits(peak=max(abs(v * factor - sky.outside) for v in extremes(grid.source, grid.wcs, grid.tiles)))
+
+    def _widest(self, observation: Observation) -> float:
+        return float(self.operator.beams(observation)[0].max(initial=0.0))
+
+    def estimate(self, context: Context) -> Estimate:
+        """Each effect as a share of a point source's peak."""
+        o, widest = context.first, self._widest(context.first)
+        grids = [self.operator.grid(observation) for observation in context.observations]
+        reached = any(g.reached(x, widest) for x, g in zip(context.observations, grids, strict=True))
+        grid, distinct = grids[0], {g.key: g for g in grids}
+        fwhm = float(self.operator.fwhm or o.focalplane.fwhm.max()) if self.operator.beam == "gaussian" and reached else 0.0
+        size = float(np.prod(grid.shape))
+        points = 2.0 * size
+        convolution = CONVOLUTION * sum(float(np.prod(g.shape)) for g in distinct.values())
+        made = grid.seconds + sum(g.interpolation for k, g in distinct.items() if k != grid.key)
+        cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8, per_sample=5e-9 if reached else 0.3e-9,
+                    once=made + (convolution if reached else 0.0), bytes=8.0 * size + 24.0 * points)  # fmt: skip
+        what = "Gaussian" if fwhm else "none" if reached else "not convolved: no detector reaches the map"
+        choices = [full(what), *self._without_beam(context, fwhm, convolution)]
+        effects = (
+            Effect("beam convolution", tuple(choices), context.sky_error(1.0), "the sky's peak"),
+            self._order(context, grid, fwhm),
+            Effect("coordinate precision", (full("float32 offsets, float64 origins"),), context.sky_error(1.43 * COORDINATES),
+                   "1.43 x 5e-4 pixel of a quarter beam"),
+            not_simulated("beam chromaticity", "one beam for the band", context.sky_error(chromaticity(o.instrument.band)),
+                          "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak"),
+        )  # fmt: skip
+        return Estimate(effects, cost)
+
+    def _without_beam(self, context: Context, fwhm: float, convolution: float) -> list[Choice]:
+        """A pencil beam changes waves on the map by 1 - exp(-2 pi^2 sigma^2 k^2), most at the pixels' Nyquist frequency."""
+        if not fwhm or not context.coverage:
+            return []
+        exponent = 2 * math.pi**2 * fwhm**2 / (8 * math.log(2)) / (2 * context.coverage.pixel) ** 2
+        text = "1 - exp(-2 pi^2 sigma^2 k^2) at k = 1 / (2 pixel) of the map, of the sky's peak"
+        bound = context.sky_error(-math.expm1(-exponent))
+        bound["transfer"] = math.expm1(min(exponent, 700.0))  # of the waves under the beam
+        settings = {"beam": "none", "fwhm": None}
+        return [Choice("dropped", "no beam", settings, bound=bound, formula=text, seconds=convolution)]
+
+    def _order(self, context: Context, grid: Grid, fwhm: float) -> Effect:
+        """Linear sampling for cubic splines: on the grid there is, or on one twice as fine."""
+        operator, cubic = self.operator, context.sky_error(CUBIC)
+        if operator.interpolation == "linear" or not fwhm:
+            what = "linear" if operator.interpolation == "linear" else "cubic B-spline"
+            return Effect("sampling order", (full(what),), cubic, "0.3 % of a point source's peak")
+        step = math.radians(math.sqrt(abs(float(np.linalg.det(grid.wcs.pixel_scale_matrix)))))
+        points = fwhm / step
+        n = points * (math.ceil(operator.pixels_per_fwhm / points - 1e-9) if 2 <= points < operator.pixels_per_fwhm else 1)
+        runs, saved = max(context.runs.get(operator.label, 1), 1), FASTER * context.samples
+        text = "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 / n^2 of its peak"
+        choices = [full("cubic B-spline")]
+        wanted = 2 * points * math.ceil(n / points - 1e-9)
+        if points >= 2 and wanted <= 16:  # the finest grid that the operator makes
+            dearer = CONVOLUTION * float(np.prod(grid.shape)) * 3 / runs
+            settings = {"interpolation": "linear", "pixels_per_fwhm": min(wanted, 16.0)}
+            bound, what = context.sky_error(LINEAR / wanted**2), "linear, on twice as fine a grid"
+            choices.append(Choice("coarse", what, settings, bound=bound, formula=text, seconds=saved - dearer))
+        bound = context.sky_error(LINEAR / n**2)
+        choices.append(Choice("coarse", "linear", {"interpolation": "linear"}, bound=bound, formula=text, seconds=saved))
+        return Effect("sampling order", tuple(choices), bound, text)

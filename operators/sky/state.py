@@ -1,0 +1,138 @@
+"""What `SkyMap` keeps for an observation: the convolved maps, where the boresight is on them, what was counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Block
+from zonda.core.numerics.projection import pixel_matrix
+from zonda.core.types import AnyFloats, Floats
+
+from .beam import Convolved
+from .brightness import Brightness
+from .cache import Cache
+from .grid import Grid
+from .linear import add_lines
+from .sampling import Chunks, Rows, add_splines, pointing, sample
+
+if TYPE_CHECKING:
+    from zonda.core.data import Tally
+
+
+@dataclass(frozen=True)
+class Beam:
+    """A map convolved with one beam.
+
+    Attributes
+    ----------
+    fwhm
+        rad; 0: no beam.
+    matrix
+        (3, 3) from ICRS directions to the points of the convolved grid.
+    covered
+        `Brightness.covered` on those points.
+    """
+
+    fwhm: float
+    convolved: Convolved
+    matrix: Floats
+    covered: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, sky: Brightness, fwhm: float, convolved: Convolved) -> Beam:
+        """``convolved``: ``sky`` with the beam of ``fwhm`` [rad]."""
+        return cls(fwhm, convolved, convolved.to_grid @ pixel_matrix(sky.wcs), _on_grid(sky.covered, convolved))
+
+    @property
+    def nbytes(self) -> int:
+        return self.covered.nbytes + sum(c.nbytes for c in self.convolved.coefficients.values())
+
+    def tell(self, tally: Tally, label: str) -> None:
+        """State its width and how finely it is sampled."""
+        if self.fwhm == 0.0:
+            tally.state(label, "beam", "none")
+            return
+        text = f"Gaussian, {' x '.join(str(q) for q in self.convolved.steps)} grid steps per input pixel"
+        if self.convolved.coarse:
+            text += "; the input has fewer than 2 pixels per FWHM: it is taken as smooth between its pixels"
+        tally.state(label, f"beam of {np.degrees(self.fwhm) * 3600:.6g} arcsec", text)
+
+
+def _on_grid(covered: NDArray[np.bool_], convolved: Convolved) -> NDArray[np.uint8]:
+    if not covered.size:
+        return np.zeros((0, 0), np.uint8)
+    shape = convolved.coefficients["float64"].shape
+    whole = np.zeros(shape, np.uint8)
+    (qx, qy), (x0, _, y0, _) = convolved.steps, convolved.bounds
+    x, y = np.floor((np.arange(shape[1]) - x0) / qx).astype(int), np.floor((np.arange(shape[0]) - y0) / qy).astype(int)
+    in_x, in_y = (x >= 0) & (x < covered.shape[1]), (y >= 0) & (y < covered.shape[0])
+    whole[np.ix_(in_y, in_x)] = covered[np.ix_(y[in_y], x[in_x])]
+    return whole
+
+
+@dataclass(frozen=True)
+class _Held:
+    chunks: Chunks
+
+    @property
+    def nbytes(self) -> int:
+        return sum(part.nbytes for part in self.chunks)
+
+
+@dataclass
+class SkyState:
+    """What `SkyMap.exec` needs.
+
+    Attributes
+    ----------
+    beams
+        None where no detector reaches the map.
+    index
+        (n_det,) number of each detector's beam.
+    """
+
+    grid: Grid
+    sky: Brightness
+    beams: list[Beam]
+    index: NDArray[np.int64]
+    _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+    _chunks: Cache = field(default_factory=lambda: Cache(2**22))
+
+    def sample(self, block: Block, out: AnyFloats, linear: bool, over: bool) -> None:
+        """Add the sky to a block's stream (`sampling.sample`), and count the samples that see none."""
+        plane, index = block.observation.focalplane, self.index[block.detectors]
+        xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
+        beyond = behind = 0
+        if not self.beams:
+            beyond, behind = out.size, self.grid.behind(block.observation.boresight_radec[block.samples], xi, eta)
+        for number, beam in enumerate(self.beams):
+            rows = np.flatnonzero(index == number)
+            if rows.size:
+                coefficients = beam.convolved.coefficients[out.dtype.name]
+                chunks = self._pointing(block, number, out.dtype.type)
+                detectors = Rows(rows, xi[rows], eta[rows])
+                found = sample(add_lines if linear else add_splines, chunks, detectors, coefficients, beam.covered, out, over)
+                beyond, behind = beyond + found[0], behind + found[1]
+        if not block.again:  # a block that is made again is counted once
+            self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
+
+    def _pointing(self, block: Block, number: int, kind: Any) -> Chunks:
+        """`pointing` of a block for a beam, which blocks of other detectors share."""
+
+        def make() -> _Held:
+            quaternions = np.ascontiguousarray(block.observation.boresight_radec[block.samples], np.float64)
+            beam = self.beams[number]
+            shape = beam.convolved.coefficients["float64"].shape
+            return _Held(pointing(quaternions, beam.matrix, shape, beam.convolved.bounds, kind))
+
+        held: _Held = self._chunks.get((block.samples.start, block.samples.stop, number, kind), make)
+        return held.chunks
+
+    def totals(self) -> tuple[int, int]:
+        """Samples (outside the input map, more than 90 deg from its centre)."""
+        counts = list(self._counts.values())
+        return sum(c[0] for c in counts), sum(c[1] for c in counts)
