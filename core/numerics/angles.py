@@ -1,4 +1,4 @@
-"""Units of angle, and the width of a Gaussian."""
+"""Units of angle, angles as text, and the width of a Gaussian."""
 
 import math
 
@@ -8,3 +8,11 @@ ARCSEC = math.pi / 648000
 """rad."""
 FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
 """Full width at half maximum of a Gaussian of unit standard deviation."""
+
+
+def angle_text(value: float, digits: int = 3) -> str:
+    """``4°``, ``1.5′``, ``8.5″``, of rad."""
+    for unit, name in ((60 * ARCMIN, "°"), (ARCMIN, "′")):
+        if abs(value) >= unit:
+            return f"{value / unit:.{digits}g}{name}"
+    return f"{value / ARCSEC:.{digits}g}″"

@@ -80,14 +80,6 @@ def unit_of(peak: float) -> tuple[float, str]:
     return 1.0, "K"
 
 
-def angle_text(value: float) -> str:
-    """``12″``, ``3.2′``, ``1.5°``, of rad."""
-    for factor, unit in ((180 / np.pi, "°"), (10800 / np.pi, "′")):
-        if value * factor >= 2:
-            return f"{value * factor:.3g}{unit}"
-    return f"{value * 648000 / np.pi:.3g}″"
-
-
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.numerics.angles import ARCMIN
+from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.types import AnyFloats
 
-from .canvas import angle_text, log_labels, unit_of, write_title
+from .canvas import log_labels, unit_of, write_title
 from .graticule import AstropyAxes
 from .map_layout import located, map_axes
 from .sky_axes import SkyAxes

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .canvas import angle_text
+from zonda.core.numerics.angles import angle_text
+
 from .flat_map import FlatMap
 from .map_layout import map_axes
 from .map_plots import SHOWN, plot_coverage, plot_map

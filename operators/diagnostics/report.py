@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import base64
-import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from html import escape
 from importlib import resources
@@ -17,20 +16,21 @@ from pydantic import PrivateAttr
 from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
-from zonda.core.data import Data, Observation
+from zonda.core.data import Data
+from zonda.core.numerics.angles import angle_text
 from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import write_text
+from zonda.core.types import AnyFloats
 
 from .plot_operators import Picture, Plots, pictures
-from .report_results import angle, class_of, flux_density, has_white_noise, results
+from .report_results import class_of, flux_density, has_white_noise, results
+from .report_text import LONG, Html, details, folded, readable, sexagesimal, small, spread, table
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
 
 _WIDE = 1000
 """Pictures wider than this many pixels take a whole row."""
-LONG = 12
-"""Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files, in one cell."""
 
 
 class Report(Output):
@@ -122,41 +122,6 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float, known: M
 """
 
 
-def _table(rows: Iterable[Sequence[Any]], head: Sequence[str] = (), numbers: Sequence[int] = ()) -> str:
-    """A table; the first column is a header. Cells are escaped unless they are `_Html`; ``numbers``: right-aligned columns."""
-
-    def cell(k: int, value: Any) -> str:
-        text = value.text if isinstance(value, _Html) else escape(str(value))
-        tag, style = ("th" if k == 0 else "td"), (' class="number"' if k in numbers else "")
-        return f"<{tag}{style}>{text}</{tag}>"
-
-    body = "".join("<tr>" + "".join(cell(k, v) for k, v in enumerate(row)) + "</tr>" for row in rows)
-    top = ""
-    if head:
-        cells = (f"<th{' class=number' if k in numbers else ''}>{escape(h)}</th>" for k, h in enumerate(head))
-        top = "<thead><tr>" + "".join(cells) + "</tr></thead>"
-    style = "" if head else ' class="pairs"'
-    return f'<div class="scroll"><table{style}>{top}<tbody>{body}</tbody></table></div>' if body else ""
-
-
-def _folded(rows: Sequence[Sequence[Any]], head: Sequence[str], what: str) -> str:
-    """A table of which the first `LONG` rows are shown, and all others folded away as so many more ``what``."""
-    if len(rows) <= LONG + 3:  # nobody unfolds three rows
-        return _table(rows, head)
-    return f"{_table(rows[:LONG], head)}{_details(f'{len(rows) - LONG} more {what}', _table(rows[LONG:], head))}"
-
-
-def _details(summary: str, body: str) -> str:
-    return f"<details><summary>{escape(summary)}</summary>{body}</details>"
-
-
-class _Html:
-    """Text that is markup already."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-
-
 def _pictures(shown: Sequence[Picture]) -> str:
     figures = []
     for picture in shown:
@@ -176,7 +141,10 @@ def _scene(data: Data) -> str:
     rows: list[tuple[str, Any]] = [
         ("Site", f"{site.name}: {np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°, {site.altitude:.0f} m"),
         ("Telescope", f"{telescope.name}, {telescope.diameter:.4g} m"),
-        ("Instrument", f"{instrument.name}: {instrument.detectors} detectors in a field of {angle(instrument.field_of_view)}"),
+        (
+            "Instrument",
+            f"{instrument.name}: {instrument.detectors} detectors in a field of {angle_text(instrument.field_of_view)}",
+        ),
         (
             "Band",
             f"{band.name}: {band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz about {band.centre / 1e9:.4g} GHz",
@@ -188,10 +156,10 @@ def _scene(data: Data) -> str:
     if data.observations:
         plane, rate = data.observations[0].focalplane, data.observations[0].sample_rate
         rows[4:4] = [
-            ("Beam (FWHM)", _spread(plane.fwhm * 648000 / np.pi, "″")),
+            ("Beam (FWHM)", spread(plane.fwhm * 648000 / np.pi, "″")),
             ("1 K_RJ at a point source's peak", flux_density(1.0, float(np.mean(plane.fwhm)), data)),
-            ("Main-beam efficiency ζ", _spread(plane.main_beam_efficiency)),
-            ("Illumination efficiency ε", _spread(plane.illumination_efficiency)),
+            ("Main-beam efficiency ζ", spread(plane.main_beam_efficiency)),
+            ("Illumination efficiency ε", spread(plane.illumination_efficiency)),
             ("NET on the sky", _net(data)),
             ("Read-out", f"{rate:.6g} Hz"),
         ]
@@ -202,13 +170,13 @@ def _scene(data: Data) -> str:
     for kind, text in (("Site", site.provenance), ("Instrument", instrument.provenance), ("Band", band.provenance)):
         if text:
             rows.append((f"{kind}: source of the numbers", text))
-    return _table(rows)
+    return table(rows)
 
 
 def _net(data: Data) -> str:
     """Of all detectors in all scans, which differ where the noise follows from the load; of a campaign, in the first."""
     known = data.observations[:1] if "campaign" in data.provenance else data.observations
-    text = _spread(np.concatenate([o.focalplane.net for o in known]) * 1e3, " mK_RJ √s")
+    text = spread(np.concatenate([o.focalplane.net for o in known]) * 1e3, " mK_RJ √s")
     if not has_white_noise(data):
         return f"{text} (no white noise is simulated)"
     return f"{text} (of the first scan)" if len(known) < len(data.observations) else text
@@ -216,120 +184,46 @@ def _net(data: Data) -> str:
 
 def _target(target: Target) -> str:
     if target.frame == "icrs":
-        return f"{_sexagesimal(target.longitude, target.latitude)} (ICRS)"
+        return f"{sexagesimal(target.longitude, target.latitude)} (ICRS)"
     names = ("azimuth", "elevation") if target.frame == "horizontal" else ("galactic l", "b")
     return f"{names[0]} {np.degrees(target.longitude):.6g}°, {names[1]} {np.degrees(target.latitude):.6g}°"
 
 
-def _sexagesimal(ra: float, dec: float) -> str:
-    """``02h32m11.00s −04°40′00.0″``, from rad."""
-    seconds, arcseconds = round(ra % (2 * math.pi) * 43200 / math.pi, 2) % 86400, round(abs(dec) * 648000 / math.pi, 1)
-    hours, degrees = f"{seconds // 3600:02.0f}h{seconds % 3600 // 60:02.0f}m", f"{arcseconds // 3600:02.0f}°"
-    sign = "−" if dec < 0 else "+"
-    return f"{hours}{seconds % 60:05.2f}s {sign}{degrees}{arcseconds % 3600 // 60:02.0f}′{arcseconds % 60:04.1f}″"
-
-
-def _spread(values: Any, unit: str = "") -> str:
-    low, high = float(np.min(values)), float(np.max(values))
-    same = math.isclose(low, high, rel_tol=1e-9)
-    return f"{low:.4g}{unit}" if same else f"{low:.4g} to {high:.4g}{unit}, mean {float(np.mean(values)):.4g}"
-
-
 def _scans(data: Data) -> str:
-    rows = []
-    for o in data.observations:
-        azimuth, elevation = _ranges(o)
-        flagged = f"{np.count_nonzero(~o.good_samples)} / {np.count_nonzero(~o.good_detectors)}"
-        centre = _sexagesimal(o.centre[0], o.centre[1])
-        rows.append(
-            (
-                o.name,
-                str(o.start).replace("T", " "),
-                f"{o.duration:.1f} s",
-                f"{o.n_detectors} × {o.n_samples}",
-                centre,
-                f"{elevation[0]:.2f}° – {elevation[1]:.2f}°",
-                f"{azimuth[0]:.2f}° – {azimuth[1]:.2f}°",
-                flagged,
-            )
+    head = ("scan", "start", "duration", "detectors × samples", "target (RA, Dec)", "elevation", "azimuth")
+    rows = [
+        (
+            o.name,
+            str(o.start).replace("T", " "),
+            f"{o.duration:.1f} s",
+            f"{o.n_detectors} × {o.n_samples}",
+            sexagesimal(*o.centre),
+            _range(o.elevation),
+            _range(np.unwrap(o.azimuth)),
+            f"{np.count_nonzero(~o.good_samples)} / {np.count_nonzero(~o.good_detectors)}",
         )
-    head = (
-        "scan",
-        "start",
-        "duration",
-        "detectors × samples",
-        "target (RA, Dec)",
-        "elevation",
-        "azimuth",
-        "flagged samples / detectors",
-    )
-    return f'<div class="compact">{_folded(rows, head, "scans")}</div>'
+        for o in data.observations
+    ]
+    return f'<div class="compact">{folded(rows, (*head, "flagged samples / detectors"), "scans")}</div>'
 
 
-def _ranges(observation: Observation) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Lowest and highest azimuth, which begins between 0 and 360 and goes on beyond, and elevation of a scan [deg].
-
-    As `Observation.azimuth` and `Observation.elevation`, which take every angle of every sample.
-    """
-    x, y, z, w = observation.boresight_azel.T
-    azimuth = np.degrees(np.unwrap(np.arctan2(2 * (w * x - y * z), 2 * (x * z + w * y))))
-    azimuth += azimuth[0] % 360 - azimuth[0]
-    sine = 1 - 2 * (x * x + y * y)
-    low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
-    return (float(azimuth.min()), float(azimuth.max())), (float(low), float(high))
-
-
-_NUMBER = re.compile(r"([-+]?\d+\.?\d*(?:e[-+]?\d+)?) ([A-Za-z][A-Za-z0-9 /()]*)", re.IGNORECASE)
-
-
-def readable(text: str) -> str:
-    """``0.0011635528346628863 rad`` as ``4 arcmin``; other text as it is."""
-    match = _NUMBER.fullmatch(text.strip())
-    if match is None:
-        return text
-    value, unit = float(match[1]), match[2].strip()
-    choices: dict[str, list[tuple[float, str]]] = {
-        "rad": [(180 / math.pi, "deg"), (10800 / math.pi, "arcmin"), (648000 / math.pi, "arcsec")],
-        "rad / s": [(180 / math.pi, "deg/s"), (10800 / math.pi, "arcmin/s"), (648000 / math.pi, "arcsec/s")],
-        "s": [(1 / 60, "min"), (1, "s"), (1e3, "ms")],
-        "Hz": [(1e-9, "GHz"), (1e-3, "kHz"), (1, "Hz")],
-        "m": [(1e-3, "km"), (1, "m"), (1e3, "mm")],
-        "K": [(1, "K"), (1e3, "mK"), (1e6, "uK")],
-        "K s(1/2)": [(1, "K s(1/2)"), (1e3, "mK s(1/2)"), (1e6, "uK s(1/2)")],
-    }
-    scales = choices.get(unit)
-    if not scales:
-        return text
-    if value == 0:
-        return f"0 {unit.replace(' / ', '/')}"
-    fitting = [(f, n) for f, n in scales if abs(value) * f >= 0.9999995] or scales[-1:]
-    factor, name = next(((f, n) for f, n in fitting if len(f"{value * f:.6g}") < 6), fitting[0])
-    return f"{value * factor:.6g} {name}"
+def _range(angles: AnyFloats) -> str:
+    return f"{np.degrees(angles.min()):.2f}° – {np.degrees(angles.max()):.2f}°"
 
 
 def _steps(data: Data) -> str:
     made = []
     for label, kind, parameters in data.provenance.get("operators", []):
         cls = class_of(kind)
-        doc = own_doc(cls).split("\n\n")[0] if cls is not None else ""
-        fields = described(cls) if cls is not None else {}
+        doc, fields = ("", {}) if cls is None else (own_doc(cls).split("\n\n")[0], described(cls))
         rows = []
         for key, text in parameters.items():
-            about = (fields[key].description or "") if key in fields else ""
-            value = _Html(f'<span title="{escape(str(text), quote=True)}">{escape(readable(str(text)))}</span>')
-            rows.append((key, value, _Html(f"<small>{_prose(about)}</small>")))
-        plain = label if label == kind else f"{label} ({kind})"
-        brief = " ".join(doc.split())
-        body = _table(rows) or '<p class="note">No parameters.</p>'
-        made.append(f"<details><summary>{escape(str(plain))}<small>{_prose(brief)}</small></summary>{body}</details>")
-    if not made:
-        return ""
-    return '<p class="note">In the order in which they acted; a step opens to its parameters.</p>' + "".join(made)
-
-
-def _prose(text: str) -> str:
-    """Docstring text: escaped, with single and double backquotes as code."""
-    return re.sub(r"``(.+?)``|`(.+?)`", lambda m: f"<code>{m[1] or m[2]}</code>", escape(" ".join(text.split())))
+            value = Html(f'<span title="{escape(str(text), quote=True)}">{escape(readable(str(text)))}</span>')
+            rows.append((key, value, small(fields[key].description or "" if key in fields else "")))
+        title = escape(label if label == kind else f"{label} ({kind})")
+        made.append(details(Html(title + small(doc)), table(rows) or '<p class="note">No parameters.</p>'))
+    note = '<p class="note">In the order in which they acted; a step opens to its parameters.</p>'
+    return note + "".join(made) if made else ""
 
 
 def _tally(data: Data) -> str:
@@ -345,40 +239,37 @@ def _tally(data: Data) -> str:
         by_run.setdefault(run, []).append(("" if again else step, what, number))
         previous = who
     head = ("step", "what", "value")
-    parts = [_folded(by_run.pop(""), head, "counts and figures")]
+    parts = [folded(by_run.pop(""), head, "counts and figures")]
     for run, rows in by_run.items():
-        parts.append(_details(f"Run {run}", _table(rows, head)))
+        parts.append(details(f"Run {run}", table(rows, head)))
     return f'<div class="steps">{"".join(parts)}</div>' if any(parts) else ""
 
 
 def _plan(data: Data) -> str:
     """What was left out, dropped or coarsened, and what that may cost (`core.plan`)."""
     head = ("effect", "decision", "error bound", "formula or reason")
-    table = _folded(list(data.provenance.get("plan", [])), head, "decisions")
+    table = folded(list(data.provenance.get("plan", [])), head, "decisions")
     return f'<div class="steps">{table}</div>' if table else ""
 
 
 def _timings(data: Data) -> str:
-    timings = data.provenance.get("timings", [])
-    if not timings:
-        return ""
     by_step: dict[str, dict[str, float]] = {}
-    for label, stage, seconds in timings:
+    for label, stage, seconds in data.provenance.get("timings", []):
         stages = by_step.setdefault(str(label), {})
         stages[str(stage)] = stages.get(str(stage), 0.0) + float(seconds)
-    total = sum(sum(s.values()) for s in by_step.values())
-    longest = max((sum(s.values()) for s in by_step.values()), default=0.0) or 1.0
+    if not by_step:
+        return ""
+    total = {label: sum(stages.values()) for label, stages in by_step.items()}
+    longest = max(total.values()) or 1.0
     rows: list[tuple[Any, ...]] = []
     for label, stages in by_step.items():
-        used = sum(stages.values())
-        if used < 0.0005:  # the pictures and this page are not done yet
-            continue
-        detail = ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005)
-        bar = f'<span class="bar" style="width:{100 * used / longest:.1f}%"></span>'
-        rows.append((label, f"{used:.3f} s", _Html(bar), _Html(f"<small>{escape(detail)}</small>")))
+        if total[label] >= 0.0005:  # the pictures and this page are not done yet
+            detail = ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005)
+            bar = f'<span class="bar" style="width:{100 * total[label] / longest:.1f}%"></span>'
+            rows.append((label, f"{total[label]:.3f} s", Html(bar), small(detail)))
     what = "CPU seconds of all runs before the products were written, added up over threads"
-    note = f'<p class="note">{what}: {total:.2f} s (first use compiles).</p>'
-    return f'{note}<div class="timings">{_table(rows, ("step", "CPU", "", "stages"), numbers=(1,))}</div>'
+    note = f'<p class="note">{what}: {sum(total.values()):.2f} s (first use compiles).</p>'
+    return f'{note}<div class="timings">{table(rows, ("step", "CPU", "", "stages"), numbers=(1,))}</div>'
 
 
 def _provenance(data: Data) -> str:
@@ -386,7 +277,7 @@ def _provenance(data: Data) -> str:
     rows: list[tuple[str, Any]] = [("seed", data.scene.seed)]
     if provenance.get("command"):
         rows.append(("command", provenance["command"]))
-    rows += [(k, v) for k, v in provenance.get("versions", {}).items()]
+    rows += provenance.get("versions", {}).items()
     if provenance.get("precision"):
         rows.append(("precision", provenance["precision"]))
     for name, run in provenance.get("runs", {}).items():
@@ -394,15 +285,10 @@ def _provenance(data: Data) -> str:
         rows.append((f"run {name}", ", ".join(parts)))
     files = [str(p.name) for key in ("map_file", "tod_file") for p in data.products.get(key, [])]
     if len(files) > LONG // 2 + 2:
-        listed = "".join(f"<li>{escape(name)}</li>" for name in files)
-        body = f'<ul class="files">{listed}</ul>'
-        rows.append(("files", _Html(f"{escape(files[0])} to {escape(files[-1])}{_details(f'all {len(files)} files', body)}")))
+        every = "".join(f"<li>{escape(name)}</li>" for name in files)
+        all_of_them = details(f"all {len(files)} files", f'<ul class="files">{every}</ul>')
+        rows.append(("files", Html(f"{escape(files[0])} to {escape(files[-1])}{all_of_them}")))
     elif files:
         rows.append(("files", ", ".join(files)))
     text = str(provenance.get("resolved_yaml", ""))
-    folded = (
-        f"<details><summary>Configuration with every default filled in</summary><pre>{escape(text)}</pre></details>"
-        if text
-        else ""
-    )
-    return _table(rows) + folded
+    return table(rows) + (details("Configuration with every default filled in", f"<pre>{escape(text)}</pre>") if text else "")

@@ -13,14 +13,9 @@ import zonda
 from zonda.core.configuration.target import Target
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
-from zonda.operators.diagnostics.report import (
-    Report,
-    _ranges,
-    _sexagesimal,
-    _target,
-    readable,
-)
+from zonda.operators.diagnostics.report import Report, _target
 from zonda.operators.diagnostics.report_results import expected, flux_density, results
+from zonda.operators.diagnostics.report_text import readable, sexagesimal
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
 EVIL = "<script>alert('x')</script>&\"quoted\""
@@ -174,10 +169,10 @@ def test_quantities_are_readable(text, shown):
 
 @pytest.mark.parametrize("dec", ["-04d40m00s", "-00d00m00.04s", "89d59m59.96s", "20d"])
 @pytest.mark.parametrize("ra", ["02h32m11s", "23h59m59.996s", "0h"])
-def test_positions_are_sexagesimal(ra, dec):
+def test_positions_aresexagesimal(ra, dec):
     """Half of the last figure is the largest error: 0.005 s of right ascension, 0.05 arcsec of declination."""
     target = Target.parse(f"{ra} {dec}")
-    again = Target.parse(_sexagesimal(target.longitude, target.latitude).translate(str.maketrans("−°′″", "-dms")))
+    again = Target.parse(sexagesimal(target.longitude, target.latitude).translate(str.maketrans("−°′″", "-dms")))
     turn = 2 * np.pi
     assert abs((again.longitude - target.longitude + np.pi) % turn - np.pi) <= 0.0051 * turn / 86400
     assert again.latitude == pytest.approx(target.latitude, abs=0.051 * turn / 1296000)
@@ -216,14 +211,6 @@ def test_the_white_noise_that_is_expected():
     ((shown, what),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle, data)
     assert "beam" not in what
     assert expected("map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle, data) == []
-
-
-def test_the_ranges_of_a_scan_are_those_of_its_samples(make_observation):
-    scan = make_observation(300)
-    azimuth, elevation = _ranges(scan)
-    around = np.degrees(np.unwrap(scan.azimuth))
-    assert azimuth == pytest.approx((around.min(), around.max()), abs=1e-9)
-    assert elevation == pytest.approx(np.degrees([scan.elevation.min(), scan.elevation.max()]), abs=1e-9)
 
 
 def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeypatch):
