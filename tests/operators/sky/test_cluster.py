@@ -1,3 +1,5 @@
+import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +9,16 @@ from astropy.io import fits
 from scipy.integrate import quad
 
 from zonda.core.numerics.radiation import thermal_sz
-from zonda.operators.sky import cluster
 
-SHIPPED = Path(cluster.__file__).parents[2] / "pipelines" / "data" / "merging_cluster.fits"
+ROOT = Path(__file__).resolve().parents[3]
+SCRIPT = ROOT / "benchmarks" / "sky_data" / "cluster.py"
+SHIPPED = ROOT / "pipelines" / "data" / "merging_cluster.fits"
+
+if not SCRIPT.exists():
+    pytest.skip("benchmarks are not in this copy", allow_module_level=True)
+_found = importlib.util.spec_from_file_location("cluster", SCRIPT)
+cluster = sys.modules["cluster"] = importlib.util.module_from_spec(_found)
+_found.loader.exec_module(cluster)
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +28,7 @@ def remade(tmp_path_factory):
     return path
 
 
-def test_the_shipped_map_is_what_the_module_makes(remade):
+def test_the_shipped_map_is_what_the_script_makes(remade):
     with fits.open(SHIPPED) as old, fits.open(remade) as new:
         before, after = dict(old[0].header), dict(new[0].header)
         assert list(before) == list(after)

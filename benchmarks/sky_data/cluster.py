@@ -1,6 +1,6 @@
 """A merging galaxy cluster in the thermal Sunyaev-Zel'dovich effect: the input of the shipped ``mustang2_cluster`` pipeline.
 
-    python -m zonda.operators.sky.cluster OUT.fits [--unit y|K_RJ]
+    python benchmarks/sky_data/cluster.py OUT.fits [--unit y|K_RJ]
 
 Model. Each halo has the universal pressure profile of Arnaud et al. 2010 (A&A 517, A92, eq. 11-13), x = r / R500:
 
@@ -183,7 +183,7 @@ def header(unit: str, redshift: float = REDSHIFT) -> Any:
         ("CUNIT2", "deg", ""),
         ("RADESYS", "ICRS", ""),
         ("OBJECT", "SIMULATED MERGING CLUSTER", "not a real object"),
-        ("ORIGIN", "zonda.operators.sky.cluster", "the module that made this file"),
+        ("ORIGIN", "benchmarks/sky_data/cluster.py", "the script that made it"),
     ]
     if unit == "y":
         cards += [("BUNIT", "y", "Compton parameter")]
@@ -212,7 +212,7 @@ def header(unit: str, redshift: float = REDSHIFT) -> Any:
     ]
     made = Header(cards)
     made["COMMENT"] = "Two generalized-NFW halos (Arnaud et al. 2010), a bow shock and a faint subhalo, Planck18."
-    made["COMMENT"] = f"Made by: python -m zonda.operators.sky.cluster OUT.fits --unit {unit}"
+    made["COMMENT"] = f"Made by: python benchmarks/sky_data/cluster.py OUT.fits --unit {unit}"
     return made
 
 
@@ -237,7 +237,7 @@ def main(arguments: list[str] | None = None) -> None:
     """The command line of this module."""
     import argparse
 
-    parser = argparse.ArgumentParser(prog="python -m zonda.operators.sky.cluster", description="Write the merging-cluster map.")
+    parser = argparse.ArgumentParser(prog="python benchmarks/sky_data/cluster.py", description="Write the merging-cluster map.")
     parser.add_argument("out", type=Path, help="FITS file to write")
     parser.add_argument("--unit", choices=["y", "K_RJ"], default="K_RJ", help="Compton y, or K_RJ at 90 GHz (default)")
     given = parser.parse_args(arguments)
