@@ -1,7 +1,7 @@
 """What plugins provide: one registry per kind of component.
 
->>> from zonda.core.registry import operators
->>> @operators.register                                     # doctest: +SKIP
+>>> import zonda
+>>> @zonda.register                                         # doctest: +SKIP
 ... class Glitches(zonda.Operator): ...
 """
 
@@ -44,6 +44,9 @@ instruments.hint = partial(hints.for_instrument, sites, instruments)
 
 steps = Together("operator", operators, mapmakers)
 """What a pipeline's list of operators may name."""
+
+register = operators.register
+"""Decorator: register an operator for this process, in scripts and notebooks. Packages use entry points."""
 
 registries = (
     operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, ground_weather, spectra, checks, metrics,

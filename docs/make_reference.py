@@ -1,4 +1,4 @@
-"""Write docs/operators.md from the classes themselves: python docs/make_reference.py (a test holds the two together)."""
+"""Write docs/operators.md from the docstrings of the classes: python docs/make_reference.py (a test compares the two)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from zonda.core.site import Site
 
 PAGE = Path(__file__).with_name("operators.md")
 FOLDERS = {
-    "pointing": "Where the telescope looks",
-    "sky": "What is in the sky",
-    "atmosphere": "The air in between",
-    "noise": "What the detectors add",
-    "optics": "What the optics take away",
-    "filters": "What the analysis removes",
-    "maps": "From time streams to maps",
-    "diagnostics": "Spectra, pictures, report",
+    "pointing": "Pointing",
+    "sky": "Sky",
+    "atmosphere": "Atmosphere",
+    "noise": "Noise",
+    "optics": "Optics",
+    "filters": "Filters",
+    "maps": "Maps",
+    "diagnostics": "Diagnostics",
     "io": "Files",
 }
 SCENE = {Site: "site", Instrument: "instrument", Telescope: "instrument.telescope", Band: "instrument.band"}
@@ -33,11 +33,11 @@ def page() -> str:
     """The whole page."""
     classes = [r.get(c.name) for r in (operators, mapmakers) for c in r.candidates() if c.distribution == "zonda"]
     lines = [
-        "# The operators",
+        "# Reference of the operators",
         "",
-        "Every operator that comes with zonda, then [noise models](#noise-models), [sites and",
-        "instruments](#sites-and-instruments), made from their own docstrings by `docs/make_reference.py`. Defaults that say",
-        "*none* are taken from the instrument, the site or the scene, as the text says.",
+        "All operators, [noise models](#noise-models), [sites and instruments](#sites-and-instruments) with their parameters.",
+        "`docs/make_reference.py` makes this page from the docstrings. Where the default is *none*, the value is taken from the",
+        "instrument, the site or the scene, as the text says.",
     ]
     for folder, title in FOLDERS.items():
         lines += ["", f"## {title}"]
@@ -48,12 +48,17 @@ def page() -> str:
             for knob in planning_class(cls).knobs or getattr(cls, "knobs", ()):
                 ladder = ", ".join(f"`{value}`" for value in knob.ladder)
                 lines += ["", f"Knob ([accuracy](accuracy.md)): `{knob.parameter}`, {ladder}: {knob.approximates}."]
-    lines += ["", "## Noise models", "", "What `model` of `WhiteNoise` takes: a name, or `{name: background_limited, modes: 1}`."]
+    lines += ["", "## Noise models", "", "Values of `WhiteNoise.model`: a name, or `{name: background_limited, modes: 1}`."]
     for found in sorted((c for c in noise_models.candidates() if c.distribution == "zonda"), key=lambda c: c.name):
         cls = noise_models.get(found.name)
         lines += ["", f"### {found.name}", "", own_doc(cls), "", *table(cls, but="name")]
-    lines += ["", "## Sites and instruments", "", "What `site:` and `instrument:` take, written out in a pipeline file"]
-    lines += ["([pipelines.md](pipelines.md)), and what the classes of these names take in Python ([plugins.md](plugins.md))."]
+    lines += [
+        "",
+        "## Sites and instruments",
+        "",
+        "Keys of `site:` and `instrument:` in a pipeline file ([pipelines.md](pipelines.md)), which",
+    ]
+    lines += ["are also the arguments of the classes in Python ([plugins.md](plugins.md))."]
     for cls, key in SCENE.items():
         lines += ["", f"### {cls.__name__}", "", f"`{key}`. {own_doc(cls)}", "", *table(cls)]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""zonda: what a ground-based (sub-)millimetre telescope records, and the maps made of it.
+"""Simulation of the data of ground-based (sub-)millimetre telescopes, and of the maps made from them.
 
 >>> import zonda
 >>> scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
@@ -28,12 +28,41 @@ _WHERE = {
     "load": "zonda.core.configuration.pipeline_file",
     "plan": "zonda.core.plan.planner",
     "hookimpl": "zonda.core.hooks",
-}
+    # for authors of operators
+    "Block": "zonda.core.block",
+    "Stream": "zonda.core.stream",
+    "Product": "zonda.core.product",
+    "Output": "zonda.core.output",
+    "Planning": "zonda.core.plan.planning",
+    "Knob": "zonda.core.knobs",
+    "register": "zonda.core.registry",
+    "normals": "zonda.core.numerics.random",
+    "uniforms": "zonda.core.numerics.random",
+    "quantity": "zonda.core.configuration.parameters",
+} | dict.fromkeys(
+    (
+        "Angle", "AngularSpeed", "AngularAcceleration", "Seconds", "Hertz", "Metres", "MetresPerSecond", "Kelvin",
+        "KelvinRootSecond", "Fraction",
+    ),
+    "zonda.core.configuration.units",
+)  # fmt: skip
 
 __all__ = ["__version__", *_WHERE]
 
 if TYPE_CHECKING:
+    from zonda.core.block import Block as Block
+    from zonda.core.configuration.parameters import quantity as quantity
     from zonda.core.configuration.pipeline_file import load as load
+    from zonda.core.configuration.units import Angle as Angle
+    from zonda.core.configuration.units import AngularAcceleration as AngularAcceleration
+    from zonda.core.configuration.units import AngularSpeed as AngularSpeed
+    from zonda.core.configuration.units import Fraction as Fraction
+    from zonda.core.configuration.units import Hertz as Hertz
+    from zonda.core.configuration.units import Kelvin as Kelvin
+    from zonda.core.configuration.units import KelvinRootSecond as KelvinRootSecond
+    from zonda.core.configuration.units import Metres as Metres
+    from zonda.core.configuration.units import MetresPerSecond as MetresPerSecond
+    from zonda.core.configuration.units import Seconds as Seconds
     from zonda.core.data import Data as Data
     from zonda.core.data import Observation as Observation
     from zonda.core.errors import ZondaError as ZondaError
@@ -42,11 +71,19 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Band as Band
     from zonda.core.instrument import Instrument as Instrument
     from zonda.core.instrument import Telescope as Telescope
+    from zonda.core.knobs import Knob as Knob
+    from zonda.core.numerics.random import normals as normals
+    from zonda.core.numerics.random import uniforms as uniforms
     from zonda.core.operator import Operator as Operator
+    from zonda.core.output import Output as Output
     from zonda.core.pipeline import Pipeline as Pipeline
     from zonda.core.plan.planner import plan as plan
+    from zonda.core.plan.planning import Planning as Planning
+    from zonda.core.product import Product as Product
+    from zonda.core.registry import register as register
     from zonda.core.scene import Scene as Scene
     from zonda.core.site import Site as Site
+    from zonda.core.stream import Stream as Stream
 
 
 def __getattr__(name: str) -> Any:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from zonda.core.configuration.units import Fraction
+from zonda import Fraction
 from zonda.operators.noise.models import NoiseModel
 
 

@@ -4,9 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from zonda import Operator
-from zonda.core.configuration.parameters import quantity
-from zonda.core.configuration.units import Seconds
+from zonda import Operator, Seconds, quantity
 
 
 class TimeConstant(Operator):
