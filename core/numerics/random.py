@@ -24,14 +24,11 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numba import float32, int32, int64, uint32, uint64
 from numpy.typing import NDArray
 
-from ..compilation import keep_kernels
-
-keep_kernels.keep()  # before the first kernel: every module with kernels imports this one, if only through core.data
+from ..compilation.jit import nb
 
 TILE = 1024
 """Numbers made together."""

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from ..compilation.columns import fused
+from ..compilation.jit import nb
 from ..types import AnyFloats
 
 PAD = 1

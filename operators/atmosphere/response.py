@@ -15,9 +15,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 
-import numba as nb
 import numpy as np
 
+from zonda.core.compilation.jit import nb
 from zonda.core.types import Floats
 
 from .weather.bands import BandAtmosphere

@@ -22,10 +22,10 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.compilation.jit import nb
 from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.smooth import product
 from zonda.core.numerics.tiles import TILE_DETECTORS

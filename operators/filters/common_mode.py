@@ -26,10 +26,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import numba as nb
 import numpy as np
 from pydantic import Field, model_validator
 
+from zonda.core.compilation.jit import nb
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD

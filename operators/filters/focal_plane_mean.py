@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.compilation.jit import nb
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.stream import Stream
 from zonda.core.types import Floats

@@ -8,10 +8,10 @@ from contextlib import AbstractContextManager, nullcontext
 from threading import Semaphore
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.compilation.jit import nb
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.run.streams import columns

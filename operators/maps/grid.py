@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix

@@ -17,11 +17,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.compilation.columns import prefetch
+from zonda.core.compilation.jit import nb
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import empty
 from zonda.core.types import Floats

@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
-import numba as nb
 import numpy as np
 from numba import uint64
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
+from zonda.core.compilation.jit import nb
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into

@@ -15,11 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import numba as nb
 import numpy as np
 from pydantic import Field
 
 from zonda.core import flags
+from zonda.core.compilation.jit import nb
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation

@@ -10,9 +10,10 @@ and no mean attenuation (Blu, Thevenaz & Unser 2001 call it quasi-interpolation)
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 from numba import int32, uint64
+
+from zonda.core.compilation.jit import nb
 
 from .sampling import CHUNK, count_covered, locate, misses, span_on_grid
 

@@ -14,12 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
 from zonda.core.compilation.columns import spline_of_four
+from zonda.core.compilation.jit import nb
 from zonda.core.types import AnyFloats
 
 CHUNK = 256

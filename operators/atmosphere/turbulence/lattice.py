@@ -31,11 +31,11 @@ import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.compilation.columns import fused
+from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import lattice_normals, stream_key
 from zonda.core.types import Floats

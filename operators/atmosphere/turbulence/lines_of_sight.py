@@ -17,9 +17,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numba as nb
 import numpy as np
 
+from zonda.core.compilation.jit import nb
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
 from zonda.core.types import Floats

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.compilation.columns import four_columns_at
+from zonda.core.compilation.jit import nb
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients

@@ -1,0 +1,116 @@
+"""The entry point of the command line: exit statuses, signals, warnings and errors as a user reads them."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import click
+
+from ..errors import ZondaError
+from .group import INTERRUPTED, Interrupted, Stopped, zonda
+
+USER_ERROR = 2
+"""Exit status after a mistake of the user's."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; the exit status: 0, 1 (a plugin's fault), 2 (a user's mistake), 128 + a signal that ended it."""
+    with _plain_warnings(), _stoppable():
+        try:
+            result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)
+            return result if isinstance(result, int) else 0
+        except click.ClickException as err:
+            err.show()
+            return err.exit_code
+        except ZondaError as err:
+            _report(err)
+        except (Interrupted, KeyboardInterrupt, click.Abort) as err:
+            _clear()
+            with contextlib.suppress(OSError):  # the terminal may be gone
+                click.echo("interrupted: unfinished files were removed", err=True)
+            return int(getattr(err, "status", INTERRUPTED))
+        except MemoryError as err:
+            cure = "make the scans shorter, the sample rate lower or the detectors fewer, or use a larger machine"
+            _report(ZondaError(f"not enough memory{f': {err}' if str(err) else ''}", cure=cure))
+        except OSError as err:
+            if err.filename is None and err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
+                raise
+            _report(ZondaError(err.strerror or str(err), place=str(err.filename or "")))
+        return USER_ERROR
+
+
+def _report(err: ZondaError) -> None:
+    colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+    _clear()
+    if render := getattr(err, "render", None):
+        click.echo(render(colour), err=True)
+    else:
+        click.echo(f"{click.style('error', fg='red', bold=True) if colour else 'error'}: {err}", err=True)
+
+
+def _clear() -> None:
+    """Clear the line that a progress plugin may have left."""
+    if sys.stderr.isatty():
+        click.echo("\r\033[K", nl=False, err=True)
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM (batch systems, containers) and SIGHUP (a terminal that closes) end a command as Ctrl-C does: cleaned up, once.
+
+    A signal that somebody handles or ignores (nohup) already is left alone.
+    """
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    taken = [n for n in numbers if signal.getsignal(n) is signal.SIG_DFL]
+
+    def stop(number: int, frame: object) -> None:
+        for n in taken:
+            signal.signal(n, signal.SIG_IGN)  # a second one must not interrupt the cleaning
+        raise Stopped(number)
+
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings as one line without the source that raised them.
+
+    One that differs in its figures alone from one before is not shown: the first look at a pipeline has told it already.
+    """
+    usual, usual_show = warnings.formatwarning, warnings.showwarning
+    told: set[str] = set()
+
+    def one_line(message: Any, category: Any, filename: str, lineno: int, line: str | None = None) -> str:
+        return f"warning: {message}\n"
+
+    def show(message: Any, *place: Any, **more: Any) -> None:
+        text = _FIGURES.sub("#", str(message))
+        if text not in told:
+            told.add(text)
+            usual_show(message, *place, **more)
+
+    warnings.formatwarning, warnings.showwarning = one_line, show
+    try:
+        yield
+    finally:
+        warnings.formatwarning, warnings.showwarning = usual, usual_show
+
+
+_FIGURES = re.compile(r"scan-\d+|(?<![\w.-])[-+]?\d[\d.]*(e[-+]?\d+)?(?!\w)")
