@@ -50,7 +50,9 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
 
     if compiled is not None:
         listen(compiled)
-    after(cli, "_load", "read the pipeline file")
+    from zonda.core.cli import run
+
+    after(run, "load", "read the pipeline file")
     mark("Python and the command line")
     import zonda.core.plan.remembered as remembered
     from zonda.core.pipeline import Pipeline

@@ -35,7 +35,7 @@ CALLS = {
 ALLOWED = {
     ("core/accuracy/measure.py", "subprocess.run"): "zonda itself, as a child; no shell; arguments are zonda's own",
     ("core/accuracy/measure.py", "pickle.load"): "the child's answer, in a folder that only this user can read, made for it",
-    ("core/cli.py", "import_module"): "names from a table in the same file",
+    ("core/cli/group.py", "import_module"): "names from the table in zonda/commands.py",
     ("core/compilation/compile_ahead.py", "import_module"): "modules named in core/compilation/kernels.py",
     ("core/compilation/compile_ahead.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
     ("core/compilation/kernel_cache.py", "pickle.loads"): "machine code that this user compiled; numba's own cache does the same",
@@ -46,7 +46,7 @@ ALLOWED = {
     ("operators/diagnostics/artist.py", "import_module"): "names from a table in the same file",
     ("operators/diagnostics/artist.py", "pickle.load"): "between parent and child, through pipes that nobody else has",
     ("operators/diagnostics/artist.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
-    ("core/registry.py", "import_module"): "names from the registries' own declarations",
+    ("core/components.py", "import_module"): "names from the registries' own declarations",
     ("plugins/checks/dispatch.py", "subprocess.run"): "zonda itself, as a child; no shell; the folder's path is one argument",
     ("zonda/__init__.py", "import_module"): "names from a table in the same file",
 }

@@ -96,7 +96,7 @@ def resume(
     The checksums of all partial products are verified, what is missing is run, failed tasks are tried again, and what is complete
     is combined. The maps are the same bits as those of an undisturbed campaign.
     """
-    from ..cli import Bytes
+    from ..command_types import Bytes
     from ..compilation.compiled import ensure_cache, one_blas_thread
 
     one_blas_thread()

@@ -15,6 +15,7 @@ import pytest
 
 from zonda import __version__
 from zonda.core import cli
+from zonda.core.command_types import Bytes
 
 HEAVY = ("numpy", "astropy", "numba", "healpy", "scipy", "matplotlib", "h5py", "pydantic")
 RUN = [sys.executable, "-c", "import sys; from zonda.core.cli import main; sys.exit(main(sys.argv[1:]))"]
@@ -278,10 +279,12 @@ def test_operating_system_errors(here: Path, capsys: pytest.CaptureFixture[str],
 
         return load
 
-    monkeypatch.setattr(cli, "_load", fail(PermissionError(errno.EACCES, "Permission denied", "secret.fits")))
+    monkeypatch.setattr("zonda.core.cli.check.load", fail(PermissionError(errno.EACCES, "Permission denied", "secret.fits")))
     assert cli.main(["check", "p.yaml"]) == 2
     assert capsys.readouterr().err == "error: secret.fits: Permission denied\n"
-    monkeypatch.setattr(cli, "_load", fail(OSError(errno.EBADF, "Bad file descriptor")))  # a fault of ours: show where
+    monkeypatch.setattr(
+        "zonda.core.cli.check.load", fail(OSError(errno.EBADF, "Bad file descriptor"))
+    )  # a fault of ours: show where
     with pytest.raises(OSError, match="Bad file descriptor"):
         cli.main(["check", "p.yaml"])
 
@@ -361,7 +364,7 @@ def test_signals_that_are_ignored_or_handled_are_left_alone(monkeypatch: pytest.
     ("text", "size"), [("4GB", 4_000_000_000), ("500MiB", 500 << 20), ("1.5 kB", 1500), ("7", 7), ("2gb", 2_000_000_000)]
 )
 def test_sizes(text: str, size: int) -> None:
-    assert cli.Bytes().convert(text, None, None) == size
+    assert Bytes().convert(text, None, None) == size
 
 
 def test_warnings_are_one_line(here: Path, plugin: Callable[..., Path]) -> None:

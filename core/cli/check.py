@@ -1,0 +1,36 @@
+"""``zonda check``. Only click is imported with this module."""
+
+from __future__ import annotations
+
+import click
+
+from .run import load
+
+
+@click.command()
+@click.argument("pipeline", metavar="FILE_OR_NAME")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
+def check(pipeline: str, settings: tuple[str, ...]) -> None:
+    """Check a pipeline file without running it.
+
+    Every mistake in the file is shown at once, with its place. The telescope is pointed at some instants of the scans: whether
+    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam; and
+    whether it is on the input maps, of which the headers alone are read. A run begins with the same look.
+    """
+    file = load(pipeline, settings)
+    from ..run.first_look import first_look
+    from ..scene import elsewhere
+
+    if note := elsewhere(file.scene()):
+        click.echo(f"warning: {note}", err=True)
+    found = first_look(file.pipeline(), file.scene())
+    click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
+    for step, lines in zip(file.steps, found, strict=True):
+        click.echo(f"  {step.key}")
+        for line in lines:
+            click.echo(f"    {line}")
+    if file.header.campaign is not None:
+        from ..campaign.command import source
+        from ..campaign.prepare import outline
+
+        click.echo(outline(source(pipeline, settings, False))[0])

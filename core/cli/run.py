@@ -1,0 +1,214 @@
+"""``zonda run``. Only click is imported with this module."""
+
+from __future__ import annotations
+
+import gc
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..command_types import Bytes, Share
+
+if TYPE_CHECKING:
+    from ..compilation.compile_ahead import Helper
+    from ..configuration.header import Accuracy
+    from ..configuration.pipeline_file import PipelineFile
+    from ..data import Data
+
+
+@dataclass(frozen=True)
+class Request:
+    """The arguments and options of ``zonda run``."""
+
+    pipelines: tuple[str, ...]
+    settings: tuple[str, ...]
+    keep: tuple[str, ...]
+    drop: tuple[str, ...]
+    only: tuple[str, ...]
+    no_prune: bool
+    output: Path | None
+    threads: int | None
+    memory: int | None
+    verbose: bool
+    verify: bool
+    engine: str | None
+    workers: int | None
+    scheduler: str | None
+    share: tuple[int, int] | None
+
+    @property
+    def is_campaign(self) -> bool:
+        """Whether this is a campaign, whatever the file says."""
+        return bool(len(self.pipelines) > 1 or self.engine or self.workers or self.scheduler or self.share)
+
+    @property
+    def command(self) -> str:
+        """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
+        options = [("--set", self.settings), ("--keep", self.keep), ("--drop", self.drop), ("--only", self.only)]
+        parts = [part for option, texts in options for text in texts for part in (option, text)]
+        return shlex.join(["zonda", "run", *self.pipelines, *parts, *(["--no-prune"] if self.no_prune else [])])
+
+
+@click.command()
+@click.argument("pipelines", metavar="FILE_OR_NAME...", nargs=-1, required=True)
+@click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, e.g. Step.parameter='0.5 Hz' or seed=8."
+)
+@click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full, see `zonda plan`.")
+@click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
+@click.option("--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone.")
+@click.option("--no-prune", is_flag=True, help="Simulate everything in full.")
+@click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
+@click.option(
+    "--memory",
+    type=Bytes(),
+    metavar="SIZE",
+    help="Most memory to hold, of a campaign all its workers' on this machine (with MPI and Dask each process's), e.g. 4GB; "
+    "results do not depend on it.  [default: half of the free]",
+)
+@click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
+@click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")
+@click.option(
+    "--engine",
+    type=click.Choice(["serial", "processes", "mpi", "dask"]),
+    help="Run scans as tasks of a campaign.  [default: as in the file's campaign]",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes.")
+@click.option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file.")
+@click.option("--task", "share", type=Share(), help="Run this share of a campaign's tasks, e.g. 3/8: for job arrays.")
+def run(**given: Any) -> None:
+    """Run a pipeline file, or a shipped pipeline by its name; a campaign of observations where the file has `campaign:`, or where
+    there are several files.
+
+    What its outputs do not depend on is left out, and effects are dropped or coarsened while the errors stay within the budget
+    (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
+    """
+    from .. import early
+    from ..compilation.compile_ahead import Helper
+    from ..compilation.compiled import ensure_cache, one_blas_thread
+    from ..machine import available_threads
+
+    request = Request(**given)
+    one_blas_thread()
+    ensure_cache()
+    context = click.get_current_context()
+    context.call_on_close(gc.enable)
+    gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
+    helper = Helper()
+    context.call_on_close(helper.close)
+    if not request.is_campaign:
+        if available_threads() > 1 and request.threads != 1:
+            context.call_on_close(early.end)
+            early.begin(request.pipelines[0])
+        helper.prepare()
+    file = load(request.pipelines[0], request.settings)
+    if request.is_campaign or file.header.campaign is not None:
+        helper.close()
+        early.end()
+        _run_campaign(request)
+    else:
+        _run_one(request, file, helper)
+
+
+def load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) -> PipelineFile:
+    """A pipeline file with the values of ``--set`` and the components of ``--only``."""
+    from ..configuration.pipeline_file import load
+
+    file = load(pipeline, settings)
+    if not only:
+        return file
+    from ..plan.only import only as alone
+
+    return alone(file, only)
+
+
+def _run_campaign(request: Request) -> None:
+    if request.verify or request.only:
+        raise click.UsageError(f"{'--verify' if request.verify else '--only'} is for one run, not for a campaign")
+    gc.enable()
+    from ..campaign import command as campaign
+
+    campaign.run(
+        request.pipelines, request.settings, keep=request.keep, drop=request.drop, no_prune=request.no_prune,
+        output=request.output, threads=request.threads, memory=request.memory, verbose=request.verbose, engine=request.engine,
+        workers=request.workers, scheduler=request.scheduler, share=request.share, command=request.command,
+    )  # fmt: skip
+
+
+def _run_one(request: Request, file: PipelineFile, helper: Helper) -> None:
+    from ..plan import remembered
+    from ..run.first_look import first_look
+    from ..storage.files import check_output_folder, write_text
+    from ..storage.lock import lock
+
+    pipeline, settings = request.pipelines[0], request.settings
+    if request.only and request.verify:
+        raise click.UsageError("--verify measures the whole pipeline: leave --only out")
+    if request.only:
+        file = load(pipeline, settings, request.only)
+    first_look(file.pipeline(), file.scene())  # minutes of work must not come before a mistake that is seen at once
+    if file.header.accuracy is not None:
+        settings = (*settings, *_knobs(file, file.header.accuracy))
+        file = load(pipeline, settings, request.only)
+    folder = file.output if request.output is None else request.output
+    check_output_folder(folder)  # before anything is worked out
+    click.get_current_context().with_resource(lock(folder))
+    campaign_there = (folder / "campaign.json").exists()
+    if campaign_there:
+        from ..campaign.folder import check_free, make_way
+
+        check_free(folder)
+    helper.begin()
+    made = remembered.summary(
+        file, keep=request.keep, drop=request.drop, prune_all=not request.no_prune, threads=request.threads, memory=request.memory
+    )
+    click.echo(str(made), err=True)
+    whole, file = len(file.steps), made.apply(file)
+    resolved = file.resolved_yaml()
+    provenance = {"resolved_yaml": resolved, "command": request.command, "plan": made.short}
+    if campaign_there:
+        make_way(folder)
+    gc.freeze()
+    gc.enable()
+    data = file.pipeline().run(
+        file.scene(), output=folder, threads=request.threads, ceiling=request.memory, provenance=provenance
+    )
+    helper.succeeded()
+    write_text(folder / "resolved.yaml", resolved)
+    _show(data, request.verbose)
+    if request.verify:
+        _verify(file, request, settings, data if len(file.steps) == whole else None)
+    click.echo(f"{folder}/")
+
+
+def _knobs(file: PipelineFile, wanted: Accuracy) -> tuple[str, ...]:
+    """Settings of the knobs that meet an accuracy."""
+    from ..accuracy.store import settings_for
+
+    choice = settings_for(file, wanted.target, wanted.metric)
+    click.echo(f"accuracy: {choice.reason}", err=True)
+    return choice.overrides
+
+
+def _show(data: Data, verbose: bool) -> None:
+    """What was lost, or with ``verbose`` all that was counted, chosen and approximated."""
+    counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
+    lost = {(who, what) for who, what in counts if what != "samples binned"}
+    for who, what, value in data.tally.told():
+        if verbose or (who, what) in lost:
+            click.echo(f"{who}: {what}: {value}", err=True)
+
+
+def _verify(file: PipelineFile, request: Request, settings: tuple[str, ...], data: Data | None) -> None:
+    """Measure the error of a run; ``data``: what it made, if that is the whole pipeline."""
+    from ..accuracy.verify import achieved
+
+    target = file.header.accuracy
+    metric = target.metric if target else "map_rms"
+    error = achieved(file, request.pipelines[0], settings, metric, request.threads, data)
+    wanted = f" (target {100 * target.target:g} %)" if target else ""
+    click.echo(f"error of {metric} against the tightest knobs: {100 * error:.2g} %{wanted}", err=True)

@@ -1,0 +1,18 @@
+"""The built-in commands and where they are, imported when they are named or listed.
+
+Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more: pluggy and the metadata.
+"""
+
+COMMANDS = {
+    "accuracy": "zonda.core.accuracy.command:accuracy",
+    "check": "zonda.core.cli.check:check",
+    "doctor": "zonda.plugins.doctor_command:doctor",
+    "pipelines": "zonda.core.cli.listing:pipelines",
+    "plan": "zonda.core.plan.command:plan",
+    "plugins": "zonda.core.cli.listing:plugins",
+    "resume": "zonda.core.campaign.command:resume",
+    "run": "zonda.core.cli.run:run",
+    "schema": "zonda.core.cli.listing:schema",
+    "status": "zonda.core.campaign.command:status",
+    "weather": "zonda.plugins.weather_command:weather",
+}
