@@ -6,11 +6,11 @@ import threading
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-import numba as nb
 import numpy as np
 from numba import uint64
 from numpy.typing import NDArray
 
+from zonda.core.compilation.jit import nb
 from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, normal_tile, normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
 from zonda.core.numerics.tiles import TILE_DETECTORS
