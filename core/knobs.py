@@ -10,7 +10,8 @@ from pydantic import BaseModel, TypeAdapter
 
 @dataclass(frozen=True)
 class Knob:
-    """One parameter that trades accuracy for time; `Operator.knobs` lists them, `zonda accuracy` turns them.
+    """One parameter that trades accuracy for time; `Planning.knobs` lists them, `zonda accuracy` turns them, `zonda plan`
+    chooses among the rungs that `Planning.estimate` bounds.
 
     Attributes
     ----------
@@ -36,6 +37,14 @@ class Knob:
         field = model.model_fields[self.parameter]
         adapter: TypeAdapter[Any] = TypeAdapter(cast(Any, Annotated[field.annotation, self.parameter, *field.metadata]))
         return [adapter.validate_python(value) for value in self.ladder]
+
+    def coarser(self, model: BaseModel) -> list[Any]:
+        """The rungs that are coarser than the model's own value, the finest of them first."""
+        rungs, own = self.values(type(model)), getattr(model, self.parameter)
+        if own in rungs:
+            return rungs[: rungs.index(own)][::-1]
+        rising = rungs[0] < rungs[-1]
+        return [rung for rung in reversed(rungs) if (rung < own) == rising]
 
 
 PRECISION = Knob("precision", ("float32", "float64"), "rounding of the time streams")

@@ -30,6 +30,8 @@ REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
 STARTUP = Cost(once=0.9, kernel="python")
 """Imports and compiled code from the cache; planning is measured."""
 
+POINTED = 200
+"""Bytes for one sample of one observation, whatever the detectors: times, boresight, flags."""
 
 LASTS = 30 * 86400.0
 """Seconds after which a remembered calibration is measured again."""
@@ -87,27 +89,27 @@ def measure_speed(budget: float = 0.3) -> dict[str, float]:
 
 
 def predict(
-    context: Context, costs: Mapping[str, Cost | None], threads: int, item: int, memory: int, portable: bool = False
+    context: Context, costs: Mapping[str, Cost | None], item: int, threads: int, memory: int, portable: bool = False
 ) -> Prediction:
-    """Of one run of the pipeline and its companions. Streams that memory has no room for may be made again (`forecast`).
+    """CPU time and memory of the pipeline, all runs. Streams that memory has no room for may be made again (`forecast`).
 
     Parameters
     ----------
     costs
         By label of the operators that take part; None: unknown.
-    threads, memory
-        As in `Settings`, but the memory is that of the whole process.
     item
         Bytes of one sample of a stream.
+    threads, memory
+        As in `Settings`, but the memory is that of the whole process.
     portable
         On the reference machine, not on this one.
     """
     factors = dict.fromkeys(REFERENCE, 1.0) if portable else calibrate()
-    late = {o.label for o in context.operators if isinstance(o, Output)}
     longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
-    own = {o.label: planning_of(o).memory(longest) for o in context.operators}
-    held = sum(own.get(label) or cost.bytes for label, cost in costs.items() if cost is not None and label not in late)
-    steps = [o for o in context.operators if not isinstance(o, Output) and "boresight" not in o.provides]
+    during = [o for o in context.operators if not isinstance(o, Output)]
+    held = POINTED * context.times + sum(planning_of(o).memory(longest) for o in during)
+    after = sum(planning_of(o).memory(longest) for o in context.operators if isinstance(o, Output))
+    steps = [o for o in during if "boresight" not in o.provides]
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
     acting: dict[str, float] = {label: max(number, 1) for label, number in context.runs.items()}
     copied = {label: names for label, names in alike(steps).items() if acting.get(label, 1) > 1}
@@ -116,21 +118,14 @@ def predict(
     share = sum(size for size, bytes_kept in zip(sizes, kept, strict=True) if bytes_kept) / max(sum(sizes), 1)
     acting |= {label: acting[label] - (acting[label] - 1) * share for label in copied}
     settings.memory -= sum(kept)
+    found = forecast(steps, longest, settings)
     seconds = {}
     for label, cost in costs.items():
-        if cost is None:
-            continue
-        runs = acting.get(label, 1)
-        each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
-        seconds[label] = factors[cost.kernel] * (runs * each + cost.once)
+        if cost is not None:
+            each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
+            again = found.again.get(label, 0) * (each - cost.fixed * len(sizes))  # prepared once, made again
+            seconds[label] = factors[cost.kernel] * (acting.get(label, 1) * (each + again) + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
-    after = sum(cost.bytes for label, cost in costs.items() if cost is not None and label in late)
     startup = factors[STARTUP.kernel] * STARTUP.once
-    found = forecast(steps, longest, settings)
-    during = held + found.bytes + sum(kept)
-    for label, times in found.again.items():  # prepared once, made again
-        if (cost := costs.get(label)) is not None:
-            runs = acting.get(label, 1)
-            each = sum(cost.seconds(o.n_samples, o.n_detectors) - cost.fixed for o in context.observations)
-            seconds[label] += factors[cost.kernel] * runs * times * each
-    return Prediction(seconds, BASE + max(during, after), unknown, startup, acting, factors)
+    held += found.bytes + sum(kept)
+    return Prediction(seconds, BASE + max(held, after), unknown, startup, acting, factors)

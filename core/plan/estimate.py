@@ -40,8 +40,8 @@ class Choice:
         Error against the effect as the pipeline asks for it.
     formula
         Where the bound comes from.
-    seconds, bytes
-        CPU time that it saves [reference s, see `cost`] and memory [B], against the effect as the pipeline asks for it.
+    seconds
+        CPU time that it saves against the effect as the pipeline asks for it [reference s, see `cost`].
     """
 
     decision: Decision
@@ -51,7 +51,6 @@ class Choice:
     bound: Bound = field(default_factory=dict)
     formula: str = ""
     seconds: float = 0.0
-    bytes: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Cost:
-    """CPU seconds on the reference machine (`cost.REFERENCE`) of one run over one observation, and memory.
+    """CPU seconds on the reference machine (`cost.REFERENCE`) of one run over one observation.
 
     Attributes
     ----------

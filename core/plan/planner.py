@@ -87,21 +87,22 @@ def plan(
     decided = decide(
         effects,
         allowed,
-        predict(context, costs, 1, item, AMPLE, portable=True),
+        predict(context, costs, item, 1, AMPLE, portable=True),
         kept=named(keep, effects, labels),
         forced={d.name for d in effects if d.operator in whole or {d.name, d.effect.name, d.operator} & {*drop}},
         prune_all=prune_all,
     )
     if measure and (unknown := [label for label, cost in costs.items() if cost is None]):
         costs |= measured(file, unknown)
-    settings = threads or available_threads(), item, memory or available_memory() // 2
-    now = predict(context, costs, *settings)
+    machine = threads or available_threads(), memory or available_memory() // 2
+    now = predict(context, costs, item, *machine)
     prediction = _with_savings(now, decided)
-    if whole:  # what is left out holds nothing
+    single = any(d.operator == "pipeline" and d.chosen for d in decided)
+    if whole or single:  # what is left out holds nothing
         rest = {o.label: costs[o.label] for o in left.operators}
-        prediction = dataclasses.replace(prediction, bytes=predict(left, rest, *settings).bytes)
+        prediction = dataclasses.replace(prediction, bytes=predict(left, rest, 4 if single else item, *machine).bytes)
     pruned = (structure.operators, structure.runs) != (everything.operators, everything.runs)
-    unpruned = predict(*_everything_on(pipeline, everything, context, estimates), *settings) if pruned else now
+    unpruned = predict(*_everything_on(pipeline, everything, context, estimates), item, *machine) if pruned else now
     planning = time.process_time() - begin
     prediction, unpruned = (dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned))
     return Plan(
@@ -129,13 +130,12 @@ def _check_arguments(file: Any, keep: Any, drop: Any) -> None:
 
 def _with_savings(now: Prediction, decided: Iterable[Decided]) -> Prediction:
     """The prediction less what the decisions save."""
-    seconds, memory = dict(now.seconds), now.bytes
+    seconds = dict(now.seconds)
     for d in decided:
         if d.operator in seconds:
             saved = seconds[d.operator] if d.choice.leave_out else d.saving(d.chosen, now)
             seconds[d.operator] = max(seconds[d.operator] - saved, 0.0)
-        memory -= d.choice.bytes if d.chosen else 0.0
-    return dataclasses.replace(now, seconds=seconds, bytes=memory)
+    return dataclasses.replace(now, seconds=seconds)
 
 
 def _everything_on(
@@ -167,7 +167,6 @@ def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
     carries_mean = context.cut == 0 and any("atmosphere" in o.provides for o in context.operators)
     if carries_mean or context.fluctuation > LARGEST_RATIO * context.noise:  # the filters refuse float32 there
         return [Effect("precision", (full("float64"),), bound, formula)]
-    whole = max(o.n_samples * o.n_detectors for o in context.observations) * 4
     seconds = 4e-9 * context.samples
-    single = Choice("coarse", "float32", {"precision": "float32"}, bound=bound, formula=formula, seconds=seconds, bytes=whole)
+    single = Choice("coarse", "float32", {"precision": "float32"}, bound=bound, formula=formula, seconds=seconds)
     return [Effect("precision", (full("float64"), single), bound, formula)]

@@ -52,6 +52,10 @@ class Planning(Generic[O]):
         """Upper bounds on what its effects contribute, coarser forms of them, and what it costs."""
         return Estimate()
 
+    def coarser(self, parameter: str) -> list[Any]:
+        """The rungs of a knob that are coarser than the operator's own value, the finest of them first."""
+        return next(knob for knob in self.knobs if knob.parameter == parameter).coarser(self.operator)
+
     def memory(self, observation: Observation) -> int:
         """Bytes that the step will hold for one observation, besides streams and blocks: tables, accumulators, products.
 

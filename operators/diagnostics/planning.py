@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from zonda.core.data import Observation
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
@@ -20,7 +21,11 @@ class PlotsPlanning(Planning[Plots]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(once=1.2, bytes=150e6, kernel="python"))
+        return Estimate((), Cost(once=1.2, kernel="python"))
+
+    def memory(self, observation: Observation) -> int:
+        """matplotlib and the pictures."""
+        return 150_000_000
 
 
 class ReportPlanning(Planning[Report]):
@@ -30,7 +35,11 @@ class ReportPlanning(Planning[Report]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(once=0.1, bytes=10e6, kernel="python"))
+        return Estimate((), Cost(once=0.1, kernel="python"))
+
+    def memory(self, observation: Observation) -> int:
+        """The page."""
+        return 10_000_000
 
 
 class TransferFunctionPlanning(Planning[TransferFunction]):
@@ -40,7 +49,11 @@ class TransferFunctionPlanning(Planning[TransferFunction]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(once=0.15, bytes=20e6, kernel="python"))
+        return Estimate((), Cost(once=0.15, kernel="python"))
+
+    def memory(self, observation: Observation) -> int:
+        """Fourier transforms of the maps."""
+        return 20_000_000
 
 
 class PowerSpectrumPlanning(Planning[PowerSpectrum]):

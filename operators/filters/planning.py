@@ -26,7 +26,7 @@ class HighpassPlanning(Planning[HighpassFilter]):
     """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
 
     of = HighpassFilter
-    knobs = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
+    knobs = (Knob("oversampling", (8, 12, 16, 24, 48), "slow part formed on a coarse series in time"),)
 
     def traits(self, observation: Observation) -> Traits:
         """A brick wall; a scan shorter than one cycle loses only a line."""
@@ -46,7 +46,7 @@ class HighpassPlanning(Planning[HighpassFilter]):
         choices = [full(f"{full_q:g} knots per cycle of the cut")]
         near = LEAKS * context.weighted(lambda f: min((f / cut) ** 4, 1.0), 0.0, cut)
         text = "1.5 sqrt(int_0^f_cut S (f / f_cut)^8 df) x (q^-4 + q_full^-4), q knots per cycle of the cut"
-        for q in (q for q in (16.0, 12.0, 8.0) if q < full_q):
+        for q in self.coarser("oversampling"):
             share = q**-4 + full_q**-4
             bound = context.bound(near * share, 1 / cut, common=True)
             bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
@@ -69,7 +69,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
     """
 
     of = CommonModeFilter
-    knobs = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
+    knobs = (Knob("residual", (1e-2, 1e-3, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
 
     def traits(self, observation: Observation) -> Traits:
         """It removes what is common."""
@@ -99,7 +99,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
             return Estimate((), cost, without)
         choices = [full(f"residual {tightest:g}")]
         text = "rms of the stream behind the high-pass filter x residual / (1 - gap^2)"
-        for residual in (r for r in (1e-4, 1e-3, 1e-2) if r > tightest):
+        for residual in self.coarser("residual"):
             share = math.sqrt(modes) * (residual + tightest) / (1 - self.operator.gap**2)
             bound = context.bound(share * context.passed, slow, common=True) | {"psd": 2 * share + share**2}
             bound |= context.sky_error(share)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from zonda.core.data import Observation
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
@@ -17,7 +18,11 @@ class SaveMapPlanning(Planning[SaveMap]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(once=0.02 * (1 + max(context.runs.values(), default=1)), bytes=20e6, kernel="python"))
+        return Estimate((), Cost(once=0.02 * (1 + max(context.runs.values(), default=1)), kernel="python"))
+
+    def memory(self, observation: Observation) -> int:
+        """A map and its copy in the file's units."""
+        return 20_000_000
 
 
 class SaveTODPlanning(Planning[SaveTOD]):

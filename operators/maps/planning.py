@@ -27,7 +27,7 @@ class BinMapPlanning(Planning[BinMap]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         n = self.operator.n_pixels
-        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9, bytes=n * 8.0 * 4 * 4))
+        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9))
 
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, their total, two halves, the product; and the pointing, twice while it is laid out."""

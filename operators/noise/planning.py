@@ -107,7 +107,7 @@ class PinkPlanning(Planning[PinkNoise]):
         correlated, common = _correlated(law, context), pink.shared > 0 and not context.removes_common
         text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
         seconds = pole_cost(pink.poles).seconds(context.times, o.n_detectors)
-        for poles in (p for p in (12, 8, 4) if p < pink.poles):
+        for poles in self.coarser("poles"):
             try:
                 coarse = spectrum.filter(poles)
             except ZondaError:
