@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from .log import Row
     from .prepare import Source
     from .settings import Campaign
+
+    Table = Sequence[tuple[Task, Row]]
     from .work import Result
 
 ENGINES = ("serial", "processes", "mpi", "dask")
@@ -45,6 +47,7 @@ def run(
     from ..storage.lock import lock
     from . import run as campaign
     from .engines import engine as opened
+    from .prepare import Pruning
 
     sources = [source(p, settings, len(pipelines) > 1) for p in pipelines]
     if len({s.name for s in sources}) < len(sources):
@@ -55,14 +58,14 @@ def run(
         if pool.executor is None:
             return
         check_output_folder(folder)
-        pruning: dict[str, Any] = {"keep": keep, "drop": drop, "prune_all": not no_prune}
+        pruning = Pruning(keep, drop, not no_prune)
         if share is not None:
             with lock(folder, f"{share[0]}-of-{share[1]}"):
-                campaign.share(sources, folder, command, pool, _say, *share, **pruning)
+                campaign.share(sources, folder, command, pool, _say, pruning, share)
             _say(f"share {share[0]} of {share[1]} is done; when all are: zonda resume {folder}")
         else:
             with lock(folder), _told_how_to_go_on(folder):
-                _show(campaign.begin(sources, folder, command, pool, _say, **pruning), verbose)
+                _show(campaign.begin(sources, folder, command, pool, _say, pruning), verbose)
     click.echo(f"{folder}/")
 
 
@@ -125,24 +128,20 @@ def resume(
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def status(folder: Path, listed: bool, as_json: bool) -> None:
     """Show how far the campaign in DIR is: its tasks by state, what failed and why."""
-    from . import log
+    from .folder import shares
     from .job import LOG, Job
+    from .log import WAITING, read
 
     job = Job.read(folder)
-    paths = [p for p in (folder / LOG, *sorted(folder.glob("jobs.*-of-*.sqlite"))) if p.exists()]
-    rows: dict[int, Row] = {}
-    for path in paths:
-        for row in log.read(path):
-            if row.number not in rows or _rank(row) > _rank(rows[row.number]):
-                rows[row.number] = row
-    table = [(task, rows.get(task.number)) for task in job.tasks]
+    rows = [row for path in (*shares(folder), folder / LOG) if path.exists() for row in read(path)]
+    latest = {row.number: row for row in sorted(rows, key=lambda row: FARTHEST.index(row.state))}
+    table = [(task, latest.get(task.number, WAITING)) for task in job.tasks]
     if as_json:
         import json
 
         click.echo(json.dumps(_as_dict(job, table), indent=2))
-        return
-    for line in _lines(job, table, listed):
-        click.echo(line)
+    else:
+        click.echo("\n".join(_lines(job, table, listed)))
 
 
 def source(pipeline: str, settings: tuple[str, ...], several: bool) -> Source:
@@ -206,25 +205,22 @@ def _show(result: Result, verbose: bool) -> None:
             _say(f"{combination}{': ' if combination else ''}{who}: {what}: {value}")
 
 
-def _rank(row: Row) -> int:
-    return ("waiting", "failed", "claimed", "done").index(row.state)
+FARTHEST = ("waiting", "failed", "claimed", "done")
+"""Of the states that several logs give of a task, the last one counts."""
 
 
-def _counts(table: Sequence[tuple[Task, Row | None]]) -> dict[str, int]:
+def _counts(table: Table) -> dict[str, int]:
     from .log import STATES
 
-    counts = dict.fromkeys(STATES, 0)
-    for _, row in table:
-        counts[row.state if row else "waiting"] += 1
-    return counts
+    found = [row.state for _, row in table]
+    return {state: found.count(state) for state in STATES}
 
 
-def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> list[str]:
+def _lines(job: Job, table: Table, listed: bool) -> list[str]:
     from .job import plural
-    from .log import WAITING
 
     counts = _counts(table)
-    done = [(task, row) for task, row in table if row and row.state == "done"]
+    done = [(task, row) for task, row in table if row.state == "done"]
     samples = sum(task.samples for task, _ in done)
     seconds = sum(row.seconds for _, row in done)
     lines = [f"{job.name}: {plural(len(job.tasks), 'task')}, {job.sets}"]
@@ -235,13 +231,11 @@ def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> 
     lines += _machines(done)
     if listed:
         lines += ["", "  task  state    attempts  seconds  worker                  entry"]
-        for task, known in table:
-            row = known or WAITING
-            state, attempts, used, host = row.state, row.attempts, row.seconds, row.host
+        for task, row in table:
             scans = f"scan {task.scans[0]}" if len(task.scans) == 1 else f"{len(task.scans)} scans"
             about = ", ".join(filter(None, (task.about, scans)))
-            lines.append(f"  {task.number:>4}  {state:<7}  {attempts:>8}  {used:>7.1f}  {host:<22}  {about}")
-    troubled = [(task, row) for task, row in table if row and row.error and (row.state != "done" or listed)]
+            lines.append(f"  {task.number:>4}  {row.state:<7}  {row.attempts:>8}  {row.seconds:>7.1f}  {row.host:<22}  {about}")
+    troubled = [(task, row) for task, row in table if row.error and (row.state != "done" or listed)]
     for task, row in troubled[:20]:
         text = row.error.strip().splitlines()
         shown = text if listed or not row.error.startswith("Traceback") else text[-1:]
@@ -251,7 +245,7 @@ def _lines(job: Job, table: Sequence[tuple[Task, Row | None]], listed: bool) -> 
     return lines
 
 
-def _machines(done: Sequence[tuple[Task, Row]]) -> list[str]:
+def _machines(done: Table) -> list[str]:
     """On what the tasks ran."""
     from .job import plural
     from .machines import EFFECT, differences, kinds, short
@@ -265,10 +259,10 @@ def _machines(done: Sequence[tuple[Task, Row]]) -> list[str]:
     return lines
 
 
-def _as_dict(job: Job, table: Sequence[tuple[Task, Row | None]]) -> dict[str, Any]:
+def _as_dict(job: Job, table: Table) -> dict[str, Any]:
     from .machines import read
 
-    made_on = list(dict.fromkeys(row.machine for _, row in table if row and row.machine))
+    made_on = list(dict.fromkeys(row.machine for _, row in table if row.machine))
     return {
         "name": job.name,
         "version": job.version,
@@ -279,12 +273,8 @@ def _as_dict(job: Job, table: Sequence[tuple[Task, Row | None]]) -> dict[str, An
         "tasks": [
             {
                 "number": task.number,
-                "state": row.state if row else "waiting",
-                "attempts": row.attempts if row else 0,
-                "error": row.error if row else "",
-                "host": row.host if row else "",
-                "seconds": row.seconds if row else 0.0,
-                "machine": made_on.index(row.machine) if row and row.machine else None,
+                **{key: getattr(row, key) for key in ("state", "attempts", "error", "host", "seconds")},
+                "machine": made_on.index(row.machine) if row.machine else None,
                 "samples": task.samples,
                 "entry": task.about,
                 "scans": list(task.scans),

@@ -74,7 +74,7 @@ def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say, same_
     ``same_machine``: products of another kind of machine than the first task's are removed.
     """
     rows = {row.number: row for row in log.rows()}
-    others = {row.number: row for path in sorted(folder.glob("jobs.*-of-*.sqlite")) for row in readable(path)}
+    others = {row.number: row for path in shares(folder) for row in readable(path)}
     missing, lost, strange = [], [], []
     first = next(filter(None, (machines.kind((others.get(n) or rows[n]).machine) for n in sorted(rows))), None)
     for task in job.tasks:
@@ -101,6 +101,11 @@ def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say, same_
     if lost:
         say(f"{len(lost)} partial products were missing or damaged: their tasks are run again")
     return missing
+
+
+def shares(folder: Path) -> list[Path]:
+    """Logs of the jobs of an array."""
+    return sorted(folder.glob("jobs.*-of-*.sqlite"))
 
 
 def readable(path: Path) -> list[joblog.Row]:

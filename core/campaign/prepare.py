@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,13 +52,20 @@ class Look:
     place: str
 
 
+@dataclass(frozen=True)
+class Pruning:
+    """Options of the planner, as `zonda run` takes them."""
+
+    keep: Sequence[str] = ()
+    drop: Sequence[str] = ()
+    prune_all: bool = True
+
+
 def job(
     sources: Sequence[Source],
     folder: Path,
     command: str,
-    keep: Sequence[str] = (),
-    drop: Sequence[str] = (),
-    prune_all: bool = True,
+    pruning: Pruning,
     say: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> Job:
     """Work out a campaign and write the layouts of its maps to ``folder``.
@@ -72,77 +80,111 @@ def job(
     """
     from zonda import __version__
 
-    from ..plan.planner import plan
-    from ..run.first_look import first_look
-
-    pipelines: list[str] = []
-    plans: list[tuple[tuple[str, ...], ...]] = []
-    combinations: list[Combination] = []
-    tasks: list[Task] = []
-    planned_files: list[PipelineFile] = []
-    files: dict[str, str] = {}
-    entry_number, need = 0, 0
+    draft, first = _Draft(folder, pruning, say), sources[0].campaign
     for source in sources:
-        campaign = source.campaign
-        found = entries(campaign, source.file.scene().seed, lambda settings, s=source: s.load(settings).scene().time)  # type: ignore[misc]
-        files |= _files(source.file)
-        members: dict[Any, list[tuple[int, Entry]]] = {}
-        for entry in found:
-            members.setdefault(repr(entry.combination), []).append((entry_number, entry))
-            entry_number += 1
-        groups: dict[tuple[tuple[str, ...], float], int] = {}  # entries that differ in seed and night alone share a plan
-        done = 0
-        for together in members.values():
-            share = 1 / math.sqrt(len(together))
-            planned: list[tuple[int, Entry, int]] = []
-            for number, entry in together:
-                say(done, len(found), "campaign: plans and grids")
-                done += 1
-                if (entry.settings, share) not in groups:
-                    with _placed(about(entry) or source.file.header.name):
-                        file = _with_budget(source.load(entry.settings), share)
-                        first_look(file.pipeline(), scene_of(file, entry.seed, entry.time))
-                        made = plan(file, keep=keep, drop=drop, prune_all=prune_all)
-                    groups[entry.settings, share] = len(pipelines)
-                    planned_files.append(made.apply(file))
-                    pipelines.append(planned_files[-1].resolved_yaml())
-                    plans.append(tuple(tuple(map(str, row)) for row in made.summary.short))
-                    files |= _files(planned_files[-1])
-                planned.append((number, entry, groups[entry.settings, share]))
-            looks = [Look(group, entry.seed, entry.time, about(entry)) for _, entry, group in planned]
-            pointed: dict[int, Data] = {}
-            layouts, scans = agree(looks, planned_files, pointed)
-            need = max([need, *(_need(planned_files[group], data, layouts, folder) for group, data in pointed.items())])
-            name, subfolder = _names(source, together[0][1], combinations)
-            combination = Combination(name, subfolder, "")
-            digest = parts.write(layout_path(folder, len(combinations)), "layout", {"layouts": layouts})
-            combinations.append(dataclasses.replace(combination, layout=digest))
-            tasks += _tasks(planned, scans, campaign.task, len(combinations) - 1, digest, pipelines, __version__, len(tasks))
-            if len(tasks) > MOST_TASKS:
-                raise InputError(
-                    f"a campaign of more than {MOST_TASKS} tasks", cure="set campaign.task: entry, or make it smaller"
-                )
-    first = sources[0].campaign
+        draft.add(source)
     return Job(
         name=sources[0].file.header.name if len(sources) == 1 else "campaign",
         version=__version__,
         command=command,
         retries=first.retries,
         keep_tasks=first.keep_tasks,
-        pipelines=tuple(pipelines),
-        plans=tuple(plans),
+        pipelines=tuple(draft.pipelines),
+        plans=tuple(draft.plans),
         source=tuple(source.file.resolved_yaml() for source in sources),
-        files=files,
-        combinations=tuple(combinations),
-        tasks=tuple(tasks),
+        files=draft.inputs,
+        combinations=tuple(draft.combinations),
+        tasks=tuple(draft.tasks),
         same_machine=first.same_machine,
-        need=need,
+        need=draft.need,
     )
+
+
+class _Draft:
+    """A campaign that is being worked out, one pipeline file after the other."""
+
+    def __init__(self, folder: Path, pruning: Pruning, say: Callable[[int, int, str], None]) -> None:
+        self._folder, self._pruning, self._say = folder, pruning, say
+        self.pipelines: list[str] = []
+        self.plans: list[tuple[tuple[str, ...], ...]] = []
+        self.combinations: list[Combination] = []
+        self.tasks: list[Task] = []
+        self.inputs: dict[str, str] = {}
+        self.need = 0
+        self._files: list[PipelineFile] = []
+        self._entries = 0
+
+    def add(self, source: Source) -> None:
+        """All entries of a pipeline file."""
+        found = _entries(source)
+        self.inputs |= _inputs(source.file)
+        together: dict[str, list[tuple[int, Entry]]] = {}
+        for number, entry in enumerate(found, self._entries):
+            together.setdefault(repr(entry.combination), []).append((number, entry))
+        self._entries += len(found)
+        planned: dict[tuple[tuple[str, ...], float], int] = {}
+        done = 0
+        for members in together.values():
+            share, looks = 1 / math.sqrt(len(members)), []
+            for _, entry in members:
+                self._say(done, len(found), "campaign: plans and grids")
+                done += 1
+                if (entry.settings, share) not in planned:  # those that differ in seed and night alone share a plan
+                    planned[entry.settings, share] = self._plan(source, entry, share)
+                looks.append(Look(planned[entry.settings, share], entry.seed, entry.time, about(entry)))
+            self._combine(source, members, looks)
+
+    def _plan(self, source: Source, entry: Entry, share: float) -> int:
+        """Plan an entry's pipeline; its number."""
+        from ..plan.planner import plan
+        from ..run.first_look import first_look
+
+        with _placed(about(entry) or source.file.header.name):
+            file = _with_budget(source.load(entry.settings), share)
+            first_look(file.pipeline(), scene_of(file, entry.seed, entry.time))
+            made = plan(file, keep=self._pruning.keep, drop=self._pruning.drop, prune_all=self._pruning.prune_all)
+        self._files.append(made.apply(file))
+        self.pipelines.append(self._files[-1].resolved_yaml())
+        self.plans.append(tuple(tuple(map(str, row)) for row in made.summary.short))
+        self.inputs |= _inputs(self._files[-1])
+        return len(self.pipelines) - 1
+
+    def _combine(self, source: Source, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]) -> None:
+        """One set of products: the layout of all that is co-added, and its tasks."""
+        pointed: dict[int, Data] = {}
+        layouts, scans = agree(looks, self._files, pointed)
+        self.need = max([self.need, *(_need(self._files[k], data, layouts, self._folder) for k, data in pointed.items())])
+        name, subfolder = _names(source, members[0][1], self.combinations)
+        digest = parts.write(layout_path(self._folder, len(self.combinations)), "layout", {"layouts": layouts})
+        self.combinations.append(Combination(name, subfolder, digest))
+        before = 0
+        for (number, _), look, samples in zip(members, looks, scans, strict=True):
+            every = tuple(range(len(samples)))
+            for own in [every] if source.campaign.task == "entry" else [(k,) for k in every]:
+                self._task(number, look, own, before, sum(samples[k] for k in own))
+                before += len(own)
+
+    def _task(self, entry: int, look: Look, scans: tuple[int, ...], before: int, samples: int) -> None:
+        from zonda import __version__
+
+        time, combination = look.time.nanoseconds, len(self.combinations) - 1
+        pipeline, layout = self.pipelines[look.pipeline], self.combinations[combination].layout
+        key = key_of(__version__, pipeline, look.seed, time, scans, before == 0, layout)
+        number = len(self.tasks)
+        if number == MOST_TASKS:
+            raise InputError(f"a campaign of more than {MOST_TASKS} tasks", cure="set campaign.task: entry, or make it smaller")
+        self.tasks.append(
+            Task(number, key, look.pipeline, combination, entry, scans, before, look.seed, time, samples, look.place)
+        )
+
+
+def _entries(source: Source) -> list[Entry]:
+    return entries(source.campaign, source.file.scene().seed, lambda settings: source.load(settings).scene().time)
 
 
 def outline(source: Source) -> tuple[str, PipelineFile]:
     """What a campaign consists of in one line; and its first entry as a pipeline file, with its share of the budget."""
-    found = entries(source.campaign, source.file.scene().seed, lambda settings: source.load(settings).scene().time)
+    found = _entries(source)
     first = found[0]
     together = sum(e.combination == first.combination for e in found)
     sets = len({repr(e.combination) for e in found})
@@ -238,33 +280,6 @@ def _need(file: PipelineFile, data: Data, layouts: Mapping[str, Mapping[str, Any
     return least(pipeline, data.observations)
 
 
-def _tasks(
-    planned: Sequence[tuple[int, Entry, int]],
-    scans_of: Sequence[tuple[int, ...]],
-    kind: str,
-    combination: int,
-    layout: str,
-    pipelines: Sequence[str],
-    version: str,
-    number: int,
-) -> list[Task]:
-    found: list[Task] = []
-    before = 0
-    for (entry_number, entry, group), samples in zip(planned, scans_of, strict=True):
-        every = tuple(range(len(samples)))
-        for scans in [every] if kind == "entry" else [(k,) for k in every]:
-            time = entry.time.nanoseconds
-            key = key_of(version, pipelines[group], entry.seed, time, scans, before == 0, layout)
-            found.append(
-                Task(
-                    number + len(found), key, group, combination, entry_number, scans, before, entry.seed, time,
-                    sum(samples[k] for k in scans), about(entry),
-                )
-            )  # fmt: skip
-            before += len(scans)
-    return found
-
-
 def _names(source: Source, entry: Entry, others: Sequence[Combination]) -> tuple[str, str]:
     """Name of a combination and the folder of its products."""
     name = ", ".join(f"{k}={v}" for k, v in entry.combination)
@@ -288,20 +303,18 @@ def _with_budget(file: PipelineFile, share: float) -> PipelineFile:
     return dataclasses.replace(file, header=file.header.model_copy(update={"budget": budget, "campaign": None}))
 
 
-class _placed:
+@contextlib.contextmanager
+def _placed(place: str) -> Iterator[None]:
     """Name the entry in every error of the body."""
-
-    def __init__(self, place: str) -> None:
-        self.place = place
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: Any, err: Any, trace: Any) -> None:
-        if isinstance(err, ZondaError) and not hasattr(err, "diagnostics"):
-            err.place = f"entry {self.place}" + (f": {err.place}" if err.place else "")
+    try:
+        yield
+    except ZondaError as err:
+        if not hasattr(err, "diagnostics"):
+            err.place = f"entry {place}" + (f": {err.place}" if err.place else "")
+        raise
 
 
-def _files(file: PipelineFile) -> dict[str, str]:
+def _inputs(file: PipelineFile) -> dict[str, str]:
     """The file and the inputs that it names, each with its stamp."""
     found: dict[str, str] = {}
     if Path(file.place).is_file():

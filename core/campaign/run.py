@@ -6,7 +6,6 @@ import contextlib
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from .. import hooks
 from ..errors import InputError, OutputError, PipelineError, ZondaError
@@ -22,6 +21,7 @@ from .folder import (
     opened,
     publish,
     readable,
+    shares,
     sources_of,
     verify,
     write_sources,
@@ -30,7 +30,7 @@ from .job import FILE, LOG, TASKS, Job, Say, Task, digest_of_text, layout_path, 
 from .log import Log, Row
 from .machines import Watch
 from .memory import share_out
-from .prepare import Source, changed, restore_layout
+from .prepare import Pruning, Source, changed, restore_layout
 from .prepare import job as prepare
 from .work import Combinations, Result, Tasks
 
@@ -41,10 +41,7 @@ def begin(
     command: str,
     pool: Pool,
     say: Say,
-    *,
-    keep: Sequence[str] = (),
-    drop: Sequence[str] = (),
-    prune_all: bool = True,
+    pruning: Pruning = Pruning(),
 ) -> Result:
     """Run a new campaign. The caller holds the folder's lock.
 
@@ -61,7 +58,7 @@ def begin(
         say(f"{folder} holds products of an earlier run: those of the same names are replaced, others stay")
     make_way(folder)
     try:
-        made = prepare(sources, folder, command, keep, drop, prune_all, _progress())
+        made = prepare(sources, folder, command, pruning, _progress())
         share_out(pool, made.need, made.name)
     except BaseException:
         make_way(folder)  # of the layouts of a campaign that does not begin
@@ -102,9 +99,9 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_mac
 
 
 def share(
-    sources: Sequence[Source], folder: Path, command: str, pool: Pool, say: Say, which: int, of: int, **options: Any
+    sources: Sequence[Source], folder: Path, command: str, pool: Pool, say: Say, pruning: Pruning, which: tuple[int, int]
 ) -> Result:
-    """Run every ``of``-th task from the ``which``-th on (counted from 1): a job of an array. Combines nothing.
+    """Run every n-th task from the k-th on (counted from 1), where ``which`` is (k, n): a job of an array. Combines nothing.
 
     The first job there works the campaign out; all write their own job log. The caller holds the lock of its share.
     """
@@ -112,15 +109,15 @@ def share(
 
     check_output_folder(folder)
     if not (folder / FILE).exists():
-        made = prepare(sources, folder, command, say=_progress(), **options)
+        made = prepare(sources, folder, command, pruning, _progress())
         write_sources(made, folder)
         publish(made, folder)
     job = Job.read(folder)
     if job.source != tuple(s.file.resolved_yaml() for s in sources) or job.version != __version__:
         raise OutputError("holds another campaign", place=str(folder), cure="choose another output folder")
     share_out(pool, job.need, job.name)
-    mine = [task for task in job.tasks if task.number % of == which - 1]
-    path = folder / f"jobs.{which}-of-{of}.sqlite"
+    mine = [task for task in job.tasks if task.number % which[1] == which[0] - 1]
+    path = folder / f"jobs.{which[0]}-of-{which[1]}.sqlite"
     try:
         log = Log(path)
         rows = {row.number: row for row in log.rows()}
@@ -137,7 +134,7 @@ def share(
             elif task.number not in rows or rows[task.number].state != "done":
                 log.done(task.number, "", 0.0, digest)
         log.put_off(task.number for task in missing)
-        theirs = [readable(path) for path in sorted(folder.glob("jobs.*-of-*.sqlite"))]
+        theirs = [readable(path) for path in shares(folder)]
         result = Tasks(job, folder, log, pool, _watch(job.same_machine, folder, theirs, say)).run(missing)
     _tell(result, say)
     _fail(result, len(mine))
