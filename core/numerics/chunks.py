@@ -19,9 +19,9 @@ LARGE = 1 << 22
 """Bytes from which on numpy asks for large pages."""
 
 
-def chunks(n: int) -> list[slice]:
-    """Of ``n`` instants."""
-    return [slice(k, min(k + CHUNK, n)) for k in range(0, n, CHUNK)]
+def chunks(n: int, size: int = CHUNK) -> list[slice]:
+    """Of ``n`` instants, or of anything, ``size`` at a time."""
+    return [slice(k, min(k + size, n)) for k in range(0, n, size)]
 
 
 def empty(shape: tuple[int, int], dtype: Any = np.float64) -> NDArray[Any]:

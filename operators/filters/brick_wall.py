@@ -200,9 +200,9 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     third = (2 / knots) ** 2 / 3
     raw = np.array([np.ones_like(t), t, t * t - third, t**3 - 3 * third * t])[: degree + 1]
     spread = np.zeros_like(raw)
-    for some in chunks(n):
-        cell, weights = _around(some, n, knots)
-        time = (np.arange(some.start, some.stop) + 0.5) * (2 / n) - 1
+    for part in chunks(n):
+        cell, weights = _around(part, n, knots)
+        time = (np.arange(part.start, part.stop) + 0.5) * (2 / n) - 1
         edges = np.flatnonzero(np.diff(cell, prepend=-1))  # of the knots' intervals
         for j, weight in enumerate(weights):
             for s in spread:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from threading import Semaphore
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.compilation.jit import nb
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.run.streams import columns
@@ -28,23 +29,27 @@ ROWS = 16 * TILE_DETECTORS
 """Detectors of a tile that are worked on in float64 at a time."""
 
 PARTS = 1 << 20
-"""Bytes of the sums of several tiles that a thread makes before they are added."""
+"""Bytes of the sums that a thread makes of several tiles before they are added."""
 
 SEVERAL, MANY = 4, 1024
-"""Tiles that are read together, and of how many detectors or more: one tile of theirs outgrows the cache, and long stretches of
-each detector are read quicker."""
+"""Tiles that are read together, and the number of detectors from which on: one tile of theirs exceeds the cache, and long rows
+are read faster."""
 
 LANES = 16
 """Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples at a time."""
 
 
 class Usable:
-    """Which detectors can take part: ``use`` (n_det,) those not flagged, ``n_used`` the number of good samples.
+    """Which detectors take part.
 
     Attributes
     ----------
+    use
+        (n_det,): those that are not flagged, until `judge` excludes some.
+    n_used
+        Number of good samples.
     not_finite, constant
-        (n_det,): detectors left out by `judge`.
+        (n_det,): detectors that `judge` excluded.
     energy
         Sum of squares of the good detectors.
     """
@@ -59,9 +64,9 @@ class Usable:
         return int(self.use.sum())
 
     def judge(self, total: Floats, square: Floats, noiseless: bool = False) -> bool:
-        """Leave out detectors that are constant or not finite, from their sums (n_det,); whether there are any.
+        """Exclude detectors that are constant or not finite, by their sums (n_det,); returns whether there are any.
 
-        ``noiseless``: without noise a constant one is none the worse: it sees nothing.
+        ``noiseless``: without noise a constant detector is valid: it sees nothing.
         """
         finite = np.isfinite(square)
         with np.errstate(invalid="ignore"):
@@ -73,109 +78,69 @@ class Usable:
         return bool(self.not_finite.any() or self.constant.any())
 
 
-class Gram:
+class Gram(Usable):
     """G = A A^T as an operator on vectors over detectors, without flagged samples, flagged and dead detectors.
 
     Work is cut into absolute tiles of `tile_length` samples, whose parts are added in order: the bits do not depend on the
-    number of threads. A spilled stream is read from its file, tile by tile, by as many threads as there is room for copies: pages
-    that are touched in a mapping count as the process's memory, and the system maps those around them too.
+    number of threads. A spilled stream is read from its file, tile by tile, by as many threads as there is memory for copies:
+    pages that are touched in a mapping count as the process's memory, and the system maps those around them too.
 
-    The detectors' moments, which tell the dead ones, are taken on the way of the product that the iteration begins with; where no
-    detector turns out dead, `apply` has it at hand.
+    The detectors' moments, which identify dead ones, come with the product that the iteration begins with; where no detector is
+    dead, `apply` returns that product.
     """
 
     def __init__(
         self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None, noiseless: bool = False
     ) -> None:
         """``use``: the detectors to use, where they are known; they are found otherwise. ``noiseless``: see `Usable.judge`."""
-        self.stream, self.pool = stream, pool
-        self.n_samples = stream.shape[1]
         self.good_samples = stream.observation.good_samples
-        self.n_used = int(self.good_samples.sum())
+        super().__init__(stream.observation.good_detectors if use is None else use, int(self.good_samples.sum()))
+        self.stream, self.pool, self.n_samples = stream, pool, stream.shape[1]
         self.length = tile_length(stream.shape[0], stream.dtype.itemsize)
         self.copied = isinstance(stream.array, np.memmap)
         self.whole = stream.means.get("signal") is None and bool(self.good_samples.all()) and not self.copied
         copy = stream.shape[0] * min(self.length, self.n_samples) * stream.dtype.itemsize
         self._copies = Semaphore(max(1, min(stream.threads, 1 + stream.room // max(1, copy))))
         self._known: tuple[Floats, Floats, Floats] | None = None
-        if use is not None:
-            self.usable = Usable(use, self.n_used)
-            return
-        use = stream.observation.good_detectors
-        vector = near_the_mean(use)
-        total, square, image, times = self._pass(vector, np.flatnonzero(use), moments=True)
-        self.usable = Usable(use, self.n_used)
-        self.usable.judge(total, square, noiseless)
-        self._known = (vector, image, times) if np.array_equal(self.use, use) else None
+        if use is None:
+            vector = near_the_mean(self.use)
+            total, square, image, times = self._pass(vector, np.flatnonzero(self.use), moments=True)
+            if not self.judge(total, square, noiseless):
+                self._known = vector, image, times
 
-    @property
-    def use(self) -> NDArray[np.bool_]:
-        """Good detectors."""
-        return self.usable.use
-
-    @property
-    def not_finite(self) -> NDArray[np.bool_]:
-        """See `Usable`."""
-        return self.usable.not_finite
-
-    @property
-    def constant(self) -> NDArray[np.bool_]:
-        """See `Usable`."""
-        return self.usable.constant
-
-    @property
-    def n_good(self) -> int:
-        """See `Usable`."""
-        return self.usable.n_good
-
-    @property
-    def energy(self) -> float:
-        """See `Usable`."""
-        return self.usable.energy
-
-    def _tiles(self) -> list[slice]:
-        return [slice(a, min(a + self.length, self.n_samples)) for a in range(0, self.n_samples, self.length)]
-
-    def _tile(self, samples: slice) -> tuple[NDArray[Any], int, int]:
-        """An array that holds these samples (mean emission included, zero where flagged), and where in it they are."""
-        if not self._copies_tile(samples):
-            return np.asarray(self.stream.array), samples.start, samples.stop
-        copy, mean, good = columns(self.stream.array, samples), self.stream.means.get("signal"), self.good_samples[samples]
-        if mean is not None:
-            for rows in _some_rows(copy.shape[0]):
-                copy[rows] += mean.evaluate(rows, samples)
-        copy[:, ~good] = 0
-        return copy, 0, copy.shape[1]
-
-    def _copies_tile(self, samples: slice) -> bool:
-        return not self.whole and (
-            self.copied or self.stream.means.get("signal") is not None or not bool(self.good_samples[samples].all())
-        )
-
-    def _room(self, samples: slice) -> AbstractContextManager[Any]:
-        """Wait until there is room for this tile's copy, if it needs one."""
-        return self._copies if self._copies_tile(samples) else nullcontext()
+    def _on_tile(self, samples: slice, act: Callable[[NDArray[Any], int, int], Any]) -> Any:
+        """``act(array, start, stop)`` on an array that has these samples, mean emission included and zero where flagged, from
+        ``start`` to ``stop``. Waits until there is memory for a copy, if it needs one."""
+        mean, good = self.stream.means.get("signal"), self.good_samples[samples]
+        if not self.copied and mean is None and good.all():
+            return act(np.asarray(self.stream.array), samples.start, samples.stop)
+        with self._copies:
+            copy = columns(self.stream.array, samples)
+            if mean is not None:
+                for rows in chunks(copy.shape[0], ROWS):
+                    copy[rows] += mean.evaluate(rows, samples)
+            copy[:, ~good] = 0
+            return act(copy, 0, copy.shape[1])
 
     def _pass(self, q: Floats, rows: NDArray[np.intp], moments: bool = False) -> tuple[Floats, Floats, Floats, Floats]:
         """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the stream."""
-        times, tiles = np.zeros(self.n_samples), self._tiles()
+        times, tiles = np.zeros(self.n_samples), chunks(self.n_samples, self.length)
         found = np.zeros((3, q.size))
 
-        def work(some: list[slice]) -> Floats:
-            parts = np.zeros((len(some), 3, q.size))
+        def work(group: list[slice]) -> Floats:
+            parts = np.zeros((len(group), 3, q.size))
             if self.whole and self.length == TILE_SAMPLES:  # no tile needs a copy: all in one call
-                at = slice(some[0].start, some[-1].stop)
+                at = slice(group[0].start, group[-1].stop)
                 _products(np.asarray(self.stream.array), at.start, at.stop, q, rows, times[at], moments, parts)
                 return parts
-            for samples, part in zip(some, parts, strict=True):
-                with self._room(samples):
-                    _products(*self._tile(samples), q, rows, times[samples], moments, part[None])
+            for samples, part in zip(group, parts, strict=True):
+                self._on_tile(samples, partial(_products, q=q, rows=rows, v=times[samples], moments=moments, out=part[None]))
             return parts
 
         threads, most = self.stream.threads, max(1, PARTS // (24 * q.size))
         at_least = min(SEVERAL, most, -(-len(tiles) // threads))
-        some = max(1, at_least, min(len(tiles) // (4 * threads), most) // SEVERAL * SEVERAL)
-        for parts in self._each(work, [tiles[k : k + some] for k in range(0, len(tiles), some)]):
+        size = max(1, at_least, min(len(tiles) // (4 * threads), most) // SEVERAL * SEVERAL)
+        for parts in self._each(work, [tiles[k : k + size] for k in range(0, len(tiles), size)]):
             for part in parts:
                 found += part
         total, square, image = found
@@ -190,19 +155,18 @@ class Gram:
     def left(self, detectors: Floats, times: Floats) -> float:
         """Energy of A - sum u v^T, formed without cancellation."""
 
-        def work(samples: slice) -> float:
-            energy = 0.0
-            with self._room(samples):
-                array, start, stop = self._tile(samples)
-                for rows in _some_rows(array.shape[0]):
-                    use = self.use[rows]
-                    rest = array[rows, start:stop][use].astype(np.float64)
-                    for u, v in zip(detectors, times, strict=True):
-                        rest -= np.outer(u[rows][use], v[samples])
-                    energy += float(np.einsum("dt,dt->", rest, rest))
-            return energy
+        def energy(samples: slice, array: NDArray[Any], start: int, stop: int) -> float:
+            total = 0.0
+            for rows in chunks(array.shape[0], ROWS):
+                use = self.use[rows]
+                rest = array[rows, start:stop][use].astype(np.float64)
+                for u, v in zip(detectors, times, strict=True):
+                    rest -= np.outer(u[rows][use], v[samples])
+                total += float(np.einsum("dt,dt->", rest, rest))
+            return total
 
-        return float(sum(self._each(work, self._tiles())))
+        tiles = chunks(self.n_samples, self.length)
+        return float(sum(self._each(lambda samples: self._on_tile(samples, partial(energy, samples)), tiles)))
 
     def _each(self, work: Callable[[Any], Any], items: list[Any]) -> Iterable[Any]:
         """Results of ``work``, in order."""
@@ -215,10 +179,6 @@ def tile_length(n_detectors: int, itemsize: int) -> int:
     while n_detectors * length * itemsize > MOST_COPIED and length > SHORTEST_TILE:
         length //= 2
     return length
-
-
-def _some_rows(n_detectors: int) -> list[slice]:
-    return [slice(d, min(d + ROWS, n_detectors)) for d in range(0, n_detectors, ROWS)]
 
 
 def near_the_mean(use: NDArray[np.bool_]) -> Floats:

@@ -130,6 +130,6 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
 def _combined(shares: Floats, times: list[Floats]) -> Floats:
     """Sums (k, n_samp) of series with their ``shares`` (k, m)."""
     found = empty((len(shares), times[0].size))
-    for some in chunks(times[0].size):
-        found[:, some] = shares @ np.array([series[some] for series in times])
+    for part in chunks(times[0].size):
+        found[:, part] = shares @ np.array([series[part] for series in times])
     return found

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zonda.core.errors import PipelineError
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.smooth import SmoothField
@@ -131,8 +132,7 @@ def rms_of_inverse(transmission: SmoothField | None, n_detectors: int) -> Floats
     cells = transmission.coefficients.shape[1] - 3
     at = 1 + np.unique(np.linspace(0, cells - 1, min(INSTANTS, cells)).round().astype(int))
     middle = (transmission.coefficients[:, at] + transmission.coefficients[:, at + 1]) / 2  # of those cells
-    for start in range(0, n_detectors, AT_ONCE):
-        rows = slice(start, start + AT_ONCE)
+    for rows in chunks(n_detectors, AT_ONCE):
         passed = transmission.weights[rows].astype(np.float64) @ middle
         clear = passed >= LEAST_TRANSMISSION
         squares = np.where(clear, 1 / np.maximum(passed, LEAST_TRANSMISSION) ** 2, 0.0).sum(axis=1)

@@ -24,13 +24,14 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .quotient import knots_of, parts, quotient
+from .quotient import AT_ONCE, knots_of, quotient
 
 
 class Efficiency(Operator):
@@ -194,7 +195,7 @@ def _flag_opaque(label: str, observation: Observation, transmission: SmoothField
     """Flag detectors that are opaque most of the time, and the samples at which one of the others is."""
     knots = knots_of(transmission, transmission.step)
     dead, cell = np.zeros(len(transmission.weights), bool), np.zeros(knots.shape[1], bool)
-    for rows in parts(len(dead)):
+    for rows in chunks(len(dead), AT_ONCE):
         opaque = ~(transmission.weights[rows] @ knots >= LEAST_TRANSMISSION)
         dead[rows] = opaque.mean(axis=1) > 0.5
         cell |= opaque[~dead[rows]].any(axis=0)

@@ -44,7 +44,7 @@ def quotient(above: SmoothField, below: SmoothField, use: NDArray[np.intp]) -> t
             _, size, fit = np.linalg.svd(known, full_matrices=False)
             fit = fit[: max(1, int(np.count_nonzero(size > 1e-13 * size[0])))]
             every = np.arange(len(nodes))
-            basis = [_ratio(above, below, step, every[part]) @ fit.T for part in parts(len(nodes))]
+            basis = [_ratio(above, below, step, every[part]) @ fit.T for part in chunks(len(nodes), AT_ONCE)]
             field, error = fitted(np.concatenate(basis), fit)
         if error <= tolerance or step == 1:
             return field, error
@@ -77,17 +77,12 @@ def _error(field: SmoothField, above: SmoothField, below: SmoothField, step: int
     """Largest difference between ``field`` and above / below at the cells' midpoints, over the detectors ``use``."""
     middle, top, bottom = (knots_of(f, step, 0.5) for f in (field, above, below))
     worst = 0.0
-    for detectors in parts(len(use)):
+    for detectors in chunks(len(use), AT_ONCE):
         one, other, fitted = (f.weights[use[detectors]] for f in (above, below, field))
         for part in chunks(middle.shape[1]):
             exact = (one @ top[:, part]) / np.maximum(other @ bottom[:, part], LEAST_TRANSMISSION)
             worst = max(worst, float(np.abs(fitted @ middle[:, part] - exact).max(initial=0.0)))
     return worst
-
-
-def parts(n: int) -> list[slice]:
-    """Ranges of up to `AT_ONCE` detectors."""
-    return [slice(k, min(k + AT_ONCE, n)) for k in range(0, n, AT_ONCE)]
 
 
 def knots_of(field: SmoothField, step: int, offset: float = 0.0) -> Floats:

@@ -65,9 +65,9 @@ def test_a_mapping_is_never_touched(bench, tmp_path, monkeypatch, n_det, n):
     """Pages that are touched in a mapping are memory of the process until they are given back."""
     (_, stream), products, copied = spilled(bench, tmp_path, n_det, n), gram._products, []
 
-    def look(array, *others):
+    def look(array, *others, **named):
         copied.append(not np.may_share_memory(array, stream.array))
-        products(array, *others)
+        products(array, *others, **named)
 
     monkeypatch.setattr(gram, "_products", look)
     with ThreadPoolExecutor(1) as pool:
@@ -82,12 +82,12 @@ def test_copies_at_one_time_are_what_there_is_room_for(bench, tmp_path, monkeypa
     (_, stream), products = spilled(bench, tmp_path, 40, 40 * 2048, room, threads=4), gram._products
     lock, held = threading.Lock(), [0, 0]
 
-    def look(*arguments):
+    def look(*arguments, **named):
         with lock:
             held[0] += 1
             held[1] = max(held)
         time.sleep(0.005)
-        products(*arguments)
+        products(*arguments, **named)
         with lock:
             held[0] -= 1
 
