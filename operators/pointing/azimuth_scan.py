@@ -14,10 +14,12 @@ from zonda.core.errors import PointingError
 from zonda.core.flags import TURNAROUND
 from zonda.core.intervals import Intervals, runs
 from zonda.core.numerics.chunks import chunks
+from zonda.core.numerics.quaternions import series
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
 from .base import Pointing
-from .transform import CelestialTransform, series, unit_vectors
+from .transform import CelestialTransform
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target

@@ -18,15 +18,17 @@ from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
 from zonda.core.errors import PointingError
 from zonda.core.intervals import Intervals
 from zonda.core.numerics.chunks import chunks
+from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .limits import Moved, check_elevation, excess, lower_elevation
+from .limits import LargestMotion, check_elevation, excess, lower_elevation
 from .motion import POINTS, Peak, Quantity, motion, rate_text
-from .observed import centre_of, observed, state_times
-from .samples_per_beam import Sampled
-from .transform import CelestialTransform, Track, series, unit_vectors
+from .observed import Samples, centre_of, observed, state_times
+from .samples_per_beam import SamplesPerBeam
+from .transform import Boresight, CelestialTransform
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -133,11 +135,12 @@ class Pointing(Operator):
         x, y = self.path(seconds)
         return _on_tangent_plane(*target.icrs(), x + offset[0], y + offset[1])
 
-    def _track(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Track:
+    def _boresight(
+        self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats
+    ) -> Boresight:
         if type(self).directions is Pointing.directions and target.frame != "horizontal":
-            return transform.track(lambda some: self._on_the_sky(target, offset, some), seconds)
-        horizontal = self.directions(transform, target, offset, seconds)
-        return Track(horizontal, *transform.boresight(horizontal, seconds))
+            return transform.follow(lambda some: self._on_the_sky(target, offset, some), seconds)
+        return transform.boresight(self.directions(transform, target, offset, seconds), seconds)
 
     # -- the scans --
 
@@ -164,7 +167,7 @@ class Pointing(Operator):
         part = "" if len(looked) == self.scans else f" ({len(looked)} of them looked at)"
         lines = [f"{self.scans} scan{'s' if self.scans > 1 else ''} from {made[0].start}{part}"]
         lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
-        motion = Moved.SAID + Sampled.SAID
+        motion = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
         return lines + [f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(motion)]
 
     def _observe(self, data: Data, which: Sequence[int], rate: float) -> None:
@@ -181,7 +184,7 @@ class Pointing(Operator):
         if data.observations:
             last = data.observations[-1]
             begin = last.start.shifted(last.duration + self.gap)
-        moved, sampled = Moved(scene.instrument.telescope), Sampled()
+        moved, sampled = LargestMotion(scene.instrument.telescope), SamplesPerBeam()
         for k in which:
             start = begin.shifted(k * (self.scan_duration + self.gap))
             observation = self._scan(data, target, start, self._offset(k), before + k, rate, moved)
@@ -204,23 +207,18 @@ class Pointing(Operator):
         offset: tuple[float, float],
         index: int,
         rate: float,
-        moved: Moved,
+        moved: LargestMotion,
     ) -> Observation:
         scene, instrument = data.scene, data.scene.instrument
-        focalplane = instrument.focalplane()
         seconds = self._seconds(max(round(self.scan_duration * rate), 1), rate, self._jitter_key(data, index))
-        beam = float(focalplane.fwhm.min())
+        beam = float(instrument.focalplane().fwhm.min())
         transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
-
-        track = self._track(transform, target, offset, seconds)
-        horizontal = track.horizontal
-        centre = centre_of(transform, target, seconds)
+        horizontal, *boresight = self._boresight(transform, target, offset, seconds)
         place = f"{self.label}, scan {index} from {start}"
         total = self.scans * self.scan_duration + (self.scans - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)
-
-        parts = self.flag(seconds), self.intervals(seconds)
-        observation = observed(self.label, scene, index, start, seconds, rate, transform, track[1:], centre, *parts)
+        samples = Samples(seconds, rate, (boresight[0], boresight[1]), self.flag(seconds), self.intervals(seconds))
+        observation = observed(self.label, scene, index, transform, centre_of(transform, target, seconds), samples)
         self._check_motion(observation, transform, target, offset, None if self.jitter else horizontal, place, moved)
         if self.jitter > 0:
             state_times(self.label, observation)
@@ -255,7 +253,7 @@ class Pointing(Operator):
         offset: tuple[float, float],
         horizontal: Floats | None,
         place: str,
-        moved: Moved,
+        moved: LargestMotion,
     ) -> None:
         """Compare the track with the telescope's limits; raise where it exceeds one that it must keep."""
         rate, limits = observation.sample_rate, moved.limits

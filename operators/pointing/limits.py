@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zonda.core.errors import PointingError
+from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.types import Floats
 
 from .motion import Peak, Quantity, rate_text
-from .transform import CelestialTransform, unit_vectors
+from .transform import CelestialTransform
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
@@ -30,8 +31,7 @@ def check_elevation(
 
     ``total`` [s] is how long all scans take, for the message.
     """
-    lowest, highest = horizontal[[horizontal[:, 2].argmin(), horizontal[:, 2].argmax()]]
-    elevation = np.array([math.atan2(v[2], math.hypot(v[0], v[1])) for v in (lowest, highest)])
+    _, elevation = angles(horizontal[[horizontal[:, 2].argmin(), horizontal[:, 2].argmax()]])
     low, high = telescope.elevation_min, telescope.elevation_max
     under, over = low - elevation.min(), elevation.max() - high
     if max(under, over) <= 1e-12:
@@ -51,7 +51,7 @@ def _when(horizontal: Floats, transform: CelestialTransform, target: Target, low
     site, start = transform.site, transform.start
     seconds = np.arange(0.0, DAY + 1, 60.0)
     day = CelestialTransform(site, start, DAY, 1e-6).horizontal(unit_vectors(*target.icrs()), seconds)
-    elevation = np.arctan2(day[:, 2], np.hypot(day[:, 0], day[:, 1]))
+    _, elevation = angles(day)
     below, above = _room(horizontal, transform, target)
     within = (elevation >= low + below) & (elevation <= (high - above if high < np.pi / 2 else np.pi))
     if not within.any():
@@ -111,10 +111,10 @@ def lower_elevation(found: dict[Quantity, Peak], over: dict[Quantity, float]) ->
     return math.acos(cosine) if cosine < 0.99 else None
 
 
-class Moved:
+class LargestMotion:
     """The largest speeds, accelerations and jerks of several scans, and the telescope's limits to them."""
 
-    SAID = ("largest speed", "largest acceleration", "over the limit")
+    TOPICS = ("largest speed", "largest acceleration", "over the limit")
     """How its statements begin."""
 
     def __init__(self, telescope: Telescope) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,55 +12,65 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.intervals import Intervals
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
-
-from .transform import unit_vectors
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
-    from zonda.core.configuration.time import Instant
     from zonda.core.scene import Scene
 
     from .transform import CelestialTransform
 
 
+@dataclass(frozen=True)
+class Samples:
+    """The samples of a scan: when they are taken, where the boresight is then, and which are flagged.
+
+    Attributes
+    ----------
+    seconds
+        (n,) since the start.
+    rate
+        Hz.
+    boresight
+        (n, 4), (n, 4) `Boresight.azel` and `Boresight.radec`.
+    flags, intervals
+        Of `Observation`.
+    """
+
+    seconds: Floats
+    rate: float
+    boresight: tuple[Floats, Floats]
+    flags: NDArray[np.uint8]
+    intervals: Intervals
+
+
 def observed(
-    label: str,
-    scene: Scene,
-    index: int,
-    start: Instant,
-    seconds: Floats,
-    rate: float,
-    transform: CelestialTransform,
-    boresight: tuple[Floats, Floats],
-    centre: tuple[float, float],
-    flags: NDArray[np.uint8],
-    intervals: Intervals | None = None,
+    label: str, scene: Scene, index: int, transform: CelestialTransform, centre: tuple[float, float], samples: Samples
 ) -> Observation:
-    """The scan whose ``boresight`` is at `Track.azel` and `Track.radec` at ``seconds`` (n,) since ``start``."""
-    instrument = scene.instrument
+    """The scan of ``samples`` that begins where ``transform`` does, about ``centre``, ICRS (ra, dec) [rad]."""
     observation = Observation(
         name=f"scan-{index:03d}",
         index=index,
         site=scene.site,
-        instrument=instrument,
-        focalplane=instrument.focalplane(),
-        start=start,
-        seconds=seconds,
-        sample_rate=rate,
-        boresight_azel=boresight[0],
-        boresight_radec=boresight[1],
+        instrument=scene.instrument,
+        focalplane=scene.instrument.focalplane(),
+        start=transform.start,
+        seconds=samples.seconds,
+        sample_rate=samples.rate,
+        boresight_azel=samples.boresight[0],
+        boresight_radec=samples.boresight[1],
         centre=centre,
         seed=scene.seed,
-        flags=flags,
-        intervals=intervals or {},
+        flags=samples.flags,
+        intervals=samples.intervals,
     )
     beam = float(observation.focalplane.fwhm.min())
     error = f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every {transform.spacing:g} s)"
     observation.tally.state(label, "interpolation error of the pointing", error)
     observation.tally.state(label, "Earth orientation", transform.source)
     if not transform.orientation_known:
-        warnings.warn(f"{label}: Earth orientation at {start}: {transform.source}", stacklevel=4)
+        warnings.warn(f"{label}: Earth orientation at {transform.start}: {transform.source}", stacklevel=4)
     return observation
 
 

@@ -19,11 +19,11 @@ from zonda.core.plan.estimate import Cost, Effect, Estimate, full, not_simulated
 from zonda.core.plan.planning import Planning
 
 from .base import Pointing
-from .limits import Moved
+from .limits import LargestMotion
 from .recorded import PointingRecorded
-from .samples_per_beam import Sampled
+from .samples_per_beam import SamplesPerBeam
 
-MOTION = Moved.SAID + Sampled.SAID
+MOTION = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
 """How entries of the tally begin that are about the telescope's motion."""
 
 STEEPEST = math.sqrt(8 * math.log(2)) * math.exp(-0.5)

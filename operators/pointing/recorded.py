@@ -17,14 +17,15 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
 from zonda.core.errors import InputError, PointingError
 from zonda.core.intervals import part
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .observed import centre_of, observed, state_times
+from .observed import Samples, centre_of, observed, state_times
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
-from .recording_files import Clock, read
-from .samples_per_beam import Sampled
-from .transform import CelestialTransform, unit_vectors
+from .recording_files import Clock, read_recording
+from .samples_per_beam import SamplesPerBeam
+from .transform import CelestialTransform
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -105,7 +106,7 @@ class PointingRecorded(Operator):
         if number := found.counts[OUT_OF_ORDER]:
             text = f"{number} rows of {self.file} were dropped: their times jump ahead or back; is its clock right?"
             warnings.warn(f"{self.label}: {text}", stacklevel=2)
-        sampled = Sampled()
+        sampled = SamplesPerBeam()
         for scan in found.scans:
             observation = self._observation(data, start, scan, recording, len(data.observations))
             sampled.add(observation, observation.sample_rate)
@@ -119,7 +120,7 @@ class PointingRecorded(Operator):
             warnings.warn(f"{self.label}: {text}", stacklevel=2)
 
     def _read(self) -> tuple[Recording, Comb]:
-        recording = read(self.file, self.clock, self.flag_mask)
+        recording = read_recording(self.file, self.clock, self.flag_mask)
         if self.celestial == "recorded" and recording.frame == "azel" and recording.radec is None:
             raise InputError(
                 "has azimuth and elevation and no boresight_radec",
@@ -151,13 +152,12 @@ class PointingRecorded(Operator):
                 cure="flag these rows, or correct site, clock, units or the telescope's limits",
             )
         target = self.target or scene.target
-        azel, computed = transform.boresight(horizontal, seconds)
+        _, azel, computed = transform.boresight(horizontal, seconds)
         radec = computed if scan.radec is None else scan.radec
         centre = centre_of(transform, target, seconds) if target else _middle(radec, good)
         parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
-        observation = observed(
-            self.label, scene, index, start, seconds, scan.rate, transform, (azel, radec), centre, scan.flags.copy(), parts
-        )
+        samples = Samples(seconds, scan.rate, (azel, radec), scan.flags.copy(), parts)
+        observation = observed(self.label, scene, index, transform, centre, samples)
         state_times(self.label, observation)
         if recording.frame == "azel":
             self._state_celestial(observation, computed, good)

@@ -65,7 +65,7 @@ class Table:
     in_seconds: bool = False
 
 
-def read(path: Path, clock: Clock, mask: int | None = None) -> Recording:
+def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recording:
     """Read a recording.
 
     Parameters

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
+from zonda.core.numerics.quaternions import conjugate, multiply
 from zonda.core.types import Floats
 
 from .motion import POINTS, rate_text
@@ -17,13 +18,13 @@ FEW = 2.0
 more than 3 % (41 % at one sample), folded to other scales. Samples are instants: what is simulated stays right."""
 
 
-class Sampled:
+class SamplesPerBeam:
     """Samples per FWHM of several scans, where the sky passes fastest.
 
     The speed is that of the outermost detector on the sky: the boresight's, and the field's rotation times its radius.
     """
 
-    SAID = ("samples per FWHM",)
+    TOPICS = ("samples per FWHM",)
     """How its statement begins."""
 
     def __init__(self) -> None:
@@ -77,11 +78,7 @@ def on_the_sky(boresight: Floats, seconds: Floats, use: NDArray[np.bool_]) -> tu
     """
     at = np.arange(0, max(len(boresight) - 1, 0), max(1, len(boresight) // POINTS))
     at = at[use[at] & use[at + 1]]
-    ax, ay, az, aw = (-boresight[at] * np.array([1.0, 1.0, 1.0, -1.0])).T
-    bx, by, bz, bw = boresight[at + 1].T
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
+    x, y, z, _ = multiply(conjugate(boresight[at]), boresight[at + 1]).T
     step = seconds[at + 1] - seconds[at]
     # sines of half angles: at most 1 but for rounding
     return 2 * np.arcsin(np.minimum(np.hypot(x, y), 1.0)) / step, 2 * np.arcsin(np.minimum(abs(z), 1.0)) / step

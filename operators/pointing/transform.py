@@ -21,16 +21,17 @@ rotation cannot hold; its rotation of the field is kept.
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from zonda.core.errors import PointingError
-from zonda.core.numerics.chunks import chunks, empty
+from zonda.core.numerics.chunks import chunks
+from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.numerics.quaternions import Upright, conjugate, multiply, rotate, series, shortest_rotation
 from zonda.core.types import Floats
 
 from .earth_orientation import orientation
@@ -58,8 +59,8 @@ class _Nodes(NamedTuple):
     """(n, 4) direction from the Sun to the observer, and their distance [au]."""
 
 
-class Track(NamedTuple):
-    """Where a boresight looks at n instants."""
+class Boresight(NamedTuple):
+    """Where the boresight looks at n instants."""
 
     horizontal: Floats
     """(n, 3) unit vectors north, west, up."""
@@ -133,8 +134,8 @@ class CelestialTransform:
             out[part] = _natural(rotate(turn, horizontal if horizontal.ndim == 1 else horizontal[part]), now)
         return out
 
-    def boresight(self, horizontal: Floats, seconds: Floats) -> tuple[Floats, Floats]:
-        """`Track.azel` and `Track.radec` for directions (n, 3) north, west, up at ``seconds``.
+    def boresight(self, horizontal: Floats, seconds: Floats) -> Boresight:
+        """The boresight in directions (n, 3) north, west, up at ``seconds``.
 
         Signs are such that neighbouring samples have neighbouring quaternions.
         """
@@ -146,10 +147,10 @@ class CelestialTransform:
             observed = rotate(turn, horizontal[part])
             azel[part] = upright(horizontal[part])
             radec[part] = _carried(turn, observed, _natural(observed, now), azel[part])
-        return azel, radec
+        return Boresight(horizontal, azel, radec)
 
-    def track(self, icrs: Callable[[Floats], Floats], seconds: Floats) -> Track:
-        """`horizontal` and `boresight` of that, at half the cost: nothing is inverted.
+    def follow(self, icrs: Callable[[Floats], Floats], seconds: Floats) -> Boresight:
+        """The `boresight` along a celestial path, at half the cost: nothing is inverted.
 
         ``icrs``: the unit vectors (m, 3) at some of the ``seconds`` (n,).
         """
@@ -163,7 +164,7 @@ class CelestialTransform:
             horizontal[part] = rotate(turn, observed)
             azel[part] = upright(horizontal[part])
             radec[part] = _carried(conjugate(turn), observed, natural, azel[part])
-        return Track(horizontal, azel, radec)
+        return Boresight(horizontal, azel, radec)
 
     def _exact(self, seconds: Floats) -> _Nodes:
         """ERFA's full model at ``seconds`` (n,)."""
@@ -185,7 +186,7 @@ class CelestialTransform:
         axes = np.array([sine * np.cos(azimuth), -sine * np.sin(azimuth), np.cos(zenith)])  # (component, axis, node)
         whole = np.einsum("can,nab->ncb", axes, star["bpn"])
         rigid = self._spin(seconds)
-        slow = np.einsum("nki,nkj->nij", matrices(rigid), whole)
+        slow = np.einsum("nki,nkj->nij", rotation_matrices(rigid), whole)
         return _Nodes(_near_identity(slow), star["v"], np.column_stack([star["eh"], star["em"]]))
 
     def _utc(self, seconds: Floats) -> tuple[Floats, Floats]:
@@ -291,111 +292,3 @@ def _near_identity(matrix: Floats) -> Floats:
     w = np.sqrt(1 + np.trace(matrix, axis1=1, axis2=2)) / 2
     x, y, z = (matrix[:, i, j] - matrix[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
     return np.stack([x / (4 * w), y / (4 * w), z / (4 * w), w], axis=1)
-
-
-# -- quaternions (..., 4) in the order x, y, z, w, unit length; of many, each component lies in one piece (Fortran's order) --
-
-
-def series(components: int, n: int) -> Floats:
-    """Room for vectors or quaternions (n, components)."""
-    return empty((components, n)).T
-
-
-def multiply(a: Floats, b: Floats) -> Floats:
-    """Product (n, 4): the rotation b, then a."""
-    ax, ay, az, aw = a.T
-    bx, by, bz, bw = b.T
-    return np.stack(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ]
-    ).T
-
-
-def conjugate(a: Floats) -> Floats:
-    """The inverse rotation."""
-    inverse: Floats = a * np.array([-1.0, -1.0, -1.0, 1.0])
-    return inverse
-
-
-def matrices(a: Floats) -> Floats:
-    """Rotation matrices (n, 3, 3)."""
-    from zonda.core.numerics.projection import rotation_matrices
-
-    return rotation_matrices(a)
-
-
-def rotate(a: Floats, vector: Floats) -> Floats:
-    """Vectors (n, 3) or (3,) turned by quaternions (n, 4)."""
-    qx, qy, qz, w = a.T
-    vx, vy, vz = vector.T
-    tx, ty, tz = 2 * (qy * vz - qz * vy), 2 * (qz * vx - qx * vz), 2 * (qx * vy - qy * vx)
-    return np.stack([vx + w * tx + qy * tz - qz * ty, vy + w * ty + qz * tx - qx * tz, vz + w * tz + qx * ty - qy * tx]).T
-
-
-def shortest_rotation(a: Floats, b: Floats) -> Floats:
-    """Quaternions (n, 4) that turn unit vectors a into b along great circles; a and b are not opposite."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    half = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx, 1 + (ax * bx + ay * by + az * bz)])
-    turned: Floats = (half / np.sqrt((half * half).sum(axis=0))).T
-    return turned
-
-
-def from_angles(longitude: Any, latitude: Any) -> Floats:
-    """TOAST's Rz(longitude) Ry(pi/2 - latitude), psi = 0: (n, 4)."""
-    a, b = np.asarray(longitude) / 2, np.pi / 4 - np.asarray(latitude) / 2
-    ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-    quaternions: Floats = np.moveaxis(np.array([-sa * sb, ca * sb, sa * cb, ca * cb]), 0, -1)
-    return quaternions
-
-
-class Upright:
-    """`from_angles` of unit vectors (n, 3), stretch by stretch: (n, 4), neighbours with neighbouring signs.
-
-    By half angles: with z = cos(b) and r = sin(b) for the distance b from the pole,
-
-        cos(b / 2) = sqrt((1 + z) / 2),   sin(b / 2) = r / (2 cos(b / 2)),                                   (3)
-
-    and so for the longitude counted from the very first direction's, in stretches in which that stays below `_FAR`.
-    """
-
-    def __init__(self) -> None:
-        self._first = self._last = math.nan  # longitudes, without jumps
-
-    def __call__(self, directions: Floats) -> Floats:
-        x, y, z = directions.T
-        if not len(x):
-            return np.empty((0, 4))
-        if math.isnan(self._first):
-            self._first = self._last = math.atan2(y[0], x[0])
-        r = np.sqrt(x * x + y * y)
-        if r.min() > 0.0 and z.min() >= -0.9 and abs(self._last - self._first) < math.pi:
-            cosine = (x * math.cos(self._first) + y * math.sin(self._first)) / r
-            if cosine.min() >= _FAR:
-                return self._by_half_angles(x, y, z, r, cosine)
-        longitude = np.unwrap(np.concatenate([[self._last], np.arctan2(y, x)]))[1:]
-        self._last = float(longitude[-1])
-        return from_angles(longitude, np.arctan2(z, r))
-
-    def _by_half_angles(self, x: Floats, y: Floats, z: Floats, r: Floats, cosine: Floats) -> Floats:
-        sine = y * math.cos(self._first) - x * math.sin(self._first)  # times r
-        self._last = self._first + math.atan2(sine[-1], r[-1] * cosine[-1])
-        cl, cb = np.sqrt((1 + cosine) / 2), np.sqrt((1 + z) / 2)
-        sl, sb = sine / (2 * r * cl), r / (2 * cb)
-        c, s = math.cos(self._first / 2), math.sin(self._first / 2)
-        ca, sa = c * cl - s * sl, s * cl + c * sl
-        return np.stack([-sa * sb, ca * sb, sa * cb, ca * cb]).T
-
-
-_FAR = math.cos(math.radians(150))
-
-
-def unit_vectors(longitude: Any, latitude: Any) -> Floats:
-    """(..., 3) directions of spherical coordinates [rad]; the longitude of a horizontal one is minus its azimuth."""
-    c = np.cos(latitude)
-    axes = np.broadcast_arrays(c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude))
-    vectors: Floats = np.stack(axes, axis=-1)
-    return vectors

@@ -10,6 +10,7 @@ import numpy as np
 from zonda.core.checks import Family, Measured
 from zonda.core.configuration.time import Instant
 from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.site import Site
 from zonda.core.types import Floats
 from zonda.operators.filters.brick_wall import plan_highpass
@@ -18,7 +19,7 @@ from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.operators.noise.streams import Streams
 from zonda.operators.pointing.earth_orientation import orientation
-from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
+from zonda.operators.pointing.transform import CelestialTransform
 
 from .cases import DECADES, PINK, TIME
 from .scenes import largest, run, scan

@@ -13,11 +13,12 @@ from zonda.core.checks import Family
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
 from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.stare import PointingStare
-from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
+from zonda.operators.pointing.transform import CelestialTransform
 from zonda.plugins.checks.numerics import ERROR, SITES, angle, erfa_horizontal
 from zonda.plugins.checks.scenes import camera, differing, largest, scene
 
@@ -73,7 +74,7 @@ def poles_of_the_sky() -> float:
     for declination in (90.0, -90.0, 89.9999999, -89.9999999):
         sky = unit_vectors(np.full(25, 1.0), np.full(25, math.radians(declination)))
         up = transform.horizontal(sky, seconds)
-        _, radec = transform.boresight(up, seconds)
+        *_, radec = transform.boresight(up, seconds)
         worst = largest(
             worst, angle(up, erfa_horizontal(sky, WHEN, seconds, SITES[0])), angle(rotation_matrices(radec)[:, :, 2], sky)
         )

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from zonda.core.checks import Family, Measured
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.pipeline import Pipeline
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.highpass import HighpassFilter
@@ -17,7 +18,6 @@ from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing.recorded import PointingRecorded
 from zonda.operators.pointing.stare import PointingStare
-from zonda.operators.pointing.transform import unit_vectors
 from zonda.plugins.checks.numerics import ERROR, SITES, angle, erfa_horizontal
 from zonda.plugins.checks.scenes import TARGET, camera, scene
 

@@ -19,7 +19,7 @@ from astropy.io import fits
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.instrument import Band
 from zonda.core.storage import fits_files, hdf5_files, packed
-from zonda.operators.pointing.recording_files import read as read_pointing
+from zonda.operators.pointing.recording_files import read_recording
 from zonda.operators.sky.read import read_map
 
 WORLD = {
@@ -128,7 +128,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_holds_is_refused(tmp_path: Path) -
         except OSError:
             pytest.skip("this libhdf5 writes no chunk larger than what it holds")
     with pytest.raises(InputError, match=r"a chunk of /az is stored in \d+ bytes, more than the 64 that it holds"):
-        read_pointing(path, "unix")
+        read_recording(path, "unix")
 
 
 def test_what_is_deflated_twice_is_refused(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_what_is_deflated_twice_is_refused(tmp_path: Path) -> None:
         space = h5py.h5s.create_simple((100_000,))
         h5py.Dataset(h5py.h5d.create(file.id, b"az", h5py.h5t.NATIVE_DOUBLE, space, plist))[...] = 1.0
     with pytest.raises(InputError, match="/az is deflated twice over"):
-        read_pointing(path, "unix")
+        read_recording(path, "unix")
 
 
 @pytest.mark.parametrize("options", [{}, {"compression": "gzip", "shuffle": True}, {"compression": "lzf", "fletcher32": True}])

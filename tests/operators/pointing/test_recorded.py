@@ -16,11 +16,12 @@ from zonda.core.data import Data
 from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.flags import INVALID, NOT_RECORDED
 from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.recorded import PointingRecorded
 from zonda.operators.pointing.recording import Recording, comb, longest_rising
-from zonda.operators.pointing.recording_files import read
-from zonda.operators.pointing.transform import CelestialTransform, unit_vectors
+from zonda.operators.pointing.recording_files import read_recording
+from zonda.operators.pointing.transform import CelestialTransform
 
 UNIX = 1732518000.0  # 2024-11-25T07:00:00Z
 NAN = np.nan
@@ -247,22 +248,22 @@ def test_bad_files(tmp_path: Path) -> None:
         ("time [s], az [deg], el [rad]", r"el is 2578.\d+ deg in row 0"),
     ):
         with pytest.raises(InputError, match=message):
-            read(write_csv(tmp_path / "bad.csv", UNIX + t, 10 * t, 45 + 0 * t, header), "unix")
+            read_recording(write_csv(tmp_path / "bad.csv", UNIX + t, 10 * t, 45 + 0 * t, header), "unix")
     (tmp_path / "ragged.csv").write_text("time [s], az [deg], el [deg]\n1,2,3\n1,2\n")
     with pytest.raises(InputError, match="cannot be read as CSV"):
-        read(tmp_path / "ragged.csv", "unix")
+        read_recording(tmp_path / "ragged.csv", "unix")
     (tmp_path / "half.h5").write_bytes(b"\x89HDF\r\n\x1a\nrest")
     with pytest.raises(InputError, match="cannot be read"):
-        read(tmp_path / "half.h5", "unix")
+        read_recording(tmp_path / "half.h5", "unix")
     (tmp_path / "binary.csv").write_bytes(bytes(range(256)))
     with pytest.raises(ZondaError):
-        read(tmp_path / "binary.csv", "unix")
+        read_recording(tmp_path / "binary.csv", "unix")
 
 
 def test_a_rotated_boresight_is_refused(tmp_path: Path) -> None:
     import h5py
 
-    from zonda.operators.pointing.transform import from_angles, multiply
+    from zonda.core.numerics.quaternions import from_angles, multiply
 
     t = np.arange(20) / 10
     turned = multiply(from_angles(-1 + 0 * t, 0.8 + 0 * t), np.tile([0, 0, np.sin(0.05), np.cos(0.05)], (20, 1)))
@@ -270,7 +271,7 @@ def test_a_rotated_boresight_is_refused(tmp_path: Path) -> None:
         for name, values in (("times", UNIX + t), ("azimuth", 1 + 0 * t), ("elevation", 0.8 + 0 * t), ("boresight_azel", turned)):
             file.create_dataset(f"shared/{name}", data=values)
     with pytest.raises(InputError, match=r"rotated by up to 5\.73 deg about itself"):
-        read(tmp_path / "turned.h5", "unix")
+        read_recording(tmp_path / "turned.h5", "unix")
 
 
 def test_outside_the_telescopes_range_is_found_by_check(observe: Callable[..., Data], tmp_path: Path) -> None:
@@ -329,7 +330,7 @@ def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path):
     """Spreadsheets write one."""
     path = write_csv(tmp_path / "bom.csv", UNIX + np.arange(20) / 10, np.full(20, 150.0), np.full(20, 45.0))
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert len(read(path, "unix").seconds) == 20
+    assert len(read_recording(path, "unix").seconds) == 20
 
 
 # ---- what TOAST's layout has beside times and directions
