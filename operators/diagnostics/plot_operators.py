@@ -19,13 +19,14 @@ from zonda.core.data import Data
 from zonda.core.early import take
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.map_view import MapView, maps_of, noise_sources
+from zonda.core.maps.noise_figures import Noise, maps_of, noise_sources
 from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, atomic_path, product_path
 from zonda.core.types import AnyFloats
 
 from .artist import Artist
 from .flat_map import FlatMap
+from .healpix_plane import on_plane
 from .pictures import (
     Picture,
     Style,
@@ -218,40 +219,39 @@ def _input(name: str, image: Image) -> tuple[Any, ...]:
 
 
 def _flat(
-    name: str, product: MapProduct, *planes: str, style: Style | None = None, per_beam: AnyFloats | float | None = None
+    product: MapProduct,
+    *planes: Literal["signal", "half_difference"],
+    style: Style | None = None,
+    per_beam: AnyFloats | float | None = None,
 ) -> FlatMap:
     """What pictures need of a map; a HEALPix map on a plane about its centre."""
-    view = MapView.of(name, product)
-    view.planes = {plane: np.asarray(getattr(product, plane)) for plane in planes}
-    if product.header is not None:
-        arrays: tuple[Any, Any] = product.hits, product.weights
-        rms: dict[str, float] = {}
-    else:
-        view.planes.update(hits=product.hits.astype(np.float64), weights=product.weights)
-        view = view.flat()
-        arrays = view.planes["hits"], view.planes["weights"]
-        known: tuple[Literal["signal", "half_difference"], ...] = ("signal", "half_difference")
-        rms = {} if style is None else {p: product.rms(style.central_diameter / 2, of=p) for p in known if p in planes}
-    hits, weights, *rest = (np.asarray(a, np.float32) for a in (*arrays, *(view.planes[p] for p in planes)))
+    found = {plane: getattr(product, plane) for plane in ("hits", "weights", *planes)}
+    header, is_flat = product.header, product.header is not None
+    rms: dict[str, float] = {}
+    if not is_flat:
+        found, wcs = on_plane(product, found)
+        header = wcs.to_header(relax=True)
+        rms = {} if style is None else {p: product.rms(style.central_diameter / 2, of=p) for p in planes}
+    arrays = {plane: np.asarray(values, np.float32) for plane, values in found.items()}
     return FlatMap(
-        dict(zip(planes, rest, strict=True)), hits, np.nan_to_num(weights), SkyAxes.of(view.header), _plain(view.header),
-        product.centre, product.pixel, product.fwhm, product.smoothed_by, rms, product.header is not None, per_beam,
+        {plane: arrays[plane] for plane in planes}, arrays["hits"], np.nan_to_num(arrays["weights"]), SkyAxes.of(header),
+        _plain(header), product.centre, product.pixel, product.fwhm, product.smoothed_by, rms, is_flat, per_beam,
     )  # fmt: skip
 
 
 def _map(name: str, product: MapProduct, style: Style) -> tuple[Any, ...]:
     run, _, key = name.rpartition("/")
-    return product_path("", name).name, run, key, _flat(name, product, "signal"), style
+    return product_path("", name).name, run, key, _flat(product, "signal"), style
 
 
-def _noise(name: str, sources: dict[Any, tuple[MapProduct, Any]], style: Style) -> tuple[Any, ...]:
-    flat = {of: _flat(name, product, plane, style=style) for of, (product, plane) in sources.items()}
+def _noise(name: str, sources: dict[Noise, tuple[MapProduct, Any]], style: Style) -> tuple[Any, ...]:
+    flat = {of: _flat(product, plane, style=style) for of, (product, plane) in sources.items()}
     return product_path("", f"noise_{name}").name, flat, style
 
 
 def _coverage(name: str, product: MapProduct) -> tuple[Any, ...]:
     hits, per_beam = product.hits, product.seconds_per_beam()
-    flat = _flat(name, product, per_beam=per_beam)
+    flat = _flat(product, per_beam=per_beam)
     return f"coverage{'' if name == 'map' else f'_{name}'}", flat, int(hits.sum()), int((hits > 0).sum())
 
 

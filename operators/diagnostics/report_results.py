@@ -11,7 +11,7 @@ import numpy as np
 
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
-from zonda.core.maps.map_view import NoiseFigure, maps_of, noise_figures
+from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
 from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.operator import Operator

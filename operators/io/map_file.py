@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Data
-from zonda.core.maps.map_view import MapView
+from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics import tangent
 from zonda.core.storage.files import atomic_path
 from zonda.core.storage.fits_image import BLOCK, Cards, image_pieces
+from zonda.core.types import AnyFloats
 
+PLANES = ("signal", "hits", "weights", "noise", "half_difference")
+"""Planes a map product may have; `signal` always, but for a map of hits alone."""
 _MEANING = {
     "signal": "brightness",
     "hits": "samples per pixel",
@@ -47,40 +51,109 @@ class Provenance:
         """Of a run that has ended."""
         return cls(_origin(data), b"".join(_tables(data)))
 
-    def named(self, view: MapView) -> Cards:
-        """The cards, with the product's name."""
-        return Cards([("PRODUCT", ascii_text(view.name), "product of the pipeline")]).add(self.cards)
 
+@dataclass(frozen=True)
+class MapFile:
+    """What a file shows of a product.
 
-def write_map(path: Path, view: MapView, about: Provenance, cards: Cards | None = None) -> Path:
-    """Write one map atomically; its path. ``cards`` are added to the header of the first image, or of the table.
-
-    Raises `OutputError` where it cannot be written.
+    Attributes
+    ----------
+    name
+        Of what is shown, e.g. ``noiseless/map``.
+    product
+        Whose pixels, frame and beam these are.
+    planes
+        ``signal``, ``hits`` ...: (ny, nx) each on a WCS grid, (n_pix,) on HEALPix; NaN where nothing is known.
+    cards
+        More of the header of the first image, or of the table.
     """
-    with atomic_path(path) as temporary:
-        if view.is_healpix:
-            _write_table(temporary, view, about, cards or Cards())
-        with open(temporary, "ab") as file:
-            for piece in () if view.is_healpix else _images(view, about, cards or Cards()):
-                file.write(piece)
-            file.write(about.tables)
-    return path
 
+    name: str
+    product: MapProduct
+    planes: dict[str, AnyFloats]
+    cards: Cards = field(default_factory=Cards)
 
-def _images(view: MapView, about: Provenance, cards: Cards) -> Iterator[bytes]:
-    world = (tangent.plain(view.header) or view.wcs).to_header(relax=True)
-    for k, (name, plane) in enumerate(view.planes.items()):
-        header = Cards((key, world[key], world.comments[key]) for key in world if key not in ("", "COMMENT", "HISTORY"))
-        header["EXTNAME"] = name.upper(), "extension name"
-        if unit := view.units.get(name, ""):
-            header["BUNIT"] = unit, _MEANING.get(name, name)
-        if unit == "K":
-            header["TEMPSCAL"] = "K_RJ", "temperature scale: Rayleigh-Jeans brightness"
-        if name not in ("hits", "weights"):
-            header.add(_beam(view))
-        if k == 0:
-            header.add(about.named(view)).add(cards)
-        yield from image_pieces(header, plane, extension=k > 0, dtype=_type(name, plane))
+    @classmethod
+    def of(cls, name: str, product: MapProduct) -> MapFile:
+        """With the planes that a product has."""
+        wanted = PLANES if product.contents == "all" else ("hits",)
+        found = {plane: getattr(product, plane) for plane in wanted}
+        return cls(name, product, {plane: values for plane, values in found.items() if values is not None})
+
+    def unit(self, plane: str) -> str:
+        """FITS unit; none for counts."""
+        if plane == "weights":
+            return "K-2" if self.product.weighting == "inverse_variance" else ""
+        return "" if plane == "hits" else "K"
+
+    @property
+    def beam(self) -> Cards:
+        """The resolution of the map."""
+        product = self.product
+        degrees = float(np.degrees(math.hypot(product.fwhm, product.smoothed_by)))
+        what = "[deg] FWHM: beam, smoothing in quadrature" if product.smoothed_by else "[deg] FWHM of the beam"
+        return Cards([("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")] if degrees else ())
+
+    def first(self, about: Provenance) -> Cards:
+        """Of the first header: the name, where it comes from, and its own cards."""
+        return Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(about.cards)
+
+    def write(self, path: Path, about: Provenance) -> Path:
+        """Write it atomically; its path. Raises `OutputError` where it cannot be written."""
+        with atomic_path(path) as temporary:
+            if self.product.header is None:
+                self._write_table(temporary, about)
+            with open(temporary, "ab") as file:
+                for piece in self._images(about) if self.product.header is not None else ():
+                    file.write(piece)
+                file.write(about.tables)
+        return path
+
+    def _images(self, about: Provenance) -> Iterator[bytes]:
+        world = (tangent.plain(self.product.header) or self.product.wcs).to_header(relax=True)
+        for k, (name, plane) in enumerate(self.planes.items()):
+            header = Cards((key, world[key], world.comments[key]) for key in world if key not in ("", "COMMENT", "HISTORY"))
+            header["EXTNAME"] = name.upper(), "extension name"
+            if unit := self.unit(name):
+                header["BUNIT"] = unit, _MEANING[name]
+            if unit == "K":
+                header["TEMPSCAL"] = "K_RJ", "temperature scale: Rayleigh-Jeans brightness"
+            if name not in ("hits", "weights"):
+                header.add(self.beam)
+            if k == 0:
+                header.add(self.first(about)).add(self.cards)
+            yield from image_pieces(header, plane, extension=k > 0, dtype=_type(name, plane))
+
+    def _write_table(self, path: Path, about: Provenance) -> None:
+        """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that healpy reads."""
+        from astropy.io import fits
+
+        product = self.product
+        columns = [fits.Column("PIXEL", "K", array=product.pixels)]
+        for name, plane in self.planes.items():
+            values: NDArray[Any] = np.asarray(plane, _type(name, plane))
+            code = "D" if values.dtype.kind == "f" else "K" if values.dtype.itemsize == 8 else "J"
+            columns.append(fits.Column(name.upper(), code, unit=self.unit(name) or None, array=values))
+        table = fits.BinTableHDU.from_columns(columns, name="MAP")
+        made = Cards(
+            [
+                ("PIXTYPE", "HEALPIX", "HEALPix pixelization"),
+                ("ORDERING", "NESTED" if product.nest else "RING", "pixel ordering"),
+                ("COORDSYS", _COORDSYS[product.frame], f"{product.frame}"),
+                ("NSIDE", product.nside, "resolution"),
+                ("INDXSCHM", "EXPLICIT", "pixel numbers are in the column PIXEL"),
+                ("OBJECT", "PARTIAL", "not all of the sky"),
+                ("TEMPSCAL", "K_RJ", "temperature scale: Rayleigh-Jeans brightness"),
+            ]
+        )
+        made.add(self.beam).add(self.first(about)).add(self.cards)
+        hdus = [fits.PrimaryHDU(), table]
+        for hdu, more in zip(hdus, (self.first(about), made), strict=True):
+            for key, value in more.items():
+                hdu.header[key] = value, more.comments.get(key, "")
+            for line in more.history:
+                hdu.header.add_history(line or " ")
+        fits.HDUList(hdus).writeto(path, output_verify="exception")
 
 
 def _type(name: str, plane: Any) -> np.dtype[Any]:
@@ -88,45 +161,6 @@ def _type(name: str, plane: Any) -> np.dtype[Any]:
     if name == "hits" and (plane.dtype.kind in "iu" or np.array_equal(plane, np.rint(plane))):
         return np.dtype(np.int64 if np.max(plane, initial=0) > 2**31 - 1 else np.int32)
     return np.dtype(np.float64)
-
-
-def _beam(view: MapView) -> Cards:
-    degrees = float(np.degrees(view.fwhm))
-    what = "[deg] FWHM: beam, smoothing in quadrature" if view.smoothed else "[deg] FWHM of the beam"
-    cards = [("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")]
-    return Cards(cards if view.fwhm else ())
-
-
-def _write_table(path: Path, view: MapView, about: Provenance, cards: Cards) -> None:
-    """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that healpy reads."""
-    from astropy.io import fits
-
-    order = np.argsort(view.pixels, kind="stable")
-    columns = [fits.Column("PIXEL", "K", array=view.pixels[order])]
-    for name, plane in view.planes.items():
-        values: NDArray[Any] = np.asarray(plane, _type(name, plane))[order]
-        code = "D" if values.dtype.kind == "f" else "K" if values.dtype.itemsize == 8 else "J"
-        columns.append(fits.Column(name.upper(), code, unit=view.units.get(name) or None, array=values))
-    table = fits.BinTableHDU.from_columns(columns, name="MAP")
-    made = Cards(
-        [
-            ("PIXTYPE", "HEALPIX", "HEALPix pixelization"),
-            ("ORDERING", "NESTED" if view.nest else "RING", "pixel ordering"),
-            ("COORDSYS", _COORDSYS[view.frame], f"{view.frame}"),
-            ("NSIDE", view.nside, "resolution"),
-            ("INDXSCHM", "EXPLICIT", "pixel numbers are in the column PIXEL"),
-            ("OBJECT", "PARTIAL", "not all of the sky"),
-            ("TEMPSCAL", "K_RJ", "temperature scale: Rayleigh-Jeans brightness"),
-        ]
-    )
-    made.add(_beam(view)).add(about.named(view)).add(cards)
-    hdus = [fits.PrimaryHDU(), table]
-    for hdu, more in zip(hdus, (about.named(view), made), strict=True):
-        for key, value in more.items():
-            hdu.header[key] = value, more.comments.get(key, "")
-        for line in more.history:
-            hdu.header.add_history(line or " ")
-    fits.HDUList(hdus).writeto(path, output_verify="exception")
 
 
 def _origin(data: Data) -> Cards:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -13,12 +12,13 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
-from zonda.core.maps.map_view import MapView, NoiseFigure, maps_of, noise_figures, noise_sources
+from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures, noise_sources
 from zonda.core.output import Output, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, product_path
 from zonda.core.storage.fits_image import Cards
+from zonda.core.types import AnyFloats
 
-from .map_file import Provenance, write_map
+from .map_file import MapFile, Provenance
 
 
 class SaveMap(Output):
@@ -49,25 +49,22 @@ class SaveMap(Output):
         maps = maps_of(data.products)
         if not maps:
             raise PipelineError("there is no map to write", place=self.label, cure="add a step that makes one, e.g. BinMap")
-        views = {product_path(folder, name, ".fits"): MapView.of(name, product) for name, product in maps.items()}
-        noise = {product_path(folder, f"noise_{name}", ".fits"): name for name in maps if noise_sources(maps, name)}
-        if not self.overwrite:
-            for path in [*views, *noise]:
-                if path.exists():
-                    raise OutputError(
-                        "is there already", place=str(path), cure="remove it, choose another output folder or set overwrite: true"
-                    )
+        files = {product_path(folder, name, ".fits"): MapFile.of(name, product) for name, product in maps.items()}
         figures = noise_figures(maps, self.central_diameter)
-        cards: dict[Path, Cards] = {}
-        for path, name in noise.items():
-            view = views[path] = MapView.of(f"noise_{name}", maps[name])
-            view.planes = {of: np.asarray(getattr(product, plane)) for of, (product, plane) in noise_sources(maps, name).items()}
-            view.units = dict.fromkeys(view.planes, "K")
-            cards[path] = noise_cards([f for f in figures if f.product == name], self.central_diameter)
+        for name, product in maps.items():
+            if sources := noise_sources(maps, name):
+                planes: dict[str, AnyFloats] = {of: getattr(found, plane) for of, (found, plane) in sources.items()}
+                cards = noise_cards([f for f in figures if f.product == name], self.central_diameter)
+                files[product_path(folder, f"noise_{name}", ".fits")] = MapFile(f"noise_{name}", product, planes, cards)
+        if not self.overwrite:
+            for path in files:
+                if path.exists():
+                    cure = "remove it, choose another output folder or set overwrite: true"
+                    raise OutputError("is there already", place=str(path), cure=cure)
         about = Provenance.of(data)
-        at_once = 1 if any(view.is_healpix for view in views.values()) else MOST_AT_ONCE  # a table is copied, an image is not
+        at_once = 1 if any(product.header is None for product in maps.values()) else MOST_AT_ONCE  # a table is copied
         with ThreadPoolExecutor(at_once, "SaveMap") as pool:  # the disk takes most of the time
-            written = [pool.submit(write_map, path, view, about, cards.get(path)) for path, view in views.items()]
+            written = [pool.submit(file.write, path, about) for path, file in files.items()]
         data.products["map_file"] = [file.result() for file in written]
 
 

@@ -34,7 +34,7 @@ def product():
 
 
 def test_smoothing_is_that_of_the_map(product):
-    mine, there = _flat("map", product, "signal", "half_difference").smoothed(9 * ARCSEC), product.smoothed(9 * ARCSEC)
+    mine, there = _flat(product, "signal", "half_difference").smoothed(9 * ARCSEC), product.smoothed(9 * ARCSEC)
     for plane in ("signal", "half_difference"):
         # float32: sums of some 300 terms about zero, each rounded at 6e-8 of 1e-4 K
         np.testing.assert_allclose(mine.planes[plane], getattr(there, plane), rtol=0, atol=3e-10, equal_nan=True)
@@ -42,7 +42,7 @@ def test_smoothing_is_that_of_the_map(product):
 
 
 def test_the_stated_noise_is_that_of_the_map(product):
-    flat = _flat("map", product, "half_difference").smoothed(9 * ARCSEC)
+    flat = _flat(product, "half_difference").smoothed(9 * ARCSEC)
     there = product.smoothed(9 * ARCSEC).rms(30 * ARCSEC, of="half_difference")
     assert flat.central_rms("half_difference", 30 * ARCSEC) == pytest.approx(there, rel=1e-5)
 
@@ -51,7 +51,7 @@ def test_the_coverage_of_a_map_with_a_pole_in_it_is_drawn(product):
     from dataclasses import replace
 
     header = tangent_wcs((1.3, np.pi / 2), 2 * ARCSEC, product.hits.shape).to_header()
-    flat = _flat("map", replace(product, header=header, centre=(1.3, np.pi / 2)), "signal")
+    flat = _flat(replace(product, header=header, centre=(1.3, np.pi / 2)), "signal")
     assert draw_coverage("coverage", flat, 1, 1)[0].png.startswith(b"\x89PNG")
 
 
@@ -71,7 +71,7 @@ def test_a_healpix_map_keeps_its_own_noise():
         signal, np.full(n, 5), np.full(n, 5.0), np.full(n, 1e-3), None, None, centre=(np.radians(75.0), np.radians(20.0)),
         pixel=healpy.nside2resol(1024), nside=1024, pixels=np.sort(pixels), fwhm=9 * ARCSEC,
     )  # fmt: skip
-    flat = _flat("map", product, "signal", style=Style(None, np.radians(0.4), 0.1))
+    flat = _flat(product, "signal", style=Style(None, np.radians(0.4), 0.1))
     assert not flat.smooth
     assert flat.central_rms("signal", np.radians(0.2)) == product.rms(np.radians(0.2))
 

@@ -18,6 +18,7 @@ from zonda.core.errors import OutputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.operators.diagnostics import canvas, pictures
+from zonda.operators.diagnostics.healpix_plane import on_plane
 from zonda.operators.diagnostics.plot_operators import Plots, _flat
 from zonda.operators.diagnostics.plots import map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
 from zonda.operators.diagnostics.png import png_of
@@ -417,7 +418,7 @@ def test_a_map_is_shown_where_it_has_samples(values, wcs):
         values, hits, hits * 1.0, values, None, wcs.to_header(), centre=(np.radians(75.0), np.radians(20.0)),
         pixel=4 * ARCSEC, fwhm=9 * ARCSEC, sample_rate=50.0,
     )  # fmt: skip
-    whole = _flat("map", product, "signal")
+    whole = _flat(product, "signal")
     cut = whole.cropped()
     assert cut.hits.shape == (12, 17)  # a hundredth of 15 pixels is one
     np.testing.assert_array_equal(cut.planes["signal"], values[29:41, 4:21].astype(np.float32))
@@ -495,40 +496,38 @@ def test_a_healpix_map_is_drawn(data):
     assert {p.name for p in data.products["pictures"]} == {"map", "coverage"}
 
 
+def healpix(nside, pixels, centre, frame):
+    ones = np.ones(len(pixels))
+    return MapProduct(ones, ones, ones, ones, None, None, centre, 0.01, frame, nside=nside, pixels=pixels)
+
+
 def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
     import healpy as hp
-
-    from zonda.core.maps.map_view import MapView
 
     nside = 512
     pixels = np.sort(hp.query_disc(nside, hp.ang2vec(266.0, -29.0, lonlat=True), np.radians(1.0)))
     centre = (np.radians(266.0), np.radians(-29.0))
-    view = MapView(
-        "map", {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, nside=nside, pixels=pixels, frame="galactic", centre=centre
-    )
-    flat = view.flat(300)
-    y, x = np.nonzero(flat.planes["hits"])
-    lon, lat = flat.wcs.pixel_to_world_values(x, y)
-    np.testing.assert_array_equal(flat.planes["signal"][y, x], hp.ang2pix(nside, lon, lat, lonlat=True))
-    assert set(flat.planes["signal"][y, x]) == set(pixels)  # none is lost
-    assert np.isnan(flat.planes["signal"][flat.planes["hits"] == 0]).all()
-    ny, nx = flat.planes["hits"].shape
+    flat, wcs = on_plane(healpix(nside, pixels, centre, "galactic"), {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, 300)
+    y, x = np.nonzero(flat["hits"])
+    lon, lat = wcs.pixel_to_world_values(x, y)
+    np.testing.assert_array_equal(flat["signal"][y, x], hp.ang2pix(nside, lon, lat, lonlat=True))
+    assert set(flat["signal"][y, x]) == set(pixels)  # none is lost
+    assert np.isnan(flat["signal"][flat["hits"] == 0]).all()
+    ny, nx = flat["hits"].shape
     assert max(nx, ny) == 300
-    np.testing.assert_allclose(flat.wcs.pixel_to_world_values(nx / 2, ny / 2), (266.0, -29.0), atol=0.1)  # a pixel of the map
-    assert all(flat.planes["hits"].any(axis=axis)[[6, -7]].all() for axis in (0, 1))  # it reaches as far as the pixels
-    assert flat.wcs.wcs.ctype[0].startswith("GLON")
+    np.testing.assert_allclose(wcs.pixel_to_world_values(nx / 2, ny / 2), (266.0, -29.0), atol=0.1)  # a pixel of the map
+    assert all(flat["hits"].any(axis=axis)[[6, -7]].all() for axis in (0, 1))  # it reaches as far as the pixels
+    assert wcs.wcs.ctype[0].startswith("GLON")
 
 
 def test_a_healpix_map_of_half_the_sky_is_drawn():
     import healpy as hp
 
-    from zonda.core.maps.map_view import MapView
-
     pixels = np.sort(hp.query_disc(32, hp.ang2vec(10.0, -60.0, lonlat=True), np.radians(100.0)))
     centre = (np.radians(10.0), np.radians(-60.0))
-    flat = MapView("map", {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, nside=32, pixels=pixels, centre=centre).flat(300)
-    assert set(flat.planes["signal"][flat.planes["hits"] > 0]) == set(pixels)
-    assert flat.wcs.wcs.ctype[0] == "RA---ZEA"
+    flat, wcs = on_plane(healpix(32, pixels, centre, "icrs"), {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, 300)
+    assert set(flat["signal"][flat["hits"] > 0]) == set(pixels)
+    assert wcs.wcs.ctype[0] == "RA---ZEA"
 
 
 def test_no_output_folder(data):

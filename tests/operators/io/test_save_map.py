@@ -213,7 +213,7 @@ def test_a_failure_in_the_middle_leaves_the_old_file(run, data, monkeypatch, err
         yield b"SIMPLE"
         raise error
 
-    monkeypatch.setattr(map_file, "_images", half)
+    monkeypatch.setattr(map_file.MapFile, "_images", half)
     expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else OutputError
     with pytest.raises(expected):
         SaveMap().finalize(data)

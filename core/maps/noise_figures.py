@@ -1,0 +1,61 @@
+"""The maps among the products of a run, and how noisy they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from .map_product import MapProduct
+
+Noise = Literal["half_difference", "source_free"]
+"""What holds noise alone: half the difference of even and odd scans, the map of the signal without the sky."""
+
+
+def maps_of(products: Mapping[str, Any]) -> dict[str, MapProduct]:
+    """Every map among ``data.products``, by name, the main run's first; not those of runs that a step made for itself (_NAME)."""
+    found = (n for n, p in products.items() if isinstance(p, MapProduct) and not n.startswith("_"))
+    names = sorted(found, key=lambda n: ("/" in n, n))
+    return {name: products[name] for name in names}
+
+
+@dataclass(frozen=True)
+class NoiseFigure:
+    """How noisy a map is near its centre.
+
+    ``of``: ``half_difference`` or ``source_free``; ``rms``: in K, NaN where there is no pixel; ``smoothed``: the same after
+    smoothing with the beam (NaN where the map cannot be or is already smoothed).
+    """
+
+    product: str
+    of: Noise
+    rms: float
+    smoothed: float
+
+
+def noise_figures(maps: Mapping[str, MapProduct], diameter: float) -> list[NoiseFigure]:
+    """Weighted rms about zero within ``diameter`` / 2 [rad] of the centre, of what holds noise alone: `noise_sources`."""
+    found = []
+    for name in maps:
+        for of, (product, plane) in noise_sources(maps, name).items():
+            rms = product.rms(diameter / 2, of=plane)
+            again = product.header is not None and product.fwhm > 0 and not product.smoothed_by
+            smoothed = product.smoothed_rms(product.fwhm, diameter / 2, of=plane) if again else math.nan
+            found.append(NoiseFigure(name, of, rms, smoothed))
+    return found
+
+
+def noise_sources(
+    maps: Mapping[str, MapProduct], name: str
+) -> dict[Noise, tuple[MapProduct, Literal["signal", "half_difference"]]]:
+    """For a map of ``signal``: which product's which plane holds noise alone; nothing for maps of other signals."""
+    found: dict[Noise, tuple[MapProduct, Literal["signal", "half_difference"]]] = {}
+    if "/" in name:
+        return found
+    if maps[name].half_difference is not None:
+        found["half_difference"] = (maps[name], "half_difference")
+    free = maps.get(f"source_free/{name}")
+    if free is not None and free.signal.shape == maps[name].signal.shape:
+        found["source_free"] = (free, "signal")
+    return found
