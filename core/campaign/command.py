@@ -9,63 +9,45 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..command_types import Bytes
+
 if TYPE_CHECKING:
+    from ..cli.request import Request
     from .job import Job, Task
     from .log import Row
     from .prepare import Source
     from .settings import Campaign
-
-    Table = Sequence[tuple[Task, Row]]
     from .work import Result
 
-ENGINES = ("serial", "processes", "mpi", "dask")
-
-engine_option = click.option("--engine", type=click.Choice(ENGINES), help="What works on the tasks.  [default: as in the file]")
-workers_option = click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes.")
-scheduler_option = click.option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file.")
+    Table = Sequence[tuple[Task, Row]]
 
 
-def run(
-    pipelines: Sequence[str],
-    settings: tuple[str, ...],
-    *,
-    keep: tuple[str, ...],
-    drop: tuple[str, ...],
-    no_prune: bool,
-    output: Path | None,
-    threads: int | None,
-    memory: int | None,
-    verbose: bool,
-    engine: str | None,
-    workers: int | None,
-    scheduler: str | None,
-    share: tuple[int, int] | None,
-    command: str,
-) -> None:
+def run(request: Request) -> None:
     """``zonda run`` of pipeline files as a campaign."""
     from ..storage.files import check_output_folder
     from ..storage.lock import lock
     from . import run as campaign
-    from .engines import engine as opened
+    from .engines import engine
     from .prepare import Pruning
 
-    sources = [source(p, settings, len(pipelines) > 1) for p in pipelines]
+    sources = [source(p, request.settings, len(request.pipelines) > 1) for p in request.pipelines]
     if len({s.name for s in sources}) < len(sources):
         raise click.UsageError("two of the pipeline files have the same name: give one of them another with the key `name:`")
-    folder = output or (sources[0].file.output if len(sources) == 1 else Path("out/campaign"))
-    options = _engine(sources[0].campaign, engine, workers, scheduler)
-    with opened(**options, threads=threads, memory=memory) as pool:
+    folder = request.output or (sources[0].file.output if len(sources) == 1 else Path("out/campaign"))
+    options = _engine(sources[0].campaign, request.engine, request.workers, request.scheduler)
+    with engine(**options, threads=request.threads, memory=request.memory) as pool:
         if pool.executor is None:
             return
         check_output_folder(folder)
-        pruning = Pruning(keep, drop, not no_prune)
-        if share is not None:
-            with lock(folder, f"{share[0]}-of-{share[1]}"):
-                campaign.share(sources, folder, command, pool, _say, pruning, share)
-            _say(f"share {share[0]} of {share[1]} is done; when all are: zonda resume {folder}")
+        pruning = Pruning(request.keep, request.drop, not request.no_prune)
+        if request.share is not None:
+            k, n = request.share
+            with lock(folder, f"{k}-of-{n}"):
+                campaign.share(sources, folder, request.command, pool, _say, pruning, (k, n))
+            _say(f"share {k} of {n} is done; when all are: zonda resume {folder}")
         else:
             with lock(folder), _told_how_to_go_on(folder):
-                _show(campaign.begin(sources, folder, command, pool, _say, pruning), verbose)
+                _show(campaign.begin(sources, folder, request.command, pool, _say, pruning), request.verbose)
     click.echo(f"{folder}/")
 
 
@@ -77,11 +59,15 @@ def run(
     default=None,
     help="Refuse tasks of another kind of machine than the first.  [default: as in the file]",
 )
-@engine_option
-@workers_option
-@scheduler_option
+@click.option(
+    "--engine",
+    type=click.Choice(["serial", "processes", "mpi", "dask"]),
+    help="What works on the tasks.  [default: as in the file]",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes.")
+@click.option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file.")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads of each task.  [default: a worker's share]")
-@click.option("--memory", metavar="SIZE", help="As of `zonda run`, e.g. 4GB.  [default: half of the free]")
+@click.option("--memory", type=Bytes(), metavar="SIZE", help="As of `zonda run`, e.g. 4GB.  [default: half of the free]")
 @click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated.")
 def resume(
     folder: Path,
@@ -91,7 +77,7 @@ def resume(
     workers: int | None,
     scheduler: str | None,
     threads: int | None,
-    memory: str | None,
+    memory: int | None,
     verbose: bool,
 ) -> None:
     """Go on with the campaign in DIR.
@@ -99,7 +85,6 @@ def resume(
     The checksums of all partial products are verified, what is missing is run, failed tasks are tried again, and what is complete
     is combined. The maps are the same bits as those of an undisturbed campaign.
     """
-    from ..command_types import Bytes
     from ..compilation.compiled import ensure_cache, one_blas_thread
 
     one_blas_thread()
@@ -112,8 +97,7 @@ def resume(
 
     job = Job.read(folder)
     options = _engine(_campaign_of(job), engine, workers, scheduler)
-    size = Bytes().convert(memory, None, None) if memory is not None else None
-    with opened(**options, threads=threads, memory=size) as pool:
+    with opened(**options, threads=threads, memory=memory) as pool:
         if pool.executor is None:
             return
         check_output_folder(folder)

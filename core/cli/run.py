@@ -3,53 +3,19 @@
 from __future__ import annotations
 
 import gc
-import shlex
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..command_types import Bytes, Share
+from .request import Request
 
 if TYPE_CHECKING:
     from ..compilation.compile_ahead import Helper
     from ..configuration.header import Accuracy
     from ..configuration.pipeline_file import PipelineFile
     from ..data import Data
-
-
-@dataclass(frozen=True)
-class Request:
-    """The arguments and options of ``zonda run``."""
-
-    pipelines: tuple[str, ...]
-    settings: tuple[str, ...]
-    keep: tuple[str, ...]
-    drop: tuple[str, ...]
-    only: tuple[str, ...]
-    no_prune: bool
-    output: Path | None
-    threads: int | None
-    memory: int | None
-    verbose: bool
-    verify: bool
-    engine: str | None
-    workers: int | None
-    scheduler: str | None
-    share: tuple[int, int] | None
-
-    @property
-    def is_campaign(self) -> bool:
-        """Whether this is a campaign, whatever the file says."""
-        return bool(len(self.pipelines) > 1 or self.engine or self.workers or self.scheduler or self.share)
-
-    @property
-    def command(self) -> str:
-        """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
-        options = [("--set", self.settings), ("--keep", self.keep), ("--drop", self.drop), ("--only", self.only)]
-        parts = [part for option, texts in options for text in texts for part in (option, text)]
-        return shlex.join(["zonda", "run", *self.pipelines, *parts, *(["--no-prune"] if self.no_prune else [])])
 
 
 @click.command()
@@ -132,11 +98,7 @@ def _run_campaign(request: Request) -> None:
     gc.enable()
     from ..campaign import command as campaign
 
-    campaign.run(
-        request.pipelines, request.settings, keep=request.keep, drop=request.drop, no_prune=request.no_prune,
-        output=request.output, threads=request.threads, memory=request.memory, verbose=request.verbose, engine=request.engine,
-        workers=request.workers, scheduler=request.scheduler, share=request.share, command=request.command,
-    )  # fmt: skip
+    campaign.run(request)
 
 
 def _run_one(request: Request, file: PipelineFile, helper: Helper) -> None:
