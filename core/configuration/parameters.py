@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -61,8 +62,16 @@ else:
         def __signature__(cls, value: Any) -> None:
             """pydantic sets its own, whose types nobody can read."""
 
+        @property
+        def __mro__(cls) -> tuple[type, ...]:
+            """The true one; `help()` is shown it without pydantic's class."""
+            order = super().__mro__
+            asked_by = sys._getframe(1).f_back  # pydoc, by way of inspect.getmro
+            shown = asked_by is not None and asked_by.f_globals.get("__name__") == "pydoc"
+            return tuple(c for c in order if c is not BaseModel) if shown else order
+
         def __dir__(cls) -> list[str]:
-            return [name for name in sorted(super().__dir__()) if name not in _PYDANTICS and not name.startswith("__pydantic")]
+            return [name for name in sorted(super().__dir__()) if name not in _PYDANTICS and not name.startswith("__")]
 
 
 _PYDANTICS = {name for name in dir(BaseModel) if name not in dir(object)} | {
