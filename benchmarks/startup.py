@@ -2,7 +2,7 @@
 
 python benchmarks/startup.py             first run with empty caches, then the best of three further runs, and of
                                          three that have the compiled kernels but plan anew
-python benchmarks/startup.py --kernels   write core/compilation/kernels.py, the list of what a first run compiles in two processes
+python benchmarks/startup.py --kernels   write the packages' kernels.py, the lists of what a first run compiles in two processes
 """
 
 from __future__ import annotations
@@ -125,11 +125,14 @@ def child(folder: Path, caches: Path, pipeline: str, kernels: bool = False, know
 
 
 def write(rows: list[list[str]]) -> None:
-    """core/compilation/kernels.py: its docstring, and ``rows`` (seconds, module, name, types)."""
-    path = Path(__file__).parents[1] / "core" / "compilation" / "kernels.py"
-    head = path.read_text().partition("KERNELS")[0]
-    lines = dict.fromkeys(f'    "{" ".join(row)}",' for row in rows)
-    path.write_text(f"{head}KERNELS = (\n" + "\n".join(lines) + "\n)\n")
+    """The lists of kernels, one in each package: ``rows`` (seconds, module, name, types) with their numbers."""
+    lists: dict[Path, list[str]] = {}
+    for number, row in enumerate(dict.fromkeys(" ".join(row) for row in rows), 1):
+        package = row.split()[1].split(".")[1:3]  # operators, sky
+        lists.setdefault(Path(__file__).parents[1].joinpath(*package, "kernels.py"), []).append(f'    "{number} {row}",')
+    for path, lines in lists.items():
+        head = path.read_text().partition("KERNELS =")[0]
+        path.write_text(f"{head}KERNELS = (\n" + "\n".join(lines) + "\n)\n")
 
 
 def table(title: str, run: dict[str, Any]) -> str:
@@ -146,7 +149,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pipeline", default=PIPELINE)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--kernels", action="store_true", help="write core/compilation/kernels.py")
+    parser.add_argument("--kernels", action="store_true", help="write the packages' kernels.py")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     parser.add_argument("--listen", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()

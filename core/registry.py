@@ -26,7 +26,7 @@ noise_models = Registry("noise model", "zonda.noise_models")
 spectra = Registry("spectra", "zonda.spectra")
 checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
 metrics = Registry("metric", "zonda.metrics", classes=True)  # classes, or functions of `Data`: core.accuracy.metrics
-ground_weather = Registry("weather on the ground", "zonda.ground_weather")
+ground_weather = Registry("weather on the ground", "zonda.ground_weather", classes=True)  # a function of the scene
 weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True)
 
 sections = Registry(

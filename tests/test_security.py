@@ -36,7 +36,7 @@ ALLOWED = {
     ("core/accuracy/measure.py", "subprocess.run"): "zonda itself, as a child; no shell; arguments are zonda's own",
     ("core/accuracy/measure.py", "pickle.load"): "the child's answer, in a folder that only this user can read, made for it",
     ("core/cli/group.py", "import_module"): "names from the table in zonda/commands.py",
-    ("core/compilation/compile_ahead.py", "import_module"): "modules named in core/compilation/kernels.py",
+    ("core/compilation/compile_ahead.py", "import_module"): "modules that packages list in their kernels.py",
     ("core/compilation/compile_ahead.py", "subprocess.Popen"): "zonda itself, as a child; no shell; arguments are zonda's own",
     ("core/compilation/kernel_cache.py", "pickle.loads"): "machine code that this user compiled; numba's own cache does the same",
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",

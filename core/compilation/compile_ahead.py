@@ -1,7 +1,8 @@
 """The first run on a machine: a second process compiles the kernels that come last, while this one compiles as it needs them.
 
-`kernels` lists those of the shipped pipelines with the types of their arguments, in the order of their first use, and what each
-takes. The child begins with the second half, the dearest first; each finds in the cache what the other has made, and waits for
+Packages with kernels list them in the entry-point group ``zonda.kernels``: rows of text with the order of first use in the
+shipped pipelines, the seconds [s] that one takes to compile with what it calls, its module, its name and its types (`text_of`).
+The child begins with the second half, the dearest first; each process finds in the cache what the other has made, and waits for
 what the other is making (`kernel_cache.share`). Whatever goes wrong there only means that this process compiles it. Later runs
 load the kernels in a thread while they point the telescope.
 """
@@ -22,12 +23,14 @@ from threading import Event, Thread
 from typing import Any
 
 from .. import children
+from ..discovery import RAISED, discover
 from ..machine import available_threads
 from ..program import fingerprint
 from ..storage import user_cache
 from ..versions import versions
 from .compiled import cache_folder
 
+GROUP = "zonda.kernels"
 KIND = "compiled"
 COMPILING = (100_000, 20, 100)
 """Thresholds of garbage collection while kernels are compiled: by Python's own it takes 7 % of the time."""
@@ -69,7 +72,7 @@ class Helper:
 
     def begin(self) -> None:
         """Let the process compile, or the thread load, the kernels of the modules that are imported now."""
-        modules = [name for name in sys.modules if name.startswith("zonda.")]
+        modules = list(sys.modules)
         if self._first:
             gc.set_threshold(*COMPILING)
         elif not self._alone:
@@ -124,9 +127,8 @@ def serve() -> None:
 def compile_listed(modules: list[str], as_child: bool = True, enough: Event | None = None) -> int:
     """Compile or load the listed kernels of these modules until ``enough``; returns how many there were."""
     from ..numerics import random  # noqa: F401  it says where kernels are kept, before any is defined
-    from .kernels import KERNELS
 
-    rows = [row for line in KERNELS if (row := line.split())[1] in modules]
+    rows = [row for row in listed() if row[1] in modules]
     done = 0
     for _, module, name, *types in for_child(rows) if as_child else rows:
         if enough is not None and enough.is_set():
@@ -135,6 +137,15 @@ def compile_listed(modules: list[str], as_child: bool = True, enough: Event | No
             getattr(import_module(module), name).compile(tuple(map(type_of, types)))
             done += 1
     return done
+
+
+def listed() -> list[list[str]]:
+    """Rows (seconds, module, name, types) of all lists, in the order of first use; a list that cannot be read is left out."""
+    rows = []
+    for found in discover(GROUP):
+        with suppress(*RAISED):
+            rows += [(float(order), rest) for order, *rest in map(str.split, found.load())]
+    return [row for _, row in sorted(rows)]
 
 
 def for_child(rows: list[list[str]]) -> list[list[str]]:

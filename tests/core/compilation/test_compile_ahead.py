@@ -9,8 +9,8 @@ from numba import types
 from numba.core.dispatcher import Dispatcher
 
 import zonda.core.numerics.random  # noqa: F401  it says where kernels are kept, before any is defined
-from zonda.core.compilation import compile_ahead, kernel_cache, kernels
-from zonda.core.compilation.compile_ahead import Helper, compile_listed, for_child, text_of, type_of
+from zonda.core.compilation import compile_ahead, kernel_cache
+from zonda.core.compilation.compile_ahead import Helper, compile_listed, for_child, listed, text_of, type_of
 
 CHEAP = ("0.1", "zonda.operators.maps.sums", "_scales", "f8", "f8", "b1")
 
@@ -45,10 +45,12 @@ def test_other_texts_are_no_types(text):
 
 
 def test_the_list_names_kernels():
-    assert len(kernels.KERNELS) >= 20
-    for _, module, name, *listed in map(str.split, kernels.KERNELS):
+    rows = listed()
+    assert len(rows) >= 20
+    assert [row[2] for row in rows[:2]] == ["_prefilter", "_lines"]  # in the order of their first use
+    for _, module, name, *kinds in rows:
         assert isinstance(getattr(import_module(module), name), Dispatcher), f"{module}.{name}"
-        assert len(list(map(type_of, listed))) == getattr(import_module(module), name).py_func.__code__.co_argcount
+        assert len(list(map(type_of, kinds))) == getattr(import_module(module), name).py_func.__code__.co_argcount
 
 
 def test_the_second_process_begins_with_the_dearest_of_the_second_half():
@@ -59,7 +61,7 @@ def test_the_second_process_begins_with_the_dearest_of_the_second_half():
 
 def test_listed_kernels_are_compiled_and_what_is_wrong_is_passed_over(monkeypatch):
     wrong = [("0.3", "zonda.no_module", "_scales"), ("0.1", CHEAP[1], "no_kernel"), (*CHEAP[:3], "f8"), (*CHEAP[:3], "x8")]
-    monkeypatch.setattr(kernels, "KERNELS", [" ".join(row) for row in (CHEAP, *wrong)])
+    monkeypatch.setattr(compile_ahead, "listed", lambda: [list(row) for row in (CHEAP, *wrong)])
     assert compile_listed(["zonda.elsewhere"]) == 0
     enough = Event()
     assert compile_listed([CHEAP[1], "zonda.no_module"], False, enough) == 1
