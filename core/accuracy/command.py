@@ -64,8 +64,8 @@ def accuracy(
     from ..configuration.units import Unit
     from ..run.first_look import first_look
     from .metrics import get
-    from .settings import knobs_of
-    from .study import setup_for, study
+    from .settings import knobs_of, shortened
+    from .study import Setup, study
 
     file = load(pipeline, settings)
     get(metric)
@@ -74,9 +74,9 @@ def accuracy(
     if check:
         return _retest(file, pipeline, metric)
     turned = knobs_of(file, knobs)
-    setup = setup_for(
-        file, pipeline, settings, metric, wanted, duration=duration, quick=quick, repeats=repeats, seeds=seeds, threads=threads
-    )
+    numbers = tuple(file.scene().seed + k for k in range(seeds))
+    shorter = shortened(file, duration, quick)
+    setup = Setup(pipeline, tuple(settings), metric, wanted, shorter, repeats=repeats, seeds=numbers, threads=threads)
     from ..storage.files import check_output_folder, product_path, write_text
 
     folder = product_path("out/accuracy", f"{file.header.name}.{metric}") if output is None else output

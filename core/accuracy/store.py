@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import InputError
 from ..output import Output
@@ -30,22 +30,21 @@ if TYPE_CHECKING:
     from .study import Study
 
 FORMAT = 2
-"""1: `Front.left` without the knobs that stay as in the file."""
+"""1: ``reference_error`` without the knobs that stay as in the file."""
 
 
 @dataclass(frozen=True)
-class Front:
-    """A stored front: its points, what the reference is itself wrong by, and what it was measured on. ``staying``: values of the
-    knobs that redraw, which are those of the file in all points."""
+class StoredFront:
+    """A stored Pareto front: its points, what the reference is itself wrong by, and what it was measured on. ``staying``: values
+    of the knobs that redraw, which are those of the file in all points."""
 
     metric: str
     fingerprint: str
-    left: float
+    reference_error: float
     points: tuple[Point, ...]
     shorter: Setting
     reference: Setting
     seed: int
-    version: str
     staying: Setting
 
 
@@ -132,31 +131,20 @@ def save(study: Study, file: PipelineFile, path: Path | None = None) -> Path:
     return write_text(path, json.dumps(_rounded(as_json(study, file)), indent=1) + "\n")
 
 
-def read(path: Path) -> Front:
-    """A stored front. Raises InputError where it cannot be read or is of another format."""
+def read(path: Path) -> StoredFront:
+    """A stored Pareto front. Raises InputError where it cannot be read or is of another format."""
+    cure = "make it anew: zonda accuracy PIPELINE --store"
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if values["format"] != FORMAT:
-            raise InputError(
-                f"is a front of format {values['format']}, not {FORMAT}",
-                place=str(path),
-                cure="make it anew: zonda accuracy --store",
-            )
-        points = tuple(Point(**p) for p in values["points"])
-        return Front(
-            values["metric"],
-            values["fingerprint"],
-            values["reference_error"],
-            points,
-            values["shorter"],
-            values["reference"],
-            values["seed"],
-            values["versions"].get("zonda", "?"),
-            values["staying"],
-        )
+            raise InputError(f"is a front of format {values['format']}, not {FORMAT}", place=str(path), cure=cure)
+        return TypeAdapter(StoredFront).validate_python(values)
+    except ValidationError as err:
+        first = err.errors()[0]
+        reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as err:
-        cure = "make it anew: zonda accuracy PIPELINE --store"
-        raise InputError(f"is not a stored front ({type(err).__name__}: {err})", place=str(path), cure=cure) from None
+        reason = f"{type(err).__name__}: {err}"
+    raise InputError(f"is not a stored front ({reason})", place=str(path), cure=cure)
 
 
 def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> Choice:
@@ -177,11 +165,11 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
             why = f"the stored front of {metric} ({path}) is of other steps or another scene"
         elif changed := [f"{k.key}={front.staying[k.key]}" for k in knobs if front.staying.get(k.key, k.present) != k.present]:
             why = f"the stored front of {metric} ({path}) was made with {' '.join(changed)}"
-        elif (point := cheapest(front.points, target, front.left)) is None:
+        elif (point := cheapest(front.points, target, front.reference_error)) is None:
             why = f"no point of the stored front of {metric} meets {100 * target:g} %"
     if point is not None:
         setting = {k: v for k, v in point.setting.items() if k not in given}
-        error = point.error + front.left
+        error = point.error + front.reference_error
         reason = f"stored front of {metric}: {100 * error:.2g} % with {' '.join(overrides(setting)) or 'the knobs as they are'}"
     else:
         setting = {k: v for k, v in tightest(knobs).items() if k not in given}

@@ -10,7 +10,7 @@ from ..errors import InputError
 from .front import Point, cheapest, pareto, point, search
 from .measure import Measured, Request, measure
 from .metrics import get
-from .settings import PipelineKnob, Setting, overrides, shortened
+from .settings import PipelineKnob, Setting, overrides
 from .sweep import Bench, Run, Sweep, sweep, tightest
 
 if TYPE_CHECKING:
@@ -128,22 +128,3 @@ def study(
         bench.scatter(found.reference),
         reference.first,
     )
-
-
-def setup_for(
-    file: PipelineFile,
-    pipeline: str,
-    settings: Sequence[str],
-    metric: str,
-    target: float,
-    *,
-    duration: str | None = None,
-    quick: bool = False,
-    repeats: int = 3,
-    seeds: int = 4,
-    threads: int = 1,
-) -> Setup:
-    """A `Setup` with consecutive seeds from the file's on."""
-    first = file.scene().seed
-    numbers = tuple(first + k for k in range(max(1, seeds)))
-    return Setup(pipeline, tuple(settings), metric, target, shortened(file, duration, quick), repeats, numbers, threads)

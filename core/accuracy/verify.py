@@ -11,7 +11,7 @@ from .child import run
 from .measure import Request, measure
 from .metrics import get
 from .settings import knobs_of, overrides
-from .store import Front, fingerprint
+from .store import StoredFront, fingerprint
 from .sweep import tightest
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def achieved(
     return measures.error(own, found((*settings, *reference)))
 
 
-def retest(front: Front, file: PipelineFile, pipeline: str, points: int | None = None) -> list[Retest]:
+def retest(front: StoredFront, file: PipelineFile, pipeline: str, points: int | None = None) -> list[Retest]:
     """Measure the errors of a stored front again (of the ``points`` with the largest errors): errors only, never times, and
     therefore in this process.
 

@@ -26,7 +26,7 @@ class HighpassPlanning(Planning[HighpassFilter]):
     """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
 
     of = HighpassFilter
-    knobs = (Knob("oversampling", (8, 12, 16, 24, 48), "slow part formed on a coarse series in time"),)
+    knobs = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
     def traits(self, observation: Observation) -> Traits:
         """A brick wall; a scan shorter than one cycle loses only a line."""
@@ -69,7 +69,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
     """
 
     of = CommonModeFilter
-    knobs = (Knob("residual", (1e-2, 1e-3, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
+    knobs = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
 
     def traits(self, observation: Observation) -> Traits:
         """It removes what is common."""
