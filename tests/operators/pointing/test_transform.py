@@ -124,15 +124,15 @@ def test_upright_goes_on_from_stretch_to_stretch(sweep: float) -> None:
 
 @pytest.mark.parametrize("scan", [PointingDaisy(), PointingBackAndForth()])
 @pytest.mark.parametrize("target", ["05h +20d", "az 180d el 45d"])
-def test_bits_do_not_depend_on_the_stretch(scan: Any, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bits_do_not_depend_on_the_chunk(scan: Any, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
     parsed, seconds = Target.parse(target), np.arange(5000) / 20.0
     transform = CelestialTransform(GREEN_BANK, START, 250.0)
-    whole = scan._track(transform, parsed, (1e-4, 2e-4), seconds)
-    monkeypatch.setattr(chunks, "CHUNK", 777)
-    parts = scan._track(transform, parsed, (1e-4, 2e-4), seconds)
+    whole = scan._boresight(transform, parsed, (1e-4, 2e-4), seconds)
+    monkeypatch.setattr(chunks.chunks, "__defaults__", (777,))
+    parts = scan._boresight(transform, parsed, (1e-4, 2e-4), seconds)
     assert np.array_equal(whole.horizontal, parts.horizontal)
     assert np.array_equal(whole.azel, parts.azel)
-    # bent light is inverted by steps that begin at the mean of a stretch
+    # bent light is inverted by steps that begin at the mean of a chunk
     assert np.abs(whole.radec - parts.radec).max() <= (0.0 if isinstance(scan, PointingDaisy) and "az" not in target else 1e-15)
 
 
