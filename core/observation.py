@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -34,7 +34,10 @@ class WhiteLevel(Protocol):
         """Whether it depends on the mean emission or transmission of the atmosphere."""
 
     def sky_net(self, observation: Observation) -> NDArray[np.float64]:
-        """(n_det,) K_RJ sqrt(s) on the sky."""
+        """(n_det,) K_RJ sqrt(s) on the sky, once every step is configured."""
+
+    def expected_sky_net(self, observation: Observation) -> NDArray[np.float64]:
+        """About what `sky_net` will be, before."""
 
     def amplitude(self, observation: Observation) -> SmoothField:
         """rms of one sample at the detector, K_RJ."""
@@ -74,10 +77,8 @@ class Observation:
     expected_load
         Tells the atmosphere's mean emission [K_RJ] and transmission in the middle of the scan, before ``smooth`` is known; None:
         there is no atmosphere.
-    expected_net
-        Tells what (n_det,) ``focalplane.net`` will be about, before it is resolved; None: what it is now.
     noise_levels
-        Levels of the white noise by step, in their order; known once all are configured. Pink noise refers to the last.
+        Levels of the white noise by step, in their order. Pink noise refers to the last.
     quoted_net
         (n_det,) ``focalplane.net`` before a step with white noise set it to what it comes to on the sky; None: there is none.
     resolved
@@ -114,7 +115,6 @@ class Observation:
     tally: Tally = field(default_factory=Tally)
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None
-    expected_net: Callable[[], AnyFloats] | None = None
     components: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -132,6 +132,11 @@ class Observation:
     @property
     def n_detectors(self) -> int:
         return len(self.focalplane)
+
+    def expected_net(self) -> NDArray[np.float64]:
+        """(n_det,) about what ``focalplane.net`` will be once the steps with white noise are prepared."""
+        levels = [level.expected_sky_net(self) for level in self.noise_levels.values()]
+        return np.asarray(reduce(np.hypot, levels) if levels else self.focalplane.net, np.float64)
 
     @property
     def good_samples(self) -> NDArray[np.bool_]:

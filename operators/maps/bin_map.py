@@ -164,8 +164,7 @@ class BinMap(Operator):
         first = data.observations[0]
         instrument = first.instrument
         if before is None:
-            expected = first.expected_net if self.contents == "all" else None
-            levels = expected() if expected else first.focalplane.net
+            levels = first.expected_net() if self.contents == "all" else first.focalplane.net
             # weights about 1 and below: a sample's weight times its value, mean emission included, must fit the sums
             net = float(max(levels.min(), np.median(levels) / 4)) or instrument.net
             found: dict[str, Any] = {

@@ -1,6 +1,6 @@
 """The level that white and pink noise share: NET per detector and its amplitude at the detector.
 
-Levels are announced in ``configure`` and resolved in ``prepare``: by then the mean emission and transmission of the atmosphere
+Levels are announced in ``observe`` and resolved in ``prepare``: by then the mean emission and transmission of the atmosphere
 and the efficiencies are known, and no step that reads ``focalplane.net`` has been prepared.
 """
 
@@ -37,8 +37,10 @@ class NoiseLevel:
     """NET of one observation's detectors, resolved when first asked for: not before every operator is configured."""
 
     model: NoiseModel
-    factors: Floats
-    """(n_det,) scatter factors, mean 1."""
+    scatter: float = 0.0
+    """Relative standard deviation from detector to detector."""
+    label: str = ""
+    """The step whose random numbers scatter it."""
     _net: Floats | None = None
 
     @property
@@ -49,7 +51,7 @@ class NoiseLevel:
     def net(self, observation: Observation) -> Floats:
         """(n_det,) K_RJ sqrt(s) referred to ``model.reference``; the value of the first call holds."""
         if self._net is None:
-            self._net = self.model.net(observation) * self.factors
+            self._net = self.model.net(observation) * scatter_factors(self.scatter, observation, self.label)
         return self._net
 
     def sky_net(self, observation: Observation) -> Floats:
@@ -66,7 +68,7 @@ class NoiseLevel:
         if observation.expected_load is not None and self.follows_load:
             for name, value in zip(("atmosphere", "transmission"), observation.expected_load(), strict=True):
                 rough.smooth[name] = SmoothField.constant(np.full(observation.n_detectors, value), observation.n_samples)
-        return NoiseLevel(self.model, self.factors).sky_net(rough)
+        return NoiseLevel(self.model, self.scatter, self.label).sky_net(rough)
 
     def amplitude(self, observation: Observation) -> SmoothField:
         """rms of one sample at the detector, NET sqrt(f_s), times zeta <e^-tau> where NET is quoted on the sky; K_RJ."""
@@ -141,20 +143,15 @@ def rms_of_inverse(transmission: SmoothField | None, n_detectors: int) -> Floats
     return found
 
 
-def announce(observation: Observation, label: str, level: NoiseLevel) -> None:
-    """Make the level of a step's white noise known, to pink noise too. The first one that a step announces holds."""
-    if observation.quoted_net is None:
-        observation.quoted_net = observation.focalplane.net.copy()
-    observation.noise_levels.setdefault(label, level)
-
-
 def resolve(observation: Observation) -> None:
     """Set ``focalplane.net`` to what all white noise comes to on the sky: levels of several steps add in quadrature."""
     levels = [level.sky_net(observation) for level in observation.noise_levels.values()]
     if levels:
+        if observation.quoted_net is None:
+            observation.quoted_net = observation.focalplane.net
         observation.focalplane.net = levels[0].copy() if len(levels) == 1 else np.sqrt(sum(net**2 for net in levels))
 
 
 def announced(observation: Observation) -> WhiteLevel:
     """The level of the white noise; the instrument's NET where the pipeline makes none."""
-    return next(reversed(observation.noise_levels.values()), NoiseLevel(FixedNet(), np.ones(observation.n_detectors)))
+    return next(reversed(observation.noise_levels.values()), NoiseLevel(FixedNet()))

@@ -161,4 +161,4 @@ def level_of(pink: PinkNoise, observation: Observation) -> WhiteLevel:
     """The white level that the knee refers to."""
     if pink.net is None:
         return announced(observation)
-    return NoiseLevel(FixedNet.of(pink.net, pink.reference), np.ones(observation.n_detectors))
+    return NoiseLevel(FixedNet.of(pink.net, pink.reference))

@@ -73,30 +73,29 @@ class Streams:
         ``level``: of the same detectors and samples; absent: 1. ``common`` (n_samp,): a stream that makes up the share
         ``shared`` of the variance. ``over``: put it into ``out``, whatever is there.
         """
-        end = detector + out.shape[0]
+        n_det, n_samp = out.shape
         if level is None:
-            n_samples = sample + out.shape[1]
-            ones = SmoothField.constant(np.ones(out.shape[0]), n_samples)
-            level = ones.series(slice(0, out.shape[0]), slice(sample, n_samples), out.dtype)
+            ones = SmoothField.constant(np.ones(n_det), sample + n_samp)
+            level = ones.series(slice(0, n_det), slice(sample, sample + n_samp), out.dtype)
         shares = np.sqrt(np.array([1 - shared, shared])).astype(out.dtype)
-        for number in range(detector // TILE_DETECTORS, -(-end // TILE_DETECTORS)):
-            origin = number * TILE_DETECTORS
-            low, high = max(detector, origin), min(end, origin + TILE_DETECTORS)
+        edges = [detector, *range((detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS)]
+        for low, high in pairwise([*edges, detector + n_det]):
             rows = slice(low - detector, high - detector)
             part = Series(level.lines[rows], level.first, level.inside)
-            self._add_tile(number, low - origin, sample, part, common, shares, over, out[rows])
+            self._add_tile(low, sample, out[rows], part, common, shares, over)
 
     def _add_tile(
         self,
-        number: int,
-        lane: int,
+        detector: int,
         sample: int,
+        out: AnyFloats,
         level: Series,
         common: NDArray[np.float32],
         shares: AnyFloats,
         over: bool,
-        out: AnyFloats,
     ) -> None:
+        """`add` for detectors of one tile."""
+        number, lane = divmod(detector, TILE_DETECTORS)
         with self._lock:
             tile = self._tiles.get(number)
             if tile is None:

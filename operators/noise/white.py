@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
 
-from .level import Amplitude, NoiseLevel, announce, resolve, scatter_factors
+from .level import Amplitude, NoiseLevel, resolve
 from .models import FixedNet, NoiseModel, noise_model
 
 if TYPE_CHECKING:
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from zonda.core.block import Block
     from zonda.core.data import Data
     from zonda.core.observation import Observation
-    from zonda.core.types import Floats
 
 _SCHEMA = {
     "anyOf": [{"type": "string"}, {"type": "object", "properties": {"name": {"type": "string"}}, "required": ["name"]}],
@@ -64,18 +62,14 @@ class WhiteNoise(Operator):
         return self
 
     def observe(self, data: Data) -> None:
-        """See `agree`."""
-        self.agree(data)
-
-    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
-        """Say what the level will be about: map makers lay out their sums for it."""
+        """Announce the level to `PinkNoise`, and to map makers, which lay out their sums for it."""
         for observation in data.observations:
-            observation.expected_net = partial(_expected, self._level(observation), observation, observation.expected_net)
-        return None
+            level = NoiseLevel(self.model or FixedNet.of(self.net, self.reference), self.scatter, self.label)
+            observation.noise_levels.setdefault(self.label, level)
 
-    def configure(self, observation: Observation) -> None:
-        """Announce the level to `PinkNoise` and to other white noise."""
-        announce(observation, self.label, self._level(observation))
+    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> None:
+        """See `observe`."""
+        self.observe(data)
 
     def prepare(self, observation: Observation) -> _State:
         """Resolve the level."""
@@ -98,20 +92,10 @@ class WhiteNoise(Operator):
         whose = f"{observation.name}: " if level.follows_load else ""  # differs from scan to scan
         observation.tally.state(self.label, f"{whose}NET on the sky, median (range), mK s^1/2", text)
 
-    def _level(self, observation: Observation) -> NoiseLevel:
-        model = self.model or FixedNet.of(self.net, self.reference)
-        return NoiseLevel(model, scatter_factors(self.scatter, observation, self.label))
-
 
 class _State(NamedTuple):
     amplitude: Amplitude
     key: NDArray[np.uint32]
-
-
-def _expected(level: NoiseLevel, observation: Observation, others: Callable[[], NDArray[np.floating[Any]]] | None) -> Floats:
-    """`NoiseLevel.expected_sky_net` and that of ``others``, in quadrature."""
-    net = level.expected_sky_net(observation)
-    return net if others is None else np.asarray(np.hypot(net, others()), np.float64)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -40,6 +40,8 @@ def simulate():
 
     def run(observation, *operators, blocks=None, dtype=np.float32):
         for operator in operators:
+            operator.observe(Data(None, [observation]))
+        for operator in operators:
             operator.configure(observation)
         states = [operator.prepare(observation) for operator in operators]
         n_det, n_samp = observation.n_detectors, observation.n_samples
