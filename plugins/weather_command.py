@@ -70,7 +70,7 @@ def show(
     from zonda.core.storage.files import atomic_path, product_path
     from zonda.operators.atmosphere.weather import summary
     from zonda.operators.atmosphere.weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
-    from zonda.operators.atmosphere.weather.sources import air_of
+    from zonda.operators.atmosphere.weather.sources import profile_of
 
     place, when = _place(site), _instant(time)
     given = {key: value for key, value in (("pwv", pwv), ("file", file), ("table", table)) if value is not None}
@@ -81,7 +81,7 @@ def show(
         limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
         raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")
     bands = list(dict.fromkeys(registry.instruments.create(name).band for name in instruments))
-    air = air_of(source, place, when, seed)
+    air = profile_of(source, place, when, seed)
     water = summary.water_by_month(place, when.datetime.year) if place.climatology is not None else None
 
     parts = [summary.place_lines(place, when, air), summary.profile_lines(air)]

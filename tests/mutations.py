@@ -57,7 +57,7 @@ def transmission_of_the_mean_opacity(patch: Patch) -> None:
         opacity = float(np.average(slant.sum(axis=0), weights=self._weight))
         return float(np.sum(self._weight * bands.emission(slant, self._source))), -opacity, -opacity
 
-    patch.setattr(bands._BandTransfer, "_at", mean_first)
+    patch.setattr(bands.BandTransfer, "_at", mean_first)
 
 
 def exponentials_before_logarithms(patch: Patch) -> None:
@@ -67,7 +67,7 @@ def exponentials_before_logarithms(patch: Patch) -> None:
         with np.errstate(divide="ignore"):
             return emitted, float(np.log(passed.sum())), float(np.log(np.sum(passed * self._cmb)))
 
-    patch.setattr(bands._BandTransfer, "_at", underflowing)
+    patch.setattr(bands.BandTransfer, "_at", underflowing)
 
 
 def differences_by_subtraction(patch: Patch) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from zonda.core.configuration.time import Instant
 from zonda.core.site import Site
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather.sources import air_of
+from zonda.operators.atmosphere.weather.sources import profile_of
 
 PWV = 1e-3 * np.array([0, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50])
 ELEVATION = np.radians([10, 20, 30, 40, 50, 60, 70, 80, 90])
@@ -21,7 +21,7 @@ GRAVITY = 9.80665
 
 
 def write_tables(folder: Path, region: str, site: Site, time: Instant) -> None:
-    profile = air_of(None, site, time, 1)
+    profile = profile_of(None, site, time, 1)
     _weather(folder / "atmosphere" / "weather" / "era5" / f"{region}.h5", profile, site.altitude)
     _spectra(folder / "atmosphere" / "spectra" / "am" / "v3" / f"{region}.h5", profile, site.altitude)
 

@@ -36,8 +36,7 @@ def main() -> None:
         block = Block(o, slice(0, o.n_detectors), slice(0, o.n_samples))
         operator.exec(block, state)
         y.append(block.detdata["pwv"] * math.sin(c["elevation"][0]) / c["pwv"])
-    profile, _ = operator._weather(o)
-    layers = operator._layers(profile)
+    layers = operator.model(o).layers
     sin, azimuth = math.sin(c["elevation"][0]), c["azimuth"][0]
     along = np.array([layer.wind @ [np.sin(azimuth), np.cos(azimuth)] for layer in layers])
     across = np.array([layer.wind @ [np.cos(azimuth), -np.sin(azimuth)] for layer in layers])

@@ -1,4 +1,4 @@
-"""How far the air averages down in a pixel of the map.
+"""How far the atmosphere averages down in a pixel of the map.
 
 Of a layer's field g and a pixel that H samples see, at times t_h along rays x_h, the map holds
 
@@ -16,69 +16,80 @@ that a ray sees above the cut made bounds that did not hold (docs/plan.md).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.observation import Observation
+from zonda.core.plan.context import Context
 from zonda.core.types import Floats
 
-from .turbulence.geometry import axes, crossing, rays, tracks
-
-if TYPE_CHECKING:
-    from zonda.core.plan.context import Context
-
-    from .layers import AtmosphereLayers
-    from .planning import Air
+from .turbulence.geometry import ScanPlane, axes, crossing, rays
+from .turbulence.nodes import Layer
 
 INSTANTS, CANDIDATES, HITS, WAVES = 4000, 48, 160, 160
 
 
-def shares(operator: AtmosphereLayers, context: Context, a: Air) -> list[float]:
-    """For each layer, the rms in a pixel over that in a sample (with the detectors' mean removed where it is), at most 1."""
+def shares(context: Context, layers: list[Layer], components: list[tuple[Floats, Floats]], plane: ScanPlane) -> list[float]:
+    """For each layer, the rms in a pixel over that in a sample (with the detectors' mean removed where it is), at most 1.
+
+    ``components``: (e, w) of each layer. ``plane``: of the first scan.
+    """
     o = context.first
     if context.coverage is None or o.n_samples < 2:
-        return [1.0] * len(a.models)
+        return [1.0] * len(layers)
     rng = np.random.default_rng(1)
-    track = operator._tracks.get(o.name) or tracks([o])[0]
     seen = _seen(context, rng)
-    xi, eta = _nodes(context, 2 if _smooth(context, a) else 4)
+    # Where the field's footprint is within the beam's in every layer four points stand for the detectors' mean.
+    smooth = all(layer.distance * o.focalplane.radius <= layer.sigma for layer in layers)
+    points = _nodes(context, 2 if smooth else 4) if context.removes_common else None
     found: list[float] = []
-    for layer, model in zip(a.layers, a.models, strict=True):
-        e, w = a.components[len(found)]
-        reach = 2 * o.focalplane.radius * model.distance
+    for layer, (e, w) in zip(layers, components, strict=True):
+        reach = 2 * o.focalplane.radius * layer.distance
         chance = w * -np.expm1(-(reach**2) / (4 * e)) + 1e-6 * w
         chance /= chance.sum()
         j = rng.choice(len(e), WAVES, p=chance)
         k = rng.standard_normal((WAVES, 2)) / np.sqrt(2 * e[j])[:, None]
         weight = w[j] / chance[j] / WAVES
-        drift = track.drift @ layer.wind
-        worst = 0.0
-        for at, where, hits in seen:
-            seconds = o.seconds[at]
-            frame = axes(o.boresight_azel[at])
-            own = frame[:, :, 2] - where[1][:, None] * frame[:, :, 0] - where[0][:, None] * frame[:, :, 1]
-            here = model.height * track.unroll(crossing(own.T)) - drift[:, None] * seconds
-            wave = np.exp(1j * (k @ here))
-            if context.removes_common:
-                all_of_them = model.height * track.unroll(crossing(rays(frame, xi, eta))) - drift[:, None, None] * seconds
-                wave -= np.exp(1j * np.tensordot(k, all_of_them, 1)).mean(axis=1)
-            number = len(at)
-            one = float(weight @ (np.abs(wave) ** 2).mean(axis=1))
-            parts = weight * np.abs(wave.mean(axis=1)) ** 2
-            raw = float(parts.sum())
-            mean = max((number * raw - one) / max(number - 1, 1), raw / 4)
-            total = mean + one / max(hits, 1.0) + 2 * math.sqrt(float((parts**2).sum()))
-            worst = max(worst, total / one if one > 0 else 1.0)
+        worst = max([0.0, *(_in_pixel(_waves(o, layer, plane, pixel, k, points), weight, pixel.hits) for pixel in seen)])
         found.append(math.sqrt(min(worst, 1.0)))
     return found
 
 
-def _smooth(context: Context, a: Air) -> bool:
-    """Whether the field's footprint is within the beam's in every layer: four points then stand for the detectors' mean."""
-    radius = context.first.focalplane.radius
-    return all(m.distance * radius <= m.sigma for m in a.models)
+@dataclass(frozen=True)
+class _Pixel:
+    """Sample numbers at which a pixel is in the field, where in it (xi, eta), and the number of its samples in all."""
+
+    at: NDArray[np.intp]
+    xi: Floats
+    eta: Floats
+    hits: float
+
+
+def _waves(
+    o: Observation, layer: Layer, plane: ScanPlane, pixel: _Pixel, k: Floats, points: tuple[Floats, Floats] | None
+) -> NDArray[np.complex128]:
+    """Plane waves k of a layer in a pixel (n_wave, n_instant), less their mean over points of the focal plane."""
+    seconds, frame, drift = o.seconds[pixel.at], axes(o.boresight_azel[pixel.at]), plane.drift @ layer.wind
+    own = frame[:, :, 2] - pixel.eta[:, None] * frame[:, :, 0] - pixel.xi[:, None] * frame[:, :, 1]
+    wave = np.exp(1j * (k @ (layer.height * plane.unroll(crossing(own.T)) - drift[:, None] * seconds)))
+    if points is not None:
+        everywhere = layer.height * plane.unroll(crossing(rays(frame, *points))) - drift[:, None, None] * seconds
+        wave -= np.exp(1j * np.tensordot(k, everywhere, 1)).mean(axis=1)
+    return np.asarray(wave, np.complex128)
+
+
+def _in_pixel(wave: NDArray[np.complex128], weight: Floats, hits: float) -> float:
+    """Variance of the mean of a pixel's samples over that of a sample."""
+    number = wave.shape[1]
+    one = float(weight @ (np.abs(wave) ** 2).mean(axis=1))
+    parts = weight * np.abs(wave.mean(axis=1)) ** 2
+    raw = float(parts.sum())
+    mean = max((number * raw - one) / max(number - 1, 1), raw / 4)
+    total = mean + one / max(hits, 1.0) + 2 * math.sqrt(float((parts**2).sum()))
+    return total / one if one > 0 else 1.0
 
 
 def _nodes(context: Context, n: int) -> tuple[Floats, Floats]:
@@ -90,7 +101,7 @@ def _nodes(context: Context, n: int) -> tuple[Floats, Floats]:
     return np.repeat(xi, n), np.tile(eta, n)
 
 
-def _seen(context: Context, rng: np.random.Generator) -> list[tuple[NDArray[np.intp], tuple[Floats, Floats], float]]:
+def _seen(context: Context, rng: np.random.Generator) -> list[_Pixel]:
     """For some pixels: instants of the first scan at which they are in the field, where in it, and the pixel's samples then."""
     o, plane = context.first, context.first.focalplane
     at = np.sort(rng.integers(0, o.n_samples, INSTANTS))
@@ -113,5 +124,5 @@ def _seen(context: Context, rng: np.random.Generator) -> list[tuple[NDArray[np.i
         if len(index) > HITS:
             index = np.sort(rng.choice(index, HITS, replace=False))
         hits = count[number] / len(at) * o.n_samples * density
-        chosen.append((at[index], (x[number, index], y[number, index]), float(hits)))
+        chosen.append(_Pixel(at[index], x[number, index], y[number, index], float(hits)))
     return chosen

@@ -22,9 +22,9 @@ from zonda.core.types import AnyFloats
 
 from .response import Response
 from .turbulence.nodes import Nodes
-from .turbulence.sampling import TIMES_AT_ONCE, Layers
+from .turbulence.sampling import TIMES_AT_ONCE, DriftingLayers
 
-Water = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
+ToPwv = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
 """(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""
 
 UNIT_DETECTORS, UNIT_SAMPLES = 128, 16384
@@ -54,7 +54,7 @@ class AtNodes:
     sums: tuple[int, float, float]
 
     @classmethod
-    def make(cls, nodes: Nodes, layers: Layers, water: Water, response: Response, step: int, n_samples: int) -> AtNodes:
+    def make(cls, nodes: Nodes, layers: DriftingLayers, to_pwv: ToPwv, response: Response, step: int, n_samples: int) -> AtNodes:
         """Evaluate the layers at the nodes over the whole scan, a part of it at a time."""
         n_node, weights = len(nodes.xi), np.ascontiguousarray(nodes.weights)
         width = -(-n_samples // step) + 3
@@ -64,7 +64,7 @@ class AtNodes:
         for start in range(0, n_samples, part):
             g, sine = layers(nodes.xi, nodes.eta, *times(slice(start, min(start + part, n_samples)), step))
             own = _own(g.shape[1])
-            y = water(g, own)
+            y = to_pwv(g, own)
             sums.append(_sums(y[:, own]))
             first = start // step
             for name, whole in coefficients.items():
@@ -73,15 +73,8 @@ class AtNodes:
         fields = {name: SmoothField(weights, c, step, n_samples) for name, c in coefficients.items()}
         return cls(fields, (sum(n for n, _, _ in sums), math.fsum(t for _, t, _ in sums), math.fsum(q for _, _, q in sums)))
 
-    fits = True
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that it takes."""
-        return sum(f.weights.nbytes + f.coefficients.nbytes for f in self.fields.values())
-
     def drawn(self) -> tuple[int, float, float]:
-        """Number of values of the water, their sum, and that of their squares."""
+        """Number of values of the PWV, their sum, and that of their squares."""
         return self.sums
 
     def into(self, detectors: slice, samples: slice, out: dict[str, AnyFloats]) -> None:
@@ -93,19 +86,15 @@ class AtNodes:
 class OfDetectors:
     """Each detector's own series, in float32, made as they are asked for. Threads may ask at the same time."""
 
-    def __init__(self, nodes: Nodes, layers: Layers, water: Water, response: Response, step: int, n_samples: int) -> None:
-        self._xi, self._eta, self._layers, self._water, self._response = nodes.xi, nodes.eta, layers, water, response
+    def __init__(
+        self, nodes: Nodes, layers: DriftingLayers, to_pwv: ToPwv, response: Response, step: int, n_samples: int
+    ) -> None:
+        self._xi, self._eta, self._layers, self._to_pwv, self._response = nodes.xi, nodes.eta, layers, to_pwv, response
         self.step, self._n_samples = step, n_samples
         self._units: OrderedDict[tuple[int, int], Future[dict[str, AnyFloats]]] = OrderedDict()
         self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
         self._lock = threading.Lock()
-        self._size = 4 * min(UNIT_DETECTORS, len(nodes.xi)) * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * len(response.names)
-
-    @property
-    def fits(self) -> bool:
-        """Whether all units can be kept, so that the order in which blocks are worked on does not matter."""
-        number = -(-len(self._xi) // UNIT_DETECTORS) * -(-self._n_samples // UNIT_SAMPLES)
-        return number * self._size <= BYTES_KEPT
+        self._size = _unit_size(len(nodes.xi), step, len(response.names))
 
     def drawn(self) -> tuple[int, float, float]:
         """As `AtNodes.drawn`, of what has been asked for."""
@@ -133,7 +122,7 @@ class OfDetectors:
 
     def _unit(self, unit: int, number: int) -> dict[str, AnyFloats]:
         """The coefficients of a unit. A thread that would wait for another to make it makes one that comes later instead."""
-        room = max(1, BYTES_KEPT // self._size)
+        most = max(1, BYTES_KEPT // self._size)
         while True:
             with self._lock:
                 wanted = self._units.get((unit, number))
@@ -143,11 +132,11 @@ class OfDetectors:
                 else:
                     self._units.move_to_end((unit, number))
                     if not wanted.done():
-                        key = next((k for k in self._next(unit, number, min(AHEAD, room)) if k not in self._units), None)
+                        key = next((k for k in self._next(unit, number, min(AHEAD, most)) if k not in self._units), None)
                 if key is not None:
                     mine: Future[dict[str, AnyFloats]] = Future()
                     self._units[key] = mine
-                    while len(self._units) > room:
+                    while len(self._units) > most:
                         self._units.popitem(last=False)  # whoever waits for it still holds it
             if key is None:
                 assert wanted is not None
@@ -177,9 +166,20 @@ class OfDetectors:
         with self._lock:  # what is made again is not counted again
             own = _own(count) if (unit, number) not in self._sums else slice(0, 0)
             self._sums.setdefault((unit, number), (0, 0.0, 0.0))
-        y = self._water(g, own)
+        y = self._to_pwv(g, own)
         self._sums[unit, number] = _sums(y[:, _own(count)])
         return {name: spline_coefficients(self._response(name, y, sine), np.float32) for name in self._response.names}
+
+
+def units_fit(n_detectors: int, n_samples: int, step: int, streams: int) -> bool:
+    """Whether all units of `OfDetectors` can be kept, so that the order in which blocks are worked on does not matter."""
+    number = -(-n_detectors // UNIT_DETECTORS) * -(-n_samples // UNIT_SAMPLES)
+    return number * _unit_size(n_detectors, step, streams) <= BYTES_KEPT
+
+
+def _unit_size(n_detectors: int, step: int, streams: int) -> int:
+    """Bytes."""
+    return 4 * min(UNIT_DETECTORS, n_detectors) * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * streams
 
 
 def _sums(y: NDArray[np.float64]) -> tuple[int, float, float]:

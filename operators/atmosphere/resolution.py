@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -14,23 +14,25 @@ from zonda.core.data import Observation
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.types import Floats
 
-from .turbulence.geometry import Track, axes, axes_at, crossing, rays
+from .turbulence.geometry import ScanPlane, axes, axes_at, crossing, rays
 from .turbulence.nodes import (
     GRIDS,
-    LayerModel,
+    Layer,
     Nodes,
     candidate_steps,
     choose_nodes,
     differential_rms,
     grid,
     layer_time_error,
-    some,
+    spread_evenly,
     time_error,
     time_error_within,
     times_with_margin,
 )
-from .weather.bands import BandAtmosphere
 from .weather.radiative_transfer import ELEVATION_MAX
+
+Emission = Callable[[Floats], Floats]
+"""The mean emission [K_RJ] at elevations [rad]."""
 
 SMALLEST_DIFFERENCE = 1e-5
 """Share of the fluctuation that must differ between detectors for the tolerance to be judged by it."""
@@ -39,7 +41,7 @@ MEAN_SHARE = 0.1
 """The mean emission's error, as a share of what the fluctuation's may be: it is so smooth that this costs nothing."""
 
 WINDOWS = (16, 1 << 14)
-"""Number and length [samples] of the parts of a longer scan at which its path is looked at."""
+"""Number and length [samples] of the parts of a longer scan at which its path is examined."""
 
 LOOKED_AT = 1024
 """Samples of a scan whose velocity and elevation are looked at."""
@@ -52,7 +54,7 @@ PAYS_FROM = 1 << 18
 
 
 @dataclass(frozen=True)
-class Plan:
+class Resolution:
     """Nodes and steps in time; the error allowed and those expected, relative to the rms of the fluctuation after the beam.
 
     ``steps``: one for each layer, multiples of ``step``. ``mean_nodes``, ``mean_step``: for the mean emission.
@@ -69,17 +71,15 @@ class Plan:
     mean_step: int
 
 
-def make_plan(
+def choose_resolution(
     observation: Observation,
-    track: Track,
-    models: Sequence[LayerModel],
-    winds: Sequence[Floats],
+    plane: ScanPlane,
+    layers: Sequence[Layer],
     variance: float,
     tolerance: float,
-    band: BandAtmosphere,
-    pwv: float,
+    emission: Emission,
     pwv_rms: float,
-) -> Plan:
+) -> Resolution:
     """The coarsest nodes and steps that keep each error below ``tolerance`` of what the focal-plane mean, subtracted, leaves.
 
     Where the detectors are the nodes, the steps in time may err by both shares, sqrt(2) of it.
@@ -87,89 +87,106 @@ def make_plan(
     """
     xi, eta = observation.focalplane.xi, observation.focalplane.eta
     rms = math.sqrt(variance)
-    stretch = 1 / math.sin(track.elevation) if track.kind == "horizontal" else 1.0
-    left = differential_rms(*some(xi, eta), models, stretch)
+    left = differential_rms(*spread_evenly(xi, eta), layers, plane.stretch)
     # Of the rms of the fluctuation. A single detector, or none apart, is judged as if a hundredth were left.
     tolerance = tolerance * (left / rms if left > SMALLEST_DIFFERENCE * rms else 0.01)
-    nodes, error = choose_nodes(xi, eta, models, tolerance * rms, stretch)
+    nodes, error = choose_nodes(xi, eta, layers, tolerance * rms, plane.stretch)
 
     path = _Path(observation, xi, eta)
     elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
-    slope = float(np.max(abs(_slope(band, pwv, elevations))))
-    # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the water fluctuated where none does).
-    kelvin = float(band.emission(pwv, elevations[1]))
-    allowed = max(MEAN_SHARE * tolerance * kelvin * max(pwv_rms, 1e-4), 1e-9)
-    truth = _mean_emission(xi, eta, band, pwv, elevations)
-    for size in GRIDS:
-        mean_nodes = grid(xi, eta, size)
-        at_nodes = _mean_emission(mean_nodes.xi, mean_nodes.eta, band, pwv, elevations)
-        if float(abs(truth - mean_nodes.weights @ at_nodes).max()) <= allowed:
-            break
+    # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the PWV fluctuated where none does).
+    allowed = max(MEAN_SHARE * tolerance * float(emission(elevations[1])) * max(pwv_rms, 1e-4), 1e-9)
+    mean_nodes = _mean_nodes(xi, eta, emission, elevations, allowed)
 
-    velocity = path.velocity(track)
-    quantiles = (np.arange(64) + 0.5) / 64 * (velocity.shape[1] - 1)
-    drifts = ((model.height * velocity - (track.drift @ wind)[:, None]) for model, wind in zip(models, winds, strict=True))
-    speeds = [np.interp(quantiles, np.arange(v.shape[1]), np.sort(np.hypot(*v))) for v in drifts]
+    timing = _Timing(path, observation, plane, layers)
     candidates = candidate_steps(observation.n_samples)
-    tried: dict[int, tuple[list[float], float]] = {}
+    late_allowed = tolerance * rms * (1.0 if nodes.shape else math.sqrt(2.0))
+    slope = float(np.max(abs(_slope(emission, elevations))))
+    mean_step = next(s for s in candidates if s == 1 or slope * timing.path_errors(s)[1] <= allowed)
+    step, late = timing.common_step(candidates[:-1], late_allowed)
+    steps = [step] * len(layers)
+    if len(nodes.xi) * observation.n_samples / step > PAYS_FROM:
+        late = timing.double(steps, late, late_allowed, candidates[0])
+    return Resolution(nodes, step, tuple(steps), tolerance, error / rms, late / rms, left / rms, mean_nodes, mean_step)
 
-    def path_errors(step: int) -> tuple[list[float], float]:
+
+def _slope(emission: Emission, elevation: Floats) -> Floats:
+    """d emission / d elevation, K_RJ per rad."""
+    h = 1e-4
+    low = np.minimum(elevation, ELEVATION_MAX - h)
+    return np.asarray((emission(low + h) - emission(low)) / h, np.float64)
+
+
+def _mean_nodes(xi: Floats, eta: Floats, emission: Emission, elevations: Floats, allowed: float) -> Nodes:
+    """The coarsest grid from which the mean emission is within ``allowed`` [K_RJ] at some elevations of the boresight."""
+
+    def at(xi: Floats, eta: Floats) -> Floats:
+        c, s = np.cos(elevations), np.sin(elevations)
+        return emission(np.arcsin((s + eta[:, None] * c) / np.sqrt(1 + xi * xi + eta * eta)[:, None]))
+
+    truth = at(xi, eta)
+    for size in GRIDS:
+        nodes = grid(xi, eta, size)
+        if float(abs(truth - nodes.weights @ at(nodes.xi, nodes.eta)).max()) <= allowed:
+            break
+    return nodes
+
+
+class _Timing:
+    """What steps in time err by, of each layer."""
+
+    def __init__(self, path: _Path, observation: Observation, plane: ScanPlane, layers: Sequence[Layer]) -> None:
+        self._path, self._observation, self._plane, self._layers = path, observation, plane, layers
+        velocity = path.velocity(plane)
+        quantiles = (np.arange(64) + 0.5) / 64 * (velocity.shape[1] - 1)
+        drifts = (layer.height * velocity - (plane.drift @ layer.wind)[:, None] for layer in layers)
+        self._speeds = [np.interp(quantiles, np.arange(v.shape[1]), np.sort(np.hypot(*v))) for v in drifts]
+        self._tried: dict[int, tuple[list[float], float]] = {}
+
+    def path_errors(self, step: int) -> tuple[list[float], float]:
         """Of the position in each layer [m], and of the elevation [rad].
 
         Between steps samples count as a comb: where they are none, the wind moves on by its speed times their `jitter`.
         """
-        if step not in tried:
-            delta_x, delta_el = path.errors(step) if step > 1 else (np.zeros(2), 0.0)
-            stretched = track.matrix @ delta_x if track.cone is None else delta_x
-            late = observation.jitter if step > 1 else 0.0
-            blown = [float(np.hypot(*(track.drift @ wind))) * late for wind in winds]
-            tried[step] = [float(abs(stretched * m.height).max()) + b for m, b in zip(models, blown, strict=True)], delta_el
-        return tried[step]
+        if step not in self._tried:
+            delta_x, delta_el = self._path.errors(step) if step > 1 else (np.zeros(2), 0.0)
+            stretched = self._plane.matrix @ delta_x if self._plane.cone is None else delta_x
+            late = self._observation.jitter if step > 1 else 0.0
+            blown = [float(np.hypot(*(self._plane.drift @ layer.wind))) * late for layer in self._layers]
+            here = [float(abs(stretched * layer.height).max()) + b for layer, b in zip(self._layers, blown, strict=True)]
+            self._tried[step] = here, delta_el
+        return self._tried[step]
 
-    late_allowed = tolerance * rms * (1.0 if nodes.shape else math.sqrt(2.0))
-    mean_step = next(s for s in candidates if s == 1 or slope * path_errors(s)[1] <= allowed)
-    step, late, still = 1, 0.0, [0.0] * len(models)
-    for candidate in candidates[:-1]:
-        dt = candidate / observation.sample_rate
-        if not time_error_within(models, speeds, still, dt, late_allowed):
-            continue  # even along an exact path
-        late = time_error(models, speeds, path_errors(candidate)[0], dt)
-        if late <= late_allowed:
-            step = candidate
-            break
-        late = 0.0
+    def common_step(self, candidates: Sequence[int], allowed: float) -> tuple[int, float]:
+        """The first of the candidates whose error is at most ``allowed``, and that error; or (1, 0)."""
+        still = [0.0] * len(self._layers)
+        for step in candidates:
+            dt = step / self._observation.sample_rate
+            if not time_error_within(self._layers, self._speeds, still, dt, allowed):
+                continue  # even along an exact path
+            error = time_error(self._layers, self._speeds, self.path_errors(step)[0], dt)
+            if error <= allowed:
+                return step, error
+        return 1, 0.0
 
-    steps = [step] * len(models)
-    if len(nodes.xi) * observation.n_samples / step > PAYS_FROM:
+    def double(self, steps: list[int], error: float, allowed: float, largest: int) -> float:
+        """Double those of the layers' steps that save most for the error they add; the error then."""
 
         @cache
-        def layer_error(k: int, of: int) -> float:
-            deltas = path_errors(of)[0]
-            return layer_time_error(models[k], speeds[k], deltas[k], of / observation.sample_rate) if of > 1 else 0.0
+        def layer_error(k: int, step: int) -> float:
+            if step == 1:
+                return 0.0
+            delta = self.path_errors(step)[0][k]
+            return layer_time_error(self._layers[k], self._speeds[k], delta, step / self._observation.sample_rate)
 
-        spent = late**2
-        while True:  # double the step that saves most for the error it adds
-            more = {k: (layer_error(k, 2 * s) - layer_error(k, s)) for k, s in enumerate(steps) if 2 * s <= candidates[0]}
-            fits = [k for k, error in more.items() if spent + error <= late_allowed**2]
+        spent = error**2
+        while True:
+            more = {k: (layer_error(k, 2 * s) - layer_error(k, s)) for k, s in enumerate(steps) if 2 * s <= largest}
+            fits = [k for k, added in more.items() if spent + added <= allowed**2]
             if not fits:
-                break
+                return math.sqrt(spent)
             best = min(fits, key=lambda k: (max(more[k], 0.0) * steps[k], k))
             spent, steps[best] = spent + more[best], 2 * steps[best]
-        late = math.sqrt(spent)
-    return Plan(nodes, step, tuple(steps), tolerance, error / rms, late / rms, left / rms, mean_nodes, mean_step)
-
-
-def _slope(band: BandAtmosphere, pwv: float, elevation: Floats) -> Floats:
-    """d emission / d elevation, K_RJ per rad."""
-    h = 1e-4
-    low = np.minimum(elevation, ELEVATION_MAX - h)
-    return np.asarray((band.emission(pwv, low + h) - band.emission(pwv, low)) / h, np.float64)
-
-
-def _mean_emission(xi: Floats, eta: Floats, band: BandAtmosphere, pwv: float, elevations: Floats) -> Floats:
-    """The mean emission over the focal plane at some elevations of the boresight: (len(xi), len(elevations)), K_RJ."""
-    c, s = np.cos(elevations), np.sin(elevations)
-    return band.emission(pwv, np.arcsin((s + eta[:, None] * c) / np.sqrt(1 + xi * xi + eta * eta)[:, None]))
 
 
 class _Path:
@@ -189,18 +206,18 @@ class _Path:
         self._windows = [slice(start, min(n, start + length) if len(starts) > 1 else n) for start in starts]
         index = np.concatenate([np.arange(w.start, w.stop) for w in self._windows])
         last = np.cumsum([w.stop - w.start for w in self._windows]) - 1
-        some = np.unique(np.linspace(0, max(len(index) - 2, 0), LOOKED_AT).astype(np.int64))
-        self._some = index[some[~np.isin(some, last)]] if n > 1 else index  # the next sample is in the same window
-        self.elevation = np.arcsin(self._rays(self._some)[2])
+        picked = np.unique(np.linspace(0, max(len(index) - 2, 0), LOOKED_AT).astype(np.int64))
+        self._picked = index[picked[~np.isin(picked, last)]] if n > 1 else index  # the next sample is in the same window
+        self.elevation = np.arcsin(self._rays(self._picked)[2])
 
     def _rays(self, index: NDArray[np.int64] | slice) -> Floats:
         return rays(axes(self._observation.boresight_azel[index]), self._xi, self._eta)
 
-    def velocity(self, track: Track) -> Floats:
+    def velocity(self, plane: ScanPlane) -> Floats:
         """Velocity of the crossing point on the plane per metre of height, 1/s, over the scan: (2, <= LOOKED_AT)."""
         if self._observation.n_samples == 1:
             return np.zeros((2, 1))
-        ends = track.unroll(np.stack([crossing(self._rays(self._some + k))[:, 0] for k in (0, 1)], axis=1))
+        ends = plane.unroll(np.stack([crossing(self._rays(self._picked + k))[:, 0] for k in (0, 1)], axis=1))
         return np.asarray((ends[:, 1] - ends[:, 0]) * self._observation.sample_rate, np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
@@ -213,12 +230,12 @@ class _Path:
             index = window.start + times_with_margin(n, step)
             u = rays(axes_at(self._observation.boresight_azel, index, step), self._xi, self._eta)
             here = self._rays(slice(window.start, window.stop, each))
-            some, rows = -(-n // each), 3 * len(self._xi)
-            truth = np.concatenate([crossing(here).reshape(-1, some), np.arcsin(here[2])])
+            count, rows = -(-n // each), 3 * len(self._xi)
+            truth = np.concatenate([crossing(here).reshape(-1, count), np.arcsin(here[2])])
             values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
-            spline = SmoothField.from_values(np.eye(rows), values, step // each, some)
-            found = ((spline.evaluate(slice(0, rows), slice(0, some)) - truth) ** 2).sum(1)
+            spline = SmoothField.from_values(np.eye(rows), values, step // each, count)
+            found = ((spline.evaluate(slice(0, rows), slice(0, count)) - truth) ** 2).sum(1)
             squares[:rows] += found
-            total += some
+            total += count
         rms = np.sqrt(squares[: 3 * len(self._xi)] / total).reshape(3, -1).max(1)
         return rms[:2], float(rms[2])

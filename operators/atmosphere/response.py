@@ -39,14 +39,14 @@ class Response:
     ----------
     band, pwv
         The band's atmosphere and the mean PWV.
-    y_low, y_high
-        Range of the fluctuation.
-    low, high
-        Range of the sine of the elevation.
+    y_range
+        Smallest and largest fluctuation.
+    sines
+        Smallest and largest sine of the elevation.
     vapour_height
-        Height of the water [m], for the airmass of ``pwv``.
+        Height of the vapour [m], for the airmass of ``pwv``.
     delay_per_vapour
-        Path delay per line-of-sight water.
+        Path delay per line-of-sight PWV.
     names
         What will be asked for, of ``emission, transmission, opacity, pwv, path_delay``.
 
@@ -60,20 +60,18 @@ class Response:
         self,
         band: BandAtmosphere,
         pwv: float,
-        y_low: float,
-        y_high: float,
-        low: float,
-        high: float,
+        y_range: tuple[float, float],
+        sines: tuple[float, float],
         vapour_height: float,
         delay_per_vapour: float,
         names: tuple[str, ...],
     ) -> None:
         self.names = names
+        self._range = y_low, y_high = y_range
         bottom, top = np.sin(ELEVATION_MIN) * (1 + 1e-12), np.sin(ELEVATION_MAX)
         self._y = ((y_low + y_high) / 2, 2 / max(y_high - y_low, 1e-9))
-        low, high = max(low, bottom), min(high, top)
+        low, high = max(sines[0], bottom), min(sines[1], top)
         self._s = ((low + high) / 2, 2 / max(high - low, 1e-9))
-        self._range = y_low, y_high
 
         def elevation(s: Floats) -> Floats:  # lines of sight beyond are refused: this cuts the widened range, and rounding
             return np.asarray(np.arcsin(np.clip(s, bottom, top)), np.float64)

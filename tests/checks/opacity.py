@@ -135,7 +135,7 @@ def positive_water() -> Measured:
         data = run([AtmosphereLayers(pwv="1 mm", pwv_rms=rms, wind={"speed": "200 m/s"}, outputs=["pwv"])], o, keep=("pwv",))
         water = 1e-3 / np.sin(o.elevation.max()) + data.observations[0].detdata["pwv"]
         wrong += int((~(water > -1e-9)).sum())
-        clipped += data.tally.get("AtmosphereLayers", "values of the water clipped to the table")
+        clipped += data.tally.get("AtmosphereLayers", "values of the PWV clipped to the table")
     return wrong, f"{clipped} values clipped, as the tally counts"
 
 

@@ -10,8 +10,8 @@ from zonda.core.data import Data
 from zonda.core.instrument import Band
 from zonda.core.plan.context import Context, Coverage
 from zonda.core.plan.planning import planning_of
-from zonda.operators.atmosphere.planning import _slope, air
-from zonda.operators.atmosphere.weather.bands import BandAtmosphere, _BandTransfer
+from zonda.operators.atmosphere.planning import Calibrated, _slope, calibrated
+from zonda.operators.atmosphere.weather.bands import BandAtmosphere, BandTransfer
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.operators.noise.planning import difference, psd_error
@@ -189,7 +189,7 @@ def sky():
     operator, data = file.operators[2], Data(file.scene())
     file.operators[0].observe(data)
     operator.observe(data)
-    return operator, data.observations[0], air(operator, data.observations[0])
+    return operator, data.observations[0], calibrated(operator.model(data.observations[0]))
 
 
 def test_the_rms_of_the_fluctuation(sky):
@@ -204,7 +204,7 @@ def test_the_rms_of_the_fluctuation(sky):
         state.into(slice(0, 1), slice(0, o.n_samples), {"emission": values})
         seen.append(float((values.astype(float) ** 2).mean()))
     o.seed = 20241125
-    transmission = float(a.band.transmission(a.pwv, a.elevations[0]))
+    transmission = float(a.model.band.transmission(a.model.pwv, a.elevations[0]))
     rms = math.sqrt(np.mean(seen)) * share / transmission
     error = np.std(seen) / math.sqrt(len(seen)) / (2 * np.mean(seen))
     assert rms == pytest.approx(a.rms, rel=3 * error + 0.02)
@@ -213,26 +213,26 @@ def test_the_rms_of_the_fluctuation(sky):
 def test_one_frequency_and_no_ozone(sky):
     """The slopes that the bounds compare, against the tabulated atmosphere of the band itself."""
     _, o, a = sky
+    m = a.model
     band, elevation = o.instrument.band, a.elevations[0]
-    right = _slope(_BandTransfer(band, a.profile.layers), a.pwv, elevation)
-    step = 1e-3 * a.pwv
-    table = float(a.band.emission_difference(a.pwv, step, elevation)) / step / float(a.band.transmission(a.pwv, elevation))
+    right = _slope(BandTransfer(band, m.profile.layers), m.pwv, elevation)
+    step = 1e-3 * m.pwv
+    table = float(m.band.emission_difference(m.pwv, step, elevation)) / step / float(m.band.transmission(m.pwv, elevation))
     assert right == pytest.approx(table, rel=2e-3)
     narrow = Band(name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz")
-    one = BandAtmosphere(narrow, a.profile, 2 * a.pwv)
-    alone = float(one.emission_difference(a.pwv, step, elevation)) / step / float(one.transmission(a.pwv, elevation))
-    bound = _slope(_BandTransfer(narrow, a.profile.layers), a.pwv, elevation)
+    one = BandAtmosphere(narrow, m.profile, 2 * m.pwv)
+    alone = float(one.emission_difference(m.pwv, step, elevation)) / step / float(one.transmission(m.pwv, elevation))
+    bound = _slope(BandTransfer(narrow, m.profile.layers), m.pwv, elevation)
     assert alone == pytest.approx(bound, rel=2e-3)
 
 
 @pytest.mark.parametrize("speed", [3.0, 30.0])
 def test_what_of_the_air_is_faster_than_a_frequency(speed):
     """The spectrum of exp(-(v t)^2 / 4 e), by a numerical transform, against the share erfc(2 pi f sqrt(e) / v)."""
-    from zonda.operators.atmosphere.planning import Air
-    from zonda.operators.atmosphere.turbulence.nodes import LayerModel
+    from zonda.operators.atmosphere.turbulence.nodes import Layer
 
-    model = LayerModel(1.0, 1000.0, 1000.0, 500.0, 40.0)
-    a = Air(None, None, 1e-3, [None], [model], [1.0], 1.0, 1.0, (0.7, 0.8), [np.array([[speed], [0.0]])])
+    model = Layer(1.0, 1000.0, 1000.0, 500.0, 40.0)
+    a = Calibrated([model], [1.0], 1.0, 0.0, [np.array([[speed], [0.0]])], None, (0.7, 0.8))
     t = np.arange(1 << 16) * 0.05
     e, w = model.gaussian()
     covariance = np.exp(-np.multiply.outer(t**2 * speed**2, 1 / (4 * e))) @ w

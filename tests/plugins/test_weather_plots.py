@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from zonda.core import registry, weather
 from zonda.core.configuration.time import Instant
 from zonda.operators.atmosphere.weather.absorption import absorption_table
-from zonda.operators.atmosphere.weather.sources import air_of
+from zonda.operators.atmosphere.weather.sources import profile_of
 from zonda.operators.atmosphere.weather.summary import water_by_month
 from zonda.plugins.weather_plots import LINES, plot_spectrum, spread, weather_figure
 
@@ -25,7 +25,7 @@ def site():
 @pytest.fixture(scope="module")
 def air(site):
     cls, values = weather.resolve({"pwv": "0.7 mm"})
-    return air_of(cls.model_validate(values), site, Instant.parse("2024-08-01T05:00"), 0)
+    return profile_of(cls.model_validate(values), site, Instant.parse("2024-08-01T05:00"), 0)
 
 
 @pytest.fixture(scope="module")

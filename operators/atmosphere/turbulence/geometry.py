@@ -140,7 +140,7 @@ class Cone:
 
 
 @dataclass(frozen=True)
-class Track:
+class ScanPlane:
     """The plane of one scan, equations (1) to (4).
 
     Attributes
@@ -178,6 +178,11 @@ class Track:
     drift: Floats
     drift_bound: float
     cone: Cone | None = None
+
+    @property
+    def stretch(self) -> float:
+        """What separations along the elevation are too large by."""
+        return 1 / math.sin(self.elevation) if self.kind == "horizontal" else 1.0
 
     def unroll(self, crossings: Floats) -> Floats:
         """M (X - X_k), or equation (4): positions per metre of height, (2, ...)."""
@@ -220,7 +225,7 @@ class Track:
         return self.effective(height) * turn, start, turn @ (self.drift @ -wind)
 
 
-def plane(observation: Observation) -> Track:
+def scan_plane(observation: Observation) -> ScanPlane:
     """The plane of one scan by itself (alpha and advection zero).
 
     A separation seen along u has the metric G = 1 - u_h u_h^T, the plane of n has 1 - n_h n_h^T and the horizontal plane 1. The
@@ -246,14 +251,14 @@ def plane(observation: Observation) -> Track:
         if bound < min(transverse, flat):
             drift, drift_bound = _mean_drift(cone, crossing(boresight))
             there = np.eye(2) - (1 - np.sin(elevation)) * np.outer(a, a)
-            return Track(
+            return ScanPlane(
                 there, a / np.tan(elevation), nothing, no_advection, there, elevation, "cone", bound, drift, drift_bound, cone,
             )  # fmt: skip
     elevation, centre = float(np.arcsin(n[2])), n[:2] / n[2]
     if transverse > max(0.5 * flat, FLAT):
         elevation = float(np.median(np.arcsin(boresight[2])))  # the mean direction may be the zenith
-        return Track(np.eye(2), centre, nothing, no_advection, np.eye(2), elevation, "horizontal", flat, np.eye(2), flat)
-    return Track(matrix, centre, nothing, no_advection, matrix, elevation, "transverse", transverse, matrix, transverse)
+        return ScanPlane(np.eye(2), centre, nothing, no_advection, np.eye(2), elevation, "horizontal", flat, np.eye(2), flat)
+    return ScanPlane(matrix, centre, nothing, no_advection, matrix, elevation, "transverse", transverse, matrix, transverse)
 
 
 def _mean_drift(cone: Cone, crossings: Floats) -> tuple[Floats, float]:
@@ -281,11 +286,11 @@ def _error(metric: Floats, u: Floats) -> float:
     return float((norm / u[2] ** 2).max())
 
 
-def tracks(observations: Sequence[Observation]) -> list[Track]:
-    """One `Track` per observation, in order of time given; positions are counted from the first one's start."""
-    out: list[Track] = []
+def scan_planes(observations: Sequence[Observation]) -> list[ScanPlane]:
+    """One `ScanPlane` per observation, in order of time given; positions are counted from the first one's start."""
+    out: list[ScanPlane] = []
     for k, observation in enumerate(observations):
-        here = plane(observation)
+        here = scan_plane(observation)
         if not out:
             out.append(replace(here, alpha=here.matrix @ here.centre))
             continue

@@ -24,7 +24,7 @@ from zonda.core.data import Observation
 from zonda.core.errors import PointingError
 from zonda.core.types import Floats
 
-from .geometry import Cone, Track, axes_at, rim
+from .geometry import Cone, ScanPlane, axes_at, rim
 
 _ERROR = 1e-9
 """Of a polynomial in equation (1): micrometres at a layer some kilometres away."""
@@ -43,7 +43,7 @@ class LinesOfSight:
 
     Parameters
     ----------
-    observation, track
+    observation, plane
         The scan and its plane.
     step
         Samples between the times.
@@ -61,7 +61,7 @@ class LinesOfSight:
         Where a line of sight is at or below the horizon.
     """
 
-    def __init__(self, observation: Observation, track: Track, step: int, first: int, count: int) -> None:
+    def __init__(self, observation: Observation, plane: ScanPlane, step: int, first: int, count: int) -> None:
         self.step, self.first, self.count = step, first, count
         index = step * (first + np.arange(count, dtype=np.int64))
         self.seconds = observation.seconds_at(index)
@@ -70,16 +70,16 @@ class LinesOfSight:
         linear = np.stack([axes[:, :, 2], -axes[:, :, 1], -axes[:, :, 0]], axis=2)
         xi, eta = rim(observation.focalplane.xi, observation.focalplane.eta)
         self.low, self.high = self._sines(linear[:, 2], np.r_[0.0, xi], np.r_[0.0, eta])
-        self._cone = track.cone
-        if track.cone is None:
-            rows = np.concatenate([np.einsum("ab,nbc->nac", track.matrix, linear[:, :2]), linear[:, 2:]], axis=1)
-            self._shift = track.matrix @ track.centre
+        self._cone = plane.cone
+        if plane.cone is None:
+            rows = np.concatenate([np.einsum("ab,nbc->nac", plane.matrix, linear[:, :2]), linear[:, 2:]], axis=1)
+            self._shift = plane.matrix @ plane.centre
             self._turn = np.zeros((2, 0))
             self._series: tuple[Floats, ...] = ()
         else:
-            rows, self._turn = _about_the_boresight(linear, track.cone)
-            self._shift = np.cos(track.cone.elevation) * track.cone.axis
-            self._series = self._polynomials(track.cone, rows, np.r_[0.0, xi], np.r_[0.0, eta])
+            rows, self._turn = _about_the_boresight(linear, plane.cone)
+            self._shift = np.cos(plane.cone.elevation) * plane.cone.axis
+            self._series = self._polynomials(plane.cone, rows, np.r_[0.0, xi], np.r_[0.0, eta])
         self._linear = np.ascontiguousarray(np.moveaxis(rows.reshape(count, 9), 0, 1))  # (9, n)
 
     def __call__(self, xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats, Floats]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -48,8 +48,20 @@ _SERIES, _SERIES_TO = 7, 0.03
 
 
 @dataclass(frozen=True)
-class LayerModel:
-    """What the bounds need of one layer: share of the fluctuation, line-of-sight distance and height [m], r0, sigma [m]."""
+class Layer:
+    """One layer as a telescope sees it: its share a_l of the fluctuation; lengths in metres.
+
+    Attributes
+    ----------
+    height, distance
+        Above the site, and along the mean line of sight.
+    outer_scale, sigma
+        r0, and the standard deviation of the Gaussian footprint.
+    aperture
+        A footprint with a rim; ``sigma`` is then that of the Gaussian of equal second moment.
+    wind
+        Velocity of its air (east, north), m/s.
+    """
 
     amplitude: float
     height: float
@@ -57,7 +69,7 @@ class LayerModel:
     outer_scale: float
     sigma: float
     aperture: Aperture | None = None
-    """A footprint with a rim; ``sigma`` is then that of the Gaussian of equal second moment."""
+    wind: Floats = field(default_factory=lambda: np.zeros(2), compare=False)
 
     def components(self) -> tuple[Floats, Floats]:
         """(e, w) of equation (1); behind an aperture those of a spectrum that is nowhere smaller (`Aperture.bound`)."""
@@ -69,7 +81,7 @@ class LayerModel:
 
 
 @lru_cache(maxsize=64)
-def _components(layer: LayerModel) -> tuple[Floats, Floats]:
+def _components(layer: Layer) -> tuple[Floats, Floats]:
     if layer.aperture is None:
         return layer.gaussian()
     square, share = layer.aperture.bound()
@@ -131,7 +143,7 @@ def detectors_as_nodes(xi: Floats, eta: Floats) -> Nodes:
     return Nodes(np.asarray(xi, np.float64), np.asarray(eta, np.float64), np.zeros((0, 0)), None)
 
 
-def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float = 1.0) -> float:
+def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float = 1.0) -> float:
     """Expected rms error of the interpolation to detectors at (xi, eta), in units of the fluctuation before the beam.
 
     Equation (1), mean over the detectors. ``stretch`` multiplies distances along eta (1 / sin(elevation) where the
@@ -143,7 +155,7 @@ def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[La
     return _grid_error(nodes.xi[::ny], nodes.eta[:ny], xi, eta, layers, stretch)
 
 
-def _grid_error(x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float) -> float:
+def _grid_error(x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float) -> float:
     components = [layer.components() for layer in layers]
     weight = np.concatenate([layer.amplitude**2 * w for layer, (_, w) in zip(layers, components, strict=True)])
     nearness = np.concatenate([layer.distance**2 / (4 * e) for layer, (e, _) in zip(layers, components, strict=True)])
@@ -163,7 +175,7 @@ def _separable(nodes: Floats, points: Floats, nearness: Floats) -> tuple[Floats,
     return np.matmul(weights[:, None, :], cross)[:, 0], own + pairs @ among
 
 
-def differential_rms(xi: Floats, eta: Floats, layers: Sequence[LayerModel], stretch: float = 1.0) -> float:
+def differential_rms(xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float = 1.0) -> float:
     """Expected rms of the fluctuation minus its focal-plane mean, in units of the fluctuation before the beam."""
     i, j = np.triu_indices(len(xi), 1)
     square = (xi[i] - xi[j]) ** 2 + (stretch * (eta[i] - eta[j])) ** 2
@@ -187,7 +199,7 @@ def _gone(nearness: Floats, square: Floats) -> Floats:
     return out
 
 
-def some(xi: Floats, eta: Floats, number: int = _TRIED) -> tuple[Floats, Floats]:
+def spread_evenly(xi: Floats, eta: Floats, number: int = _TRIED) -> tuple[Floats, Floats]:
     """At most ``number`` detectors evenly taken from the list, the outermost four included."""
     if len(xi) <= number:
         return xi, eta
@@ -197,13 +209,13 @@ def some(xi: Floats, eta: Floats, number: int = _TRIED) -> tuple[Floats, Floats]
 
 
 def choose_nodes(
-    xi: Floats, eta: Floats, layers: Sequence[LayerModel], tolerance: float, stretch: float = 1.0, at_least: int = 1
+    xi: Floats, eta: Floats, layers: Sequence[Layer], tolerance: float, stretch: float = 1.0, at_least: int = 1
 ) -> tuple[Nodes, float]:
     """The coarsest grid whose `focal_plane_error` is <= ``tolerance``, and that error.
 
     Where a grid would need as many nodes as there are detectors, the detectors are the nodes. ``at_least`` nodes per axis.
     """
-    some_xi, some_eta = some(xi, eta)
+    some_xi, some_eta = spread_evenly(xi, eta)
 
     @cache
     def error(n: int) -> float:
@@ -277,7 +289,7 @@ def spline_error(q: Floats) -> Floats:
     return np.asarray(np.exp(log_error), np.float64)
 
 
-def time_error(layers: Sequence[LayerModel], speeds: Sequence[Floats], deltas: Sequence[float], dt: float) -> float:
+def time_error(layers: Sequence[Layer], speeds: Sequence[Floats], deltas: Sequence[float], dt: float) -> float:
     """Expected rms error of the spline in time, equation (2), in units of the fluctuation before the beam.
 
     ``speeds``: per layer, speeds [m/s] that the rays have at times evenly spread over the scan (the mean of E_t is
@@ -288,7 +300,7 @@ def time_error(layers: Sequence[LayerModel], speeds: Sequence[Floats], deltas: S
 
 
 def time_error_within(
-    layers: Sequence[LayerModel], speeds: Sequence[Floats], deltas: Sequence[float], dt: float, allowed: float
+    layers: Sequence[Layer], speeds: Sequence[Floats], deltas: Sequence[float], dt: float, allowed: float
 ) -> bool:
     """Whether `time_error` is at most ``allowed``; only as many layers are looked at as it takes to exceed it."""
     total = 0.0
@@ -299,7 +311,7 @@ def time_error_within(
     return True
 
 
-def layer_time_error(layer: LayerModel, speeds: Floats, delta: float, dt: float) -> float:
+def layer_time_error(layer: Layer, speeds: Floats, delta: float, dt: float) -> float:
     """One layer's part of `time_error`, squared."""
     e, w = layer.components()
     share = spline_error(np.multiply.outer(speeds, dt / np.sqrt(e))).mean(0) @ w

@@ -24,7 +24,7 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
 from zonda.core.types import Floats
 
-from .geometry import Track, rim
+from .geometry import ScanPlane, rim
 from .lattice import Field, Turbulence
 from .lines_of_sight import LinesOfSight
 
@@ -119,7 +119,7 @@ class Tiles:
         return made
 
 
-class Layers:
+class DriftingLayers:
     """The sum of drifting layers at any focal-plane points and times of one scan, in units of the PWV's rms.
 
     Times are numbered in units of ``step``: time k is sample k step. Layers that take a coarser step of their own are
@@ -127,16 +127,16 @@ class Layers:
 
     Parameters
     ----------
-    observation, track
+    observation, plane
         The scan and its plane.
-    xi, eta
-        The focal-plane points that will be asked for.
+    points
+        The focal-plane points (xi, eta) that will be asked for.
     drifting
         The layers; their steps are ``step`` times powers of two.
     step
         Samples between times.
-    first, stop
-        Times that may be asked for.
+    span
+        First time that may be asked for, and the one after the last.
     dtype
         What the splines over the lattices are summed in: float32 is right to 1e-7 of each layer.
 
@@ -151,25 +151,24 @@ class Layers:
     def __init__(
         self,
         observation: Observation,
-        track: Track,
-        xi: Floats,
-        eta: Floats,
+        plane: ScanPlane,
+        points: tuple[Floats, Floats],
         drifting: Sequence[Drifting],
         step: int,
-        first: int,
-        stop: int,
+        span: tuple[int, int],
         dtype: type = np.float64,
     ) -> None:
+        first, stop = span
         self._drifting, self._step, self._tiles = list(drifting), step, Tiles()
         self.paths: dict[int, LinesOfSight] = {}
         for own in sorted({step, *(d.step for d in drifting)}):
             low, high = (first, stop) if own == step else _coarse(first, stop, own // step)
-            self.paths[own] = LinesOfSight(observation, track, own, low, high - low)
+            self.paths[own] = LinesOfSight(observation, plane, own, low, high - low)
         self._constants: list[NDArray[np.floating]] = [
             np.array([1 / 6, 2 / 3, 0.5, 1.0, d.amplitude], dtype) for d in self._drifting
         ]
-        self._places = [_place(track, d, self.paths[d.step].seconds) for d in self._drifting]
-        swept = self._swept(*rim(xi, eta))
+        self._places = [_place(plane, d, self.paths[d.step].seconds) for d in self._drifting]
+        swept = self._swept(*rim(*points))
         self._slabs = [_slab(box, cells) for box, cells in swept]
         self._sides = [STRIP if box[1] - box[0] < NARROW else SQUARE for box, _ in swept]
         self._pieces = [_widened(box) for box, _ in swept]
@@ -285,12 +284,12 @@ def _coarse(first: int, stop: int, ratio: int) -> tuple[int, int]:
     return first // ratio - PAD - SPLINE_MARGIN, (stop - 1) // ratio + 3 + SPLINE_MARGIN
 
 
-def _place(track: Track, layer: Drifting, seconds: Floats) -> tuple[Floats, Floats, Floats]:
+def _place(plane: ScanPlane, layer: Drifting, seconds: Floats) -> tuple[Floats, Floats, Floats]:
     """Lattice coordinates (across, along the wind) = matrix (x, y) + (i, j) of positions per metre of height.
 
     Equation (2) of `geometry`; matrix (4,), i and j at ``seconds``, both about 0 where the scan begins.
     """
-    matrix, start, velocity = track.affine(layer.height, layer.wind)
+    matrix, start, velocity = plane.affine(layer.height, layer.wind)
     d = layer.field.spacing
     i, j = (np.asarray((b + v * seconds) / d, np.float64) for b, v in zip(start, velocity, strict=True))
     return matrix.ravel() / d, i, j

@@ -74,7 +74,7 @@ class BandAtmosphere:
         check_pwv(self.pwv_max)
         if self.pwv_max == 0:
             raise InputError("the air is dry, so there is no water to vary", cure="give a PWV above 0 mm")
-        self._transfer = _BandTransfer(band, replace(profile.layers, spectra=spectra))
+        self._transfer = BandTransfer(band, replace(profile.layers, spectra=spectra))
         self._v_max = -math.log(math.sin(ELEVATION_MIN))
         for n_u, n_v, ratio in GRIDS:
             self._scale, self._u_max = self.pwv_max / ratio, math.log1p(ratio)
@@ -191,7 +191,7 @@ class BandAtmosphere:
         return found.reshape(elevation.shape)
 
 
-class _BandTransfer:
+class BandTransfer:
     """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln transmission, ln background) each."""
 
     def __init__(self, band: Band, layers: Layers) -> None:

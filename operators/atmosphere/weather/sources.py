@@ -85,7 +85,7 @@ DRY = 1e-12
 """m: what air of 0 mm is given, so that its profile keeps the shape of the water; it absorbs 1e-9 of what a millimetre does."""
 
 
-def air_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None) -> Profile:
+def profile_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None) -> Profile:
     """The air of a scene; its ``stated`` says what was taken, and why.
 
     Parameters
@@ -138,7 +138,7 @@ def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None
 
 def of_scene(scene: Scene) -> GroundWeather:
     """What instruments at the telescope read in the air of a scene at its start."""
-    return on_the_ground(air_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
+    return on_the_ground(profile_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
 
 
 def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 import zonda
-from zonda.operators.atmosphere.layers import beam_sigma
+from zonda.operators.atmosphere.model import beam_sigma
 from zonda.operators.atmosphere.turbulence.covariance import beam_structure
 
 HEIGHT, ELEVATION, P, SEEDS = 2000.0, 50.0, 0.02, 30

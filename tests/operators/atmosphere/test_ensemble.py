@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.operators.atmosphere.layers import beam_sigma
+from zonda.operators.atmosphere.distribution import Fluctuation
+from zonda.operators.atmosphere.model import beam_sigma
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation
 
 HEIGHT, SPEED, P = 1500.0, 8.0, 0.02
@@ -68,10 +69,10 @@ def test_between_and_within_scans(seconds):
 def test_covariance_of_the_log_normal_water(rho):
     """Two lines of sight with normal correlation rho: <y1 y2> = exp(s^2 v rho) - 1, and neighbours' differences follow."""
     p, v, n = 0.4, 0.9, 2_000_000
-    air = zonda.AtmosphereLayers(pwv="1 mm", pwv_rms=p, pwv_rms_after_beam=True)
+    law = Fluctuation(p, True, v)
     first, second = np.random.default_rng(3).standard_normal((2, n))
     g = np.sqrt(v) * np.array([first, rho * first + math.sqrt(1 - rho**2) * second])
-    one, other = air._water(g, p / math.sqrt(v), v)
+    one, other = law(g)
     assert min(one.min(), other.min()) > -1
     s2v = math.log1p(p**2)  # after the beam: s^2 v gives the rms that was asked for
     product, difference = one * other, (one - other) ** 2

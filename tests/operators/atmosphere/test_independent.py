@@ -160,7 +160,7 @@ def test_ten_layers_add_up_to_the_rms_asked_for(bench: Any, beam: str, diameter:
     r0, el, rms = 20.0, math.radians(60.0), 0.01
     angle = 4.0 / (1500 / math.sin(el))
     o = observe(8000.0, 0.25, 60.0, 0.0, camera=instrument(diameter=f"{diameter} m"), offsets=([0.0, angle], [0.0, 0.0]), seed=6)
-    profile, _ = zonda.AtmosphereLayers(pwv="7.7 mm")._weather(o)
+    profile = zonda.AtmosphereLayers(pwv="7.7 mm").model(o).profile
     heights = np.linspace(500.0, 5000.0, 10)
     vapour = np.asarray(profile.at(heights).vapour_density)
     share = vapour / math.sqrt((vapour**2).sum())
@@ -194,7 +194,8 @@ def test_streams_are_the_radiative_transfer_at_the_water_they_state(
     camera = instrument(diameter="50 m").model_copy(update={"band": Band(name="b", low=low, high=high)})
     o = observe(200.0, 1.0, elevation, camera=camera, offsets=([0.0, 1e-3], [0.0, 2e-3]), seed=4)
     parameters = {"pwv": f"{pwv} mm", "pwv_rms": rms, "layers": 3, "wind": {"speed": "15 m/s"}}
-    profile, band = zonda.AtmosphereLayers(**parameters)._weather(o)
+    model = zonda.AtmosphereLayers(**parameters).model(o)
+    profile, band = model.profile, model.band
     (o,) = streams([o], bench, **parameters)
     heights = np.linspace(500.0, 5000.0, 3)
     air = profile.at(heights)
@@ -233,7 +234,7 @@ def test_log_normal_water_has_the_mean_and_rms_asked_for_and_stays_positive(benc
     square, error = mean_and_error(y**2)
     assert error < 0.12 * expected
     assert abs(square - expected) < 4 * error
-    assert o.tally.get("AtmosphereLayers", "node values of the water clipped to the table") == 0
+    assert o.tally.get("AtmosphereLayers", "node values of the PWV clipped to the table") == 0
 
 
 # ------------------------------------------------------------------------------------------------------------ the lattice

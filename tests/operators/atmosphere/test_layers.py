@@ -15,15 +15,19 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import ZondaError
 from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.plan.planning import planning_of
 from zonda.core.run.blocks import cut
 from zonda.core.scene import Scene
 from zonda.core.site import Site
 from zonda.operators.atmosphere import fluctuations, resolution
+from zonda.operators.atmosphere.distribution import Fluctuation
 from zonda.operators.atmosphere.fluctuations import AtNodes, OfDetectors
-from zonda.operators.atmosphere.layers import AtmosphereLayers, Wind, _model, _turbulence, beam_sigma
+from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.atmosphere.model import beam_sigma
+from zonda.operators.atmosphere.parameters import Wind
 from zonda.operators.atmosphere.turbulence import sampling
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
-from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, tracks
+from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, scan_planes
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 from zonda.operators.atmosphere.turbulence.nodes import differential_rms
 
@@ -103,16 +107,14 @@ def whole(observation: Observation, state: AtNodes | OfDetectors, name: str = "e
 def water(op: AtmosphereLayers, observation: Observation) -> Floats:
     """y of every detector and sample: relative fluctuation of the water, from the emission and its slope (y << 1)."""
     emission = whole(observation, op.prepare(observation))
-    _, band = op._weather(observation)
+    band = op.model(observation).band
     u = rays(axes(observation.boresight_azel), observation.focalplane.xi, observation.focalplane.eta)
     slope = (band.emission(PWV * 1.001, np.arcsin(u[2])) - band.emission(PWV * 0.999, np.arcsin(u[2]))) / 0.002
     return emission / slope
 
 
 def layers_of(op: AtmosphereLayers, observation: Observation) -> list[Any]:
-    profile, _ = op._weather(observation)
-    track = tracks([observation])[0]
-    return [_model(op, layer, track, observation) for layer in op._layers(profile)]
+    return op.model(observation).layers
 
 
 def expected_variance(op: AtmosphereLayers, observation: Observation) -> float:
@@ -183,17 +185,17 @@ def test_rms_after_the_beam_is_the_option() -> None:
 
 def test_large_rms_takes_the_log_normal_map_and_keeps_mean_and_rms() -> None:
     # Single lines of sight of n = 1500 seeds, through the map itself: y = exp(s g - s^2 v / 2) - 1 with g normal.
-    op = operator(pwv_rms="40 %", pwv_rms_after_beam=True)
+    op, law = operator(pwv_rms="40 %", pwv_rms_after_beam=True), Fluctuation(0.4, True, 0.9)
     g = np.random.default_rng(0).standard_normal(400_000) * np.sqrt(0.9)
-    y = op._water(g, 0.4 / np.sqrt(0.9), 0.9)
+    y = law(g)
     assert y.min() > -1
     assert y.mean() == pytest.approx(0, abs=4 * 0.4 / np.sqrt(len(g)))
     assert y.std() == pytest.approx(0.4, rel=0.02)
     o = observe(5.0)
     op.prepare(o)
-    assert ("AtmosphereLayers", "distribution of the water", "log-normal") in list(o.tally)
-    assert o.tally.get("AtmosphereLayers", "values of the water clipped to the table") == 0
-    covariance = np.mean(op._water(g, 1.0, 0.9) * op._water(g, 1.0, 0.9))  # exp(s^2 v) - 1 = p^2
+    assert ("AtmosphereLayers", "distribution of the PWV", "log-normal") in list(o.tally)
+    assert o.tally.get("AtmosphereLayers", "values of the PWV clipped to the table") == 0
+    covariance = np.mean(law(g) * law(g))  # exp(s^2 v) - 1 = p^2
     assert covariance == pytest.approx(0.16, rel=0.03)
 
 
@@ -214,12 +216,11 @@ def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: st
     # `tolerance` is a fraction of what the focal-plane mean leaves; from here on of the whole fluctuation.
     left = differential_rms(o.focalplane.xi, o.focalplane.eta, layers_of(op, o))
     tolerance *= op.pwv_rms * left / np.sqrt(expected_variance(op, o))
-    profile, band = op._weather(o)
-    track = tracks([o])[0]
+    model = op.model(o)
+    band, track = model.band, model.plane
     u = rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)
     g = np.zeros(u.shape[1:])
-    for number, layer in enumerate(op._layers(profile)):
-        beam = _turbulence(op, o, number, _model(op, layer, track, o))
+    for layer, beam in zip(model.layers, model.turbulence, strict=True):
         across, along = track.positions(crossing(u), o.seconds, layer.height, layer.wind)
         g += layer.amplitude * at_points(beam, across, along)
     elevation = np.arcsin(u[2])
@@ -443,7 +444,7 @@ def test_detectors_below_a_telescopes_limit_see_the_air_there() -> None:
     o = observe(10.0, elevation=5.0)
     op = operator()
     op.prepare(o)
-    _, band = op._weather(o)
+    band = op.model(o).band
     lowest = int(o.focalplane.eta.argmin())
     elevation = np.radians(5.0) + np.arctan(o.focalplane.eta[lowest])
     assert elevation < np.radians(4.97)
@@ -457,7 +458,7 @@ def test_mean_emission_is_as_good_at_the_ends_of_a_scan_as_inside(seconds: float
     o = observe(seconds, elevation=30.0, scan=4.0)
     op = operator()
     op.prepare(o)
-    _, band = op._weather(o)
+    band = op.model(o).band
     field, n = o.smooth["atmosphere"], o.n_samples
     d = int(o.focalplane.eta.argmax())
     truth = band.emission(PWV, np.arcsin(rays(axes(o.boresight_azel), o.focalplane.xi[[d]], o.focalplane.eta[[d]])[2, 0]))
@@ -498,7 +499,7 @@ def test_wide_throws_unroll_the_cone(elevation: float, throw: float, field: str,
     # Pairs of detectors, any azimuth of the scan: squared separation on the plane against that across the line of sight.
     camera = instrument(detectors=61, field=field, diameter="6 m")
     o = swept(elevation, back_and_forth(throw), camera)
-    track = tracks([o])[0]
+    track = scan_planes([o])[0]
     assert track.kind == "cone"
     assert track.bound < bound
     u = rays(axes(o.boresight_azel[::200]), o.focalplane.xi, o.focalplane.eta)
@@ -513,12 +514,12 @@ def test_wide_throws_unroll_the_cone(elevation: float, throw: float, field: str,
 
 
 def test_a_narrow_scan_keeps_one_plane_and_the_horizon_falls_back() -> None:
-    narrow = tracks([observe(40.0, elevation=50.0, scan=4.0)])[0]
+    narrow = scan_planes([observe(40.0, elevation=50.0, scan=4.0)])[0]
     assert (narrow.kind, narrow.cone) == ("transverse", None)
     assert narrow.bound < 0.01
     np.testing.assert_array_equal(narrow.drift, narrow.matrix)
     o = swept(50.0, np.linspace(0, 360, 2000))
-    track = tracks([o])[0]
+    track = scan_planes([o])[0]
     assert track.kind == "horizontal"
     assert track.bound == pytest.approx(1 / np.tan(np.radians(50.0)) ** 2, rel=0.01)
     operator(layers=2, tolerance="20 %").prepare(o)
@@ -528,7 +529,7 @@ def test_a_narrow_scan_keeps_one_plane_and_the_horizon_falls_back() -> None:
 
 def test_the_cone_is_the_plane_to_first_order_and_wind_drifts_within_its_bound() -> None:
     o = swept(50.0, back_and_forth(60.0))
-    track = tracks([o])[0]
+    track = scan_planes([o])[0]
     h = 1e-5
     for e in np.eye(2):
         moved = track.unroll((track.centre + h * e)[:, None]) - track.unroll(track.centre[:, None])
@@ -547,7 +548,7 @@ def test_transverse_plane_measures_separations_across_the_line_of_sight() -> Non
     # Detectors 1 arcmin apart in any direction, at any elevation, are z theta apart on the plane.
     for elevation in (20.0, 57.0, 89.0):
         o = observe(1.0, elevation=elevation)
-        track = tracks([o])[0]
+        track = scan_planes([o])[0]
         theta = np.radians(1 / 60)
         angle = np.linspace(0, 2 * np.pi, 9)
         u = rays(axes(o.boresight_azel[:1]), np.r_[0, theta * np.cos(angle)], np.r_[0, theta * np.sin(angle)])
@@ -573,11 +574,10 @@ def test_wind_directions_are_where_the_wind_comes_from() -> None:
 def test_winds_and_weights_per_layer() -> None:
     o = observe(1.0)
     op = operator(layers=2, wind=[{"speed": "3 m/s"}, {"speed": "5 m/s", "direction": "0 deg"}], weights="equal")
-    profile, _ = op._weather(o)
-    one, two = op._layers(profile)
+    one, two = op.model(o).layers
     np.testing.assert_allclose([one.amplitude, two.amplitude], np.sqrt(0.5))
     np.testing.assert_allclose([one.wind, two.wind], [[3, 0], [0, -5]], atol=1e-14)
-    vapour = operator()._layers(profile)
+    vapour, profile = operator().model(o).layers, op.model(o).profile
     assert sum(v.amplitude**2 for v in vapour) == pytest.approx(1)
     assert [v.amplitude for v in vapour] == sorted((v.amplitude for v in vapour), reverse=True)
     np.testing.assert_allclose(vapour[3].wind, [profile.at(2000.0).wind_east, profile.at(2000.0).wind_north])
@@ -812,7 +812,7 @@ def test_a_pipeline_gives_the_same_bits_in_any_order_of_blocks(kept: int, bench:
     monkeypatch.setattr(fluctuations, "BYTES_KEPT", kept)
     steps = [operator(layers=1, lowest="3 km")]
     state = steps[0].prepare(o)
-    assert steps[0].in_time_order(o, state) is (kept == 0)
+    assert planning_of(steps[0]).in_time_order(o) is (kept == 0)
     assert [
         s.in_time_order for s in cut([*steps, HighpassFilter(frequency="0.1 Hz")], o, [steps[0].label] if kept == 0 else [])
     ] == ([True, False] if kept == 0 else [False])
@@ -822,12 +822,11 @@ def test_a_pipeline_gives_the_same_bits_in_any_order_of_blocks(kept: int, bench:
 
 def directly(op: AtmosphereLayers, o: Observation) -> tuple[Floats, Any, Floats]:
     """(sum of the layers, band, elevation) at every detector and sample."""
-    track = tracks([o])[0]
+    model = op.model(o)
+    band, track = model.band, model.plane
     u = rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)
-    profile, band = op._weather(o)
     g = np.zeros(u.shape[1:])
-    for number, layer in enumerate(op._layers(profile)):
-        beam = _turbulence(op, o, number, _model(op, layer, track, o))
+    for layer, beam in zip(model.layers, model.turbulence, strict=True):
         across, along = track.positions(crossing(u), o.seconds, layer.height, layer.wind)
         g += layer.amplitude * at_points(beam, across, along)
     return g, band, np.arcsin(u[2])
@@ -852,7 +851,7 @@ def test_wind_along_across_and_against_the_scan(direction: float) -> None:
     # layer, and so do they on the plane; s = w along the scan would see the same air for ever.
     az = 180 + np.arange(500) * 0.002 / np.cos(np.radians(50.0))
     o = swept(50.0, az, instrument(detectors=1, field="0 deg"))
-    track = tracks([o])[0]
+    track = scan_planes([o])[0]
     speed = np.radians(0.2) * 2000 / np.sin(np.radians(50.0))
     # Looking south with growing azimuth: the line of sight moves west.
     wind = speed * np.array([-np.cos(np.radians(direction)), np.sin(np.radians(direction))])
@@ -862,15 +861,3 @@ def test_wind_along_across_and_against_the_scan(direction: float) -> None:
     foreshortened = np.array([wind[0], wind[1] * np.sin(np.radians(50.0))])
     expected = np.hypot(-speed - foreshortened[0], -foreshortened[1])
     np.testing.assert_allclose(step, expected, atol=0.03 * speed)  # the path is an arc: 1.5 deg of azimuth
-
-
-def test_companion_runs_look_through_the_air_that_was_drawn():
-    observation, operator = observe(), AtmosphereLayers(pwv="7.7 mm")
-    first = operator.prepare(observation)
-    assert isinstance(first, AtNodes)
-    rows, means = list(observation.tally), dict(observation.smooth)
-    observation.tally, observation.smooth = type(observation.tally)(), {}  # as a run begins
-    assert operator.prepare(observation) is first
-    assert list(observation.tally) == rows
-    assert observation.smooth == means
-    assert AtmosphereLayers(pwv="15 mm").prepare(observation) is not first  # another operator's is not taken

@@ -11,7 +11,7 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.errors import ZondaError
-from zonda.operators.atmosphere.turbulence.geometry import tracks
+from zonda.operators.atmosphere.turbulence.geometry import scan_planes
 
 from .test_layers import instrument, observe, operator, swept
 
@@ -115,7 +115,7 @@ def test_nan_in_the_pointing_is_named() -> None:
 def test_a_scan_round_the_horizon_is_at_its_own_elevation() -> None:
     # Footprints, separations and every error bound use height / sin(elevation): half of it at 30 deg, and the nodes are wrong
     # by 2.4e-3 of the fluctuation where the report states 3e-5 (50 m, 0.5 deg).
-    track = tracks([swept(30.0, np.linspace(0, 360, 2000), instrument(detectors=1, field="0 deg"))])[0]
+    track = scan_planes([swept(30.0, np.linspace(0, 360, 2000), instrument(detectors=1, field="0 deg"))])[0]
     assert track.elevation == pytest.approx(np.radians(30.0), abs=1e-3)
 
 

@@ -16,10 +16,10 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal.windows import blackmanharris
 from scipy.special import erfc
 
-from zonda.operators.atmosphere.layers import beam_sigma
+from zonda.operators.atmosphere.model import beam_sigma
 from zonda.operators.atmosphere.turbulence.beams import widened
 from zonda.operators.atmosphere.turbulence.covariance import NU, beam_correlation, beam_structure, mixture
-from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, tracks
+from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, scan_planes
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
 from .test_layers import instrument, layers_of, observe, operator, quaternions, water
@@ -132,13 +132,12 @@ def test_the_fast_path_has_the_statistics_of_the_direct_sum(diameter: str, field
         y = water(op, o)[:, ::5] / op.pwv_rms
         fast[seed] = np.mean((y - y.mean(0)) ** 2)
         rng = np.random.default_rng(seed)
-        track = tracks([o])[0]
+        track = scan_planes([o])[0]
         u = rays(axes(o.boresight_azel[::5]), o.focalplane.xi, o.focalplane.eta)
-        profile, _ = op._weather(o)
         direct = np.zeros(u.shape[1:])
-        for model, layer in zip(layers_of(op, o), op._layers(profile), strict=True):
+        for layer in layers_of(op, o):
             across, along = track.positions(crossing(u), o.seconds[::5], layer.height, layer.wind)
-            k, a = waves(rng, 400, model.sigma)
+            k, a = waves(rng, 400, layer.sigma)
             phase = 2 * np.pi * rng.random(len(a))
             direct += layer.amplitude * np.cos(np.multiply.outer(across, k[0]) + np.multiply.outer(along, k[1]) + phase) @ a
         slow[seed] = np.mean((direct - direct.mean(0)) ** 2)

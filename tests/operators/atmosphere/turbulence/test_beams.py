@@ -15,7 +15,7 @@ from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.turbulence.beams import Aperture
 from zonda.operators.atmosphere.turbulence.covariance import beam_structure, correlation, structure
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
-from zonda.operators.atmosphere.turbulence.nodes import LayerModel
+from zonda.operators.atmosphere.turbulence.nodes import Layer
 
 Floats = NDArray[np.float64]
 OUTER_SCALE = 500.0
@@ -102,7 +102,7 @@ def test_footprints_compared() -> None:
     gaussian, disc = beam_structure(0.5, OUTER_SCALE, 6 / 2.3548)[0], Aperture(6.0).structure(0.5, OUTER_SCALE)[0]
     tapered = Aperture(6.0, 10.0).structure(0.5, OUTER_SCALE)[0]
     assert gaussian < disc < tapered
-    model = LayerModel(1.0, 500.0, 600.0, OUTER_SCALE, 1.5, Aperture(6.0))
+    model = Layer(1.0, 500.0, 600.0, OUTER_SCALE, 1.5, Aperture(6.0))
     e, w = model.components()
     assert (-np.expm1(-(0.5**2) / (4 * e)) @ w) > disc  # what the choice of nodes is judged by
 

@@ -9,7 +9,7 @@ from scipy.interpolate import make_interp_spline
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, mixture
 from zonda.operators.atmosphere.turbulence.nodes import (
     LARGEST_STEP,
-    LayerModel,
+    Layer,
     candidate_steps,
     chebyshev,
     choose_nodes,
@@ -18,16 +18,16 @@ from zonda.operators.atmosphere.turbulence.nodes import (
     focal_plane_error,
     grid,
     lagrange,
-    some,
     spline_error,
     spline_table,
+    spread_evenly,
     time_error,
     time_error_within,
 )
 
 RNG = np.random.default_rng(1)
 XI, ETA = RNG.uniform(-0.01, 0.01, (2, 300))
-LAYERS = [LayerModel(0.8, 500.0, 600.0, 500.0, 2.6), LayerModel(0.6, 3000.0, 3600.0, 500.0, 3.0)]
+LAYERS = [Layer(0.8, 500.0, 600.0, 500.0, 2.6), Layer(0.6, 3000.0, 3600.0, 500.0, 3.0)]
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
@@ -119,12 +119,12 @@ def test_differences_of_near_detectors_are_those_of_far_ones(radius: float, stre
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
 def test_the_coarsest_grid_within_tolerance_is_chosen(tolerance: float) -> None:
-    layers = [LayerModel(1.0, 500.0, 600.0, 500.0, 42.5)]
+    layers = [Layer(1.0, 500.0, 600.0, 500.0, 42.5)]
     nodes, error = choose_nodes(XI, ETA, layers, tolerance)
     assert error <= tolerance
     assert nodes.shape is not None
     coarser = nodes.shape[0] - 1
-    assert coarser == 0 or focal_plane_error(grid(XI, ETA, coarser), *some(XI, ETA), layers) > tolerance
+    assert coarser == 0 or focal_plane_error(grid(XI, ETA, coarser), *spread_evenly(XI, ETA), layers) > tolerance
 
 
 def test_where_nodes_do_not_pay_the_detectors_are_the_nodes() -> None:

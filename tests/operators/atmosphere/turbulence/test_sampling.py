@@ -17,12 +17,12 @@ from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.numerics.smooth import SPLINE_MARGIN, spline_coefficients
 from zonda.core.site import Site
 from zonda.operators.atmosphere.response import Response, airmass
-from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, tracks
+from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, scan_planes
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 from zonda.operators.atmosphere.turbulence.lines_of_sight import LinesOfSight
-from zonda.operators.atmosphere.turbulence.sampling import Drifting, Layers
+from zonda.operators.atmosphere.turbulence.sampling import Drifting, DriftingLayers
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
-from zonda.operators.atmosphere.weather.sources import air_of
+from zonda.operators.atmosphere.weather.sources import profile_of
 
 _spec = importlib.util.spec_from_file_location("direct", Path(__file__).parents[1] / "direct.py")
 assert _spec
@@ -65,7 +65,7 @@ def observation(field: str, elevation: float, throw: float, samples: int = 1200)
 @pytest.mark.parametrize("kind", SCANS)
 def test_positions_and_elevations_are_those_of_the_geometry(kind: str) -> None:
     o = observation(*SCANS[kind])
-    track = tracks([o])[0]
+    track = scan_planes([o])[0]
     assert track.kind == {"far": "cone"}.get(kind, kind)
     path = LinesOfSight(o, track, 8, -20, 200)
     xi, eta = o.focalplane.xi, o.focalplane.eta
@@ -85,7 +85,7 @@ def test_positions_and_elevations_are_those_of_the_geometry(kind: str) -> None:
 
 def test_times_outside_the_path_are_refused() -> None:
     o = observation(*SCANS["cone"])
-    path = LinesOfSight(o, tracks([o])[0], 8, -20, 200)
+    path = LinesOfSight(o, scan_planes([o])[0], 8, -20, 200)
     with pytest.raises(ValueError, match="outside"):
         path(o.focalplane.xi, o.focalplane.eta, 100, 100)
 
@@ -94,13 +94,13 @@ def test_times_outside_the_path_are_refused() -> None:
 @pytest.mark.parametrize("spacing", [4, 16])
 def test_layers_are_those_of_the_lattice_at_the_positions(kind: str, spacing: int) -> None:
     o = observation(*SCANS[kind])
-    track = tracks([o])[0]
+    track = scan_planes([o])[0]
     field = Turbulence(1, "air", outer_scale=500.0, sigma=2.6)
     other = Turbulence(1, "more", outer_scale=500.0, sigma=3.1)
     wind = np.array([7.0, -3.0])
     drifting = [Drifting(field, 800.0, 0.7, wind, 4), Drifting(other, 3000.0, 0.3, 2 * wind, spacing)]
     xi, eta = o.focalplane.xi, o.focalplane.eta
-    layers = Layers(o, track, xi, eta, drifting, 4, -30, 330)
+    layers = DriftingLayers(o, track, (xi, eta), drifting, 4, (-30, 330))
     assert (layers.cells > 1e4) is True
     total, sine = layers(xi, eta, 0, 300)
     u = rays(axes(o.boresight_azel[::4]), xi, eta)
@@ -127,7 +127,9 @@ def test_a_scan_that_sweeps_over_too_much_is_refused(monkeypatch: pytest.MonkeyP
     o = observation(*SCANS["cone"])
     field = Turbulence(1, "air", outer_scale=500.0, sigma=2.6)
     with pytest.raises(ZondaError, match=r"sweep over .* lattice points .* limit is 1e\+04"):
-        Layers(o, tracks([o])[0], np.zeros(1), np.zeros(1), [Drifting(field, 800.0, 1.0, np.zeros(2), 4)], 4, -30, 330)
+        DriftingLayers(
+            o, scan_planes([o])[0], (np.zeros(1), np.zeros(1)), [Drifting(field, 800.0, 1.0, np.zeros(2), 4)], 4, (-30, 330)
+        )
 
 
 def test_spline_coefficients_are_scipys_and_local() -> None:
@@ -144,14 +146,14 @@ def test_spline_coefficients_are_scipys_and_local() -> None:
 
 @pytest.fixture(scope="module")
 def band() -> Any:
-    profile = air_of(None, SITE, Instant.parse("2022-08-01T23:00:00Z"), 1, 1e-3)
+    profile = profile_of(None, SITE, Instant.parse("2022-08-01T23:00:00Z"), 1, 1e-3)
     return BandAtmosphere(BAND, profile, 3e-3)
 
 
 @pytest.mark.parametrize(("rms", "low"), [(0.005, 0.7), (0.05, 0.5), (0.05, 0.09), (0.12, 0.2)])
 def test_the_response_is_that_of_the_band(band: Any, rms: float, low: float) -> None:
     names = ("emission", "transmission", "opacity", "pwv", "path_delay")
-    response = Response(band, 1e-3, -8 * rms, 8 * rms, low, low + 0.1, 1500.0, 6.5, names)
+    response = Response(band, 1e-3, (-8 * rms, 8 * rms), (low, low + 0.1), 1500.0, 6.5, names)
     assert not response.exact
     rng = np.random.default_rng(1)
     y, s = rms * rng.standard_normal((4, 50)), low + 0.1 * rng.random((4, 50))
@@ -190,7 +192,7 @@ def test_wide_ranges_are_left_to_the_band(band: Any, monkeypatch: pytest.MonkeyP
     from zonda.operators.atmosphere import response as module
 
     monkeypatch.setattr(module, "_DEGREES", ((2, 2), (3, 3)))
-    response = Response(band, 1e-5, -1.0, 250.0, 0.3, 0.6, 1500.0, 6.5, ("emission",))
+    response = Response(band, 1e-5, (-1.0, 250.0), (0.3, 0.6), 1500.0, 6.5, ("emission",))
     assert response.exact
     y, s = np.array([[-0.9, 0.0, 100.0]]), np.array([[0.4, 0.5, 0.55]])
     np.testing.assert_array_equal(response("emission", y, s), band.emission_difference(1e-5, 1e-5 * y, np.arcsin(s)))
@@ -199,7 +201,7 @@ def test_wide_ranges_are_left_to_the_band(band: Any, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(("field", "elevation", "throw"), [("30 deg", 74.0, 20.0), ("12 deg", 83.0, 5.0), ("6 deg", 17.0, 60.0)])
 def test_the_polynomials_hold_near_the_zenith_and_the_horizon(field: str, elevation: float, throw: float) -> None:
     o = observation(field, elevation, throw, 400)
-    track = tracks([o])[0]
+    track = scan_planes([o])[0]
     if track.kind != "cone":
         pytest.fail(f"{track.kind}: nothing is shown")
     path = LinesOfSight(o, track, 8, 0, 50)
@@ -214,4 +216,4 @@ def test_what_no_polynomial_follows_is_refused(monkeypatch: pytest.MonkeyPatch) 
     o = observation(*SCANS["far"], samples=400)
     monkeypatch.setattr(module, "_DEGREES", (4,))  # of 35 deg, which wants 20
     with pytest.raises(ZondaError, match=r"so close to the horizon .* of the height at best"):
-        LinesOfSight(o, tracks([o])[0], 8, 0, 50)
+        LinesOfSight(o, scan_planes([o])[0], 8, 0, 50)

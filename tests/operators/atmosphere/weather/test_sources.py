@@ -19,7 +19,7 @@ from zonda.core.site import Site
 from zonda.core.weather import PWV_MAX, Column, Pwv, WeatherSource
 from zonda.operators.atmosphere.weather import humidity, standard_atmosphere
 from zonda.operators.atmosphere.weather.profiles import WaterDistribution, profile
-from zonda.operators.atmosphere.weather.sources import Climatology, Era5, Standard, Table, air_of
+from zonda.operators.atmosphere.weather.sources import Climatology, Era5, Standard, Table, profile_of
 
 _spec = importlib.util.spec_from_file_location("era5_files", Path(__file__).with_name("era5_files.py"))
 files = importlib.util.module_from_spec(_spec)
@@ -48,7 +48,7 @@ def scene(weather, **changes):
 
 def air(weather, **changes):
     s = scene(weather, **changes)
-    return air_of(s.weather, s.site, s.time, s.seed)
+    return profile_of(s.weather, s.site, s.time, s.seed)
 
 
 # ------------------------------------------------------------------------------------------------------------- what is written
@@ -211,10 +211,10 @@ def test_typical_speed_is_the_median_of_normal_components():
 def test_operator_and_scene_may_not_disagree_about_the_water():
     s = scene({"pwv": "25 %"})
     with pytest.raises(InputError, match=r"given twice: 5 mm by the operator, 25 % by the scene's weather"):
-        air_of(s.weather, s.site, s.time, 0, 5e-3)
+        profile_of(s.weather, s.site, s.time, 0, 5e-3)
     s = scene({"pwv": "5 mm"})
-    assert air_of(s.weather, s.site, s.time, 0, 5e-3).pwv == pytest.approx(5e-3)
-    assert air_of(scene({"wind": "median"}).weather, s.site, s.time, 0, 5e-3).pwv == pytest.approx(5e-3)
+    assert profile_of(s.weather, s.site, s.time, 0, 5e-3).pwv == pytest.approx(5e-3)
+    assert profile_of(scene({"wind": "median"}).weather, s.site, s.time, 0, 5e-3).pwv == pytest.approx(5e-3)
 
 
 def test_the_scenes_weather_reaches_the_pipeline():
@@ -234,14 +234,14 @@ def test_the_scenes_weather_reaches_the_pipeline():
 
 def test_a_place_without_climatology_needs_water_or_a_file():
     with pytest.raises(InputError, match=r"site 'here': has no climatology[\s\S]*weather: \{pwv: 3 mm\}[\s\S]*ERA5"):
-        air_of(None, here(), NIGHT, 0)
+        profile_of(None, here(), NIGHT, 0)
     with pytest.raises(InputError, match="has no climatology"):
-        air_of(Climatology(pwv="50 %"), here(), NIGHT, 0)
+        profile_of(Climatology(pwv="50 %"), here(), NIGHT, 0)
     with pytest.raises(InputError, match="standard atmosphere does not know the water"):
-        air_of(Standard(), here(), NIGHT, 0)
+        profile_of(Standard(), here(), NIGHT, 0)
     for made in (
-        air_of(Climatology(pwv="3 mm"), here(), NIGHT, 0),
-        air_of(None, here(), NIGHT, 0, 3e-3),
+        profile_of(Climatology(pwv="3 mm"), here(), NIGHT, 0),
+        profile_of(None, here(), NIGHT, 0, 3e-3),
         profile(here(), NIGHT, 3e-3),
     ):
         assert made.pwv == pytest.approx(3e-3, rel=1e-12)
@@ -374,7 +374,7 @@ def test_files_that_are_not_netcdf(tmp_path):
 def test_site_below_or_above_the_air(tmp_path):
     path = files.new_layout(tmp_path / "era5.nc", levels=files.LEVELS[files.LEVELS <= 700])
     with pytest.raises(InputError, match="site 'here': lies at 600 m, more than 500 m below the lowest level of ERA5"):
-        air_of(Era5(file=path), here(), NIGHT, 0)
+        profile_of(Era5(file=path), here(), NIGHT, 0)
 
 
 # ------------------------------------------------------------------------------------------------------------- tables
@@ -392,7 +392,7 @@ def test_table_is_read(tmp_path):
     np.testing.assert_allclose(made.pressure[1], 84500)
     np.testing.assert_allclose(made.h2o[0], 0.5 * humidity.saturation_pressure(283.15) / 95500)
     np.testing.assert_allclose(made.wind_north, [1, 1, 2, 3, 0])
-    air = air_of(table(tmp_path, TABLE), here(), NIGHT, 0)
+    air = profile_of(table(tmp_path, TABLE), here(), NIGHT, 0)
     assert 2e-3 < air.pwv < 15e-3
     # above the table: the standard lapse, hydrostatic; 9000 m and -44 C here, 229.7 K there
     assert air.temperature[np.argmin(abs(air.height - 14.4e3))] == pytest.approx(216.65 + 229.15 - 229.65, abs=1)
@@ -496,9 +496,9 @@ def test_fetch_asks_for_the_cells_around_the_site(monkeypatch, tmp_path):
 
 def test_dry_air_keeps_the_shape_of_its_water() -> None:
     site, time = sites.create("chajnantor"), Instant.parse("2022-08-01T23:00:00Z")
-    dry = air_of(Climatology(pwv="0 mm"), site, time, 1)
+    dry = profile_of(Climatology(pwv="0 mm"), site, time, 1)
     assert 0 < dry.pwv < 1e-11
-    usual = air_of(None, site, time, 1)
+    usual = profile_of(None, site, time, 1)
     # the pressure stays, so that the few per mille of molecules that were water are air: shapes agree to that
     np.testing.assert_allclose(dry.scaled(usual.pwv).h2o, usual.h2o, rtol=1e-6)
     with pytest.raises(InputError, match="no water at all"):
@@ -514,15 +514,15 @@ def said(profile, what):
 
 def test_water_above_saturation_is_said(tmp_path):
     moist = table(tmp_path, TABLE.replace("-18, 20", "-18, 115"))
-    text = said(air_of(moist, here(), NIGHT, 1), "relative humidity above 100 %")
+    text = said(profile_of(moist, here(), NIGHT, 1), "relative humidity above 100 %")
     levels, of, most = (int(n) for n in re.match(r"at (\d+) of (\d+) levels, up to (\d+)%", text).groups())
     assert (of, 1 <= levels < 20) == (61, True)
     assert 100 <= most <= 115  # 115 % at one level of the table, between two of the profile
     assert text.endswith("above saturation; taken as it is")
-    dry = air_of(table(tmp_path, TABLE), here(), NIGHT, 1)
+    dry = profile_of(table(tmp_path, TABLE), here(), NIGHT, 1)
     assert said(dry, "relative humidity above 100 %") is None
     # a PWV that is asked for scales the water, past saturation where it must
-    wet = air_of(table(tmp_path, TABLE).model_copy(update={"pwv": Pwv.parse("50 mm")}), here(), NIGHT, 1)
+    wet = profile_of(table(tmp_path, TABLE).model_copy(update={"pwv": Pwv.parse("50 mm")}), here(), NIGHT, 1)
     assert "taken as it is" in said(wet, "relative humidity above 100 %")
 
 

@@ -12,8 +12,9 @@ from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.site import Site
+from zonda.operators.atmosphere.model import Models
 from zonda.operators.atmosphere.weather.absorption import TABLE, AbsorptionTable, CrossSections, absorption_table
-from zonda.operators.atmosphere.weather.bands import _BandTransfer
+from zonda.operators.atmosphere.weather.bands import BandTransfer
 from zonda.operators.atmosphere.weather.profiles import profile
 from zonda.operators.atmosphere.weather.radiative_transfer import EARTH_RADIUS, Layers, emission, spectrum
 
@@ -106,7 +107,7 @@ def test_dry_wet_and_low_air_agrees_with_am_in_every_window(name):
 def test_band_means_agree_with_am(name, low, high):
     file = reference(name)
     air = layers(file, file["h2o_vmr"])
-    transfer = _BandTransfer(Band(name="flat", low=f"{low} GHz", high=f"{high} GHz"), replace(air, height=plane(air)))
+    transfer = BandTransfer(Band(name="flat", low=f"{low} GHz", high=f"{high} GHz"), replace(air, height=plane(air)))
     emitted, log_transmission, _ = transfer(air.pwv, [math.radians(float(file["elevation_deg"]))])[0]
     edges = np.append(file["freq_GHz"] - 0.25, file["freq_GHz"][-1] + 0.25)
     running = lambda y: np.interp([low, high], edges, np.append(0, np.cumsum(y)) * 0.5)  # noqa: E731
@@ -261,11 +262,11 @@ def test_spectra_are_plugins(monkeypatch):
     )  # fmt: skip
     depths = {}
     for name in ("am", "thin"):
-        _, band = zonda.AtmosphereLayers(pwv="5 mm", spectra=name)._weather(observation)
+        _, band = Models().weather(zonda.AtmosphereLayers(pwv="5 mm", spectra=name), observation)
         depths[name] = float(band.opacity(5e-3, 1.0))
     # the band's mean of e^-tau is not linear in tau: a little more than half
     assert depths["thin"] / depths["am"] == pytest.approx(0.5, abs=0.02)
     with pytest.raises(ZondaError, match="'wrong' is str, not an AbsorptionTable"):
-        zonda.AtmosphereLayers(pwv="5 mm", spectra="wrong")._weather(observation)
+        Models().weather(zonda.AtmosphereLayers(pwv="5 mm", spectra="wrong"), observation)
     with pytest.raises(ValueError, match="unknown spectra 'thim'"):
         zonda.AtmosphereLayers(pwv="5 mm", spectra="thim")

@@ -1,0 +1,231 @@
+"""What an observation sees of the atmosphere before any of it is drawn: built once, for the run and for planning."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zonda.core.data import Data
+from zonda.core.errors import InputError
+from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
+from zonda.core.numerics.smooth import SmoothField
+from zonda.core.observation import Observation
+from zonda.core.registry import spectra
+from zonda.core.types import Floats
+from zonda.core.weather import GroundWeather, WeatherSource
+
+from .distribution import Fluctuation, largest_pwv
+from .parameters import LayerParameters, Wind
+from .resolution import Resolution, choose_resolution
+from .turbulence.beams import GAUSSIAN_FWHM, Aperture, widened
+from .turbulence.geometry import ScanPlane, axes_at, rays, scan_planes
+from .turbulence.lattice import Turbulence
+from .turbulence.nodes import Layer, times_with_margin
+from .weather.absorption import AbsorptionTable
+from .weather.bands import BandAtmosphere
+from .weather.profiles import Profile
+from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
+from .weather.sources import on_the_ground, profile_of
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.time import Instant
+
+EDGE_TAPER = 10.0
+"""dB: power at the rim of a tapered aperture below that at its centre, where none is given."""
+
+MODELS_KEPT = 2
+"""Observations whose models are kept: one is prepared while the one before is worked on."""
+
+
+@dataclass(eq=False)
+class AtmosphereModel:
+    """The atmosphere above one observation: weather, the band's response to it, the layers as the telescope sees them.
+
+    Attributes
+    ----------
+    parameters
+        Of the operator.
+    observation, plane
+        The scan, and the plane that its turbulence is laid out in.
+    profile, band
+        The weather; emission and transmission of the band.
+    ground
+        The weather at the telescope.
+    """
+
+    parameters: LayerParameters
+    observation: Observation
+    plane: ScanPlane
+    profile: Profile
+    band: BandAtmosphere
+    time: Instant
+    _resolutions: dict[float, Resolution] = field(default_factory=dict)
+
+    @property
+    def pwv(self) -> float:
+        """Mean PWV at zenith, m."""
+        return self.parameters.pwv or self.profile.pwv
+
+    @cached_property
+    def layers(self) -> list[Layer]:
+        """The layers, the lowest first."""
+        p, telescope, band = self.parameters, self.observation.instrument.telescope, self.observation.instrument.band
+        heights = np.linspace(p.lowest, p.highest, p.layers)
+        shares, winds = _shares(p, self.profile, heights), _winds(p, self.profile, heights)
+        layers = []
+        for height, share, wind in zip(heights.tolist(), shares.tolist(), winds, strict=True):
+            distance = self.plane.effective(height) / math.sin(self.plane.elevation)
+            aperture, sigma = None, beam_sigma(telescope, band, distance)
+            if p.beam != "gaussian":
+                taper = 0.0 if p.beam == "top_hat" else p.edge_taper or EDGE_TAPER
+                aperture = Aperture(widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance), taper)
+                sigma = aperture.sigma
+            layers.append(Layer(share, height, distance, p.outer_scale, sigma, aperture, np.asarray(wind, np.float64)))
+        return layers
+
+    @cached_property
+    def turbulence(self) -> list[Turbulence]:
+        """The layers' fields. Keyed by seed, operator and layer, not by observation: all scans see the same air."""
+        p = self.parameters
+        return [
+            Turbulence(
+                self.observation.seed,
+                p.label,
+                "layer",
+                number,
+                outer_scale=layer.outer_scale,
+                sigma=layer.sigma,
+                aperture=layer.aperture,
+                lattice=p.lattice,
+                fidelity=p.fidelity,
+            )
+            for number, layer in enumerate(self.layers)
+        ]
+
+    @cached_property
+    def fluctuation(self) -> Fluctuation:
+        """The distribution of the PWV about its mean."""
+        variance = sum(m.amplitude**2 * b.variance for m, b in zip(self.layers, self.turbulence, strict=True))
+        return Fluctuation(self.parameters.pwv_rms, self.parameters.pwv_rms_after_beam, variance)
+
+    def resolution(self, tolerance: float | None = None) -> Resolution:
+        """Nodes and steps in time, for the parameters' tolerance or another."""
+        tolerance = tolerance or self.parameters.tolerance
+        if tolerance not in self._resolutions:
+            emission = partial(self.band.emission, self.pwv)
+            variance, rms = self.fluctuation.variance, self.parameters.pwv_rms
+            found = choose_resolution(self.observation, self.plane, self.layers, variance, tolerance, emission, rms)
+            self._resolutions[tolerance] = found
+        return self._resolutions[tolerance]
+
+    @property
+    def ground(self) -> GroundWeather:
+        """The weather at the telescope."""
+        return on_the_ground(self.profile, self.time, None if self.parameters.wind == "profile" else self.layers[0].wind)
+
+    def means(self) -> dict[str, SmoothField]:
+        """Mean emission and transmission over the scan, at nodes of their own."""
+        chosen, n = self.resolution(), self.observation.n_samples
+        nodes, step = chosen.mean_nodes, chosen.mean_step
+        index = times_with_margin(n, step)
+        elevation = np.arcsin(rays(axes_at(self.observation.boresight_azel, index, step), nodes.xi, nodes.eta)[2])
+        # The margin of the spline is an extrapolated path: it stays inside the limits of the radiative transfer.
+        inside = (index >= 0) & (index < n)
+        elevation[:, ~inside] = np.clip(elevation[:, ~inside], ELEVATION_MIN, ELEVATION_MAX)
+        values = {"atmosphere": self.band.emission, "transmission": self.band.transmission}
+        return {k: SmoothField.from_values(nodes.weights, f(self.pwv, elevation), step, n) for k, f in values.items()}
+
+
+@dataclass
+class Models:
+    """The scene of an operator's observations, and the models of those that were last asked for."""
+
+    _time: Instant | None = field(default=None, compare=False)
+    _weather: WeatherSource | None = field(default=None, compare=False)
+    _planes: dict[str, ScanPlane] = field(default_factory=dict, compare=False)
+    _bands: dict[Any, tuple[Profile, BandAtmosphere]] = field(default_factory=dict, compare=False)
+    _made: list[tuple[str, AtmosphereModel]] = field(default_factory=list, compare=False)
+
+    def take(self, data: Data) -> None:
+        """Note when the run begins, and its weather: that of all its scans."""
+        self._time, self._weather = data.scene.time, data.scene.weather
+
+    def follow(self, observations: Sequence[Observation]) -> None:
+        """Note how the scans follow each other: all of them look through the same drifting air."""
+        self._planes = dict(zip((o.name for o in observations), scan_planes(observations), strict=True))
+
+    def of(self, parameters: LayerParameters, observation: Observation) -> AtmosphereModel:
+        """The model of one observation."""
+        key = f"{parameters!r} {parameters.label} {observation.seed}"
+        for known, model in self._made:
+            if known == key and model.observation is observation:
+                return model
+        plane = self._planes.get(observation.name) or scan_planes([observation])[0]
+        profile, band = self.weather(parameters, observation)
+        # A planner changes parameters in copies of the operator; the model keeps those that it was built with.
+        made = AtmosphereModel(parameters.model_copy(), observation, plane, profile, band, self._time or observation.start)
+        self._made = [*self._made[1 - MODELS_KEPT :], (key, made)]
+        return made
+
+    def weather(self, parameters: LayerParameters, observation: Observation) -> tuple[Profile, BandAtmosphere]:
+        """One weather for the run: the scene's at its start; and the band's response to it."""
+        time, band = self._time or observation.start, observation.instrument.band
+        water = parameters.pwv, parameters.pwv_rms, parameters.spectra
+        key = (repr(observation.site), time, repr(band), repr(self._weather), observation.seed, *water)
+        if key not in self._bands:
+            profile = profile_of(self._weather, observation.site, time, observation.seed, parameters.pwv)
+            largest = largest_pwv(parameters.pwv or profile.pwv, parameters.pwv_rms)
+            self._bands[key] = profile, BandAtmosphere(band, profile, largest, absorption_of(parameters))
+        return self._bands[key]
+
+
+def expected_load(models: Models, parameters: LayerParameters, observation: Observation) -> tuple[float, float]:
+    """Mean emission [K_RJ] and transmission in the middle of a scan, before its model is built."""
+    profile, band = models.weather(parameters, observation)
+    elevation = min(max(float(np.median(observation.elevation)), ELEVATION_MIN), ELEVATION_MAX)
+    pwv = parameters.pwv or profile.pwv
+    return float(band.emission(pwv, elevation)), float(band.transmission(pwv, elevation))
+
+
+def absorption_of(parameters: LayerParameters) -> AbsorptionTable:
+    """The registered cross-sections that the parameters name."""
+    table = spectra.create(parameters.spectra)
+    if not isinstance(table, AbsorptionTable):
+        raise InputError(
+            f"spectra {parameters.spectra!r} is {type(table).__name__}, not an AbsorptionTable",
+            place=parameters.label,
+            cure="choose another table, or mend the plugin (docs/plugins.md)",
+        )
+    return table
+
+
+def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
+    """Standard deviation [m] of the beam at a distance [m] along the line of sight: D sqrt(1 + (z/z_r)^2) / 2.3548.
+
+    From the paper's near-field FWHM(z) = D sqrt(z^-2 + z_r^-2) rad, z_r = pi (D/2)^2 / lambda at the band centre.
+    """
+    return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance) / GAUSSIAN_FWHM
+
+
+def _shares(parameters: LayerParameters, profile: Profile, heights: Floats) -> Floats:
+    """a_l: by vapour density times thickness, or equal."""
+    share = np.ones(len(heights))
+    if parameters.weights == "vapour":
+        thickness = np.gradient(heights) if len(heights) > 1 else share
+        share = np.asarray(profile.at(heights).vapour_density) * thickness
+    if not share.sum() > 0:
+        raise InputError("the air is dry at every layer", place=parameters.label, cure="set weights: equal, or lower the layers")
+    return np.asarray(share / np.sqrt((share**2).sum()), np.float64)
+
+
+def _winds(parameters: LayerParameters, profile: Profile, heights: Floats) -> Sequence[Floats]:
+    wind = parameters.wind
+    if isinstance(wind, str):
+        air = profile.at(heights)
+        return list(np.stack([air.wind_east, air.wind_north], axis=-1))
+    return [wind.vector] * len(heights) if isinstance(wind, Wind) else [one.vector for one in wind]
