@@ -11,6 +11,7 @@ and, where what all detectors have in common is removed, at most K times what th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
@@ -85,7 +86,11 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         if (key := str(context.coverage)) not in a.averages:
             a.averages[key] = shares(context, a.layers, a.components, first.plane)
         points = _points(context, first, p.tolerance)
-        effects = [*_layer_effects(context, a, points), *_resolution(context, a, first), *_spectral(context, a)]
+        effects = [
+            *_layer_effects(context, a, points),
+            *_resolution(context, a, first, self.coarser("tolerance")),
+            *_spectral(context, a),
+        ]
         effects += _slopes(context, a)
         points /= len(context.observations)
         fixed = 0.02 + (POINT * (len(a.layers) - len(set(p.omit))) + TRANSFER) * points
@@ -290,7 +295,7 @@ def _opacity_share(a: Calibrated) -> float:
     return abs(float(a.model.band.log_transmission_difference(a.model.pwv, a.model.pwv * step, a.elevations[0]))) / step
 
 
-def _resolution(context: Context, a: Calibrated, first: AtmosphereModel) -> list[Effect]:
+def _resolution(context: Context, a: Calibrated, first: AtmosphereModel, coarser: Sequence[float]) -> list[Effect]:
     """Nodes and steps in time; lattice; fidelity."""
     p = a.model.parameters
     xi, eta = spread_evenly(context.first.focalplane.xi, context.first.focalplane.eta)
@@ -301,15 +306,14 @@ def _resolution(context: Context, a: Calibrated, first: AtmosphereModel) -> list
     choices = [full(f"within {p.tolerance:g} of what the detectors' mean leaves")]
     text = "(sqrt 2 + 0.1) tolerance x rms left after subtraction of the detectors' mean: nodes, steps in time, mean emission"
     now = _points(context, first, p.tolerance)
-    for tolerance in (0.03, 0.1, 0.3):
-        if tolerance > p.tolerance:
-            rms = 1.52 * (tolerance + p.tolerance) * left
-            bound = context.bound(rms, correlated, common=True) | {"psd": (rms / max(context.noise, a.rms, 1e-30)) ** 2}
-            saved = 0.0
-            if now * POINT * len(a.layers) > PAYS and context.affords(bound):
-                saved = POINT * len(a.layers) * (now - _points(context, first, tolerance))
-            what = f"within {tolerance:g}"
-            choices.append(Choice("coarse", what, {"tolerance": tolerance}, bound=bound, formula=text, seconds=saved))
+    for tolerance in coarser:
+        rms = 1.52 * (tolerance + p.tolerance) * left
+        bound = context.bound(rms, correlated, common=True) | {"psd": (rms / max(context.noise, a.rms, 1e-30)) ** 2}
+        saved = 0.0
+        if now * POINT * len(a.layers) > PAYS and context.affords(bound):
+            saved = POINT * len(a.layers) * (now - _points(context, first, tolerance))
+        settings = {"tolerance": tolerance}
+        choices.append(Choice("coarse", f"within {tolerance:g}", settings, bound=bound, formula=text, seconds=saved))
     effects = [Effect("detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text)]
     wrong = _in_proportion(context, a, 0.5 * FIDELITIES[p.fidelity].structure_error, correlated)
     text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
