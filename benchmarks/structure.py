@@ -137,7 +137,7 @@ def _functions(product: dict[str, Module]) -> Iterator[tuple[str, ast.FunctionDe
         for node in ast.walk(module.tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 decorators = " ".join(ast.unparse(d) for d in node.decorator_list)
-                if not re.search("jit|click|option|command", decorators):
+                if not re.search("jit|intrinsic|click|option|command", decorators):
                     yield f"{module.name}.{node.name}", node
 
 

@@ -241,7 +241,7 @@ def test_a_pipeline_that_writes_nothing_says_so(here, capsys, warned, command):
     (here / "my.yaml").write_text(PIPELINE.replace("  - SaveMap\n", ""))
     assert cli.main([command, "my.yaml"]) == 0
     said = capsys.readouterr().err
-    assert "warning: my: no step writes a product, so what is computed is lost; add one that does, e.g. SaveMap" in said
+    assert "warning: my: no step writes a product, so what is computed is lost; add a step that saves or shows it" in said
     if command == "run":
         assert said.index("no step writes") < said.index("of CPU time")
 

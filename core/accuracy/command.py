@@ -26,7 +26,13 @@ NOT_MET = 1
 )
 @click.option("--target", default="1 %", show_default=True, metavar="ERROR", help="Error that the metric may have.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value of the file, as for `zonda run`.")
-@click.option("--knob", "knobs", multiple=True, metavar="NAME", help="Turn only this one, e.g. PinkNoise.poles; may be repeated.")
+@click.option(
+    "--knob",
+    "knobs",
+    multiple=True,
+    metavar="NAME",
+    help="Turn only this one, e.g. Step.parameter; may be repeated.",
+)
 @click.option("--quick", is_flag=True, help="Shorten the scans to at most two of 30 s.")
 @click.option("--duration", metavar="TIME", help="Length of each scan, e.g. '2 min'.")
 @click.option("--repeats", default=3, show_default=True, type=click.IntRange(2, 100), help="Timed runs of each setting.")

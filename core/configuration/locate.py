@@ -64,15 +64,14 @@ def read(path: Path) -> str:
 
 
 SHIPPED = "`zonda pipelines` lists those that have names"
-_IMAGE = "to observe it, name it in a pipeline: - SkyMap: {file: %s}"
 _DATA = "give the path of a YAML file; `zonda pipelines` lists examples"
 _KINDS = (
-    (b"SIMPLE  =", "a FITS file", _IMAGE),
-    (b"\x89HDF\r\n", "an HDF5 file", "to observe with its pointing, name it in a pipeline: - PointingRecorded: {file: %s}"),
+    (b"SIMPLE  =", "a FITS file", "to observe it, name it in a pipeline: <sky>"),
+    (b"\x89HDF\r\n", "an HDF5 file", "to observe with its pointing, name it in a pipeline: <boresight>"),
     (b"\x93NUMPY", "a NumPy array", _DATA),
-    (b"CDF\x01", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: %s}"),
-    (b"CDF\x02", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: %s}"),
-    (b"\x1f\x8b", "compressed (gzip)", "unpack it; an image is named in a pipeline: - SkyMap: {file: %s}"),
+    (b"CDF\x01", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: <name>}"),
+    (b"CDF\x02", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: <name>}"),
+    (b"\x1f\x8b", "compressed (gzip)", "unpack it; an image is named in a pipeline: <sky>"),
     (b"BZh", "compressed (bzip2)", "unpack it"),
     (b"\xfd7zXZ", "compressed (xz)", "unpack it"),
     (b"PK\x03\x04", "a ZIP archive", "unpack it"),
@@ -85,7 +84,7 @@ _KINDS = (
     (b"<html", "a web page", "download the file itself, not the page that shows it"),
     (b"<?xml", "an XML file", _DATA),
 )
-"""How files begin that are no pipeline files, what they are, and what to do with them."""
+"""How files begin that are no pipeline files, what they are, and what to do with them; ``<sky>``: the step that reads it."""
 
 
 def _check_kind(path: Path, content: bytes) -> None:
@@ -93,8 +92,19 @@ def _check_kind(path: Path, content: bytes) -> None:
     start = content.lstrip()[:20]
     for begins, kind, cure in _KINDS:
         if start.startswith(begins) or start.lower().startswith(begins):
-            raise InputError(f"is {kind}, not a pipeline file", place=str(path), cure=cure.replace("%s", path.name))
+            for what in ("sky", "boresight"):
+                if f"<{what}>" in cure:
+                    cure = cure.replace(f"<{what}>", _reader(what))
+            raise InputError(f"is {kind}, not a pipeline file", place=str(path), cure=cure.replace("<name>", path.name))
     if b"\0" in content:
         raise InputError("is a binary file, not a pipeline file", place=str(path), cure=_DATA)
     if path.suffix == ".py":
         raise InputError("is a Python script, not a pipeline file", place=str(path), cure=f"run it: python {path}")
+
+
+def _reader(what: str) -> str:
+    """How a step that reads ``what`` from a file is written in a pipeline."""
+    from ..registry import makers, steps
+
+    names = [name for name in makers(what) if "file" in steps.get(name).model_fields]
+    return " or ".join(f"- {name}: {{file: <name>}}" for name in names) or f"a step that provides {what}"

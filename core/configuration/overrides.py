@@ -21,7 +21,7 @@ def apply(document: Document, text: str, keys: list[str]) -> list[Diagnostic]:
     key, equals, value = text.partition("=")
     place = Span(source, 0, 0, 0, max(1, len(key)))
     if not equals or not key.strip():
-        cure = "write Key.parameter=value, e.g. --set PinkNoise.knee='0.5 Hz' or --set seed=8"
+        cure = "write Key.parameter=value, e.g. --set Step.frequency='0.5 Hz' or --set seed=8"
         return [Diagnostic("a setting needs a key, '=' and a value", place, "", cure)]
     new = yaml_places.load(source, column=len(key) + 1, text=value)
     if new.faults:

@@ -124,7 +124,7 @@ class MapProduct:
         """
         values = getattr(self, of)
         if values is None:
-            raise InputError("the map has no half-difference", place="map", cure="set BinMap.half_difference and make two scans")
+            raise InputError("the map has no half-difference", place="map", cure="set half_difference and make two scans")
         return _rms(values, self.weights, self.distance() <= radius)
 
     def smoothed_rms(
@@ -209,7 +209,7 @@ class MapProduct:
         import healpy
 
         if self.pixels is None:
-            raise InputError("not a HEALPix map", place="map", cure="set BinMap.nside")
+            raise InputError("not a HEALPix map", place="map", cure="set nside of the map maker")
         whole = np.full(healpy.nside2npix(self.nside), healpy.UNSEEN)
         known = self.hits > 0
         whole[self.pixels[known]] = self.signal[known]

@@ -20,7 +20,7 @@ PRECISIONS = ("float32", "float64")
 def steps(operators: Any, name: str) -> list[Operator]:
     """Copies of the operators, whose labels are the pipeline's own. Raises PipelineError for what is none."""
     if isinstance(operators, Operator | str | Mapping) or not isinstance(operators, Iterable):
-        cure = "write Pipeline([PointingDaisy(...), ...]): a list of operators"
+        cure = "write Pipeline([zonda.Name(...), ...]): a list of operators"
         raise PipelineError(f"the steps are a list of operators, not {_what(operators)}", place=name, cure=cure)
     made, wrong, cures = [], [], []
     for k, operator in enumerate(operators, 1):
@@ -97,4 +97,4 @@ def _cure(value: Any, step: int) -> str:
     name = value if isinstance(value, str) else next(iter(value), "") if isinstance(value, Mapping) else ""
     if isinstance(name, str) and name.isidentifier():
         return f"write zonda.{name}(...) at step {step}; zonda.load(file).pipeline() makes the steps of a file"
-    return "an operator is made of a class: zonda.BinMap(pixel='2 arcsec'); docs/plugins.md shows how to write your own"
+    return "an operator is made of a class: zonda.Name(parameter=value); docs/plugins.md shows how to write your own"

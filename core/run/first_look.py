@@ -25,7 +25,7 @@ def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[
     found = [operator.check(data) for operator in pipeline.operators]
     if saved and not writes(pipeline.operators):
         text = f"{pipeline.name}: no step writes a product, so what is computed is lost"
-        warnings.warn(f"{text}; add one that does, e.g. SaveMap, SaveTOD, Plots or Report", stacklevel=2)
+        warnings.warn(f"{text}; add a step that saves or shows it (`zonda plugins` lists the operators)", stacklevel=2)
     return found
 
 

@@ -59,5 +59,6 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
             )
         have |= operator.provides
     if operators and not any("boresight" in o.provides | o.requires for o in operators):
-        problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step, e.g. PointingDaisy"))
+        cure = f"{' or '.join(makers('boresight'))} would"
+        problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step", cure))
     return problems
