@@ -52,7 +52,7 @@ def lines(front: dict[str, Any]) -> Iterator[str]:
             name = f"`{alone['knob']}`" if rung is alone["rungs"][0] else ""
             left = percent(alone["left"]) if rung is last else ""
             yield f"| {name} | {rung['value']} | {error} | {cost(rung)} | {saved} | {left} |"
-    yield from ("", "The joint front:", "", "| error | CPU s | MB | what differs from the tightest |", "|---|---|---|---|")
+    yield from ("", "The joint Pareto front:", "", "| error | CPU s | MB | what differs from the tightest |", "|---|---|---|---|")
     for point in front["front"]:
         different = [f"`{k}={v}`" for k, v in point["setting"].items() if front["reference"].get(k) != v]
         chosen = " (chosen)" if point == front["chosen"] else ""
