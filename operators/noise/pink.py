@@ -60,33 +60,12 @@ class PinkNoise(Operator):
         return self
 
     def prepare(self, observation: Observation) -> _State | None:
-        """Fit the filter; draw the common part.
-
-        Raises
-        ------
-        InputError
-            Where the number of poles cannot fit the spectrum (see `power_law_filter`).
-        """
-        spectrum = PinkSpectrum.of(self, observation)
-        if spectrum is None:
-            observation.tally.state(self.label, "pink noise", "none: the knee is at 0 Hz")
-            observation.focalplane.knee = np.zeros(observation.n_detectors)
-            return None
-        try:
-            law = spectrum.filter(self.poles)
-        except InputError as err:
-            raise InputError(err.message, place=self.label, cure=err.cure) from None
-        observation.tally.state(self.label, "power over that of white noise", spectrum.describe(law))
-        resolve(observation)
-        level = level_of(self, observation)
-        spectrum.state(observation, level.sky_net(observation))
-        amplitude = Amplitude(self.label, level, observation, spectrum.factor * np.sqrt(law.gain))
-        streams = Streams(law, observation.detector_key(self.label), observation.detector_key(self.label, "start"))
-        common = np.zeros((1, observation.n_samples if self.shared else 0), np.float32)
-        if self.shared:
-            keys = (observation.detector_key(self.label, "shared", *more) for more in ((), ("start",)))
-            Streams(law, *keys).add(0, 0, common)
-        return _State(amplitude, streams, common[0])
+        """Fit the filter; draw the common part. None: there is no pink noise."""
+        if spectrum := PinkSpectrum.of(self, observation):
+            return _prepared(self, spectrum, observation)
+        observation.tally.state(self.label, "pink noise", "none: the knee is at 0 Hz")
+        observation.focalplane.knee = np.zeros(observation.n_detectors)
+        return None
 
     def exec(self, block: Block, state: _State | None) -> None:
         """Add noise to ``pink``."""
@@ -111,6 +90,25 @@ class _State(NamedTuple):
     streams: Streams
     common: NDArray[np.float32]
     """(n_samp,), or (0,) where nothing is shared."""
+
+
+def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
+    """Raises InputError where the number of poles cannot fit the spectrum (see `power_law_filter`)."""
+    try:
+        law = spectrum.filter(pink.poles)
+    except InputError as err:
+        raise InputError(err.message, place=pink.label, cure=err.cure) from None
+    observation.tally.state(pink.label, "power over that of white noise", spectrum.describe(law))
+    resolve(observation)
+    level = level_of(pink, observation)
+    spectrum.state(observation, level.sky_net(observation))
+    amplitude = Amplitude(pink.label, level, observation, spectrum.factor * np.sqrt(law.gain))
+    streams = Streams(law, observation.detector_key(pink.label), observation.detector_key(pink.label, "start"))
+    common = np.zeros((1, observation.n_samples if pink.shared else 0), np.float32)
+    if pink.shared:
+        keys = (observation.detector_key(pink.label, "shared", *more) for more in ((), ("start",)))
+        Streams(law, *keys).add(0, 0, common)
+    return _State(amplitude, streams, common[0])
 
 
 @dataclass(frozen=True)
