@@ -26,7 +26,7 @@ from zonda.core.types import Floats
 
 from .limits import LargestMotion, check_elevation, excess, lower_elevation
 from .motion import POINTS, Peak, Quantity, motion, rate_text
-from .observed import Samples, centre_of, observed, state_times
+from .observed import Samples, centre_of, observed, report, state_times
 from .samples_per_beam import SamplesPerBeam
 from .transform import Boresight, CelestialTransform
 
@@ -190,11 +190,7 @@ class Pointing(Operator):
             observation = self._scan(data, target, start, self._offset(k), before + k, rate, moved)
             sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
             data.observations.append(observation)
-        for what, text in [*moved.statements(), *sampled.statements()]:
-            for observation in data.observations[before:]:
-                observation.tally.state(self.label, what, text)
-        for text in [*moved.warnings(), *sampled.warnings()]:
-            warnings.warn(f"{self.label}: {text}", stacklevel=3)
+        report(self.label, data.observations[before:], moved, sampled)
 
     def _jitter_key(self, data: Data, index: int) -> NDArray[np.uint32]:
         return stream_key(data.scene.seed, self.label, "jitter", index)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,3 +102,24 @@ def state_times(label: str, observation: Observation) -> None:
         f"a component at frequency f is off by at most 2 pi f {rms * 1e3:.3g} ms of its rms: "
         f"{2 * math.pi * rms:.1e} at 1 Hz, {min(at_nyquist, 2.0):.1e} at {rate / 2:.4g} Hz",
     )
+
+
+class Findings(Protocol):
+    """What was found about several scans: `LargestMotion`, `SamplesPerBeam`."""
+
+    def statements(self) -> list[tuple[str, str]]:
+        """(what, text) for the tally."""
+
+    def warnings(self) -> list[str]:
+        """What a run warns of."""
+
+
+def report(label: str, observations: Sequence[Observation], *findings: Findings) -> None:
+    """Enter findings in the tally of each observation, and warn."""
+    for found in findings:
+        for what, text in found.statements():
+            for observation in observations:
+                observation.tally.state(label, what, text)
+    for found in findings:
+        for text in found.warnings():
+            warnings.warn(f"{label}: {text}", stacklevel=4)

@@ -17,11 +17,11 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
 from zonda.core.errors import InputError, PointingError
 from zonda.core.intervals import part
-from zonda.core.numerics.sphere import unit_vectors
+from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .observed import Samples, centre_of, observed, state_times
+from .observed import Samples, centre_of, observed, report, state_times
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
 from .recording_files import Clock, read_recording
 from .samples_per_beam import SamplesPerBeam
@@ -30,6 +30,7 @@ from .transform import CelestialTransform
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
+    from zonda.core.instrument import Telescope
 
 MOST_CHECKED = 100_000
 """Samples of a scan that `zonda check` looks at."""
@@ -78,29 +79,16 @@ class PointingRecorded(Operator):
     def check(self, data: Data) -> list[str]:
         """What is in the file, and whether the telescope can look there."""
         recording, found = self._read()
-        lines, start = [], recording.start or data.scene.time
         for scan in found.scans:
-            some = slice(None, None, -(-len(scan.seconds) // MOST_CHECKED))
-            ways = {k: getattr(scan, k)[some] for k in ("seconds", "longitude", "latitude", "flags")}
-            radec = None if scan.radec is None else scan.radec[some]
-            coarse = replace(scan, rate=scan.rate / some.step, radec=radec, **ways)
-            data.observations.append(self._observation(data, start, coarse, recording, len(data.observations)))
-            seconds = scan.seconds[-1] - scan.seconds[0]
-            good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
-            text = f"{len(scan.seconds)} samples at {scan.rate:.6g} Hz, {seconds:.1f} s"
-            if recording.frame == "azel" and good.any():
-                low, high = np.degrees([scan.latitude[good].min(), scan.latitude[good].max()])
-                text += f", elevation {low:.2f} to {high:.2f} deg"
-            lines.append(text)
+            data.observations.append(_observation(self, data, _thinned(scan), recording))
+        lines = [_summary(scan, recording.frame) for scan in found.scans]
         return lines + [f"{what}: {number}" for what, number in found.counts.items() if number]
 
     def observe(self, data: Data) -> None:
         """Append an observation for each part of the record without long gaps."""
         recording, found = self._read()
-        first = len(data.observations)
-        start = recording.start or data.scene.time
-        apart = abs(data.scene.time.seconds_since(start))
-        if apart > ANOTHER_DAY:
+        first, start = len(data.observations), recording.start or data.scene.time
+        if abs(data.scene.time.seconds_since(start)) > ANOTHER_DAY:
             text = f"the record begins {start}, the weather is that of {data.scene.time}"
             warnings.warn(f"{self.label}: {text}: set the scene's time", stacklevel=2)
         if number := found.counts[OUT_OF_ORDER]:
@@ -108,16 +96,12 @@ class PointingRecorded(Operator):
             warnings.warn(f"{self.label}: {text}", stacklevel=2)
         sampled = SamplesPerBeam()
         for scan in found.scans:
-            observation = self._observation(data, start, scan, recording, len(data.observations))
+            observation = _observation(self, data, scan, recording)
             sampled.add(observation, observation.sample_rate)
             data.observations.append(observation)
         for what, number in found.counts.items():
             data.observations[first].tally.count(self.label, what, number)
-        for what, text in sampled.statements():
-            for observation in data.observations[first:]:
-                observation.tally.state(self.label, what, text)
-        for text in sampled.warnings():
-            warnings.warn(f"{self.label}: {text}", stacklevel=2)
+        report(self.label, data.observations[first:], sampled)
 
     def _read(self) -> tuple[Recording, Comb]:
         recording = read_recording(self.file, self.clock, self.flag_mask)
@@ -131,50 +115,78 @@ class PointingRecorded(Operator):
             recording = replace(recording, radec=None)
         return recording, comb(recording, self.split, f"{self.label}, {self.file}")
 
-    def _observation(self, data: Data, begin: Instant, scan: Scan, recording: Recording, index: int) -> Observation:
-        scene, telescope = data.scene, data.scene.instrument.telescope
-        start, seconds = begin.shifted(float(scan.seconds[0])), scan.seconds - scan.seconds[0]
-        beam = float(scene.instrument.focalplane().fwhm.min())
-        transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
-        if recording.frame == "azel":
-            horizontal = unit_vectors(-scan.longitude, scan.latitude)
-        else:
-            horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
-        elevation = np.arctan2(horizontal[:, 2], np.hypot(horizontal[:, 0], horizontal[:, 1]))
-        outside = (elevation < telescope.elevation_min - 1e-9) | (elevation > telescope.elevation_max + 1e-9)
-        good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
-        if (wrong := np.flatnonzero(outside & good)).size:
-            limits = f"{np.degrees(telescope.elevation_min):g} deg to {np.degrees(telescope.elevation_max):g} deg"
-            where = f"elevation {np.degrees(elevation[wrong[0]]):.2f} deg, {seconds[wrong[0]]:.4g} s after {start}"
-            raise PointingError(
-                f"the boresight is at {where}; {telescope.name} reaches {limits}",
-                place=f"{self.label}, {self.file}",
-                cure="flag these rows, or correct site, clock, units or the telescope's limits",
-            )
-        target = self.target or scene.target
-        _, azel, computed = transform.boresight(horizontal, seconds)
-        radec = computed if scan.radec is None else scan.radec
-        centre = centre_of(transform, target, seconds) if target else _middle(radec, good)
-        parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
-        samples = Samples(seconds, scan.rate, (azel, radec), scan.flags.copy(), parts)
-        observation = observed(self.label, scene, index, transform, centre, samples)
-        state_times(self.label, observation)
-        if recording.frame == "azel":
-            self._state_celestial(observation, computed, good)
-        return observation
 
-    def _state_celestial(self, observation: Observation, computed: Floats, good: NDArray[np.bool_]) -> None:
-        """Say which directions on the sky are used, and how far recorded ones are from those that follow from az and el."""
-        text = "recomputed from azimuth, elevation and time"
-        if observation.boresight_radec is not computed:
-            some = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
-            apart = np.linalg.norm(_directions(observation.boresight_radec[some]) - _directions(computed[some]), axis=1)
-            most = 2 * float(np.arcsin(apart.max(initial=0.0) / 2))
-            text = f"as recorded, up to {np.degrees(most) * 3600:.3g} arcsec from those {text}"
-            if most > FAR:
-                cure = "are site and clock right? celestial: recomputed takes azimuth and elevation"
-                warnings.warn(f"{self.label}: {observation.name}: directions on the sky are {text}: {cure}", stacklevel=4)
-        observation.tally.state(self.label, f"{observation.name}: directions on the sky", text)
+def _thinned(scan: Scan) -> Scan:
+    """At most about `MOST_CHECKED` samples of a scan."""
+    some = slice(None, None, -(-len(scan.seconds) // MOST_CHECKED))
+    series = {k: getattr(scan, k)[some] for k in ("seconds", "longitude", "latitude", "flags")}
+    return replace(scan, rate=scan.rate / some.step, radec=None if scan.radec is None else scan.radec[some], **series)
+
+
+def _summary(scan: Scan, frame: str) -> str:
+    """Samples, length and elevations of a scan."""
+    text = f"{len(scan.seconds)} samples at {scan.rate:.6g} Hz, {scan.seconds[-1] - scan.seconds[0]:.1f} s"
+    good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
+    if frame == "azel" and good.any():
+        low, high = np.degrees([scan.latitude[good].min(), scan.latitude[good].max()])
+        text += f", elevation {low:.2f} to {high:.2f} deg"
+    return text
+
+
+def _observation(step: PointingRecorded, data: Data, scan: Scan, recording: Recording) -> Observation:
+    """Of one scan. Raises PointingError where the telescope cannot look there."""
+    scene = data.scene
+    start = (recording.start or scene.time).shifted(float(scan.seconds[0]))
+    seconds = scan.seconds - scan.seconds[0]
+    beam = float(scene.instrument.focalplane().fwhm.min())
+    transform = CelestialTransform(scene.site, start, seconds[-1], step.interpolation_error * beam)
+    if recording.frame == "azel":
+        horizontal = unit_vectors(-scan.longitude, scan.latitude)
+    else:
+        horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
+    good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
+    _check_elevation(horizontal, seconds, good, scene.instrument.telescope, f"{step.label}, {step.file}", start)
+    _, azel, computed = transform.boresight(horizontal, seconds)
+    radec = computed if scan.radec is None else scan.radec
+    target = step.target or scene.target
+    centre = centre_of(transform, target, seconds) if target else _middle(radec, good)
+    parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
+    samples = Samples(seconds, scan.rate, (azel, radec), scan.flags.copy(), parts)
+    observation = observed(step.label, scene, len(data.observations), transform, centre, samples)
+    state_times(step.label, observation)
+    if recording.frame == "azel":
+        _state_celestial(step.label, observation, computed, good)
+    return observation
+
+
+def _check_elevation(
+    horizontal: Floats, seconds: Floats, good: NDArray[np.bool_], telescope: Telescope, place: str, start: Instant
+) -> None:
+    """Raise PointingError where an unflagged direction (n, 3) lies outside the telescope's elevation limits."""
+    _, elevation = angles(horizontal)
+    outside = (elevation < telescope.elevation_min - 1e-9) | (elevation > telescope.elevation_max + 1e-9)
+    if (wrong := np.flatnonzero(outside & good)).size:
+        limits = f"{np.degrees(telescope.elevation_min):g} deg to {np.degrees(telescope.elevation_max):g} deg"
+        where = f"elevation {np.degrees(elevation[wrong[0]]):.2f} deg, {seconds[wrong[0]]:.4g} s after {start}"
+        raise PointingError(
+            f"the boresight is at {where}; {telescope.name} reaches {limits}",
+            place=place,
+            cure="flag these rows, or correct site, clock, units or the telescope's limits",
+        )
+
+
+def _state_celestial(label: str, observation: Observation, computed: Floats, good: NDArray[np.bool_]) -> None:
+    """State which directions on the sky are used, and how far recorded ones are from those that follow from az and el."""
+    text = "recomputed from azimuth, elevation and time"
+    if observation.boresight_radec is not computed:
+        some = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
+        apart = np.linalg.norm(_directions(observation.boresight_radec[some]) - _directions(computed[some]), axis=1)
+        most = 2 * float(np.arcsin(apart.max(initial=0.0) / 2))
+        text = f"as recorded, up to {np.degrees(most) * 3600:.3g} arcsec from those {text}"
+        if most > FAR:
+            cure = "are site and clock right? celestial: recomputed takes azimuth and elevation"
+            warnings.warn(f"{label}: {observation.name}: directions on the sky are {text}: {cure}", stacklevel=4)
+    observation.tally.state(label, f"{observation.name}: directions on the sky", text)
 
 
 def _directions(quaternions: Floats) -> Floats:
@@ -186,5 +198,5 @@ def _directions(quaternions: Floats) -> Floats:
 def _middle(radec: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
     """ICRS (ra, dec) of the mean direction."""
     some = np.flatnonzero(good)[:: max(1, int(good.sum()) // 10_000)]
-    x, y, z = _directions(radec[some]).mean(axis=0)
-    return float(np.arctan2(y, x) % (2 * np.pi)), float(np.arctan2(z, np.hypot(x, y)))
+    ra, dec = angles(_directions(radec[some]).mean(axis=0))
+    return float(ra % (2 * np.pi)), float(dec)

@@ -28,13 +28,7 @@ def geometry(
     place: str, header: Any, pixel_size: float | None, centred: bool, notes: dict[str, str]
 ) -> tuple[Any, Floats | None]:
     """(wcs, scale) of `WcsMap`, or the error that says what is missing."""
-    header = header.copy()
-    for key in ("CUNIT1", "CUNIT2"):
-        text = str(header.get(key, "") or "").strip()
-        if text and text.lower() in _ANGLES:
-            header[key] = _ANGLES[text.lower()]
-        elif text and _celestial(header, key[-1]):
-            raise InputError(f"{key} = '{text}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'")
+    header = _with_known_units(header, place)
     scaled = _has_scale(header)
     if not scaled and pixel_size is None:
         raise InputError(
@@ -54,6 +48,39 @@ def geometry(
             raise _no_position(place, "CTYPE1, CTYPE2, CRVAL1, CRVAL2, CRPIX1, CRPIX2")
         notes["position"] = "the file has no WCS: its centre is put on the target, its first axis runs west, its second north"
         return None, _plain_scale(place, header, scaled, pixel_size)
+    _check_frame(header, place)
+    absent = [k for k in ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2") if k not in header]
+    if absent and not centred:
+        raise _no_position(place, ", ".join(absent))
+    wcs, matrix = _wcs(header, place)
+    check_geometry(matrix if pixel_size is None else np.eye(2) / 60, wcs.wcs.crpix, header, place)
+    if pixel_size is None:
+        return wcs, None
+    if not is_plain_tan(wcs):
+        raise InputError(
+            f"pixel_size cannot replace the scale of a map in projection {', '.join(wcs.wcs.ctype)}",
+            place=place,
+            cure="remove pixel_size, or give a TAN map",
+        )
+    notes["pixel size"] = f"{np.degrees(pixel_size) * 3600:g} arcsec as given; the header's scale is overridden"
+    cd = matrix if scaled else np.diag([-1.0, 1.0])
+    return rescaled(wcs, cd / np.linalg.norm(cd, axis=0) * np.degrees(pixel_size)), None
+
+
+def _with_known_units(header: Any, place: str) -> Any:
+    """A copy of the header whose celestial axes have units that FITS knows."""
+    header = header.copy()
+    for key in ("CUNIT1", "CUNIT2"):
+        text = str(header.get(key, "") or "").strip()
+        if text and text.lower() in _ANGLES:
+            header[key] = _ANGLES[text.lower()]
+        elif text and _celestial(header, key[-1]):
+            raise InputError(f"{key} = '{text}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'")
+    return header
+
+
+def _check_frame(header: Any, place: str) -> None:
+    """Refuse axes that are neither equatorial nor Galactic; of Galactic ones what belongs to equatorial axes is removed."""
     kinds = {str(header[f"CTYPE{axis}"]).upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH"):  # they are for equatorial axes; astropy would take ICRS
@@ -65,9 +92,10 @@ def geometry(
             place=place,
             cure="give a map in ICRS, FK5, FK4 or Galactic coordinates",
         )
-    absent = [k for k in ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2") if k not in header]
-    if absent and not centred:
-        raise _no_position(place, ", ".join(absent))
+
+
+def _wcs(header: Any, place: str) -> tuple[Any, Floats]:
+    """The WCS of a header and its pixel scale matrix (2, 2) [deg]."""
     try:
         wcs = tangent.plain(header)
         if wcs is None:
@@ -84,21 +112,10 @@ def geometry(
         area = np.linalg.det(matrix)
     if not np.isfinite([*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]).all() or area == 0.0:
         raise InputError("the WCS is singular: its pixels have no area", place=place, cure="check CDELT1, CDELT2, PC and CD")
-    check_geometry(matrix if pixel_size is None else np.eye(2) / 60, wcs.wcs.crpix, header, place)
-    if pixel_size is None:
-        return wcs, None
-    if not is_plain_tan(wcs):
-        raise InputError(
-            f"pixel_size cannot replace the scale of a map in projection {', '.join(wcs.wcs.ctype)}",
-            place=place,
-            cure="remove pixel_size, or give a TAN map",
-        )
-    notes["pixel size"] = f"{np.degrees(pixel_size) * 3600:g} arcsec as given; the header's scale is overridden"
-    cd = matrix if scaled else np.diag([-1.0, 1.0])
-    return linear(wcs, cd / np.linalg.norm(cd, axis=0) * np.degrees(pixel_size)), None
+    return wcs, matrix
 
 
-def linear(wcs: Any, matrix: Floats) -> Any:
+def rescaled(wcs: Any, matrix: Floats) -> Any:
     """A copy of a plain TAN ``wcs`` with the pixel scale matrix (2, 2) [deg], whether it had CD, PC, CDELT or CROTA."""
     from astropy.wcs import WCS
 

@@ -10,7 +10,7 @@ import numpy as np
 from zonda.core.errors import InputError
 from zonda.core.numerics.sphere import local_axes
 
-from .geometry import is_plain_tan, linear
+from .geometry import is_plain_tan, rescaled
 from .inputs import WcsMap
 from .resample import from_pixels
 
@@ -42,7 +42,7 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
     wcs.wcs.crval = np.degrees(centre)[::-1] if swapped else np.degrees(centre)
     wcs.wcs.crpix = [(columns + 1) / 2, (rows + 1) / 2]
     wcs.wcs.radesys = "ICRS"
-    return linear(wcs, matrix)
+    return rescaled(wcs, matrix)
 
 
 def turned(image: WcsMap, centre: tuple[float, float], place: str = "") -> WcsMap:
