@@ -10,7 +10,7 @@ from .registry import sites
 
 
 class Site(Parameters):
-    """A place on the Earth (WGS84 geodetic) and the climatology that describes the air above it."""
+    """A place on the Earth (WGS84 geodetic) and the climatology of the atmosphere above it."""
 
     name: str
     """Registered name."""

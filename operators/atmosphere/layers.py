@@ -40,7 +40,7 @@ class _Provides:
 
 
 class AtmosphereLayers(LayerParameters):
-    """Turbulent layers of water vapour, seen through near-field beams, as emission and opacity of the band.
+    """Turbulent layers of water vapour seen through near-field beams: their emission and transmission in the band.
 
     Sets ``observation.smooth["atmosphere"]`` (mean emission, K_RJ) and ``["transmission"]`` (band-mean e^-tau), and adds the
     fluctuation of the emission to the stream ``atmosphere`` and that of the transmission, relative, to ``transmission``.

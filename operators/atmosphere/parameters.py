@@ -38,7 +38,7 @@ class LayerParameters(Operator):
     """Mean precipitable water vapour at zenith; where absent, that of the scene's `weather` (by default the climatology's median
     for the date and hour). A scene whose weather gives another PWV is refused: it would be given twice."""
     pwv_rms: Fraction = quantity("0.5 %", ge=0, le=1)
-    """Ensemble rms of the water along a line of sight, as a fraction of its mean (at one point of the sky, over all weather)."""
+    """Ensemble rms of the line-of-sight water vapour, as a fraction of its mean (at one point of the sky, over all weather)."""
     pwv_rms_after_beam: bool = False
     """Whether `pwv_rms` is what the telescope sees, or what a pencil beam would see (the beam smooths a part away)."""
     layers: int = Field(10, ge=1, le=200)
@@ -60,11 +60,11 @@ class LayerParameters(Operator):
     edge_taper: float | None = Field(None, gt=0, le=60)
     """With `beam: tapered`, dB by which the illumination's power falls from the centre to the rim; 10 where absent."""
     outputs: list[Literal["pwv", "opacity", "path_delay"]] = Field(default_factory=list)
-    """Further streams to make: fluctuations of the line-of-sight water (m), of the band's opacity, of the wet path delay (m)."""
+    """Further streams: fluctuations of the line-of-sight water vapour (m), of the band's opacity, of the wet path delay (m)."""
     spectra: str = "am"
-    """Cross-sections of the air: a registered table of them (`zonda plugins`); am's in cells of 0.5 GHz by default."""
+    """Absorption cross-sections of the atmosphere: a registered table (`zonda plugins`); am's in cells of 0.5 GHz by default."""
     omit: list[int] = Field(default_factory=list)
-    """Layers that are left out, the lowest is 0; the others stay as they are (their shares, their air)."""
+    """Layers to omit, the lowest is 0; the others do not change (their shares, their turbulence)."""
     lattice: float | None = Field(None, gt=0, le=0.8)
     """Largest spacing of the turbulence lattice, in units of the beam's sigma at the layer (a power of two metres is used);
     where absent that of the `fidelity`, 0.8 or 0.5."""

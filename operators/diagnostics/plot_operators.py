@@ -51,7 +51,7 @@ LARGEST = 1500
 
 
 class Plots(Output):
-    """Draw what the run made and write it as PNG files to the output folder.
+    """Pictures of the products, as PNG files in the output folder.
 
     ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``, ``power_spectra.png``, ``tod.png``,
     ``scan.png``, ``transfer_function.png``, each where there is something to show. Acts after all runs; the report shows the same

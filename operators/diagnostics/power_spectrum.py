@@ -111,7 +111,7 @@ class _State:
 
 
 class PowerSpectrum(Operator):
-    """Mean one-sided power spectra of the streams as they stand at this step, in K_RJ^2/Hz on the calibrated sky.
+    """Mean one-sided power spectra of the streams at this step, in K_RJ^2/Hz on the calibrated sky.
 
     Components are divided as the calibration divides them: `atmosphere` times epsilon, `white` and `pink`, by zeta e^-tau.
     Each segment is freed of a straight line, which takes the slow drift of the mean emission with elevation out.

@@ -34,7 +34,7 @@ _WIDE = 1000
 
 
 class Report(Output):
-    """Write ``report.html``: the pictures, what was simulated, with which seed and versions, what was counted and approximated.
+    """HTML report, ``report.html``: pictures, what was simulated, seed and versions, counts and approximations.
 
     The page needs no other file and no network. Acts after all runs: put it last, so that it knows of the files before it.
 

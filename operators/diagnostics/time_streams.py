@@ -18,7 +18,7 @@ from .series import TimeStream
 
 
 class TimeStreams(Operator):
-    """Keep the streams of a few detectors of one scan as they stand at this step, for a picture: product ``time_streams``.
+    """Streams of a few detectors of one scan at this step, for a picture: product ``time_streams``.
 
     Components (`sky`, `white` ...) are at the detector, before the calibration; `signal` is the calibrated sum.
     """
@@ -32,7 +32,7 @@ class TimeStreams(Operator):
     product_only: ClassVar[bool] = True
 
     streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
-    """Streams to keep; those absent at this step are left out and counted."""
+    """Streams to keep; those absent at this step are skipped and counted."""
     detectors: int = Field(3, ge=1, le=64)
     """Number of detectors, chosen evenly."""
     observation: int = Field(0, ge=0)

@@ -45,7 +45,7 @@ NO_POWER = 1e-12
 
 
 class TransferFunction(Output):
-    """Measure the share of each angular scale of the sky that the filters leave in the map.
+    """Transfer function of the filters: the share of the sky that they leave in the map at each angular scale.
 
     The map of the sky alone is compared with the same map binned without filters: the ratio of their cross spectrum to the
     spectrum of the latter, in rings of equal width in the logarithm of the scale. The two runs are made for this step, unless

@@ -22,12 +22,12 @@ from .map_file import MapFile, Provenance
 
 
 class SaveMap(Output):
-    """Write every map of the main and companion runs to the output folder.
+    """FITS files of all maps, in the output folder.
 
     ``map.fits``, ``noiseless_map.fits`` ...: the signal in the primary HDU (K_RJ), then HITS, WEIGHTS, NOISE and, where it was
     made, HALF_DIFFERENCE, all with the same world coordinates; HEALPix maps are explicit-index (partial) tables that healpy
     reads. ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the central
-    arcminute. Every file carries beam, seed, versions, the resolved YAML and the tally. Acts after all runs.
+    arcminute. Every file carries beam, seed, versions, the resolved YAML and the log of the run.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """

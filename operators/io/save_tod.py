@@ -43,7 +43,7 @@ class _State:
 
 
 class SaveTOD(Operator):
-    """Write the streams as they stand at this step, one file per scan: ``tod_<observation>.h5`` or ``.fits``.
+    """Files of the streams at this step, one per scan: ``tod_<observation>.h5`` or ``.fits``.
 
     The smooth mean emission is added in float64, so `signal` is the whole T_scan (or what the filters left of it). HDF5
     files have TOAST 3's layout (version 2), which TOAST and sotodlib read; the noise model in them is the instrument's

@@ -35,7 +35,7 @@ class NoiseModel(Parameters):
 
 
 class FixedNet(NoiseModel):
-    """The same NET whatever the loading."""
+    """The same NET for any load."""
 
     level: KelvinRootSecond | None = Field(None, ge=0)
     """Noise-equivalent temperature; None: each detector's own, from the instrument (quoted on the sky)."""

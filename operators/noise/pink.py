@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 
 class PinkNoise(Operator):
-    """Gaussian noise with a power-law spectrum, its own stream in every detector and observation.
+    """Gaussian noise with a power-law spectrum, independent for each detector and observation.
 
     One-sided power spectral density 2 NET^2 (f_knee / f)^slope from `minimum_frequency` to the Nyquist frequency, at the
     detector as for `WhiteNoise`; flat below. Made by a recursive filter (`power_law_filter`) of white noise, stationary from
-    the first sample and of any length. The error of the fitted spectrum is stated in the tally.
+    the first sample and of any length. The log of the run states the error of the fitted spectrum.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})

@@ -16,7 +16,7 @@ from .base import Pointing
 
 
 class PointingDaisy(Pointing):
-    """A double Lissajous daisy around the target (van Marrewijk et al. 2024).
+    """Daisy scan around the target, a double Lissajous figure (van Marrewijk et al. 2024).
 
     With x + iy the tangent-plane offset,
 

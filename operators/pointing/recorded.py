@@ -44,7 +44,7 @@ FAR = np.radians(0.1)
 
 
 class PointingRecorded(Operator):
-    """Simulate on a real scan: times and directions of the boresight, read from a file.
+    """Recorded scan: times and directions of the boresight, read from a file.
 
     HDF5 in TOAST's layout (what `SaveTOD` writes, too) or with datasets ``time``, ``az`` and ``el`` (or ``ra`` and ``dec``,
     ICRS; attribute ``units``), a FITS table with such columns, or CSV that begins with ``time [s], az [deg], el [deg]``; a

@@ -10,7 +10,7 @@ from .base import Pointing
 
 
 class PointingStare(Pointing):
-    """The boresight stays on the target: tracked where the target is ICRS or Galactic, still where it is az/el."""
+    """Boresight fixed on the target: tracking if it is ICRS or Galactic, at rest if it is az/el."""
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
         return np.zeros(len(seconds)), np.zeros(len(seconds))

@@ -43,7 +43,7 @@ LARGE = 1 << 26
 
 
 class SkyMap(Operator):
-    """Sky signal of a FITS or HEALPix map, averaged over the band and convolved with the beam, above the atmosphere (K_RJ).
+    """Signal of the sky above the atmosphere (K_RJ), from a FITS or HEALPix map: averaged over the band, convolved with the beam.
 
     A TAN image is used on its own pixels; other projections and HEALPix maps are first interpolated (third order) onto a
     TAN grid about the observation. The smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at
