@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any, ClassVar, Self
 
 
@@ -36,3 +37,16 @@ class Product(ABC):
         Only asked of products of map makers (`core.mapmaker`) that are linear.
         """
         raise NotImplementedError
+
+
+class Record(Product):
+    """A product that is a dataclass: what crosses are its fields."""
+
+    def arrays(self) -> Mapping[str, Any]:
+        """Its fields."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any]) -> Self:
+        """See `Product.of`."""
+        return cls(**arrays)

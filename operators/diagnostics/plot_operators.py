@@ -180,7 +180,8 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
             yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style), "run" if complete else "")
     if data.observations:
         yield Drawing("scan", draw_scan, lambda: ([Track.of(o) for o in data.observations],), "at once")
-    for name, product in data.products.items():
+    early = {p.product: p for p in data.partial.values() if isinstance(p, TimeStream)}
+    for name, product in (data.products | early).items():
         file = product_path("", name).name
         if isinstance(product, Spectrum):
             file = "power_spectra" if name == "spectrum" else f"power_spectra_{file}"

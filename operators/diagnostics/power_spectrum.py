@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, cast
 
@@ -13,17 +13,18 @@ from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
-from zonda.core.data import Block, Data, Observation, Tally
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
 
-from .series import Spectrum
+from .series import Spectrum, product_name
 
 StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
 
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
+"""Of spectra in pictures."""
 
 
 CHUNK = 8
@@ -102,12 +103,49 @@ def _quick(n: int) -> int:
 
 
 @dataclass
-class _State:
+class Periodograms:
+    """What is found of one scan: spectra by detector and stream.
+
+    ``welch``: None where the scan is too short. ``streams``: those asked for, None: the usual ones. ``place``: the step's label.
+    """
+
     detectors: NDArray[np.int64]
     welch: Welch | None
-    """None where the scan is too short."""
+    streams: Sequence[str] | None
+    place: str
     found: dict[int, dict[str, Floats]] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, block: Block, detector: int) -> None:
+        """Those of one detector, whose whole scan is in the block."""
+        assert self.welch is not None
+        found: dict[str, Floats] = {}
+        gain = _gain(block, detector)
+        for name in self.streams or [s for s in in_order(block.detdata) if s != "transmission"]:
+            if name not in block.detdata:
+                have = ", ".join(sorted(block.detdata))
+                raise PipelineError(f"there is no stream {name!r} at this step", place=self.place, cure=f"choose from: {have}")
+            with np.errstate(invalid="ignore", over="ignore"):  # of samples that are not finite: their spectrum is not
+                power = self.welch(_on_sky(block, detector, name, gain))
+            if np.isfinite(power).all():
+                found[name] = power
+            else:
+                block.observation.tally.count(self.place, f"detectors left out for non-finite samples of {name}", 1)
+        with self.lock:
+            self.found[detector] = found
+
+    def mean(self, observation: Observation) -> Spectrum | None:
+        """Of all detectors; None where there is nothing, which is counted."""
+        if self.welch is None or not any(self.found.values()):
+            why = "too short for" if self.welch is None else "without a detector that has"
+            observation.tally.count(self.place, f"scans {why} a power spectrum", 1)
+            return None
+        every, count = sorted(self.found), len(self.found)
+        rows = {name: [self.found[d][name] for d in every if name in self.found[d]] for d in every for name in self.found[d]}
+        psd = {name: np.mean(rows[name], axis=0) for name in in_order(rows)}
+        net = observation.focalplane.net[every]
+        white = 2 * float(np.mean(net**2)) if "white" in observation.components else 0.0
+        return Spectrum(self.welch.frequency, psd, self.welch.independent * count, white, self.place, count)
 
 
 class PowerSpectrum(Operator):
@@ -135,96 +173,49 @@ class PowerSpectrum(Operator):
     """Length of Welch's segments (at most the scan): the inverse of the frequency resolution. Shortened to a number of samples
     that has no prime factor above 5."""
 
-    def prepare(self, observation: Observation) -> _State:
+    def prepare(self, observation: Observation) -> Periodograms:
         usable = np.flatnonzero(observation.good_detectors)
         count = min(usable.size, self.detectors)
         chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
         length = _quick(min(observation.n_samples, max(2, round(self.segment * observation.sample_rate))))
         if flagged := int(np.count_nonzero(~observation.good_samples)):
             observation.tally.count(self.label, "flagged samples that the power spectra include", flagged, observation.n_samples)
-        return _State(usable[chosen], Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None)
+        welch = Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None
+        return Periodograms(usable[chosen], welch, self.streams, self.label)
 
-    def exec(self, block: Block, state: _State) -> None:
-        observation = block.observation
-        if block.shape[1] != observation.n_samples:
+    def exec(self, block: Block, state: Periodograms) -> None:
+        if block.shape[1] != block.observation.n_samples:
             raise PipelineError(
                 "got a part of a scan, not a whole one", place=self.label, cure="this is a fault of the executor: report it"
             )
-        if state.welch is None:
-            return
-        for d in state.detectors[(state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)]:
-            found: dict[str, Floats] = {}
-            gain = _gain(block, int(d))
-            names: Sequence[str] = self.streams or [s for s in ORDER if s in block.detdata and s != "transmission"]
-            for name in names:
-                if name not in block.detdata:
-                    have = ", ".join(sorted(block.detdata))
-                    raise PipelineError(
-                        f"there is no stream {name!r} at this step", place=self.label, cure=f"choose from: {have}"
-                    )
-                with np.errstate(invalid="ignore", over="ignore"):  # of samples that are not finite: their spectrum is not
-                    power = state.welch(_on_sky(block, int(d), name, gain))
-                if np.isfinite(power).all():
-                    found[name] = power
-                else:
-                    observation.tally.count(self.label, f"detectors left out for non-finite samples of {name}", 1)
-            with state.lock:
-                state.found[int(d)] = found
+        here = (state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)
+        for detector in state.detectors[here] if state.welch is not None else ():
+            state.add(block, int(detector))
 
-    def collect(self, data: Data, observation: Observation, state: _State) -> None:
-        if state.welch is None:
-            observation.tally.count(self.label, "scans too short for a power spectrum", 1)
-            return
-        if not any(state.found.values()):
-            observation.tally.count(self.label, "scans without a detector that has a power spectrum", 1)
-            return
-        names = [s for s in ORDER if any(s in f for f in state.found.values())]
-        psd = {}
-        for name in names:
-            rows = [state.found[d][name] for d in sorted(state.found) if name in state.found[d]]
-            psd[name] = np.mean(rows, axis=0)
-        count = len(state.found)
-        net = observation.focalplane.net[sorted(state.found)]
-        white = 2 * float(np.mean(net**2)) if "white" in observation.components else 0.0
-        mean = Spectrum(state.welch.frequency, psd, state.welch.independent * count, white, self.label, count)
-        self._add(data, mean, observation.tally)
+    def collect(self, data: Data, observation: Observation, state: Periodograms) -> None:
+        if (mean := state.mean(observation)) is not None:
+            data.add(self.label, mean)
 
-    @property
-    def _key(self) -> str:
-        return self.name or ("spectrum" if self.label == type(self).__name__ else self.label)
-
-    def _add(self, data: Data, new: Spectrum, tally: Tally) -> None:
-        """Take the mean of all scans, each with the same weight."""
-        key = data.product(self._key)
-        old = data.products.get(key)
-        if old is None:
-            data.products[key] = new
-        elif (
-            old.frequency.shape == new.frequency.shape
-            and np.allclose(old.frequency, new.frequency, rtol=1e-12)
-            and old.psd.keys() == new.psd.keys()
-        ):
-            n, m = old.observations, new.observations
-            merged = {k: (old.psd[k] * n + new.psd[k] * m) / (n + m) for k in old.psd}
-            level = (old.white_level * n + new.white_level * m) / (n + m)
-            averages = old.averages + new.averages
-            data.products[key] = Spectrum(old.frequency, merged, averages, level, self.label, new.detectors, n + m)
-        else:
-            tally.count(self.label, "scans of another length left out of the mean spectrum", new.observations)
+    def finalize(self, data: Data) -> None:
+        mean: Spectrum | None = data.take(self.label)
+        if mean is not None:
+            what = "scans of another length left out of the mean spectrum"
+            data.tally.count(self.label, what, mean.of_another_length)
+            data.products[product_name(self, "spectrum")] = mean
 
     def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
         """The mean so far."""
-        mean: Spectrum | None = data.products.pop(data.product(self._key), None)
-        if mean is None:
-            return None
-        return {
-            "frequency": mean.frequency, "psd": dict(mean.psd), "averages": mean.averages, "white_level": mean.white_level,
-            "detectors": mean.detectors, "observations": mean.observations,
-        }  # fmt: skip
+        mean: Spectrum | None = data.take(self.label)
+        return None if mean is None else mean.arrays()
 
     def merge(self, data: Data, part: Mapping[str, Any]) -> None:
         """Into the mean of all scans."""
-        self._add(data, Spectrum(**part, label=self.label), data.tally)
+        data.add(self.label, Spectrum.of(part))
+
+
+def in_order(streams: Iterable[str]) -> list[str]:
+    """Names of streams in the order of pictures."""
+    return sorted(streams, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
 
 
 def _gain(block: Block, detector: int) -> Floats:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from zonda.core.product import Record
 from zonda.core.types import Floats
+
+if TYPE_CHECKING:
+    from zonda.core.operator import Operator
 
 
 @dataclass
-class Spectrum:
+class Spectrum(Record):
     """Mean one-sided power spectral densities of time streams.
 
     Attributes
@@ -28,6 +33,8 @@ class Spectrum:
         Of the step that measured it.
     detectors, observations
         How many were averaged.
+    of_another_length
+        Scans that are not in the mean, since their frequencies or streams differ.
     """
 
     frequency: Floats
@@ -37,6 +44,20 @@ class Spectrum:
     label: str
     detectors: int
     observations: int = 1
+    of_another_length: int = 0
+
+    def __iadd__(self, other: Spectrum) -> Spectrum:
+        """The mean of all scans, each with the same weight."""
+        self.of_another_length += other.of_another_length
+        if self.psd.keys() != other.psd.keys() or not _close(self.frequency, other.frequency):
+            self.of_another_length += other.observations
+            return self
+        n, m = self.observations, other.observations
+        self.psd = {k: (self.psd[k] * n + other.psd[k] * m) / (n + m) for k in self.psd}
+        self.white_level = (self.white_level * n + other.white_level * m) / (n + m)
+        self.averages += other.averages
+        self.detectors, self.observations = other.detectors, n + m
+        return self
 
     def knee(self) -> float | None:
         """Highest frequency at which the pink part exceeds the white one [Hz]; None where it never does or one is absent."""
@@ -58,8 +79,12 @@ class Spectrum:
         return float(np.exp(np.interp(0.0, [-ratio[k], -ratio[k + 1]], [log_f[k], log_f[k + 1]])))
 
 
+def _close(a: Floats, b: Floats) -> bool:
+    return a.shape == b.shape and np.allclose(a, b, rtol=1e-12)
+
+
 @dataclass
-class TimeStream:
+class TimeStream(Record):
     """Streams of a few detectors of one scan.
 
     Attributes
@@ -72,6 +97,8 @@ class TimeStream:
         (n_det) detector names.
     observation, label
         Name of the scan; the step at which they were taken.
+    product
+        Name among the products.
     """
 
     seconds: Floats
@@ -79,3 +106,13 @@ class TimeStream:
     names: list[str]
     observation: str
     label: str
+    product: str = "time_streams"
+
+    def __iadd__(self, other: TimeStream) -> TimeStream:
+        """The first one stays."""
+        return self
+
+
+def product_name(step: Operator, usual: str) -> str:
+    """Name of a step's product: ``usual``, or the step's own where it has one."""
+    return step.name or (usual if step.label == type(step).__name__ else step.label)

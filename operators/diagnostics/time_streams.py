@@ -14,7 +14,7 @@ from zonda.core.operator import Operator
 from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
 
-from .series import TimeStream
+from .series import TimeStream, product_name
 
 
 class TimeStreams(Operator):
@@ -50,29 +50,24 @@ class TimeStreams(Operator):
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:
             return None
-        n = observation.n_detectors
-        chosen = np.unique(np.linspace(0, n - 1, min(n, self.detectors)).round().astype(int))
+        n, shape = observation.n_detectors, (min(observation.n_detectors, self.detectors), observation.n_samples)
+        chosen = np.linspace(0, n - 1, shape[0]).round().astype(int)
         names = [observation.focalplane.names[d] for d in chosen]
-        streams: dict[str, Floats] = {
-            s: np.full((len(names), observation.n_samples), np.nan) for s in dict.fromkeys(self.streams)
-        }
-        return TimeStream(observation.seconds, streams, names, observation.name, self.label)
+        streams: dict[str, Floats] = {name: np.full(shape, np.nan) for name in self.streams}
+        key = product_name(self, "time_streams")
+        return TimeStream(observation.seconds, streams, names, observation.name, self.label, key)
 
     def exec(self, block: Block, state: TimeStream | None) -> None:
         if state is None:
             return
-        order = {name: k for k, name in enumerate(state.names)}
-        for d in range(block.detectors.start, block.detectors.stop):
-            k = order.get(block.observation.focalplane.names[d])
-            if k is None:
-                continue
-            row = slice(d, d + 1)
-            for name, kept in state.streams.items():
-                if name in block.detdata:
+        for k, detector in enumerate(state.names):
+            d = block.observation.focalplane.names.index(detector)
+            if block.detectors.start <= d < block.detectors.stop:
+                for name in state.streams.keys() & block.detdata.keys():
                     values = block.detdata[name][d - block.detectors.start].astype(np.float64)
                     if name in block.means:
-                        values += block.means[name].evaluate(row, block.samples)[0]
-                    kept[k, block.samples] = values
+                        values += block.means[name].evaluate(slice(d, d + 1), block.samples)[0]
+                    state.streams[name][k, block.samples] = values
 
     def collect(self, data: Data, observation: Observation, state: TimeStream | None) -> None:
         if state is None:
@@ -80,23 +75,18 @@ class TimeStreams(Operator):
         for name in [s for s, values in state.streams.items() if np.isnan(values).all()]:
             del state.streams[name]
             observation.tally.count(self.label, f"stream {name} is absent at this step", 1)
-        data.products[data.product(self._key)] = state
+        data.add(self.label, state)
 
-    @property
-    def _key(self) -> str:
-        return self.name or ("time_streams" if self.label == type(self).__name__ else self.label)
+    def finalize(self, data: Data) -> None:
+        kept: TimeStream | None = data.take(self.label)
+        if kept is not None:
+            data.products[kept.product] = kept
 
     def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
         """The streams."""
-        kept: TimeStream | None = data.products.pop(data.product(self._key), None)
-        if kept is None:
-            return None
-        return {
-            "seconds": kept.seconds, "streams": dict(kept.streams), "names": list(kept.names), "observation": kept.observation
-        }  # fmt: skip
+        kept: TimeStream | None = data.take(self.label)
+        return None if kept is None else kept.arrays()
 
     def merge(self, data: Data, part: Mapping[str, Any]) -> None:
         """Keep those of the first part that has any."""
-        key = data.product(self._key)
-        if key not in data.products:
-            data.products[key] = TimeStream(part["seconds"], part["streams"], part["names"], part["observation"], self.label)
+        data.add(self.label, TimeStream.of(part))

@@ -17,6 +17,7 @@ from zonda.core.errors import InputError, OutputError
 from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
 from zonda.core.operator import Operator
 from zonda.core.output import output_folder
+from zonda.core.product import Record
 from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
 from zonda.core.stream_names import StreamsAsked
@@ -28,6 +29,18 @@ if TYPE_CHECKING:
     from zonda.core.weather import GroundWeather
 
 _FORMATS: dict[str, Any] = {"hdf5": toast_hdf5, "fits": fits_table}
+
+
+@dataclass
+class Files(Record):
+    """Files that were written, in the order of their scans."""
+
+    paths: list[str]
+
+    def __iadd__(self, other: Files) -> Files:
+        """Those of later scans follow."""
+        self.paths += other.paths
+        return self
 
 
 @dataclass
@@ -111,7 +124,12 @@ class SaveTOD(Operator):
         state.tod.metadata.update(_provenance(data), tally="\n".join(f"{who}: {what}: {v}" for who, what, v in observation.tally))
         state.writer.finish()
         publish(state.temporary, state.path)
-        data.products.setdefault(data.product("tod_file"), []).append(state.path)
+        data.add(self.label, Files([str(state.path)]))
+
+    def finalize(self, data: Data) -> None:
+        files: Files | None = data.take(self.label)
+        if files is not None:
+            data.products.setdefault("tod_file", []).extend(map(Path, files.paths))
 
     def _weather(self, data: Data, observation: Observation) -> GroundWeather | None:
         """That of the scene, where no step made an atmosphere of it."""
@@ -124,12 +142,12 @@ class SaveTOD(Operator):
 
     def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
         """The names of the files."""
-        files = data.products.pop(data.product("tod_file"), None)
-        return None if files is None else {"files": [str(path) for path in files]}
+        files: Files | None = data.take(self.label)
+        return None if files is None else files.arrays()
 
     def merge(self, data: Data, part: Mapping[str, Any]) -> None:
         """Add to the list of files."""
-        data.products.setdefault(data.product("tod_file"), []).extend(Path(path) for path in part["files"])
+        data.add(self.label, Files.of(part))
 
     def discard(self, observation: Observation, state: _State) -> None:
         state.writer.close()

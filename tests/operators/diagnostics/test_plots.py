@@ -557,6 +557,7 @@ def test_time_streams_are_kept_whole(make_observation, data):
         for columns in (slice(0, 2048), slice(2048, 5000)):
             operator.exec(Block(observation, rows, columns, {"signal": signal[rows, columns]}, {"signal": mean}), state)
     operator.collect(data, observation, state)
+    operator.finalize(data)
     kept = data.products["time_streams"]
     assert kept.names == ["d00", "d09", "d18"]
     np.testing.assert_allclose(

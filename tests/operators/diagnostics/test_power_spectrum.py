@@ -27,6 +27,7 @@ def run(operator, observation, data, streams, means=None, sizes=(16,)):
             operator.exec(Block(observation, slice(first, last), slice(0, observation.n_samples), part, means or {}), state)
         first = last
     operator.collect(data, observation, state)
+    operator.finalize(data)
     return data.products["spectrum"]
 
 
@@ -108,14 +109,16 @@ def test_no_block_size_changes_a_bit(make_observation, data, noise):
 
 def test_scans_are_averaged(make_observation, data, noise):
     operator = PowerSpectrum(streams=["signal"], detectors=4)
-    one = run(operator, make_observation(20000), data, noise)
-    both = run(operator, make_observation(20000, index=1), data, {"signal": 3 * noise["signal"]})
+    one, three = (run(operator, make_observation(20000), data, {"signal": k * noise["signal"]}) for k in (1, 3))
+    short = run(operator, make_observation(1000), data, {"signal": noise["signal"][:, :1000]})
+    before = one.psd["signal"].copy()
+    for spectrum in (one, three, short):
+        data.add(operator.label, type(spectrum).of(spectrum.arrays()))  # as from another process
+    operator.finalize(data)
+    both = data.products["spectrum"]
     assert both.observations == 2
-    np.testing.assert_allclose(both.psd["signal"], 5 * one.psd["signal"], rtol=1e-6)  # (1 + 9) / 2
-    third = make_observation(1000, index=2)
-    run(operator, third, data, {"signal": noise["signal"][:, :1000]})
-    assert third.tally.get("PowerSpectrum", "scans of another length left out of the mean spectrum") == 1
-    assert data.products["spectrum"].observations == 2
+    np.testing.assert_allclose(both.psd["signal"], 5 * before, rtol=1e-6)  # (1 + 9) / 2
+    assert data.tally.get("PowerSpectrum", "scans of another length left out of the mean spectrum") == 1
 
 
 def test_flagged_and_broken_detectors(make_observation, data, noise):
@@ -135,6 +138,7 @@ def test_a_scan_of_one_sample(make_observation, data):
     state = operator.prepare(observation)
     operator.exec(Block(observation, slice(0, 19), slice(0, 1), {"signal": np.ones((19, 1), np.float32)}), state)
     operator.collect(data, observation, state)
+    operator.finalize(data)
     assert data.products == {}
     assert observation.tally.get("PowerSpectrum", "scans too short for a power spectrum") == 1
 
@@ -146,6 +150,7 @@ def test_a_scan_whose_detectors_are_all_flagged(make_observation, data, noise):
     state = operator.prepare(observation)
     operator.exec(Block(observation, slice(0, 19), slice(0, 20000), noise), state)
     operator.collect(data, observation, state)
+    operator.finalize(data)
     assert data.products == {}
     assert observation.tally.get("PowerSpectrum", "scans without a detector that has a power spectrum") == 1
 

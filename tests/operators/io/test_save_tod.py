@@ -69,6 +69,7 @@ def write(operator, observation, data, streams, mean, threads=False, **sizes):
             operator.exec(block, state)
     observation.detector_flags[3] = 1  # set while the chain ran: must be in the file
     operator.collect(data, observation, state)
+    operator.finalize(data)
     (path,) = data.products["tod_file"]
     return path
 
