@@ -35,6 +35,7 @@ _WHERE = {
     "Output": "zonda.core.output",
     "Planning": "zonda.core.plan.planning",
     "Knob": "zonda.core.knobs",
+    "NoiseModel": "zonda.operators.noise.models",
     "register": "zonda.core.registry",
     "normals": "zonda.core.numerics.random",
     "uniforms": "zonda.core.numerics.random",
@@ -84,6 +85,7 @@ if TYPE_CHECKING:
     from zonda.core.scene import Scene as Scene
     from zonda.core.site import Site as Site
     from zonda.core.stream import Stream as Stream
+    from zonda.operators.noise.models import NoiseModel as NoiseModel
 
 
 def __getattr__(name: str) -> Any:

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from zonda import Fraction
-from zonda.operators.noise.models import NoiseModel
+from zonda import Fraction, NoiseModel
 
 
 class ExampleRings(NoiseModel):
