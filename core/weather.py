@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
-from pydantic_core import PydanticCustomError, core_schema
+from pydantic import ValidationInfo
 
-from .configuration.diagnostics import refusal
 from .configuration.parameters import Parameters
 from .configuration.units import Unit
+from .configuration.values import TextValue, mistake, refusal
 from .errors import InputError, ZondaError
 from .registry import weather_sources
 
@@ -30,10 +29,12 @@ SHORTHAND = {"file": "era5", "table": "table"}
 
 
 @dataclass(frozen=True)
-class Pwv:
+class Pwv(TextValue):
     """Precipitable water vapour as a user gives it: a value, a quantile of what the place has at that season and hour, or a
-    random draw from the same distribution. A pydantic field type.
+    random draw from the same distribution.
     """
+
+    json_schema: ClassVar[dict[str, Any]] = {"type": "string", "examples": ["1.2 mm", "25 %", "random"]}
 
     metres: float | None = None
     """Value, m."""
@@ -42,7 +43,7 @@ class Pwv:
 
     @classmethod
     def parse(cls, value: Any) -> Pwv:
-        """From ``1.2 mm``, ``25 %``, ``random``, an astropy quantity, or a Pwv. Raises PydanticCustomError."""
+        """From ``1.2 mm``, ``25 %``, ``random``, an astropy quantity, or a Pwv."""
         if isinstance(value, Pwv):
             return value
         text = value.strip() if isinstance(value, str) else ""
@@ -51,29 +52,18 @@ class Pwv:
         if text.endswith("%"):
             quantile = Unit("").parse(text)
             if not 0 < quantile < 1:
-                message = f"a quantile of {text} is outside the limits, above 0 % and below 100 %"
-                raise PydanticCustomError("pwv_quantile", "{message}", {"message": message})
+                raise mistake(f"a quantile of {text} is outside the limits, above 0 % and below 100 %")
             return cls(quantile=quantile)
         metres = Unit("m").parse(value)
         if not 0 <= metres <= PWV_MAX:
             message = f"a precipitable water vapour of {metres * 1e3:g} mm is outside the limits, 0 to {PWV_MAX * 1e3:g} mm"
-            raise PydanticCustomError("pwv_range", "{message}", {"message": message, "label": "not the air of this planet"})
+            raise mistake(message, "more than any atmosphere on Earth holds" if metres > 0 else "it cannot be negative")
         return cls(metres=metres)
 
     def __str__(self) -> str:
         if self.metres is not None:
             return Unit("m").write(self.metres)
         return f"{self.quantile * 100:.12g} %" if self.quantile is not None else "random"
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        return core_schema.no_info_plain_validator_function(
-            cls.parse, serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json")
-        )
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"type": "string", "examples": ["1.2 mm", "25 %", "random"]}
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,9 @@ import difflib
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from ..errors import ZondaError
 from .yaml_places import Span
-
-if TYPE_CHECKING:
-    from pydantic_core import PydanticCustomError
 
 WIDTH = 140
 """Longer source lines are cut around the caret."""
@@ -97,16 +93,6 @@ class ConfigurationError(ZondaError):
 
     def __str__(self) -> str:
         return self.render()
-
-
-def refusal(err: ZondaError) -> PydanticCustomError:
-    """What a validator raises where ``err`` says what is wrong with its value: shown at the value's place."""
-    from pydantic_core import PydanticCustomError
-
-    first = err.diagnostics[0] if isinstance(err, ConfigurationError) and err.diagnostics else None
-    message = first.message if first else f"{err.place}: {err.message}" if err.place else err.message
-    label, cure = (first.label, first.help) if first else (getattr(err, "label", ""), err.cure)
-    return PydanticCustomError("refused", "{message}", {"message": message, "label": label, "help": cure})
 
 
 def nearest(word: object, options: Iterable[str], otherwise: str = "") -> str:

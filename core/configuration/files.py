@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ValidationInfo
-from pydantic_core import PydanticCustomError
+
+from .diagnostics import nearest
+from .values import mistake
 
 
 def find(value: Any, info: ValidationInfo) -> Path:
-    """The absolute path of an existing file. Raises PydanticCustomError with the folders tried."""
+    """The absolute path of an existing file. Raises what names the folders tried."""
     if not isinstance(value, str | Path) or not str(value).strip():
-        raise PydanticCustomError("path_type", "expected the path of a file, got {value}", {"value": repr(value)[:60]})
+        raise mistake(f"expected the path of a file, got {value!r:.60}")
     path = Path(value)
     with suppress(RuntimeError):  # nobody of that name: take ~ as it stands
         path = path.expanduser()
@@ -25,17 +27,13 @@ def find(value: Any, info: ValidationInfo) -> Path:
             return candidate.resolve()
     for candidate in tried:
         if candidate.exists():
-            message = "'{path}' is not a file" + (" but a folder" if candidate.is_dir() else "")
-            raise PydanticCustomError("path_kind", message, {"path": str(value), "help": f"it is {candidate}"})
+            message = f"'{value}' is not a file" + (" but a folder" if candidate.is_dir() else "")
+            raise mistake(message, help=f"it is {candidate}")
     where = " and ".join(str(p.parent) for p in tried)
-    near = _similar(tried)
-    context = {"path": str(value), "where": where, "label": near}
-    raise PydanticCustomError("path_missing", "no such file: '{path}', looked in {where}", context)
+    raise mistake(f"no such file: '{value}', looked in {where}", _similar(tried))
 
 
 def _similar(tried: list[Path]) -> str:
-    from .diagnostics import nearest
-
     for path in tried:
         if path.parent.is_dir():
             hint = nearest(path.name, (p.name for p in path.parent.iterdir() if p.is_file()))

@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, Validat
 
 from ..errors import ZondaError
 from ..notebook import html_table
-from .diagnostics import refusal
 from .docstrings import described, own_doc, remember_place
+from .values import refusal
 
 
 def quantity(default: str, **limits: Any) -> Any:

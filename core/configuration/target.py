@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
-from pydantic_core import PydanticCustomError, core_schema
+from pydantic import GetJsonSchemaHandler
+
+from .values import TextValue, mistake
 
 Frame = Literal["icrs", "galactic", "horizontal"]
 
@@ -62,8 +63,8 @@ _DEGREES = {
 
 
 @dataclass(frozen=True, repr=False)
-class Target:
-    """A point of the sky. A pydantic field type.
+class Target(TextValue):
+    """A point of the sky.
 
     Attributes
     ----------
@@ -84,9 +85,7 @@ class Target:
         """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, a pair of angles (ICRS), SkyCoord or Target.
 
         Text: two angles, sexagesimal (h for hours; colons or spaces mean hours for a right ascension and degrees elsewhere) or
-        with a unit; the frame's name or the coordinates' names may stand before them; ICRS where neither does.
-        Raises `pydantic_core.PydanticCustomError` (a ValueError) that says what was expected.
-        """
+        with a unit; the frame's name or the coordinates' names may stand before them; ICRS where neither does."""
         if isinstance(value, Target):
             return value
         if isinstance(value, str):
@@ -97,9 +96,7 @@ class Target:
             return cls._of("icrs", *value)
         if hasattr(getattr(value, "icrs", None), "ra") and getattr(value, "isscalar", False):  # a SkyCoord
             return cls("icrs", float(value.icrs.ra.rad) % (2 * math.pi), float(value.icrs.dec.rad))
-        raise PydanticCustomError(
-            "target_type", "expected a position such as '{eg}', got {got}", {"eg": _EXAMPLES[0], "got": repr(value)}
-        )
+        raise mistake(f"expected a position such as '{_EXAMPLES[0]}', got {value!r}")
 
     @classmethod
     def _from_text(cls, text: str) -> Target:
@@ -109,41 +106,24 @@ class Target:
             return cls._of("icrs", f"{h}:{m}:{s}", ":".join(dec))
         match = _PAIR.fullmatch(plain)
         if match is None and text.strip().lower() == "map":
-            raise PydanticCustomError(
-                "target_map", "'map', the centre of the input map, is for the target at the top level of a pipeline file", {}
-            )
+            raise mistake("'map', the centre of the input map, is for the target at the top level of a pipeline file")
         if match is None and (_SEXAGESIMAL.fullmatch(plain) or (_DECIMAL.fullmatch(plain) and plain[-1:].isalpha())):
-            raise PydanticCustomError(
-                "target_one",
-                "{got} is one angle; a position needs two, a right ascension and a declination, such as '{eg}'",
-                {"got": repr(text), "eg": _EXAMPLES[0], "label": "one angle is missing"},
-            )
+            wanted = f"a position needs two, a right ascension and a declination, such as '{_EXAMPLES[0]}'"
+            raise mistake(f"{text!r} is one angle; {wanted}", "one angle is missing")
         if match is None and (equinox := _EQUINOX.search(plain)):
-            raise PydanticCustomError(
-                "target_equinox",
-                "positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read",
-                {
-                    "word": equinox[0].strip(),
-                    "label": f"leave '{equinox[0].strip()}' out" + ("" if "2000" in equinox[0] else "; precess it"),
-                },
-            )
+            word = equinox[0].strip()
+            label = f"leave '{word}' out" + ("" if "2000" in word else "; precess it")
+            raise mistake(f"positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read", label)
         if match is None:
-            raise PydanticCustomError(
-                "target_text",
-                "cannot read {got} as a position; write two angles such as '{eg}' (names of objects are not looked up)",
-                {"got": repr(text), "eg": _EXAMPLES[0], "label": f"e.g. {' | '.join(_EXAMPLES)}"},
-            )
+            cure = f"write two angles such as '{_EXAMPLES[0]}' (names of objects are not looked up)"
+            raise mistake(f"cannot read {text!r} as a position; {cure}", f"e.g. {' | '.join(_EXAMPLES)}")
         keys = tuple((match[k] or "").lower() for k in ("key1", "key2"))
         named = match["frame"].lower() if match["frame"] else None
         frame: Frame = next((f for f in _KEYS if f == named), "icrs")
         if any(keys):
             by_key = [f for f, pair in _KEYS.items() if pair == keys]
             if not by_key or (named and named != by_key[0]):
-                raise PydanticCustomError(
-                    "target_frame",
-                    "the coordinate names in {got} do not belong together; use ra dec, l b, or az el",
-                    {"got": repr(text)},
-                )
+                raise mistake(f"the coordinate names in {text!r} do not belong together; use ra dec, l b, or az el")
             frame = by_key[0]
         return cls._of(frame, match["first"], match["second"])
 
@@ -152,11 +132,8 @@ class Target:
         for frame, pair in _KEYS.items():
             if set(value) == set(pair):
                 return cls._of(frame, value[pair[0]], value[pair[1]])
-        raise PydanticCustomError(
-            "target_keys",
-            "a position needs exactly the keys ra and dec, l and b, or az and el, not {got}",
-            {"got": ", ".join(map(str, value)) or "none"},
-        )
+        given = ", ".join(map(str, value)) or "none"
+        raise mistake(f"a position needs exactly the keys ra and dec, l and b, or az and el, not {given}")
 
     @classmethod
     def _of(cls, frame: Frame, first: Any, second: Any) -> Target:
@@ -164,9 +141,7 @@ class Target:
         longitude = _radians(first, names[0], hours=frame == "icrs", wrap=True)
         latitude = _radians(second, names[1], hours=False)
         if not abs(latitude) <= math.pi / 2:
-            raise PydanticCustomError(
-                "target_latitude", "{name} must lie between -90 deg and 90 deg, got {got}", {"name": names[1], "got": str(second)}
-            )
+            raise mistake(f"{names[1]} must lie between -90 deg and 90 deg, got {second}")
         return cls(frame, longitude, latitude)
 
     def icrs(self) -> tuple[float, float]:
@@ -189,12 +164,6 @@ class Target:
 
     def __repr__(self) -> str:
         return f"Target.parse({str(self)!r})"
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        return core_schema.no_info_plain_validator_function(
-            cls.parse, serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json")
-        )
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -232,53 +201,38 @@ def _read(value: Any, name: str, *, hours: bool) -> tuple[float, Literal["rad", 
     if hasattr(value, "to_value"):  # an astropy Quantity or Angle
         return float(value.to_value("deg")), "deg"
     if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise PydanticCustomError("target_angle", "{name} must be an angle such as '75 deg', got {got}", _about(name, value))
+        raise mistake(f"{name} must be an angle such as '75 deg', got {value!r}")
     text = str(value).replace("\N{MINUS SIGN}", "-").strip()
+    given = f"{name} {(value.strip() if isinstance(value, str) else value)!r}"
     if match := _SEXAGESIMAL.fullmatch(text):
         return _sexagesimal(match, name, hours=hours), "deg"
     match = _DECIMAL.fullmatch(text)
     if match is None:
-        raise PydanticCustomError(
-            "target_angle", "cannot read {name} {got}; write an angle such as '75 deg'", _about(name, value)
-        )
+        raise mistake(f"cannot read {given}; write an angle such as '75 deg'")
     number, unit = float(match["number"]), match["unit"].strip().lower()
     if not unit:
-        raise PydanticCustomError(
-            "unit_missing",
-            "{name} {got} has no unit; write an angle such as '{text} deg'",
-            {**_about(name, value), "text": text, "label": f"add a unit, e.g. {text} deg"},
-        )
+        raise mistake(f"{given} has no unit; write an angle such as '{text} deg'", f"add a unit, e.g. {text} deg")
     if not math.isfinite(number):
-        raise PydanticCustomError("target_finite", "{name} must be finite, got {got}", _about(name, value))
+        raise mistake(f"{name} must be finite, got {value!r}")
     if unit in ("rad", "radian", "radians"):
         return number, "rad"
     if unit not in _DEGREES:
-        raise PydanticCustomError(
-            "unit_unknown",
-            "unknown unit '{unit}' in {name} {got}; use deg, hourangle, arcmin, arcsec or rad",
-            {**_about(name, value), "unit": unit},
-        )
+        raise mistake(f"unknown unit '{unit}' in {given}; use deg, hourangle, arcmin, arcsec or rad")
     return number * _DEGREES[unit], "deg"
 
 
 def _sexagesimal(match: re.Match[str], name: str, *, hours: bool) -> float:
-    colons = match["mark"] == ":"
+    colons, given = match["mark"] == ":", f"{name} {match[0]!r}"
     if colons and match["mark2"] not in (":", None):
-        raise PydanticCustomError(
-            "target_angle", "cannot read {name} {got}; do not mix colons and letters", _about(name, match[0])
-        )
+        raise mistake(f"cannot read {given}; do not mix colons and letters")
     minutes, seconds = float(match["minutes"]), float(match["seconds"] or 0)
     if minutes >= 60 or seconds >= 60:
-        raise PydanticCustomError("target_sixty", "minutes and seconds of {name} {got} must be below 60", _about(name, match[0]))
+        raise mistake(f"minutes and seconds of {given} must be below 60")
     if (match["mark"].lower() == "h" or (colons and hours)) and int(match["whole"]) >= 24:
-        raise PydanticCustomError("target_hours", "the hours of {name} {got} must be below 24", _about(name, match[0]))
+        raise mistake(f"the hours of {given} must be below 24")
     magnitude = int(match["whole"]) + (minutes + seconds / 60) / 60
     unit = 15.0 if match["mark"].lower() == "h" or (colons and hours) else 1.0
     return (-magnitude if match["sign"] == "-" else magnitude) * unit
-
-
-def _about(name: str, value: Any) -> dict[str, Any]:
-    return {"name": name, "got": repr(value.strip() if isinstance(value, str) else value)}
 
 
 def _text(angle: float, *, wrap: bool = False) -> str:

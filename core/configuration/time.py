@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
-from typing import Any
+from typing import Any, ClassVar
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
-from pydantic_core import PydanticCustomError, core_schema
+from .values import TextValue, mistake
 
 SECOND = 1_000_000_000
 """Nanoseconds in a second."""
@@ -25,22 +24,21 @@ _ISO = re.compile(
 
 
 @dataclass(frozen=True, order=True, repr=False)
-class Instant:
-    """An instant of UTC, exact to the nanosecond. A pydantic field type; ordered and hashable.
+class Instant(TextValue):
+    """An instant of UTC, exact to the nanosecond. Ordered and hashable.
 
     POSIX time: every day has 86400 seconds, so differences across a leap second (the last one ended 2016) are one second
     short, and the leap second itself (23:59:60) has no name.
     """
+
+    json_schema: ClassVar[dict[str, Any]] = {"type": "string", "pattern": r"^\d{4}-\d{2}-\d{2}", "examples": _EXAMPLES}
 
     nanoseconds: int
     """Nanoseconds since 1970-01-01T00:00:00 UTC."""
 
     @classmethod
     def parse(cls, value: Any) -> Instant:
-        """From ISO 8601 text (UTC unless it carries Z or an offset), a datetime (naive: UTC), an astropy Time or an Instant.
-
-        Raises `pydantic_core.PydanticCustomError` (a ValueError) that says what was expected.
-        """
+        """From ISO 8601 text (UTC unless it carries Z or an offset), a datetime (naive: UTC), an astropy Time or an Instant."""
         if isinstance(value, Instant):
             return value
         if isinstance(value, datetime):
@@ -49,9 +47,7 @@ class Instant:
             return cls._from_text(value)
         if hasattr(value, "utc") and hasattr(value, "jd1"):
             return cls._from_astropy(value)
-        raise PydanticCustomError(
-            "time_type", "expected a time such as '{eg}', got {got}", {"eg": _EXAMPLES[0], "got": repr(value)}
-        )
+        raise mistake(f"expected a time such as '{_EXAMPLES[0]}', got {value!r}")
 
     @classmethod
     def _from_datetime(cls, value: datetime) -> Instant:
@@ -63,26 +59,15 @@ class Instant:
     def _from_text(cls, text: str) -> Instant:
         match = _ISO.fullmatch(text.strip())
         if match is None:
-            raise PydanticCustomError(
-                "time_text",
-                "cannot read {got} as a time; write ISO 8601 text such as '{eg}'",
-                {"got": repr(text), "eg": _EXAMPLES[0], "label": "expected YYYY-MM-DDThh:mm[:ss][Z or an offset such as -05:00]"},
-            )
+            message = f"cannot read {text!r} as a time; write ISO 8601 text such as '{_EXAMPLES[0]}'"
+            raise mistake(message, "expected YYYY-MM-DDThh:mm[:ss][Z or an offset such as -05:00]")
         part = match.groupdict()
         seconds = int(part["second"] or 0)
         if seconds == 60:
-            raise PydanticCustomError(
-                "time_leap",
-                "{got} is a leap second, which POSIX time cannot name",
-                {"got": repr(text), "label": "add one second"},
-            )
+            raise mistake(f"{text!r} is a leap second, which POSIX time cannot name", "add one second")
         fraction = part["fraction"] or ""
         if len(fraction.rstrip("0")) > 9:
-            raise PydanticCustomError(
-                "time_digits",
-                "{got} has more than nine decimals of a second",
-                {"got": repr(text), "label": "times are exact to 1 ns"},
-            )
+            raise mistake(f"{text!r} has more than nine decimals of a second", "times are exact to 1 ns")
         try:
             zone: timezone = UTC
             if part["sign"]:
@@ -96,16 +81,14 @@ class Instant:
             if not 2 <= local.year <= 9998:  # a scan, or another time zone, may end in another year
                 raise ValueError("the year is not between 2 and 9998")
         except ValueError as err:
-            raise PydanticCustomError(
-                "time_range", "{got} is no time: {why}", {"got": repr(text), "why": str(err), "eg": _EXAMPLES[0]}
-            ) from None
+            raise mistake(f"{text!r} is no time: {err}") from None
         return cls(cls._from_datetime(local).nanoseconds + int(fraction[:9].ljust(9, "0")))
 
     @classmethod
     def _from_astropy(cls, value: Any) -> Instant:
         utc = value.utc
         if not getattr(utc, "isscalar", True):
-            raise PydanticCustomError("time_scalar", "expected one time, got an array of {n}", {"n": int(utc.size)})
+            raise mistake(f"expected one time, got an array of {utc.size}")
         utc.precision = 9
         return cls._from_text(str(utc.isot))
 
@@ -140,13 +123,3 @@ class Instant:
 
     def __repr__(self) -> str:
         return f"Instant.parse({self.isoformat()!r})"
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        return core_schema.no_info_plain_validator_function(
-            cls.parse, serialization=core_schema.plain_serializer_function_ser_schema(cls.isoformat, when_used="json")
-        )
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"type": "string", "pattern": r"^\d{4}-\d{2}-\d{2}", "examples": _EXAMPLES}

@@ -22,6 +22,7 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
 from .diagnostics import nearest
+from .values import mistake
 
 
 class Kind(NamedTuple):
@@ -162,12 +163,12 @@ class Unit:
         return self.kind.examples[0]
 
     def parse(self, value: Any) -> float:
-        """The quantity in SI. Raises PydanticCustomError with ``label`` and ``caret`` (offset, length) in its context."""
+        """The quantity in SI. Raises what `mistake` makes."""
         if isinstance(value, str):
             number, unit, caret = self._split(value)
             result = number * self._factor(value, unit, caret) if unit else number
         elif isinstance(value, bool) or value is None or not (isinstance(value, Real) or hasattr(value, "to_value")):
-            raise self._error("unit_type", f"expected {self.kind.noun} such as '{self.example}', got {value!r:.60}")
+            raise mistake(f"expected {self.kind.noun} such as '{self.example}', got {value!r:.60}")
         elif isinstance(value, Real):
             if self.unit:
                 raise self._without_unit(f"{value}")
@@ -175,10 +176,10 @@ class Unit:
         else:
             result = self._from_astropy(value)
         if not math.isfinite(result):
-            raise self._error("unit_finite", f"expected a finite number, got {value}")
+            raise mistake(f"expected a finite number, got {value}")
         if result and not LEAST <= abs(result) <= self.kind.most:
             beyond = f"more than {self.kind.most:g}" if abs(result) > 1 else f"less than {LEAST:g}"
-            raise self._error("unit_range", f"{value} is {beyond} {self.unit}".rstrip() + ", beyond what can be computed with")
+            raise mistake(f"{value} is {beyond} {self.unit}".rstrip() + ", beyond what can be computed with")
         return result
 
     def write(self, value: float) -> str:
@@ -196,19 +197,15 @@ class Unit:
         match = _NUMBER.match(text)
         if not match:
             message = f"cannot read {text!r:.60} as {self.kind.noun}; write a number and a unit such as '{self.example}'"
-            raise self._error("unit_number", message if self.unit else message.replace(" and a unit", ""))
+            raise mistake(message if self.unit else message.replace(" and a unit", ""))
         if not match[2] and self.unit:
             raise self._without_unit(match[1])
         return float(match[1]), match[2], (match.start(2), len(match[2]))
 
     def _factor(self, text: str, unit: str, caret: tuple[int, int]) -> float:
         if self.unit == "K s(1/2)" and "Hz" in unit:
-            raise self._error(
-                "unit_ambiguous",
-                f"'{unit}' may mean two things that differ by sqrt(2); write {self.kind.noun} in K s(1/2)",
-                caret,
-                "divide a NET per root hertz by sqrt(2)",
-            )
+            message = f"'{unit}' may mean two things that differ by sqrt(2); write {self.kind.noun} in K s(1/2)"
+            raise mistake(message, "divide a NET per root hertz by sqrt(2)", caret=caret)
         measure, own = read_unit(unit), read_unit(self.unit)
         if measure is None or own is None:
             return self._factor_by_astropy(text, unit, caret)
@@ -229,7 +226,7 @@ class Unit:
             otherwise = f"did you mean {hint[1]}?" if hint else f"expected {self.kind.noun}, e.g. '{self.example}'"
             own = read_unit(self.unit)
             label = nearest(unit, (name for name, (_, powers) in UNITS.items() if own and powers == own.powers), otherwise)
-            raise self._error("unit_unknown", f"unknown unit '{unit}' in {text!r:.60}", caret, label) from None
+            raise mistake(f"unknown unit '{unit}' in {text!r:.60}", label, caret=caret) from None
         try:
             return float(parsed.to(u.Unit(self.unit)))
         except u.UnitConversionError:
@@ -239,7 +236,7 @@ class Unit:
         import astropy.units as u
 
         if getattr(value, "shape", ()) != ():
-            raise self._error("unit_type", f"expected one value, got an array of shape {value.shape}")
+            raise mistake(f"expected one value, got an array of shape {value.shape}")
         if self.unit == "K s(1/2)" and "Hz" in str(value.unit):
             return self._factor(str(value), str(value.unit), (0, 0))  # raises
         try:
@@ -249,15 +246,11 @@ class Unit:
 
     def _without_unit(self, number: str) -> PydanticCustomError:
         message = f"{number} has no unit; write {self.kind.noun} such as '{self.example}'"
-        return self._error("unit_missing", message, None, f"add a unit, e.g. {number} {self.example.split(' ', 1)[1]}")
+        return mistake(message, f"add a unit, e.g. {number} {self.example.split(' ', 1)[1]}")
 
     def _wrong_kind(self, unit: str, got: str, caret: tuple[int, int] | None) -> PydanticCustomError:
         message = f"expected {self.kind.noun} such as '{self.example}', but '{unit}' is a unit of {got}"
-        return self._error("unit_kind", message, caret, f"not {self.kind.noun}")
-
-    @staticmethod
-    def _error(code: Any, message: str, caret: tuple[int, int] | None = None, label: str = "") -> PydanticCustomError:
-        return PydanticCustomError(code, "{message}", {"message": message, "caret": caret, "label": label})
+        return mistake(message, f"not {self.kind.noun}", caret=caret)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         write = (lambda v: v) if self.unit == "" else self.write

@@ -1,0 +1,45 @@
+"""Values that are written as text, and what a validator raises where one is mistaken."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Self
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import PydanticCustomError, core_schema
+
+from ..errors import ZondaError
+from .diagnostics import ConfigurationError
+
+
+class TextValue:
+    """A pydantic field type that `parse` reads and ``str`` writes."""
+
+    json_schema: ClassVar[dict[str, Any]] = {"type": "string"}
+
+    @classmethod
+    def parse(cls, value: Any) -> Self:
+        """From text, or whatever else stands for such a value. Raises what `mistake` makes."""
+        raise NotImplementedError
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            cls.parse, serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json")
+        )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return cls.json_schema
+
+
+def mistake(message: str, label: str = "", help: str = "", caret: tuple[int, int] | None = None) -> PydanticCustomError:
+    """What a validator raises: shown at the value's place. ``caret``: (offset, length) of what is wrong in a text."""
+    return PydanticCustomError("mistake", "{message}", {"message": message, "label": label, "help": help, "caret": caret})
+
+
+def refusal(err: ZondaError) -> PydanticCustomError:
+    """What a validator raises where ``err`` says what is wrong with its value."""
+    if isinstance(err, ConfigurationError) and err.diagnostics:
+        first = err.diagnostics[0]
+        return mistake(first.message, first.label, first.help)
+    return mistake(f"{err.place}: {err.message}" if err.place else err.message, getattr(err, "label", ""), err.cure)
