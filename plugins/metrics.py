@@ -166,7 +166,23 @@ class Transfer(Metric):
         return float(np.sqrt(np.mean(reference[1] ** 2)))
 
 
-class Psd(Metric):
+class _Binned(Metric):
+    """What is measured in bins: (2, n) values and their relative standard errors."""
+
+    def error(self, found: Floats, reference: Floats) -> float:
+        return float(np.sqrt(np.mean((found[0] / reference[0] - 1) ** 2)))
+
+    def summary(self, found: Floats) -> Floats:
+        """The logarithm of the values: differences of it are relative."""
+        return np.asarray(np.log(np.maximum(found[0], 1e-300)), np.float64)
+
+    def floor(self, reference: Floats) -> float | None:
+        """The standard errors, from periodograms averaged or from white noise; None where they are not known."""
+        value = float(np.sqrt(np.mean(reference[1] ** 2)))
+        return value if math.isfinite(value) else None
+
+
+class Psd(_Binned):
     """Equation (4)."""
 
     says: ClassVar[str] = "rms over log-frequency bins of the relative error of the signal's power spectrum"
@@ -189,19 +205,8 @@ class Psd(Metric):
         mean = np.bincount(number, spectrum.psd["signal"], BINS)[count > 0] / count[count > 0]
         return np.array([mean, 1 / np.sqrt(spectrum.averages * count[count > 0])])
 
-    def error(self, found: Floats, reference: Floats) -> float:
-        return _relative(found[0], reference[0])
 
-    def summary(self, found: Floats) -> Floats:
-        """ln P_j: differences of it are relative."""
-        return np.asarray(np.log(found[0]), np.float64)
-
-    def floor(self, reference: Floats) -> float | None:
-        """Statistical uncertainty of the bins, from the number of periodograms averaged."""
-        return float(np.sqrt(np.mean(reference[1] ** 2)))
-
-
-class Structure(Metric):
+class Structure(_Binned):
     """Equation (5). It keeps the atmosphere's stream, and the white noise, at some detectors by a step of its own."""
 
     says: ClassVar[str] = "rms relative error of the atmosphere's structure functions in time and across the field"
@@ -248,26 +253,10 @@ class Structure(Metric):
         d = np.concatenate([in_time, across])
         return np.array([d, _uncertain(d, noise, pairs)])
 
-    def error(self, found: Floats, reference: Floats) -> float:
-        return _relative(found[0], reference[0])
-
-    def summary(self, found: Floats) -> Floats:
-        """ln D: differences of it are relative."""
-        return np.asarray(np.log(np.maximum(found[0], 1e-300)), np.float64)
-
-    def floor(self, reference: Floats) -> float | None:
-        """Statistical uncertainty of D where it is measured through the detectors' white noise, equation (6)."""
-        value = float(np.sqrt(np.mean(reference[1] ** 2)))
-        return value if math.isfinite(value) else None
-
 
 def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
     """Relative standard error of D from N differences that carry white noise of the given rms, equation (6)."""
     return np.asarray(np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs) / np.maximum(d, 1e-300), np.float64)
-
-
-def _relative(a: Floats, b: Floats) -> float:
-    return float(np.sqrt(np.mean((a / b - 1) ** 2)))
 
 
 def _mean_square(values: Floats, weights: Floats, use: NDArray[np.bool_]) -> float:

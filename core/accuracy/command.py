@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
 
 NOT_MET = 1
-"""Exit status where no setting meets the target, or a stored front does not hold any more."""
+"""Exit status where no setting meets the target, or a stored Pareto front does not hold any more."""
 
 
 @click.command()
@@ -39,9 +39,9 @@ NOT_MET = 1
 @click.option("--seeds", default=4, show_default=True, type=click.IntRange(1, 1000), help="For scatter, and knobs that redraw.")
 @click.option("--threads", default=1, show_default=True, type=click.IntRange(min=1), metavar="N", help="Threads of each run.")
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: out/accuracy/NAME.METRIC]")
-@click.option("--store", is_flag=True, help="Keep the front beside the pipeline file, for `accuracy: 1 %` in it.")
+@click.option("--store", is_flag=True, help="Keep the Pareto front beside the pipeline file, for `accuracy: 1 %` in it.")
 @click.option(
-    "--check", "check", is_flag=True, help="Measure the errors of the stored front again; exit status 1 where one grew."
+    "--check", "check", is_flag=True, help="Measure the errors of the stored Pareto front again; exit status 1 where one grew."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def accuracy(

@@ -13,7 +13,7 @@ MARKERS = "osD^vPX"
 
 
 def draw(study: Study, ax: Any = None) -> Any:
-    """Each knob alone, the joint front, the file's own and the chosen setting, floor and scatter; returns the Axes.
+    """Each knob alone, the Pareto front, the file's own and the chosen setting, floor and scatter; returns the Axes.
 
     A setting that gives the reference's bits has no place on a logarithmic axis: it stands on the lower edge, hollow.
     """
@@ -30,7 +30,7 @@ def draw(study: Study, ax: Any = None) -> Any:
         _line(ax, alone, COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)], bottom)
     front, present, chosen = study.front, study.present, study.chosen
     x, y, spread = [p.seconds for p in front], [max(p.error, bottom) for p in front], [p.spread for p in front]
-    ax.errorbar(x, y, xerr=spread, color="black", marker=".", ms=7, lw=1.8, elinewidth=0.8, label="joint front", zorder=4)
+    ax.errorbar(x, y, xerr=spread, color="black", marker=".", ms=7, lw=1.8, elinewidth=0.8, label="Pareto front", zorder=4)
     ax.plot(
         present.seconds, max(present.error, bottom), "s", ms=10, mfc="none", mec="black", label="the file's setting", zorder=5
     )

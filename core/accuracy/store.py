@@ -1,4 +1,4 @@
-"""Fronts as files: what `accuracy: 1 %` in a pipeline chooses from, and a regression test of the errors.
+"""Pareto fronts as files: what `accuracy: 1 %` in a pipeline chooses from, and a regression test of the errors.
 
 The front of ``pipelines/my.yaml`` for the metric ``peak`` is ``pipelines/fronts/my.peak.json``. It holds for the pipeline it was
 made of: a fingerprint of scene and steps, without seed, knobs and the length of the scans, is compared.
@@ -19,8 +19,8 @@ from ..errors import InputError
 from ..output import Output
 from ..plan.planning import planning_of
 from ..storage.files import write_text
-from .front import Point, cheapest
 from .metrics import get
+from .pareto import Point, cheapest
 from .settings import LENGTH, Setting, knobs_of, overrides
 from .sweep import tightest
 
@@ -58,8 +58,8 @@ class Choice:
 
 
 def fingerprint(file: PipelineFile) -> str:
-    """Of what a front belongs to: the scene without its seed, the steps without their knobs, the length of the scans and what
-    acts at the end. Files count by name and size, parameters at their defaults not at all.
+    """Of what a Pareto front belongs to: the scene without its seed, the steps without their knobs, the length of the scans and
+    the outputs. Files count by name and size, parameters at their defaults not at all.
     """
     scene = file.scene()
     described: list[Any] = [
@@ -101,14 +101,8 @@ def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
         "staying": {a.knob.key: a.knob.present for a in study.sweep.alone if a.knob.redraws},
         "first_run_seconds": study.first,
         "alone": [
-            {
-                "knob": a.knob.key,
-                "approximates": a.knob.approximates,
-                "redraws": a.knob.redraws,
-                "rungs": [asdict(r) for r in a.rungs],
-                "left": a.left,
-                "how": a.how,
-            }
+            {"knob": a.knob.key, "approximates": a.knob.approximates, "redraws": a.knob.redraws, "left": a.left, "how": a.how}
+            | {"rungs": [asdict(r) for r in a.rungs]}
             for a in study.sweep.alone
         ],
         "points": [asdict(p) for p in study.points],
@@ -137,18 +131,18 @@ def read(path: Path) -> StoredFront:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if values["format"] != FORMAT:
-            raise InputError(f"is a front of format {values['format']}, not {FORMAT}", place=str(path), cure=cure)
+            raise InputError(f"is a Pareto front of format {values['format']}, not {FORMAT}", place=str(path), cure=cure)
         return TypeAdapter(StoredFront).validate_python(values)
     except ValidationError as err:
         first = err.errors()[0]
         reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as err:
         reason = f"{type(err).__name__}: {err}"
-    raise InputError(f"is not a stored front ({reason})", place=str(path), cure=cure)
+    raise InputError(f"is not a stored Pareto front ({reason})", place=str(path), cure=cure)
 
 
 def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> Choice:
-    """The knobs with which this pipeline meets ``target`` at least cost, by its stored front; else all at their tightest.
+    """The knobs with which this pipeline meets ``target`` at least cost, by its stored Pareto front; else all at their tightest.
 
     Knobs that the file states are left as they are. The errors of a front are measured on the scans it was made with; what this
     run has is measured by ``zonda run --verify``. Raises `RegistryError` for a metric that is not there.
@@ -158,19 +152,21 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
     known = {k.key for k in knobs}
     given = [k.key for k in knobs if k.given]
     path = path_for(file, metric)
-    why, point = f"no stored front of {metric} for this pipeline ({path})", None
+    why, point = f"no stored Pareto front of {metric} for this pipeline ({path})", None
     if path.is_file():
         front = read(path)
         if front.fingerprint != fingerprint(file) or not front.reference.keys() <= known:
-            why = f"the stored front of {metric} ({path}) is of other steps or another scene"
+            why = f"the stored Pareto front of {metric} ({path}) is of other steps or another scene"
         elif changed := [f"{k.key}={front.staying[k.key]}" for k in knobs if front.staying.get(k.key, k.present) != k.present]:
-            why = f"the stored front of {metric} ({path}) was made with {' '.join(changed)}"
+            why = f"the stored Pareto front of {metric} ({path}) was made with {' '.join(changed)}"
         elif (point := cheapest(front.points, target, front.reference_error)) is None:
-            why = f"no point of the stored front of {metric} meets {100 * target:g} %"
+            why = f"no point of the stored Pareto front of {metric} meets {100 * target:g} %"
     if point is not None:
         setting = {k: v for k, v in point.setting.items() if k not in given}
         error = point.error + front.reference_error
-        reason = f"stored front of {metric}: {100 * error:.2g} % with {' '.join(overrides(setting)) or 'the knobs as they are'}"
+        reason = (
+            f"stored Pareto front of {metric}: {100 * error:.2g} % with {' '.join(overrides(setting)) or 'the knobs as they are'}"
+        )
     else:
         setting = {k: v for k, v in tightest(knobs).items() if k not in given}
         error, reason = None, f"{why}: the knobs are at their tightest; `zonda accuracy {file.header.name} --store` makes one"

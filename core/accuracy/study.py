@@ -1,4 +1,4 @@
-"""A whole study of one pipeline and metric: every knob alone, the joint front, and the setting that is recommended."""
+"""A whole study of one pipeline and metric: every knob alone, the Pareto front, and the setting that is recommended."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from .front import Point, cheapest, pareto, point, search
 from .measure import Measured, Request, measure
 from .metrics import get
+from .pareto import Point, cheapest, pareto, point, search
 from .settings import PipelineKnob, Setting, overrides
 from .sweep import Bench, Run, Sweep, sweep, tightest
 
@@ -67,7 +67,7 @@ class Study:
     points
         Every joint setting that was measured, ``present`` among them.
     chosen
-        Of those that meet the target, see `front.cheapest`; None where none does.
+        Of those that meet the target, see `pareto.cheapest`; None where none does.
     floor, scatter
         Instrument noise and realization scatter in units of the error; None where they have no meaning or were not measured.
     first

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from .fragment import arguments
-from .front import Point, least
+from .pareto import Point, least
 from .study import Study
 from .sweep import Alone, Rung, differences
 
 
 def lines(study: Study, width: int = 130) -> Iterator[str]:
-    """The whole report, top down: what was measured, each knob alone, the joint front, the recommendation."""
+    """The whole report, top down: what was measured, each knob alone, the Pareto front, the recommendation."""
     yield from _heading(study)
     for alone in study.sweep.alone:
         yield ""
@@ -78,7 +78,7 @@ def _alone(alone: Alone) -> Iterator[str]:
 
 
 def _front(study: Study, width: int) -> Iterator[str]:
-    yield f"joint front ({len(study.points)} joint settings measured)"
+    yield f"Pareto front ({len(study.points)} joint settings measured)"
     yield f"  {'error':>9}  {'CPU s':>15}  {'memory':>8}  what differs from the tightest"
     for point in study.front:
         yield f"  {_point(point)}  {_short(_pairs(point, study), width - 42)}{_marks(point, study)}"

@@ -1,4 +1,4 @@
-"""The error that a run has reached, measured against all knobs at their tightest; and a stored front tested again."""
+"""The error that a run has reached, measured against all knobs at their tightest; and a stored Pareto front tested again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SMALLEST = 1e-5
 
 @dataclass(frozen=True)
 class Retest:
-    """A point of a stored front and its error now."""
+    """A point of a stored Pareto front and its error now."""
 
     setting: dict[str, str]
     stored: float
@@ -62,14 +62,14 @@ def achieved(
 
 
 def retest(front: StoredFront, file: PipelineFile, pipeline: str, points: int | None = None) -> list[Retest]:
-    """Measure the errors of a stored front again (of the ``points`` with the largest errors): errors only, never times, and
-    therefore in this process.
+    """Measure the errors of a stored Pareto front again (of the ``points`` with the largest errors): errors only, never
+    times, and therefore in this process.
 
     Raises InputError where the front is of another pipeline.
     """
     if front.fingerprint != fingerprint(file):
         cure = "make it anew: zonda accuracy PIPELINE --store"
-        raise InputError("the stored front is of other steps or another scene", place=file.place, cure=cure)
+        raise InputError("the stored Pareto front is of other steps or another scene", place=file.place, cure=cure)
     metric = get(front.metric)
     base = (*overrides(front.shorter), f"seed={front.seed}")
 

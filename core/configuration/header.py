@@ -45,7 +45,7 @@ class Header(Parameters):
     """Type of the time streams."""
     accuracy: Accuracy | None = None
     """Error that the result may have from its approximations, e.g. 1 %, or {target: 1 %, metric: peak}: `zonda run` then takes
-    the cheapest setting of the knobs that a stored front of `zonda accuracy` shows to meet it, else the tightest."""
+    the cheapest setting of the knobs that a stored Pareto front of `zonda accuracy` shows to meet it, else the tightest."""
     budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
     """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
     campaign: Any = None

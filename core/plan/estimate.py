@@ -83,8 +83,6 @@ class Cost:
         seconds = fixed + per_time N_t + per_sample N_det N_t.
     once
         Seconds for the whole run, whatever the observations and companion runs (pictures, files).
-    bytes
-        Held at the same time as the streams.
     kernel
         Which calibration kernel scales it: ``random``, ``stream`` or ``python``.
     """
@@ -93,7 +91,6 @@ class Cost:
     per_time: float = 0.0
     per_sample: float = 0.0
     once: float = 0.0
-    bytes: float = 0.0
     kernel: Literal["random", "stream", "python"] = "stream"
 
     def seconds(self, n_times: int, n_detectors: int) -> float:

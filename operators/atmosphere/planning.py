@@ -95,7 +95,7 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         points /= len(context.observations)
         fixed = 0.02 + (POINT * (len(a.layers) - len(set(p.omit))) + TRANSFER) * points
         once = 0.05 + (CHOICE[0] + CHOICE[1] * context.first.n_detectors) * len(context.observations)
-        cost = Cost(fixed + LATTICE * _cells(context.first, a), per_sample=0.6e-9, once=once, bytes=20.0 * points + 60e6)
+        cost = Cost(fixed + LATTICE * _cells(context.first, a), per_sample=0.6e-9, once=once)
         return Estimate(tuple(effects), cost, _without(self.operator.label, context, effects))
 
 

@@ -80,7 +80,7 @@ class SkyPlanning(Planning[SkyMap]):
         convolution = CONVOLUTION * sum(float(np.prod(g.shape)) for g in distinct.values())
         made = grid.seconds + sum(g.interpolation for k, g in distinct.items() if k != grid.key)
         cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8, per_sample=5e-9 if reached else 0.3e-9,
-                    once=made + (convolution if reached else 0.0), bytes=8.0 * size + 24.0 * points)  # fmt: skip
+                    once=made + (convolution if reached else 0.0))  # fmt: skip
         what = "Gaussian" if fwhm else "none" if reached else "not convolved: no detector reaches the map"
         choices = [full(what), *self._without_beam(context, fwhm, convolution)]
         effects = (

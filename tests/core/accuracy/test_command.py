@@ -104,13 +104,13 @@ def test_the_whole_command(toy_file, tmp_path, capsys):
     assert (tmp_path / "out" / "work_precision.png").read_bytes()[:4] == b"\x89PNG"
     assert "- ZaIntegral: {n: 8}" in (tmp_path / "out" / "fragment.yaml").read_text()
 
-    # the stored front is used and holds
+    # the stored Pareto front is used and holds
     assert command("accuracy", toy_file, "--metric", "integral", "--check") == 0
     assert capsys.readouterr().out.count("ok") >= 2
     wanted = "accuracy={target: 0.3 %, metric: integral}"
     assert command("run", toy_file, "--set", wanted, "--verify", "--output", tmp_path / "run") == 0
     said = capsys.readouterr().err
-    assert "accuracy: stored front of integral: " in said
+    assert "accuracy: stored Pareto front of integral: " in said
     assert "ZaIntegral.n=8" in said
     assert "error of integral against the tightest knobs: 0.13 % (target 0.3 %)" in said
     assert "n: 8" in (tmp_path / "run" / "resolved.yaml").read_text()

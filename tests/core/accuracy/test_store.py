@@ -73,7 +73,7 @@ def test_the_chosen_setting_meets_the_target(made):
         chosen = dict(text.split("=") for text in choice.overrides)
         error = 0.1 / float(chosen["HighpassFilter.oversampling"]) - 0.1 / 48 + float(chosen["CommonModeFilter.residual"])
         assert error <= choice.error <= target
-        assert "stored front" in choice.reason
+        assert "stored Pareto front" in choice.reason
 
 
 def test_a_front_holds_for_its_own_pipeline(made):
@@ -110,7 +110,7 @@ def test_without_a_front_the_tightest(made):
     _, file, _ = made
     choice = store.settings_for(file, 0.01)
     assert choice.error is None
-    assert "no stored front" in choice.reason
+    assert "no stored Pareto front" in choice.reason
     assert {"HighpassFilter.oversampling=48", "precision=float64"} <= set(choice.overrides)
     assert not any("poles" in text for text in choice.overrides)  # another number of poles is another realization
 
@@ -119,7 +119,7 @@ def test_a_target_that_no_point_meets(made):
     _, file, found = made
     store.save(found, file)
     choice = store.settings_for(file, 1e-9)
-    assert "no point of the stored front" in choice.reason
+    assert "no point of the stored Pareto front" in choice.reason
     assert "HighpassFilter.oversampling=48" in choice.overrides
 
 

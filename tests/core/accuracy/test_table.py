@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from zonda.core.accuracy.front import Point, cheapest
 from zonda.core.accuracy.measure import Measured
+from zonda.core.accuracy.pareto import Point, cheapest
 from zonda.core.accuracy.study import Setup, Study
 from zonda.core.accuracy.sweep import Alone, Bench, Rung, Sweep, sweep, tightest
 from zonda.core.accuracy.table import lines

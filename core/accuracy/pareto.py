@@ -1,4 +1,4 @@
-"""The joint front: which settings of all knobs together nothing beats in error, CPU seconds and memory.
+"""The Pareto front: which settings of all knobs together nothing beats in error, CPU seconds and memory.
 
 The search begins with every knob at its tightest and relaxes one knob at a time, that with the best saving per added error as
 the knobs alone predict it; each joint setting is then measured, never added up. While the measured error stays within what is
