@@ -40,6 +40,8 @@ _WHERE = {
     "normals": "zonda.core.numerics.random",
     "uniforms": "zonda.core.numerics.random",
     "quantity": "zonda.core.configuration.parameters",
+    "WeatherSource": "zonda.core.weather",
+    "Column": "zonda.core.weather",
 } | dict.fromkeys(
     (
         "Angle", "AngularSpeed", "AngularAcceleration", "Seconds", "Hertz", "Metres", "MetresPerSecond", "Kelvin",
@@ -85,6 +87,8 @@ if TYPE_CHECKING:
     from zonda.core.scene import Scene as Scene
     from zonda.core.site import Site as Site
     from zonda.core.stream import Stream as Stream
+    from zonda.core.weather import Column as Column
+    from zonda.core.weather import WeatherSource as WeatherSource
     from zonda.operators.noise.models import NoiseModel as NoiseModel
 
 
