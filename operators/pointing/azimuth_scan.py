@@ -18,11 +18,9 @@ from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
-from .base import Pointing
-from .transform import CelestialTransform
+from .base import Aim, Pointing
 
 if TYPE_CHECKING:
-    from zonda.core.configuration.target import Target
     from zonda.core.data import Observation
 
 
@@ -68,11 +66,12 @@ class PointingBackAndForth(Pointing):
         late: NDArray[np.bool_] = np.mod(seconds, leg + self.turnaround) > leg
         return late
 
-    def directions(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
+    def directions(self, aim: Aim, seconds: Floats) -> Floats:
+        target, offset = aim.target, aim.offset
         longitude, elevation = -target.longitude, target.latitude
         if target.frame != "horizontal":
             middle = np.array([(seconds[0] + seconds[-1]) / 2])
-            north, west, up = transform.horizontal(unit_vectors(*target.icrs()), middle)[0]
+            north, west, up = aim.transform.horizontal(unit_vectors(*target.icrs()), middle)[0]
             longitude, elevation = math.atan2(west, north), math.atan2(up, math.hypot(north, west))
         elevation += offset[1]
         widest = self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2)
@@ -112,6 +111,6 @@ class PointingBackAndForth(Pointing):
             found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
         return found
 
-    def state(self, observation: Observation) -> None:
+    def describe(self, observation: Observation) -> None:
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
         observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()), observation.n_samples)

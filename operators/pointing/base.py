@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +23,11 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .limits import LargestMotion, check_elevation, excess, lower_elevation
-from .motion import POINTS, Peak, Quantity, motion, rate_text
+from .limits import LargestMotion, check_elevation, excess
+from .motion import POINTS, Peak, Quantity, motion
 from .observed import Samples, centre_of, observed, report, state_times
 from .samples_per_beam import SamplesPerBeam
+from .slower import what_fits
 from .transform import Boresight, CelestialTransform
 
 if TYPE_CHECKING:
@@ -52,6 +52,15 @@ Offsets = Annotated[
     Annotated[Literal["none", "box"], Tag("name")] | Annotated[list[tuple[Angle, Angle]], Tag("list")], Discriminator(_kind)
 ]
 """A named pattern of offsets, or the offsets themselves."""
+
+
+class Aim(NamedTuple):
+    """What a scan is centred on."""
+
+    transform: CelestialTransform
+    target: Target
+    offset: tuple[float, float]
+    """rad on the sky, towards east and north; for az/el targets towards azimuth and up."""
 
 
 class Pointing(Operator):
@@ -108,15 +117,16 @@ class Pointing(Operator):
         """
         raise NotImplementedError
 
-    def directions(self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
+    def directions(self, aim: Aim, seconds: Floats) -> Floats:
         """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the scan."""
+        target, offset = aim.target, aim.offset
         found = series(3, len(seconds))
         for some in chunks(len(seconds)):
             if target.frame == "horizontal":
                 x, y = self.path(seconds[some])
                 found[some] = _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])
             else:
-                found[some] = transform.horizontal(self._on_the_sky(target, offset, seconds[some]), seconds[some])
+                found[some] = aim.transform.horizontal(self._on_the_sky(aim, seconds[some]), seconds[some])
         return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
@@ -127,20 +137,19 @@ class Pointing(Operator):
         """Parts of a scan whose samples are taken at ``seconds`` (n,), by TOAST's names; by default all is *scanning*."""
         return {}
 
-    def state(self, observation: Observation) -> None:
-        """Tell the tally what else should be known of this scan."""
+    def describe(self, observation: Observation) -> None:
+        """Enter in the tally what else should be known of this scan."""
 
-    def _on_the_sky(self, target: Target, offset: tuple[float, float], seconds: Floats) -> Floats:
+    def _on_the_sky(self, aim: Aim, seconds: Floats) -> Floats:
         """ICRS unit vectors (n, 3) of a `path` about a celestial target."""
         x, y = self.path(seconds)
-        return _on_tangent_plane(*target.icrs(), x + offset[0], y + offset[1])
+        return _on_tangent_plane(*aim.target.icrs(), x + aim.offset[0], y + aim.offset[1])
 
-    def _boresight(
-        self, transform: CelestialTransform, target: Target, offset: tuple[float, float], seconds: Floats
-    ) -> Boresight:
-        if type(self).directions is Pointing.directions and target.frame != "horizontal":
-            return transform.follow(lambda some: self._on_the_sky(target, offset, some), seconds)
-        return transform.boresight(self.directions(transform, target, offset, seconds), seconds)
+    def boresight(self, aim: Aim, seconds: Floats) -> Boresight:
+        """Where the boresight is at ``seconds`` (n,) since the start of the scan."""
+        if type(self).directions is Pointing.directions and aim.target.frame != "horizontal":
+            return aim.transform.follow(lambda some: self._on_the_sky(aim, some), seconds)
+        return aim.transform.boresight(self.directions(aim, seconds), seconds)
 
     # -- the scans --
 
@@ -187,7 +196,7 @@ class Pointing(Operator):
         moved, sampled = LargestMotion(scene.instrument.telescope), SamplesPerBeam()
         for k in which:
             start = begin.shifted(k * (self.scan_duration + self.gap))
-            observation = self._scan(data, target, start, self._offset(k), before + k, rate, moved)
+            observation = self._scan(data, target, start, before + k, self._offset(k), rate, moved)
             sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
             data.observations.append(observation)
         report(self.label, data.observations[before:], moved, sampled)
@@ -200,29 +209,31 @@ class Pointing(Operator):
         data: Data,
         target: Target,
         start: Instant,
-        offset: tuple[float, float],
         index: int,
+        offset: tuple[float, float],
         rate: float,
         moved: LargestMotion,
     ) -> Observation:
+        """The observation ``index``, sampled at ``rate`` [Hz]."""
         scene, instrument = data.scene, data.scene.instrument
         seconds = self._seconds(max(round(self.scan_duration * rate), 1), rate, self._jitter_key(data, index))
         beam = float(instrument.focalplane().fwhm.min())
         transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
-        horizontal, *boresight = self._boresight(transform, target, offset, seconds)
+        aim = Aim(transform, target, offset)
+        horizontal, *boresight = self.boresight(aim, seconds)
         place = f"{self.label}, scan {index} from {start}"
         total = self.scans * self.scan_duration + (self.scans - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)
         samples = Samples(seconds, rate, (boresight[0], boresight[1]), self.flag(seconds), self.intervals(seconds))
         observation = observed(self.label, scene, index, transform, centre_of(transform, target, seconds), samples)
-        self._check_motion(observation, transform, target, offset, None if self.jitter else horizontal, place, moved)
+        self._check_motion(observation, aim, None if self.jitter else horizontal, place, moved)
         if self.jitter > 0:
             state_times(self.label, observation)
         if (wanted := self.scan_duration * rate) < 0.5:
             observation.tally.state(
                 self.label, f"{observation.name}: shorter than a sample", f"{wanted:.2g} of one; one is taken"
             )
-        self.state(observation)
+        self.describe(observation)
         return observation
 
     def _seconds(self, n: int, rate: float, key: NDArray[np.uint32]) -> Floats:
@@ -242,21 +253,14 @@ class Pointing(Operator):
     # -- what the telescope can do --
 
     def _check_motion(
-        self,
-        observation: Observation,
-        transform: CelestialTransform,
-        target: Target,
-        offset: tuple[float, float],
-        horizontal: Floats | None,
-        place: str,
-        moved: LargestMotion,
+        self, observation: Observation, aim: Aim, horizontal: Floats | None, place: str, moved: LargestMotion
     ) -> None:
         """Compare the track with the telescope's limits; raise where it exceeds one that it must keep."""
         rate, limits = observation.sample_rate, moved.limits
         length = observation.n_samples / rate
 
         def track(scan: Pointing, step: float) -> Floats:
-            return scan.directions(transform, target, offset, np.arange(max(round(length / step), 1), dtype=np.float64) * step)
+            return scan.directions(aim, np.arange(max(round(length / step), 1), dtype=np.float64) * step)
 
         def of(scan: Pointing) -> dict[Quantity, Peak]:
             coarse = min(rate, POINTS / length)
@@ -265,49 +269,9 @@ class Pointing(Operator):
         found = of(self) if horizontal is None else motion(horizontal, rate, limits, lambda step: track(self, step))
         over = excess(found, limits)
         if over and self.check_limits == "error":
-            cure = self._that_fits(found, over, lambda scan: not excess(of(scan), limits))
+            cure = what_fits(self, self.slows, found, over, lambda scan: not excess(of(scan), limits))
             raise PointingError(moved.too_fast(next(iter(over)), found), place=place, cure=cure)
         moved.add(observation.name, found)
-
-    def _that_fits(self, found: dict[Quantity, Peak], over: dict[Quantity, float], fits: Callable[[Pointing], bool]) -> str:
-        """Values of the scan's own parameters at which it exceeds no limit, each tried on the track itself."""
-        alone = [self._slower([name], fits) for name in self.slows]
-        cures = [text for text in alone if text] or [text for text in (self._slower(list(self.slows), fits),) if text]
-        if (elevation := lower_elevation(found, over)) is not None:
-            cures.append(f"an elevation below {math.floor(10 * math.degrees(elevation)) / 10:g} deg")
-        other = "scan more slowly, or in larger curves" if self.slows else "choose another target or time"
-        fitting = f"this would fit: {', or '.join(cures)}" if cures else other
-        return f"{fitting} (check_limits: warn simulates it as it is)"
-
-    def _slower(self, names: Sequence[str], fits: Callable[[Pointing], bool]) -> str:
-        """``names`` with values, all changed by one factor (at most 1000), at which the scan fits; empty where none does."""
-
-        def values(share: float) -> dict[str, float]:
-            found = {}
-            for name in names:
-                sign, _ = self.slows[name]
-                value = math.degrees(getattr(self, name)) * 3600 * 10.0 ** (3 * share * sign)
-                unit = 10.0 ** (math.floor(math.log10(value)) - 2)  # three digits, on the safe side
-                found[name] = math.radians((math.floor if sign < 0 else math.ceil)(value / unit) * unit / 3600)
-            return found
-
-        def allowed(name: str, value: float) -> bool:
-            return all(value <= getattr(m, "le", math.inf) for m in type(self).model_fields[name].metadata)
-
-        def good(share: float) -> bool:
-            tried = values(share)
-            with suppress(PointingError):  # e.g. turnarounds so long that they reach round the sky
-                return all(allowed(*item) for item in tried.items()) and fits(self.model_copy(update=tried))
-            return False
-
-        enough = next((share for share in (1 / 8, 1 / 4, 1 / 2, 1.0) if names and good(share)), None)
-        if enough is None:
-            return ""
-        too_little = 0.0
-        for _ in range(8):
-            middle = (enough + too_little) / 2
-            enough, too_little = (middle, too_little) if good(middle) else (enough, middle)
-        return " with ".join(f"{name} {rate_text(value, self.slows[name][1])}" for name, value in values(enough).items())
 
     def _offset(self, k: int) -> tuple[float, float]:
         if self.offsets == "none":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,7 +104,7 @@ def excess(found: dict[Quantity, Peak], limits: dict[Quantity, float]) -> dict[Q
     return dict(sorted(over.items(), key=lambda item: -(item[1] ** (1 / item[0][1]))))
 
 
-def lower_elevation(found: dict[Quantity, Peak], over: dict[Quantity, float]) -> float | None:
+def lower_elevation(found: Mapping[Quantity, Peak], over: Mapping[Quantity, float]) -> float | None:
     """Elevation [rad] at which the scan would fit, where only the azimuth axis is too fast: it turns by 1 / cos(elevation)."""
     if any(axis != "azimuth" for axis, _ in over):
         return None

@@ -16,7 +16,7 @@ from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
-from zonda.operators.pointing.base import Pointing
+from zonda.operators.pointing.base import Aim, Pointing
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.motion import motion
 from zonda.operators.pointing.samples_per_beam import peak_lost
@@ -68,7 +68,7 @@ def test_figures_equal_a_brute_force_derivative(which: str, speed: float, size: 
     target: Any = type("Target", (), {"frame": "horizontal", "longitude": az0, "latitude": el0})()
 
     def track(step: float) -> np.ndarray:
-        return scan.directions(None, target, (0.0, 0.0), np.arange(0, 30, step))  # type: ignore[arg-type]
+        return scan.directions(Aim(None, target, (0.0, 0.0)), np.arange(0, 30, step))  # type: ignore[arg-type]
 
     found = motion(track(0.01), 100.0, {("azimuth", 1): 1e-9, ("azimuth", 2): 1e-9, ("elevation", 2): 1e-9}, track)
     mp.mp.dps = 30

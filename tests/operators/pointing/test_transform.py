@@ -20,6 +20,7 @@ from zonda.core.numerics.quaternions import Upright, from_angles
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.site import Site
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
+from zonda.operators.pointing.base import Aim
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.stare import PointingStare
@@ -127,9 +128,9 @@ def test_upright_goes_on_from_stretch_to_stretch(sweep: float) -> None:
 def test_bits_do_not_depend_on_the_chunk(scan: Any, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
     parsed, seconds = Target.parse(target), np.arange(5000) / 20.0
     transform = CelestialTransform(GREEN_BANK, START, 250.0)
-    whole = scan._boresight(transform, parsed, (1e-4, 2e-4), seconds)
+    whole = scan.boresight(Aim(transform, parsed, (1e-4, 2e-4)), seconds)
     monkeypatch.setattr(chunks.chunks, "__defaults__", (777,))
-    parts = scan._boresight(transform, parsed, (1e-4, 2e-4), seconds)
+    parts = scan.boresight(Aim(transform, parsed, (1e-4, 2e-4)), seconds)
     assert np.array_equal(whole.horizontal, parts.horizontal)
     assert np.array_equal(whole.azel, parts.azel)
     # bent light is inverted by steps that begin at the mean of a chunk
