@@ -116,6 +116,8 @@ def cost(case: str) -> None:
 
 def implied_error(layer, ratio: float) -> tuple[float, float]:
     """Largest errors of C (of the variance) and S (of itself), along, across and oblique, from one cell to 3 r0."""
+    from zonda.operators.atmosphere.turbulence.implied import implied_covariance
+
     top = max(400, int(3 * ratio * layer.sigma / layer.spacing))
     lags = np.unique(np.r_[1, 2, 3, 5, 8, np.geomspace(12, top, 8).astype(int)])
     worst_c = worst_s = 0.0
@@ -123,7 +125,7 @@ def implied_error(layer, ratio: float) -> tuple[float, float]:
         for direction in ((0, 1), (1, 1), (1, 3)):
             a = np.array([phase] * len(lags))
             b = a + lags[:, None] * np.array(direction)
-            here, there, between = (layer.implied_covariance(p, q) for p, q in ((a[:1], a[:1]), (b, b), (a, b)))
+            here, there, between = (implied_covariance(layer, p, q) for p, q in ((a[:1], a[:1]), (b, b), (a, b)))
             s = structure_of(layer, lags * np.hypot(*direction) * layer.spacing)
             worst_c = max(
                 worst_c, abs(between / layer.variance - 1 + s / layer.variance).max(), abs(there / layer.variance - 1).max()
@@ -142,7 +144,8 @@ def structure_of(layer, r):
 
 def covariance() -> None:
     from zonda.operators.atmosphere.turbulence.beams import Aperture
-    from zonda.operators.atmosphere.turbulence.lattice import FIDELITIES, Turbulence
+    from zonda.operators.atmosphere.turbulence.lattice import Turbulence
+    from zonda.operators.atmosphere.turbulence.levels import FIDELITIES
 
     ratios = (1e-3, 0.06, 1.0, 30.0, 100.0, 1e3, 1e4, 1e6)
     print("Gaussian footprint; r0 / sigma:", *(f"{r:g}" for r in ratios), sep="\t")

@@ -11,17 +11,17 @@ from time import perf_counter
 
 LOAD = """
 import numpy, zonda.core.site, zonda.core.registry, zonda.core.configuration.time
-from zonda.operators.atmosphere.weather import absorption, profiles
+from zonda.operators.atmosphere.weather import absorption, climatology
 from time import perf_counter
 site = zonda.core.registry.sites.create("chajnantor")
 when = zonda.core.configuration.time.Instant.parse("2022-08-01T23:00")
 start = perf_counter()
-profiles.profile(site, when)
+climatology.profile(site, when)
 first = perf_counter()
 absorption.absorption_table()
 table = perf_counter()
 for hour in range(100):
-    profiles.profile(site, when.shifted(3600 * hour))
+    climatology.profile(site, when.shifted(3600 * hour))
 print(first - start, table - first, (perf_counter() - table) / 100)
 """
 

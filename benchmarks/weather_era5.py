@@ -18,7 +18,8 @@ from atmosphere_data.fit_climatology import MEDIAN, column, read, saturation_liq
 
 from zonda.core.configuration.time import Instant
 from zonda.core.registry import sites
-from zonda.operators.atmosphere.weather.profiles import climatologies, climatology_column, on_heights
+from zonda.operators.atmosphere.weather.climatology import climatologies, climatology_column
+from zonda.operators.atmosphere.weather.profiles import on_heights
 from zonda.plugins.sites import table
 
 HOURS = range(0, 24, 3)

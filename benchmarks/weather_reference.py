@@ -14,7 +14,8 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.registry import sites
-from zonda.operators.atmosphere.weather.profiles import climatology_column, on_heights, profile
+from zonda.operators.atmosphere.weather.climatology import climatology_column, profile
+from zonda.operators.atmosphere.weather.profiles import on_heights
 
 
 def instant(day: float, hour: float) -> Instant:

@@ -48,8 +48,8 @@ def difference_of_covariances(patch: Patch) -> None:
 
 
 def weights_that_do_not_sum_to_one(patch: Patch) -> None:
-    kriging = lattice._kriging
-    patch.setattr(lattice, "_kriging", lambda *of: kriging(*of) * np.float32(1 - 1e-3))
+    kriging = lattice.kriging
+    patch.setattr(lattice, "kriging", lambda *of: kriging(*of) * np.float32(1 - 1e-3))
 
 
 def transmission_of_the_mean_opacity(patch: Patch) -> None:

@@ -354,9 +354,9 @@ def test_clocks_that_jump_change_nothing(here: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "bytes", "text", "other"])
 @pytest.mark.parametrize("name", ["absorption", "climatology"])
 def test_damaged_package_data(name: str, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from zonda.operators.atmosphere.weather import absorption, profiles
+    from zonda.operators.atmosphere.weather import absorption, climatology
 
-    module, key = {"absorption": (absorption, "TABLE"), "climatology": (profiles, "CLIMATOLOGY")}[name]
+    module, key = {"absorption": (absorption, "TABLE"), "climatology": (climatology, "CLIMATOLOGY")}[name]
     data = getattr(module, key).read_bytes()
     path = tmp_path / f"{name}.npz"
     if damage == "other":
@@ -371,20 +371,20 @@ def test_damaged_package_data(name: str, damage: str, tmp_path: Path, monkeypatc
         if name == "absorption":
             absorption.AbsorptionTable(path)
         else:
-            for place in profiles.climatologies():
-                profiles.coefficients(place)
+            for place in climatology.climatologies():
+                climatology.coefficients(place)
 
-    profiles.climatologies.cache_clear()
-    profiles.coefficients.cache_clear()
+    climatology.climatologies.cache_clear()
+    climatology.coefficients.cache_clear()
     try:
         if name == "climatology" and damage == "other":
-            assert profiles.climatologies() == ("something",)  # whole, but not ours: the site's is said not to exist
+            assert climatology.climatologies() == ("something",)  # whole, but not ours: the site's is said not to exist
             return
         with pytest.raises(InputError) as caught:
             read()
     finally:
-        profiles.climatologies.cache_clear()
-        profiles.coefficients.cache_clear()
+        climatology.climatologies.cache_clear()
+        climatology.coefficients.cache_clear()
     assert str(path) in str(caught.value)
     assert "reinstall" in caught.value.cure
 

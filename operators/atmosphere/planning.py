@@ -30,7 +30,7 @@ from .drawing import in_time_order
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
 from .turbulence.geometry import ScanPlane, axes, crossing, rays
-from .turbulence.lattice import FIDELITIES
+from .turbulence.levels import FIDELITIES
 from .turbulence.nodes import Layer, differential_rms, spread_evenly
 from .weather.bands import BandAtmosphere, BandTransfer
 from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN

@@ -8,7 +8,9 @@ import numpy as np
 
 from zonda.core.checks import Family
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
-from zonda.operators.atmosphere.turbulence.lattice import FIDELITIES, Turbulence
+from zonda.operators.atmosphere.turbulence.implied import implied_covariance
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
+from zonda.operators.atmosphere.turbulence.levels import FIDELITIES
 
 from .cases import BLOCKS, FAR
 from .scenes import differing, largest
@@ -27,7 +29,7 @@ def implied_error(ratio: float, fidelity: str, sigma: float = SIGMA) -> tuple[fl
     step = (lags[:, None, None] * ways).reshape(-1, 2)
     a = np.repeat(start, len(step), axis=0)
     b = a + np.tile(step, (len(start), 1))
-    here, there, between = (layer.implied_covariance(p, q) for p, q in ((a, a), (b, b), (a, b)))
+    here, there, between = (implied_covariance(layer, p, q) for p, q in ((a, a), (b, b), (a, b)))
     r = np.hypot(*(b - a).T) * layer.spacing
     c, s = beam_correlation(r, layer.outer_scale, sigma), beam_structure(r, layer.outer_scale, sigma)
     apart = r > 0

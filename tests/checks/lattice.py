@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from zonda.core.checks import Family, Measured
 from zonda.operators.atmosphere.turbulence.covariance import beam_structure
-from zonda.operators.atmosphere.turbulence.lattice import FIDELITIES, Turbulence
+from zonda.operators.atmosphere.turbulence.implied import implied_covariance
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
+from zonda.operators.atmosphere.turbulence.levels import FIDELITIES
 from zonda.plugins.checks.lattice import SIGMA, implied_error
 from zonda.plugins.checks.scenes import differing, largest
 
@@ -65,7 +67,7 @@ def neighbours() -> float:
     w = _cardinal(at + r / layer.spacing, n) - _cardinal(at, n)
     for row, column in ((0, 0), (1, 0), (2, 5)):
         ends = (np.stack([v + row, np.full(v.shape, column)], axis=1) for v in (i, j))
-        among = layer.implied_covariance(*ends).reshape(n, n)
+        among = implied_covariance(layer, *ends).reshape(n, n)
         implied = np.einsum("an,nm,am->a", w, among, w) / 2
         worst = largest(worst, float(abs(implied / exact - 1).max()))
     return worst

@@ -14,7 +14,8 @@ from zonda.core.instrument import Band
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.weather.absorption import absorption_table
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
-from zonda.operators.atmosphere.weather.profiles import Profile, profile
+from zonda.operators.atmosphere.weather.climatology import profile
+from zonda.operators.atmosphere.weather.profiles import Profile
 from zonda.operators.atmosphere.weather.table import read_table
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zonda.core.registry import bands, instruments, sites
-from zonda.operators.atmosphere.weather.profiles import climatologies
+from zonda.operators.atmosphere.weather.climatology import climatologies
 from zonda.plugins import bands as band_table
 from zonda.plugins import instruments as instrument_table
 from zonda.plugins import sites as site_table

@@ -25,7 +25,8 @@ from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline
 from zonda.core.types import Floats
 
 from .geometry import ScanPlane, rim
-from .lattice import Field, Turbulence
+from .lattice import Turbulence
+from .levels import Field
 from .lines_of_sight import LinesOfSight
 
 _Key = tuple[int, tuple[int, int, int, int]]

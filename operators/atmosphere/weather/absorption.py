@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.storage.files import own_data
-
-Array = NDArray[np.float64]
+from zonda.core.types import Floats
 
 TABLE = Path(__file__).parent.parent / "data" / "absorption.npz"
 
@@ -45,11 +44,11 @@ class CrossSections:
     cell, `OZONE_PARTS`, over the cell's mean.
     """
 
-    dry_air: Array
-    water: Array
-    water_self: Array
-    ozone: Array
-    ozone_ratio: Array
+    dry_air: Floats
+    water: Floats
+    water_self: Floats
+    ozone: Floats
+    ozone_ratio: Floats
 
 
 class AbsorptionTable:
@@ -69,13 +68,13 @@ class AbsorptionTable:
         with own_data(path) as file:
             self._code = np.cumsum(file["difference"], axis=-1, dtype=np.uint16)
             self._low, self._high = file["low"].astype(np.float64), file["high"].astype(np.float64)
-            self.frequency: Array = file["frequency"].astype(np.float64)
-            self.pressure: Array = file["pressure"].astype(np.float64)
-            self.temperature: Array = file["temperature"].astype(np.float64)
+            self.frequency: Floats = file["frequency"].astype(np.float64)
+            self.pressure: Floats = file["pressure"].astype(np.float64)
+            self.temperature: Floats = file["temperature"].astype(np.float64)
             self._ozone_code = file["ozone_ratio"]
 
     @property
-    def edges(self) -> Array:
+    def edges(self) -> Floats:
         """(n + 1,) Hz, edges of the cells."""
         half = (self.frequency[1] - self.frequency[0]) / 2
         return np.append(self.frequency - half, self.frequency[-1] + half)
@@ -98,7 +97,7 @@ class AbsorptionTable:
             )
         return slice(int(np.searchsorted(edges, low, "right")) - 1, int(np.searchsorted(edges, high, "left")))
 
-    def cross_sections(self, pressure: Array, temperature: Array, cells: slice = slice(None)) -> CrossSections:
+    def cross_sections(self, pressure: Floats, temperature: Floats, cells: slice = slice(None)) -> CrossSections:
         """Cross-sections of layers at ``pressure`` [Pa] and ``temperature`` [K], both (n_layer,), in some cells.
 
         The logarithm is interpolated linearly in ln(pressure) and as a quartic in 1/temperature.
@@ -125,7 +124,7 @@ class AbsorptionTable:
         ratio /= np.einsum("g,glf->lf", OZONE_PARTS, ratio)
         return CrossSections(dry, water, (water_high - water) / MIXING_RATIO_HIGH, ozone, ratio)
 
-    def _bracket(self, pressure: Array) -> tuple[NDArray[np.intp], Array]:
+    def _bracket(self, pressure: Floats) -> tuple[NDArray[np.intp], Floats]:
         """Index of the table's pressure below each layer, and the weight of the one above."""
         grid, x = -np.log(self.pressure), -np.log(pressure)
         step = grid[1] - grid[0]
@@ -136,7 +135,7 @@ class AbsorptionTable:
         # Air thinner than the table's 0.13 hPa has the cross-sections of its edge; a `Profile` has none, it ends at 0.75 hPa.
         return below, np.minimum((x - grid[below]) / step, PRESSURE_MARGIN)
 
-    def _temperature_weights(self, pressure: Array, temperature: Array, row: NDArray[np.intp]) -> Array:
+    def _temperature_weights(self, pressure: Floats, temperature: Floats, row: NDArray[np.intp]) -> Floats:
         """Lagrange weights in 1/temperature on the nodes of each layer's row. (n_temperature, n_layer)."""
         nodes = self.temperature[row]
         low, high = nodes[:, 0] - TEMPERATURE_MARGIN, nodes[:, -1] + TEMPERATURE_MARGIN

@@ -16,11 +16,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import T_CMB, rayleigh_jeans
+from zonda.core.types import Floats
 
 from .absorption import AbsorptionTable, CrossSections
 from .profiles import PWV_MAX, check_pwv
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     from .profiles import Profile
 
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-5
 """Aim of the interpolation: largest error of T relative to T, and of the logarithms relative to 1 + |logarithm|."""
@@ -93,38 +93,38 @@ class BandAtmosphere:
         """Equations (1) to (3) by radiative transfer, without interpolation: K_RJ, neper, ln K_RJ."""
         return self._transfer(pwv, [elevation])[0]
 
-    def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """Equation (1): the atmosphere alone, background 0 K. PWV in m, elevation in rad -> K_RJ."""
         return self._evaluate(0, pwv, elevation)
 
-    def log_transmission(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def log_transmission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """Equation (2), <= 0."""
         return self._evaluate(1, pwv, elevation)
 
-    def transmission(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def transmission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """<e^-tau>."""
         return np.exp(self.log_transmission(pwv, elevation))
 
-    def opacity(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def opacity(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """-ln <e^-tau> along the line of sight, neper."""
         return -self.log_transmission(pwv, elevation)
 
-    def background(self, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def background(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """<J(nu, 2.725 K) e^-tau>: the microwave background behind the atmosphere, K_RJ."""
         return np.exp(self._evaluate(2, pwv, elevation))
 
-    def emission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def emission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """emission(pwv + dpwv) - emission(pwv), K_RJ, to float64 precision of the difference however small it is."""
         return self._difference(0, pwv, dpwv, elevation)
 
-    def log_transmission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def log_transmission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """log_transmission(pwv + dpwv) - log_transmission(pwv), to float64 precision of the difference."""
         return self._difference(1, pwv, dpwv, elevation)
 
     def __repr__(self) -> str:
         return f"BandAtmosphere({self.band.name}, PWV 0 to {self.pwv_max * 1e3:.3g} mm, error {self.error:.0e})"
 
-    def _tabulate(self, n_u: int, n_v: int) -> Array:
+    def _tabulate(self, n_u: int, n_v: int) -> Floats:
         """Chebyshev coefficients (3, n_u, n_v) from values at the Chebyshev points."""
         x_u, x_v = _chebyshev_points(n_u), _chebyshev_points(n_v)
         values = np.array([self._transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u])  # (n_u, n_v, 3)
@@ -148,7 +148,7 @@ class BandAtmosphere:
         """Elevation at y = -1 (zenith) .. 1 (4.5 deg)."""
         return max(math.asin(math.exp(-self._v_max * (y + 1) / 2)), ELEVATION_MIN)
 
-    def _x(self, pwv: Array) -> Array:
+    def _x(self, pwv: Floats) -> Floats:
         if pwv.size and not (pwv.min() >= 0 and pwv.max() <= self.pwv_max * (1 + 1e-12)):
             at = int(np.argmax((pwv < 0) | ~(pwv <= self.pwv_max)))
             raise InputError(
@@ -158,7 +158,7 @@ class BandAtmosphere:
             )
         return 2 * np.log1p(pwv / self._scale) / self._u_max - 1
 
-    def _y(self, elevation: Array) -> Array:
+    def _y(self, elevation: Floats) -> Floats:
         low, high = (float(elevation.min()), float(elevation.max())) if elevation.size else (ELEVATION_MIN, ELEVATION_MAX)
         if not ELEVATION_MIN * (1 - 1e-9) <= low <= high <= ELEVATION_MAX * (1 + 1e-9):
             raise InputError(
@@ -168,21 +168,21 @@ class BandAtmosphere:
             )
         return -2 * np.log(np.sin(elevation)) / self._v_max - 1
 
-    def _evaluate(self, which: int, pwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def _evaluate(self, which: int, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         pwv, elevation = np.asarray(pwv, np.float64), np.asarray(elevation, np.float64)
         if pwv.ndim:
             pwv, elevation = np.broadcast_arrays(pwv, elevation)
         basis = _chebyshev(self._x(pwv).ravel(), self._coefficients.shape[1])
         return self._contract(which, basis, elevation)
 
-    def _difference(self, which: int, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Array:
+    def _difference(self, which: int, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Floats:
         pwv, dpwv, elevation = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (pwv, dpwv, elevation)))
         start, stop = self._x(pwv).ravel(), self._x(pwv + dpwv).ravel()
         step = (2 * np.log1p(dpwv / (self._scale + pwv)) / self._u_max).ravel()
         basis = _chebyshev_difference(start, stop, step, self._coefficients.shape[1])
         return self._contract(which, basis, elevation)
 
-    def _contract(self, which: int, basis: Array, elevation: Array) -> Array:
+    def _contract(self, which: int, basis: Floats, elevation: Floats) -> Floats:
         """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the number of threads."""
         y, found, along = self._y(elevation).ravel(), np.empty(elevation.size), self._coefficients[which]
         for some in chunks(len(y)):
@@ -208,7 +208,7 @@ class BandTransfer:
         vertical = layers.opacity(self._cross_sections)
         return [self._at(vertical * layers.airmass(elevation)[:, None]) for elevation in elevations]
 
-    def _at(self, slant: Array) -> tuple[float, float, float]:
+    def _at(self, slant: Floats) -> tuple[float, float, float]:
         emitted = float(np.sum(self._weight * emission(slant, self._source)))
         opacity = slant.sum(axis=0)
         least = float(opacity.min())  # factored out, so that opaque bands do not underflow
@@ -216,7 +216,7 @@ class BandTransfer:
         return emitted, math.log(passed.sum()) - least, math.log(np.sum(passed * self._cmb)) - least
 
 
-def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Array, Array, slice]:
+def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, slice]:
     """Integral of the (piecewise linear) transmission over each cell of the absorption table that it touches, and the mean
     frequency of that integral: not the cell's centre where the band ends inside the cell.
     """
@@ -237,7 +237,7 @@ def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Array, Array, sli
     return integral, table.frequency[cells] + shift, cells
 
 
-def _at_frequencies(layers: Layers, frequency: Array, cells: slice) -> CrossSections:
+def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSections:
     """Cross-sections at one frequency in each cell, linear between the cells' centres."""
     centres = layers.table.frequency
     wide = slice(max(cells.start - 1, 0), min(cells.stop + 1, len(centres)))
@@ -247,7 +247,7 @@ def _at_frequencies(layers: Layers, frequency: Array, cells: slice) -> CrossSect
     upper = np.clip(upper, 0.0, 1.0)  # of the first and the last cell of the table
     nearest = low + (upper > 0.5)
 
-    def linear(sections: Array) -> Array:
+    def linear(sections: Floats) -> Floats:
         return np.asarray(sections[..., low] * (1 - upper) + sections[..., low + 1] * upper)
 
     return CrossSections(
@@ -255,18 +255,18 @@ def _at_frequencies(layers: Layers, frequency: Array, cells: slice) -> CrossSect
     )
 
 
-def _chebyshev_points(n: int) -> Array:
+def _chebyshev_points(n: int) -> Floats:
     return np.cos(np.pi * (np.arange(n) + 0.5) / n)
 
 
-def _chebyshev_transform(n: int) -> Array:
+def _chebyshev_transform(n: int) -> Floats:
     """(n, n) matrix from values at `_chebyshev_points` to coefficients."""
     transform = np.cos(np.pi * np.outer(np.arange(n), np.arange(n) + 0.5) / n) * 2 / n
     transform[0] /= 2
     return transform
 
 
-def _chebyshev(x: Array, n: int) -> Array:
+def _chebyshev(x: Floats, n: int) -> Floats:
     """(n, len(x)) T_0 .. T_n-1."""
     out = np.ones((n, x.size))
     out[1] = x
@@ -275,7 +275,7 @@ def _chebyshev(x: Array, n: int) -> Array:
     return out
 
 
-def _chebyshev_difference(x: Array, y: Array, step: Array, n: int) -> Array:
+def _chebyshev_difference(x: Floats, y: Floats, step: Floats, n: int) -> Floats:
     """(n, len(x)) T_k(y) - T_k(x) for y - x = step, by the recurrence of the differences, so nothing cancels:
 
     D_k+1 = 2 y D_k + 2 step T_k(x) - D_k-1.

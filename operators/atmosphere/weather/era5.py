@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.storage import hdf5_files
 from zonda.core.storage.files import reading
+from zonda.core.types import Floats
 from zonda.core.weather import Column
 
 from .humidity import from_relative, from_specific, ozone_from_mass
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
 
-Array = NDArray[np.float64]
 
 VARIABLES = {
     "t": "temperature",
@@ -92,7 +91,7 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
         }
         order = np.argsort(-pressure)
 
-        def column(name: str, logarithm: bool = False) -> Array:
+        def column(name: str, logarithm: bool = False) -> Floats:
             return file.interpolated(name, axes, weights, logarithm, place)[order]
 
         pressure, temperature = pressure[order], column("t")
@@ -115,7 +114,7 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
         )
 
 
-def _remarks(water_below_none: int, o3: Array | None) -> list[str]:
+def _remarks(water_below_none: int, o3: Floats | None) -> list[str]:
     """What ERA5's packing and spectral transform leave: slightly negative water and ozone, which are taken as none."""
     ozone_below_none = 0 if o3 is None else int(np.count_nonzero(o3 < 0))
     found = ["ozone of the standard atmosphere"] if o3 is None else []
@@ -143,7 +142,7 @@ class _File:
             return value.decode()
         return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
 
-    def values(self, name: str, where: Any = ()) -> Array:
+    def values(self, name: str, where: Any = ()) -> Floats:
         """Unpacked values, NaN where they are missing."""
         if hasattr(self._variables[name], "dims"):
             hdf5_files.check_size(self._variables[name], self._place)
@@ -157,9 +156,11 @@ class _File:
                 out = np.where(raw == value, np.nan, out)
         return np.atleast_1d(out)
 
-    def interpolated(self, name: str, axes: dict[str, str], weights: dict[str, dict[int, float]], log: bool, place: str) -> Array:
+    def interpolated(
+        self, name: str, axes: dict[str, str], weights: dict[str, dict[int, float]], log: bool, place: str
+    ) -> Floats:
         """(n_level,) of a variable."""
-        total: Array | float = 0.0
+        total: Floats | float = 0.0
         for i, a in weights["time"].items():
             for j, b in weights["lat"].items():
                 for k, c in weights["lon"].items():
@@ -170,7 +171,7 @@ class _File:
                     total = total + a * b * c * column
         return np.asarray(np.exp(total) if log else total)
 
-    def _column(self, name: str, axes: dict[str, str], at: dict[str, int], place: str) -> Array:
+    def _column(self, name: str, axes: dict[str, str], at: dict[str, int], place: str) -> Floats:
         names = self._dimensions[name]
         index = {axes[kind]: value for kind, value in at.items()} | {axes["level"]: slice(None)}
         if any(axis not in names for axis in axes.values()):
@@ -219,7 +220,7 @@ def _axis(file: _File, names: tuple[str, ...], place: str) -> str:
     return found
 
 
-def _pressure(file: _File, name: str, place: str) -> Array:
+def _pressure(file: _File, name: str, place: str) -> Floats:
     """(n_level,) Pa."""
     unit = str(file.attribute(name, "units", "hPa"))
     pressure = file.values(name) * (1.0 if unit == "Pa" else 100.0)
@@ -258,12 +259,12 @@ def _time_weights(file: _File, name: str, time: Instant, place: str) -> dict[int
     return {int(order[k]): w for k, w in weights.items()}
 
 
-def _latitude_weights(latitude: Array, wanted: float, place: str) -> dict[int, float]:
+def _latitude_weights(latitude: Floats, wanted: float, place: str) -> dict[int, float]:
     order = np.argsort(latitude)
     return {int(order[k]): w for k, w in _within(latitude[order], wanted, "latitudes", place).items()}
 
 
-def _longitude_weights(longitude: Array, wanted: float, latitude: float, place: str) -> dict[int, float]:
+def _longitude_weights(longitude: Floats, wanted: float, latitude: float, place: str) -> dict[int, float]:
     offset = (longitude - wanted + 180) % 360 - 180  # the place is at 0, wherever the file cuts the globe
     order = np.argsort(offset)
     if latitude > 89.9:
@@ -271,7 +272,7 @@ def _longitude_weights(longitude: Array, wanted: float, latitude: float, place: 
     return {int(order[k]): w for k, w in _within(offset[order], 0.0, "longitudes", place, wanted).items()}
 
 
-def _within(points: Array, wanted: float, noun: str, place: str, origin: float = 0.0) -> dict[int, float]:
+def _within(points: Floats, wanted: float, noun: str, place: str, origin: float = 0.0) -> dict[int, float]:
     if not points[0] - HALF_CELL <= wanted <= points[-1] + HALF_CELL:
         message = f"covers {noun} {points[0] + origin:.2f} to {points[-1] + origin:.2f} deg, not {wanted + origin:.2f} deg"
         raise InputError(message, place=place, cure=f"get the file for this place: {GET}")
@@ -283,7 +284,7 @@ def _within(points: Array, wanted: float, noun: str, place: str, origin: float =
     return weights
 
 
-def _linear(points: Array, wanted: float) -> dict[int, float]:
+def _linear(points: Floats, wanted: float) -> dict[int, float]:
     """Weights of the points around ``wanted``, by index; the nearest end where it is outside."""
     k = int(np.searchsorted(points, wanted))
     if k == 0 or k == len(points):

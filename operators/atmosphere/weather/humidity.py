@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from zonda.core.types import Floats
 
 from .radiative_transfer import MOLAR_MASS_DRY_AIR, MOLAR_MASS_WATER, VAPOUR_GAS_CONSTANT
-
-Array = NDArray[np.float64]
 
 EPSILON = MOLAR_MASS_WATER / MOLAR_MASS_DRY_AIR
 MOLAR_MASS_OZONE = 47.998e-3
 """kg / mol."""
 
 
-def saturation_pressure(temperature: Array) -> Array:
+def saturation_pressure(temperature: Floats) -> Floats:
     """Pa, over liquid water above 0 C, ice below -23 C and a mixture between (IFS documentation cy41r2, IV, eq. 7.93)."""
     t = np.asarray(temperature, np.float64)
     liquid = 611.21 * np.exp(17.502 * (t - 273.16) / (t - 32.19))
@@ -23,21 +22,21 @@ def saturation_pressure(temperature: Array) -> Array:
     return np.asarray(share * liquid + (1 - share) * ice)
 
 
-def from_relative(relative: Array, pressure: Array, temperature: Array) -> Array:
+def from_relative(relative: Floats, pressure: Floats, temperature: Floats) -> Floats:
     """From relative humidity, 0 to 1, of the mixed-phase saturation pressure."""
     return np.asarray(relative * saturation_pressure(temperature) / pressure)
 
 
-def from_specific(specific: Array) -> Array:
+def from_specific(specific: Floats) -> Floats:
     """From specific humidity, kg of vapour per kg of moist air."""
     return np.asarray(specific / (EPSILON + (1 - EPSILON) * specific))
 
 
-def from_density(density: Array, pressure: Array, temperature: Array) -> Array:
+def from_density(density: Floats, pressure: Floats, temperature: Floats) -> Floats:
     """From the mass of vapour, kg/m3."""
     return np.asarray(density * VAPOUR_GAS_CONSTANT * temperature / pressure)
 
 
-def ozone_from_mass(mass_mixing_ratio: Array) -> Array:
+def ozone_from_mass(mass_mixing_ratio: Floats) -> Floats:
     """From kg of ozone per kg of air."""
     return np.asarray(mass_mixing_ratio * MOLAR_MASS_DRY_AIR / MOLAR_MASS_OZONE)

@@ -1,41 +1,28 @@
-"""The air above a site: profiles from the ground up, and the embedded climatology (see data/README.md).
-
-Per site and pressure level the median temperature, ln(vapour density), wind and height of 15 years of ERA5 are harmonics,
-
-    x(day, hour) = sum_k c_k A_i(2 pi day / 365.25) H_j(2 pi hour / 24),   k = 5 i + j                             (1)
-
-with A = 1, cos a, sin a, ... cos 4a, sin 4a and H = 1, cos b, sin b, cos 2b, sin 2b; day counts from 1 January, hour is UTC.
-"""
+"""The atmosphere above a site: profiles from the ground up, made from the levels of a weather source."""
 
 from __future__ import annotations
 
 import math
-from calendar import isleap
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from pathlib import Path
+from functools import cached_property
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zonda.core.errors import InputError
-from zonda.core.storage.files import own_data
+from zonda.core.types import Floats
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
 
 from .humidity import saturation_pressure
 from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT, Layers
-from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, STRATOSPHERIC_WATER, ozone, standard_column, upper_levels
+from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, STRATOSPHERIC_WATER, ozone, upper_levels
 
 if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
 
-Array = NDArray[np.float64]
-
-CLIMATOLOGY = Path(__file__).parent.parent / "data" / "climatology.npz"
 
 LEVELS = 61
 """Heights of a profile."""
@@ -44,8 +31,6 @@ TOP = 46e3
 EXTRAPOLATION_MAX = 500.0
 """m that a site may lie below the lowest level of its climatology."""
 
-YEARS = (1940, 2100)
-"""Years for which the climatology, of 15 recent ones, is taken: ERA5 begins with the first."""
 STACKING = 0.77
 """Levels do not vary together: the column's ln(PWV) scatters this much of what the levels' quantiles, stacked, would give. This
 is the mean of the sites where ERA5's own columns tell (0.6 to 0.96, `Column.column_spread`), for the others."""
@@ -59,19 +44,19 @@ STRATOPAUSE_TEMPERATURE = 270.65
 
 
 @dataclass(frozen=True)
-class Air:
+class Conditions:
     """The air at some heights, arrays of the shape asked for: m above the site, Pa, K, kg/m3, m/s, m/s."""
 
-    height: Array
-    pressure: Array
-    temperature: Array
-    vapour_density: Array
-    wind_east: Array
-    wind_north: Array
+    height: Floats
+    pressure: Floats
+    temperature: Floats
+    vapour_density: Floats
+    wind_east: Floats
+    wind_north: Floats
 
 
 @dataclass(frozen=True)
-class WaterDistribution:
+class PwvDistribution:
     """Law of the PWV: its logarithm is normal with one width below the median and another above, cut at `PWV_MAX`.
 
     Attributes
@@ -125,21 +110,21 @@ class Profile:
         (what, text): where this air comes from, for the reports.
     """
 
-    height: Array
-    pressure: Array
-    temperature: Array
-    h2o: Array
-    o3: Array
-    wind_east: Array
-    wind_north: Array
+    height: Floats
+    pressure: Floats
+    temperature: Floats
+    h2o: Floats
+    o3: Floats
+    wind_east: Floats
+    wind_north: Floats
     altitude: float
-    wind_east_spread: Array | None = None
-    wind_north_spread: Array | None = None
-    distribution: WaterDistribution | None = None
+    wind_east_spread: Floats | None = None
+    wind_north_spread: Floats | None = None
+    distribution: PwvDistribution | None = None
     stated: tuple[tuple[str, str], ...] = ()
 
     @property
-    def vapour_density(self) -> Array:
+    def vapour_density(self) -> Floats:
         """Mass of water vapour, kg/m3."""
         return self.h2o * self.pressure / (VAPOUR_GAS_CONSTANT * self.temperature)
 
@@ -196,7 +181,7 @@ class Profile:
         north = np.where(median > 0, self.wind_north, 0.0) / np.where(median > 0, median, 1.0)
         return replace(self, wind_east=speed * east, wind_north=speed * north)
 
-    def at(self, height: ArrayLike) -> Air:
+    def at(self, height: ArrayLike) -> Conditions:
         """The air at heights above the site [m], any shape: winds as vectors, pressure and vapour as logarithms, linearly.
 
         Raises
@@ -209,12 +194,12 @@ class Profile:
             given, limits = f"{wanted.min():g} to {wanted.max():g} m", f"0 to {self.height[-1]:g} m"
             raise InputError(f"heights of {given} above the site are outside the profile, {limits}")
 
-        def linear(values: Array) -> Array:
+        def linear(values: Floats) -> Floats:
             return np.asarray(np.interp(wanted, self.height, values))
 
         tiny = np.finfo(np.float64).tiny
         vapour = np.exp(linear(np.log(np.maximum(self.vapour_density, tiny))))
-        return Air(
+        return Conditions(
             height=wanted,
             pressure=np.exp(linear(np.log(self.pressure))),
             temperature=linear(self.temperature),
@@ -222,24 +207,6 @@ class Profile:
             wind_east=linear(self.wind_east),
             wind_north=linear(self.wind_north),
         )
-
-
-def profile(site: Site, time: Instant, pwv: float | None = None) -> Profile:
-    """The median air above a site at a time, its water scaled to ``pwv`` [m] where that is given.
-
-    A site without climatology has the US Standard Atmosphere where ``pwv`` is given.
-
-    Raises
-    ------
-    InputError
-        Neither climatology nor PWV, an unknown climatology, one whose levels begin far above the site, an unphysical PWV, a
-        time outside `YEARS`.
-    """
-    if pwv is not None:
-        check_pwv(pwv)
-    column = standard_column(site) if site.climatology is None and pwv is not None else climatology_column(site, time)
-    median = on_heights(column, site)
-    return median if pwv is None else median.scaled(pwv)
 
 
 def check_pwv(pwv: float) -> None:
@@ -251,86 +218,6 @@ def check_pwv(pwv: float) -> None:
         )
 
 
-@lru_cache(maxsize=1)
-def climatologies() -> tuple[str, ...]:
-    """Names of the embedded climatologies, sorted."""
-    with own_data(CLIMATOLOGY) as file:
-        return tuple(sorted({key.split("/")[0] for key in file.files}))
-
-
-@lru_cache(maxsize=8)
-def coefficients(name: str) -> dict[str, NDArray[np.float32]]:
-    """The arrays of one embedded climatology by quantity, as data/README.md lists them."""
-    with own_data(CLIMATOLOGY) as file:
-        return {key.split("/")[1]: file[key] for key in file.files if key.startswith(f"{name}/")}
-
-
-def climatology_column(site: Site, time: Instant) -> Column:
-    """Equation (1), with its spreads. Raises `InputError` as `profile`."""
-    name, place = site.climatology, f"site '{site.name}'"
-    known = climatologies()
-    if name is None:
-        raise InputError(
-            "has no climatology, so the air above it is unknown",
-            place=place,
-            cure="give its water, e.g. weather: {pwv: 3 mm}, or an ERA5 file, weather: {file: era5.nc}, which "
-            "`zonda weather fetch` gets; or choose a site that has a climatology (see `zonda plugins`), or set the site's "
-            f"climatology to one of: {', '.join(known)}",
-        )
-    if name not in known:
-        raise InputError(f"climatology '{name}' does not exist", place=place, cure=f"choose one of: {', '.join(known)}")
-    if not YEARS[0] <= time.datetime.year < YEARS[1]:
-        raise InputError(
-            f"{time} is outside what the climatology stands for, {YEARS[0]} to {YEARS[1]}",
-            place=place,
-            cure="choose a time in these years: the climatology is that of ERA5's recent ones",
-        )
-    basis, arrays = harmonics(*_day_and_hour(time)), coefficients(name)
-
-    def median(quantity: str) -> Array:
-        return np.asarray(basis @ arrays[quantity].astype(np.float64))
-
-    every_pressure = arrays["pressure"].astype(np.float64)
-    height, temperature = median("height"), median("temperature")
-    pressure = every_pressure[: len(height)]  # the highest levels have ozone only
-    h2o = np.exp(median("log_vapour_density")) * VAPOUR_GAS_CONSTANT * temperature / pressure
-    annual = basis[::5]  # 1, cos a, sin a, ...
-    spread = {name: annual[:3] @ arrays[f"{name}_spread"] for name in ("log_vapour_density", "wind_east", "wind_north")}
-    shares = arrays.get("column_spread")
-    return Column(
-        pressure=pressure,
-        height=height,
-        temperature=temperature,
-        h2o=h2o,
-        wind_east=median("wind_east"),
-        wind_north=median("wind_north"),
-        ozone_pressure=every_pressure,
-        ozone=np.exp(annual @ arrays["log_ozone"].astype(np.float64)),
-        log_vapour_spread=spread["log_vapour_density"],
-        wind_east_spread=spread["wind_east"],
-        wind_north_spread=spread["wind_north"],
-        column_spread=None if shares is None else (float(shares[0] @ annual[:3]), float(shares[1] @ annual[:3])),
-        ground_temperature=float(median("ground_temperature")) if "ground_temperature" in arrays else None,
-        stated=f"climatology '{name}' (ERA5), {time}",
-    )
-
-
-def _day_and_hour(time: Instant) -> tuple[float, float]:
-    """Days since 1 January, stretched so that every year has 365.25 and closes, and the hour of the day, UTC."""
-    moment = time.datetime
-    hour = moment.hour + moment.minute / 60 + moment.second / 3600
-    return (moment.timetuple().tm_yday - 1 + hour / 24) * 365.25 / (365 + isleap(moment.year)), hour
-
-
-def harmonics(day: float, hour: float) -> Array:
-    """(45,) the products A_i H_j of equation (1)."""
-    a, b = 2 * np.pi * day / 365.25, 2 * np.pi * hour / 24
-    annual, diurnal = (
-        np.concatenate([[1.0], *([np.cos(k * x), np.sin(k * x)] for k in range(1, n + 1))]) for x, n in ((a, 4), (b, 2))
-    )
-    return np.outer(annual, diurnal).ravel()
-
-
 def on_heights(column: Column, site: Site) -> Profile:
     """A column from its levels to heights above the site; above it the stratosphere of the US Standard Atmosphere.
 
@@ -339,28 +226,14 @@ def on_heights(column: Column, site: Site) -> Profile:
     InputError
         A site far below the column's lowest level, or above its highest.
     """
-    column, altitude = _continued(column), site.altitude
-    whole: Array | None = None
-    if not column.height[0] - EXTRAPOLATION_MAX <= altitude < column.height[-1]:
-        low, who = altitude < column.height[0], column.stated or "its weather"
-        where = f"more than {EXTRAPOLATION_MAX:g} m below the lowest" if low else "above the highest"
-        raise InputError(
-            f"lies at {altitude:g} m, {where} level of {who}, {column.height[0 if low else -1]:.0f} m",
-            place=f"site '{site.name}'",
-            cure="check the site's altitude, or choose another climatology or source of weather",
-        )
+    _check_altitude(column := _continued(column), site)
     height = TOP * np.expm1(2.5 * np.linspace(0, 1, LEVELS)) / np.expm1(2.5)
-    z = altitude + height
+    z = site.altitude + height
     inside = np.clip(z, column.height[0], column.height[-1])
     above, below = np.maximum(z - column.height[-1], 0.0), np.minimum(z - column.height[0], 0.0)
 
-    def linear(values: Array) -> Array:
+    def linear(values: Floats) -> Floats:
         return np.asarray(np.interp(inside, column.height, values))
-
-    def spread(values: Array | None) -> Array | None:
-        return None if values is None else linear(values)
-
-    log_vapour_spread = spread(column.log_vapour_spread)
 
     lapse = (column.temperature[1] - column.temperature[0]) / (column.height[1] - column.height[0])
     top = column.temperature[-1]
@@ -369,38 +242,62 @@ def on_heights(column: Column, site: Site) -> Profile:
     h2o = np.exp(linear(np.log(np.maximum(column.h2o, 1e-12))))  # a logarithm of dry air: 6e-9 mm of water in the whole column
     mean = np.where(above > 0, (temperature + top) / 2, temperature)  # of the air between the outermost level and z
     log_pressure = linear(np.log(column.pressure)) - GRAVITY * (above + below) / (DRY_AIR_GAS_CONSTANT * mean)
-    if column.ground_temperature is not None:
-        temperature = temperature + (column.ground_temperature - temperature[0]) * np.exp(-height / INVERSION_DEPTH)
-        saturated = saturation_pressure(temperature) / np.exp(log_pressure)
-        cold = (height < 5 * INVERSION_DEPTH) & (h2o > saturated)
-        whole, h2o = h2o, np.where(cold, saturated, h2o)
-    if column.ozone_pressure is None or column.ozone is None:
-        o3 = ozone(np.exp(log_pressure))
-    else:
-        rising = np.argsort(column.ozone_pressure)
-        o3 = np.interp(log_pressure, np.log(column.ozone_pressure[rising]), column.ozone[rising])
+    spreads = [None if s is None else linear(s) for s in (column.wind_east_spread, column.wind_north_spread)]
     made = Profile(
         height=height,
         pressure=np.exp(log_pressure),
         temperature=temperature,
         h2o=h2o,
-        o3=o3,
+        o3=_ozone(column, log_pressure),
         wind_east=linear(column.wind_east),
         wind_north=linear(column.wind_north),
-        altitude=altitude,
-        wind_east_spread=spread(column.wind_east_spread),
-        wind_north_spread=spread(column.wind_north_spread),
+        altitude=site.altitude,
+        wind_east_spread=spreads[0],
+        wind_north_spread=spreads[1],
         stated=(("weather", column.stated),) if column.stated else (),
     )
-    if whole is not None and cold.any():
-        lost = 1 - made.pwv / replace(made, h2o=whole).pwv
-        text = f"cut to saturation at {np.count_nonzero(cold)} levels of the inversion, which takes {lost:.2%} of the column"
-        made = replace(made, stated=(*made.stated, ("water near the ground", text)))
-    if log_vapour_spread is None:
+    if column.ground_temperature is not None:
+        made = _inverted(made, column.ground_temperature)
+    if column.log_vapour_spread is None:
         return made
-    low, high = (replace(made, h2o=made.h2o * np.exp(sign * log_vapour_spread)).pwv for sign in (-1, 1))
+    wide = linear(column.log_vapour_spread)
+    low, high = (replace(made, h2o=made.h2o * np.exp(sign * wide)).pwv for sign in (-1, 1))
     stacked, shares = math.log(high / low) / 2, column.column_spread or (STACKING, STACKING)
-    return replace(made, distribution=WaterDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked))
+    return replace(made, distribution=PwvDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked))
+
+
+def _check_altitude(column: Column, site: Site) -> None:
+    lowest, highest = column.height[0], column.height[-1]
+    if lowest - EXTRAPOLATION_MAX <= site.altitude < highest:
+        return
+    low, who = site.altitude < lowest, column.stated or "its weather"
+    where = f"more than {EXTRAPOLATION_MAX:g} m below the lowest" if low else "above the highest"
+    raise InputError(
+        f"lies at {site.altitude:g} m, {where} level of {who}, {lowest if low else highest:.0f} m",
+        place=f"site '{site.name}'",
+        cure="check the site's altitude, or choose another climatology or source of weather",
+    )
+
+
+def _ozone(column: Column, log_pressure: Floats) -> Floats:
+    if column.ozone_pressure is None or column.ozone is None:
+        return ozone(np.exp(log_pressure))
+    rising = np.argsort(column.ozone_pressure)
+    return np.interp(log_pressure, np.log(column.ozone_pressure[rising]), column.ozone[rising])
+
+
+def _inverted(profile: Profile, ground_temperature: float) -> Profile:
+    """With the inversion that a temperature on the ground means; cold air there holds no more water than saturates it."""
+    temperature = profile.temperature + (ground_temperature - profile.temperature[0]) * np.exp(-profile.height / INVERSION_DEPTH)
+    saturated = saturation_pressure(temperature) / profile.pressure
+    cold = (profile.height < 5 * INVERSION_DEPTH) & (profile.h2o > saturated)
+    whole = replace(profile, temperature=temperature)
+    if not cold.any():
+        return whole
+    cut = replace(whole, h2o=np.where(cold, saturated, profile.h2o))
+    lost = 1 - cut.pwv / whole.pwv
+    text = f"cut to saturation at {np.count_nonzero(cold)} levels of the inversion, which takes {lost:.2%} of the column"
+    return replace(cut, stated=(*cut.stated, ("vapour near the ground", text)))
 
 
 def _continued(column: Column) -> Column:
@@ -409,7 +306,7 @@ def _continued(column: Column) -> Column:
     if not height.size:
         return column
 
-    def held(values: Array | None) -> Array | None:
+    def held(values: Floats | None) -> Floats | None:
         return None if values is None else np.append(values, np.full(height.size, values[-1]))
 
     return replace(
@@ -426,7 +323,7 @@ def _continued(column: Column) -> Column:
     )
 
 
-def _layer_mean(pressure: Array, mixing_ratio: Array) -> Array:
+def _layer_mean(pressure: Floats, mixing_ratio: Floats) -> Floats:
     """Mean over each layer's mass of a mixing ratio that is a power of the pressure between its boundaries. (n - 1,)."""
     low, high = mixing_ratio[:-1], mixing_ratio[1:]
     if not mixing_ratio.all():

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import BOLTZMANN, T_CMB, rayleigh_jeans
+from zonda.core.types import Floats
 
 from .absorption import OZONE_PARTS, AbsorptionTable, CrossSections, absorption_table
-
-Array = NDArray[np.float64]
 
 AVOGADRO = 6.02214076e23
 """1 / mol (SI, exact)."""
@@ -58,11 +57,11 @@ class Layers:
         (n + 1,) m above sea level of the boundaries.
     """
 
-    pressure: Array
-    temperature: Array
-    h2o: Array
-    o3: Array
-    height: Array
+    pressure: Floats
+    temperature: Floats
+    h2o: Floats
+    o3: Floats
+    height: Floats
     spectra: AbsorptionTable | None = None
     """Cross-sections; where absent, `absorption_table`."""
 
@@ -72,7 +71,7 @@ class Layers:
         return self.spectra or absorption_table()
 
     @property
-    def molecules(self) -> Array:
+    def molecules(self) -> Floats:
         """(n,) molecules per m2 in hydrostatic balance."""
         mass = MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o
         return -np.diff(self.pressure) / GRAVITY / mass * AVOGADRO
@@ -97,7 +96,7 @@ class Layers:
         pressure, temperature = (self.pressure[1:] + self.pressure[:-1]) / 2, (self.temperature[1:] + self.temperature[:-1]) / 2
         return self.table.cross_sections(pressure, temperature, cells)
 
-    def opacity(self, cross_sections: CrossSections) -> Array:
+    def opacity(self, cross_sections: CrossSections) -> Floats:
         """(n, n_frequency) vertical opacity of each layer, neper."""
         k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
         # Linear in the mixing ratio, falling to 0.8 of its dry value at 0.05 at most: it is positive up to 0.25, which no air
@@ -105,7 +104,7 @@ class Layers:
         water_section = np.maximum(k.water + water * k.water_self, 0.0)
         return self.molecules[:, None] * ((1 - water) * k.dry_air + water * water_section + ozone * k.ozone)
 
-    def in_parts(self, sections: CrossSections) -> tuple[CrossSections, NDArray[np.intp], Array]:
+    def in_parts(self, sections: CrossSections) -> tuple[CrossSections, NDArray[np.intp], Floats]:
         """Cross-sections with each cell that has narrow ozone lines in parts, (n, n_part); the cell of each part; its share."""
         column = (self.molecules * self.o3)[:, None] * sections.ozone
         opacity = np.einsum("lf,glf->gf", column, sections.ozone_ratio)
@@ -123,7 +122,7 @@ class Layers:
             share,
         )
 
-    def airmass(self, elevation: float, *, plane_parallel: bool = False) -> Array:
+    def airmass(self, elevation: float, *, plane_parallel: bool = False) -> Floats:
         """(n,) slant over vertical path of each layer, equation (1), or 1/sin(elevation) when ``plane_parallel``.
 
         Raises
@@ -160,18 +159,18 @@ class Spectrum:
         Rayleigh-Jeans brightness of the atmosphere alone along the ray (background 0 K), K.
     """
 
-    frequency: Array
-    opacity: Array
-    slant_opacity: Array
-    brightness: Array
+    frequency: Floats
+    opacity: Floats
+    slant_opacity: Floats
+    brightness: Floats
 
     @property
-    def cmb(self) -> Array:
+    def cmb(self) -> Floats:
         """Rayleigh-Jeans brightness of the cosmic microwave background behind the atmosphere, J(2.725 K) e^-tau, K."""
         return rayleigh_jeans(self.frequency, T_CMB) * np.exp(-self.slant_opacity)
 
 
-def emission(slant_opacity: Array, source: Array) -> Array:
+def emission(slant_opacity: Floats, source: Floats) -> Floats:
     """Brightness at the ground of layers whose source function is linear in the opacity from boundary to boundary.
 
         T = sum_i e^-tau_below,i [J_i (1 - e^-t_i) + (J_i+1 - J_i) ((1 - e^-t_i)/t_i - e^-t_i)]                    (2)

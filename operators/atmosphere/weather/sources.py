@@ -13,9 +13,10 @@ from zonda.core.numerics.random import normals, stream_key, uniforms
 from zonda.core.types import AnyFloats
 from zonda.core.weather import Column, GroundWeather, WeatherSource
 
+from .climatology import climatology_column
 from .era5 import read_era5
 from .humidity import saturation_pressure
-from .profiles import Profile, check_pwv, climatology_column, on_heights
+from .profiles import Profile, check_pwv, on_heights
 from .radiative_transfer import VAPOUR_GAS_CONSTANT
 from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, standard_column
 from .table import read_table

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zonda.core.site import Site
+from zonda.core.types import Floats
 from zonda.core.weather import Column
 
 from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT
-
-Array = NDArray[np.float64]
 
 DRY_AIR_GAS_CONSTANT = 287.05
 """J / (kg K)."""
@@ -37,12 +36,12 @@ EXTEND_BELOW = 1500.0
 """Pa: a source whose highest level has more than this is continued upwards."""
 
 
-def temperature(height: ArrayLike) -> Array:
+def temperature(height: ArrayLike) -> Floats:
     """K at geopotential heights [m above sea level]; constant above 47 km."""
     return np.asarray(np.interp(np.asarray(height, np.float64), HEIGHT, TEMPERATURE))
 
 
-def pressure(height: ArrayLike) -> Array:
+def pressure(height: ArrayLike) -> Floats:
     """Pa at geopotential heights [m above sea level], hydrostatic."""
     fine = np.linspace(HEIGHT[0], 80e3, 1621)
     step = np.diff(fine) * GRAVITY / DRY_AIR_GAS_CONSTANT / temperature((fine[1:] + fine[:-1]) / 2)
@@ -51,12 +50,12 @@ def pressure(height: ArrayLike) -> Array:
     return np.asarray(SEA_LEVEL_PRESSURE * np.exp(np.interp(np.asarray(height, np.float64), fine, logarithm) - at_sea_level))
 
 
-def wind_speed(above_ground: ArrayLike) -> Array:
+def wind_speed(above_ground: ArrayLike) -> Floats:
     """Wind where there is none in the profile, m/s: 8 + 30 exp(-((h - 9400 m) / 4800 m)^2), h above the ground."""
     return 8 + 30 * np.exp(-(((np.asarray(above_ground, np.float64) - 9400) / 4800) ** 2))
 
 
-def ozone(pressures: ArrayLike) -> Array:
+def ozone(pressures: ArrayLike) -> Floats:
     """Volume mixing ratio at pressures [Pa]."""
     at = np.log(pressure(OZONE_HEIGHT))
     return np.asarray(np.interp(-np.log(pressures), -at, OZONE))
@@ -79,7 +78,7 @@ def standard_column(site: Site) -> Column:
     )
 
 
-def upper_levels(top_height: float, top_pressure: float, top_temperature: float) -> tuple[Array, Array, Array]:
+def upper_levels(top_height: float, top_pressure: float, top_temperature: float) -> tuple[Floats, Floats, Floats]:
     """(height, pressure, temperature) above a source's highest level up to 31 km, with the standard lapse rates."""
     height = np.arange(top_height + 1e3, 31.5e3, 1e3)
     if top_pressure < EXTEND_BELOW or not height.size:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
+from zonda.core.types import Floats
 
 from .bands import BandAtmosphere
-from .profiles import PWV_MAX, Profile, profile
+from .climatology import profile
+from .profiles import PWV_MAX, Profile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Band
     from zonda.core.site import Site
 
-Array = NDArray[np.float64]
 
 HOURS = tuple(range(0, 24, 3))
 """UTC."""
@@ -34,8 +34,8 @@ MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", 
 class WaterByMonth:
     """PWV [m] on the 15th of each month: ``median`` (12, n_hour), and the mean over the hours of ``quantiles`` (12, 5)."""
 
-    median: Array
-    quantiles: Array
+    median: Floats
+    quantiles: Floats
 
 
 def water_by_month(site: Site, year: int = 2023) -> WaterByMonth:

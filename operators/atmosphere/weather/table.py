@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.types import Floats
 from zonda.core.weather import Column
 
 from .humidity import from_density, from_relative, from_specific
@@ -20,7 +21,6 @@ from .standard_atmosphere import wind_speed
 if TYPE_CHECKING:
     from zonda.core.site import Site
 
-Array = NDArray[np.float64]
 
 HIGHEST = 8e3
 """m above sea level that a table must reach: nearly all water lies below."""
@@ -71,7 +71,7 @@ def read_table(path: Path, site: Site) -> Column:
             place=place,
             cure=f"give at least 5, up to {HIGHEST:g} m: the water and most of the oxygen lie below",
         )
-    humidity: dict[str, Callable[[Array], Array]] = {
+    humidity: dict[str, Callable[[Floats], Floats]] = {
         "relative humidity": lambda x: from_relative(x, pressure, temperature),
         "vapour density": lambda x: from_density(x, pressure, temperature),
         "specific humidity": from_specific,
@@ -129,7 +129,7 @@ def _header(cells: list[str], place: str) -> list[tuple[str, str]]:
     return columns
 
 
-def _numbers(lines: list[tuple[int, list[str]]], columns: list[tuple[str, str]], place: str) -> dict[str, Array]:
+def _numbers(lines: list[tuple[int, list[str]]], columns: list[tuple[str, str]], place: str) -> dict[str, Floats]:
     """SI values of each column."""
     table = np.empty((len(lines) - 1, len(columns)))
     for row, (number, cells) in enumerate(lines[1:]):
@@ -153,7 +153,7 @@ def _numbers(lines: list[tuple[int, list[str]]], columns: list[tuple[str, str]],
     return values
 
 
-def _limits(values: dict[str, Array], rows: list[int], place: str) -> None:
+def _limits(values: dict[str, Floats], rows: list[int], place: str) -> None:
     def refuse(bad: NDArray[np.bool_], message: str, cure: str) -> None:
         if bad.any():
             raise InputError(f"line {rows[int(np.argmax(bad))]}: {message}", place=place, cure=cure)

@@ -20,6 +20,7 @@ from zonda.operators.atmosphere.model import beam_sigma
 from zonda.operators.atmosphere.turbulence.beams import widened
 from zonda.operators.atmosphere.turbulence.covariance import NU, beam_correlation, beam_structure, mixture
 from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, scan_planes
+from zonda.operators.atmosphere.turbulence.implied import implied_covariance
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
 from .test_layers import instrument, layers_of, observe, operator, quaternions, water
@@ -51,7 +52,7 @@ def implied_difference(layer: Turbulence, at: Floats, r: float, phase: tuple[int
     n = 18
     i, j = (v.ravel() for v in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
     ends = (np.stack([v + phase[0], 0 * v + phase[1]], axis=1) for v in (i, j))
-    among = layer.implied_covariance(*ends).reshape(n, n)
+    among = implied_covariance(layer, *ends).reshape(n, n)
     cardinal = make_interp_spline(np.arange(n), np.eye(n), k=3)
     w = cardinal(at + n // 2 - 3 + r / layer.spacing) - cardinal(at + n // 2 - 3)
     return np.asarray(np.einsum("an,nm,am->a", w, among, w) / 2, np.float64)
@@ -75,7 +76,7 @@ def test_every_aperture_along_across_and_oblique_to_the_wind(diameter: float, he
             if not end.any():
                 end = np.array([1, 0]) if angle < 45 else np.array([0, 1])
             a, b = np.array([[3, 8]]), np.array([[3, 8]]) + end
-            here, there, between = (layer.implied_covariance(p, q)[0] for p, q in ((a, a), (b, b), (a, b)))
+            here, there, between = (implied_covariance(layer, p, q)[0] for p, q in ((a, a), (b, b), (a, b)))
             at = np.hypot(*end) * layer.spacing
             assert between == pytest.approx(beam_correlation(at, OUTER_SCALE, sigma)[0], abs=layer.fidelity.error)
             exact = beam_structure(at, OUTER_SCALE, sigma)[0]

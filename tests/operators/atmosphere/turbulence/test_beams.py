@@ -14,6 +14,7 @@ from zonda.core.errors import ZondaError
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.turbulence.beams import Aperture
 from zonda.operators.atmosphere.turbulence.covariance import beam_structure, correlation, structure
+from zonda.operators.atmosphere.turbulence.implied import implied_covariance
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 from zonda.operators.atmosphere.turbulence.nodes import Layer
 
@@ -84,7 +85,7 @@ def test_implied_covariance_behind_apertures(diameter: float, taper: float, fide
         for direction in ((0, 1), (1, 0), (1, 1)):
             a = np.array([phase] * len(lags))
             b = a + lags[:, None] * np.array(direction)
-            here, there, between = (layer.implied_covariance(p, q) for p, q in ((a, a), (b, b), (a, b)))
+            here, there, between = (implied_covariance(layer, p, q) for p, q in ((a, a), (b, b), (a, b)))
             s = aperture.structure(lags * np.hypot(*direction) * layer.spacing, OUTER_SCALE)
             assert abs(((here + there) / 2 - between) / s - 1).max() < 1e-3
             assert abs(here / layer.variance - 1).max() < 1e-3

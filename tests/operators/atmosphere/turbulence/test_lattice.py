@@ -13,7 +13,9 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.random import lattice_normals
 from zonda.operators.atmosphere.turbulence import lattice
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
-from zonda.operators.atmosphere.turbulence.lattice import FIDELITIES, Turbulence
+from zonda.operators.atmosphere.turbulence.implied import implied_covariance
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
+from zonda.operators.atmosphere.turbulence.levels import FIDELITIES
 
 LAGS = (0, 1, 2, 5, 20, 130, 400)
 DIRECTIONS = ((0, 1), (1, 0), (1, 1))  # along, across and diagonal
@@ -24,7 +26,7 @@ def implied_error(layer: Turbulence) -> tuple[float, float]:
     """Largest error of the implied covariance (of the variance) and of the structure function (of itself, one cell and up)."""
     ends = [(p, p + lag * np.array(d), lag * np.hypot(*d) * layer.spacing) for d in DIRECTIONS for p in PHASES for lag in LAGS]
     a, b, r = (np.array(v) for v in zip(*ends, strict=True))
-    here, there, between = (layer.implied_covariance(p, q) for p, q in ((a, a), (b, b), (a, b)))
+    here, there, between = (implied_covariance(layer, p, q) for p, q in ((a, a), (b, b), (a, b)))
     s = beam_structure(r, layer.outer_scale, layer.sigma)
     c = beam_correlation(r, layer.outer_scale, layer.sigma)
     apart = r > 0
@@ -94,7 +96,7 @@ def in_float64(layer: Turbulence, i0: int, i1: int, j0: int, j1: int) -> np.ndar
     for _ in layer.levels[1:]:
         a, b, c, d = boxes[-1]
         boxes.append(((a >> 1) - half + 1, ((b - 1) >> 1) + half + 1, (c >> 1) - half + 1, ((d - 1) >> 1) + half + 1))
-    weights = layer._weights.astype(np.float64)
+    weights = layer.weights.astype(np.float64)
     field = None
     for level, key, box, coarse in zip(
         layer.levels[::-1], layer._keys[::-1], boxes[::-1], [(0, 0, 0, 0), *boxes[:0:-1]], strict=True

@@ -11,7 +11,7 @@ from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.site import Site
 from zonda.operators.atmosphere.weather.absorption import absorption_table
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere, _cell_weights, _chebyshev
-from zonda.operators.atmosphere.weather.profiles import profile
+from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 
 PWV = 7.7e-3

@@ -7,8 +7,8 @@ import pytest
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.site import Site
-from zonda.operators.atmosphere.weather import profiles
-from zonda.operators.atmosphere.weather.profiles import climatologies, coefficients, harmonics, profile
+from zonda.operators.atmosphere.weather import climatology, profiles
+from zonda.operators.atmosphere.weather.climatology import climatologies, coefficients, harmonics, profile
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -168,16 +168,16 @@ def test_ice_sheets_have_their_inversion_in_winter(name):
 
 
 def test_water_has_one_width_below_its_median_and_another_above():
-    law = profiles.WaterDistribution(10e-3, 0.6, 0.4)
+    law = profiles.PwvDistribution(10e-3, 0.6, 0.4)
     half = 0.6744897501960817  # quartile of the normal law
     assert law.at(0.25) == pytest.approx(10e-3 * math.exp(-0.6 * half), rel=1e-3)
     assert law.at(0.75) == pytest.approx(10e-3 * math.exp(0.4 * half), rel=1e-3)
     assert law.sigma == pytest.approx(0.5)
-    assert profiles.WaterDistribution(40e-3, 0.3, 0.9).at(1 - 1e-12) <= profiles.PWV_MAX
+    assert profiles.PwvDistribution(40e-3, 0.3, 0.9).at(1 - 1e-12) <= profiles.PWV_MAX
 
 
 def test_data_are_small():
-    assert sum(path.stat().st_size for path in profiles.CLIMATOLOGY.parent.glob("*.npz")) < 3e6
+    assert sum(path.stat().st_size for path in climatology.CLIMATOLOGY.parent.glob("*.npz")) < 3e6
 
 
 def test_bad_requests_name_cause_and_cure():

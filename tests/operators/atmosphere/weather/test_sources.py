@@ -18,7 +18,8 @@ from zonda.core.registry import sites, weather_sources
 from zonda.core.site import Site
 from zonda.core.weather import PWV_MAX, Column, Pwv, WeatherSource
 from zonda.operators.atmosphere.weather import humidity, standard_atmosphere
-from zonda.operators.atmosphere.weather.profiles import WaterDistribution, profile
+from zonda.operators.atmosphere.weather.climatology import profile
+from zonda.operators.atmosphere.weather.profiles import PwvDistribution
 from zonda.operators.atmosphere.weather.sources import Climatology, Era5, Standard, Table, profile_of
 
 _spec = importlib.util.spec_from_file_location("era5_files", Path(__file__).with_name("era5_files.py"))
@@ -167,7 +168,7 @@ def test_given_water_and_climatology():
 
 
 def test_quantiles_are_log_normal_and_never_beyond_the_limit():
-    law = WaterDistribution(20e-3, 0.4)
+    law = PwvDistribution(20e-3, 0.4)
     assert law.at(0.5) == pytest.approx(20e-3, rel=2e-3)
     assert math.log(law.at(0.8413) / law.at(0.1587)) / 2 == pytest.approx(0.4, rel=0.01)
     assert law.at(1 - 1e-9) <= PWV_MAX
@@ -530,14 +531,14 @@ def test_water_that_an_inversion_cannot_hold_is_cut_and_said():
     cold = profile(sites.create("amundsen_scott"), Instant.parse("2024-07-01T00:00Z"))
     over = cold.h2o * cold.pressure / humidity.saturation_pressure(cold.temperature)
     assert over[:8].max() <= 1 + 1e-9
-    text = said(cold, "water near the ground")
+    text = said(cold, "vapour near the ground")
     assert text is None or "cut to saturation at" in text
     column = Climatology().column(sites.create("amundsen_scott"), Instant.parse("2024-07-01T00:00Z"))
     wetter = dataclasses.replace(column, h2o=column.h2o * 3)
     from zonda.operators.atmosphere.weather.profiles import on_heights
 
     made = on_heights(wetter, sites.create("amundsen_scott"))
-    assert "levels of the inversion, which takes" in said(made, "water near the ground")
+    assert "levels of the inversion, which takes" in said(made, "vapour near the ground")
 
 
 def test_negative_water_and_ozone_of_era5_are_said(tmp_path):

@@ -15,7 +15,7 @@ from zonda.core.site import Site
 from zonda.operators.atmosphere.model import Models
 from zonda.operators.atmosphere.weather.absorption import TABLE, AbsorptionTable, CrossSections, absorption_table
 from zonda.operators.atmosphere.weather.bands import BandTransfer
-from zonda.operators.atmosphere.weather.profiles import profile
+from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.radiative_transfer import EARTH_RADIUS, Layers, emission, spectrum
 
 ROOT = Path(__file__).resolve().parents[4]

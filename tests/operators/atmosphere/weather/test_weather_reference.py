@@ -10,7 +10,7 @@ import pytest
 
 from zonda.core.configuration.time import Instant
 from zonda.core.registry import sites
-from zonda.operators.atmosphere.weather.profiles import climatology_column, profile
+from zonda.operators.atmosphere.weather.climatology import climatology_column, profile
 
 ROOT = Path(__file__).resolve().parents[4]
 SITES = ("green_bank", "chajnantor", "south_pole")
