@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 from zonda.core.configuration.pipeline_file import load
+from zonda.core.output import Output
 from zonda.core.pipeline import Pipeline
 
 PIPELINES = {
@@ -36,7 +37,7 @@ def main(names: list[str]) -> None:
     print(f"numba {numba.__version__}, numpy {np.__version__}, CPU {llvmlite.binding.get_host_cpu_name()}")
     for name in names or PIPELINES:
         file = load(name, PIPELINES[name])
-        steps = [o for o in file.operators if not o.at_end and o.provides.isdisjoint({"spectrum", "time_streams"})]
+        steps = [o for o in file.operators if not isinstance(o, Output) and o.provides.isdisjoint({"spectrum", "time_streams"})]
         with TemporaryDirectory() as folder:
             data = Pipeline(steps).run(file.scene(), output=Path(folder), memory=8 * 10**9)
         product = data.products["map"]

@@ -85,8 +85,9 @@ def scene(instrument):
 
 def one(name, budget, threads):
     """Predicted and actual memory of one case, as JSON."""
-    from zonda.core.errors import PipelineError
     from zonda.core.run.forecast import forecast, room
+
+    from zonda.core.errors import PipelineError
     from zonda.core.run.settings import Settings
 
     case = dict(SCENES[name])

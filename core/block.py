@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +12,8 @@ from numpy.typing import NDArray
 
 from .numerics.smooth import SmoothField
 from .observation import Observation
+from .signal import MAIN, Component, Entrance, is_signal
+from .tally import Tally
 from .types import AnyFloats
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
@@ -53,6 +57,56 @@ class Block:
     """These samples were worked on before, and are made again because the streams do not fit in memory: an operator makes the
     same bits and counts nothing (what it tells ``observation.tally`` is thrown away)."""
 
+    components: frozenset[Component] = frozenset()
+    """What ``signal`` is the sum of."""
+    suffix: str = ""
+    """Tells the buffers of one signal from those of the others."""
+
+    @property
+    def signals(self) -> list[str]:
+        """Names of the streams of all signals that are here, the complete one first."""
+        return sorted(filter(is_signal, self.detdata))
+
+    def entering(self, where: Entrance) -> list[str]:
+        """Names of the components of ``signal`` that are here and enter there, in a fixed order."""
+        return sorted(c for c in self.components if c.enters == where and c in self.detdata)
+
+    def alone(self, stream: str, components: frozenset[Component], others: Collection[str]) -> Block:
+        """The block as a step sees it that knows one signal: under the name ``signal``, with its mean and its components alone.
+
+        ``others``: components of the scene that are not part of it. What a step tells of another than the complete signal is
+        thrown away.
+        """
+        observation = self.observation
+        if stream != MAIN:
+            observation = copy.copy(observation)
+            observation.tally = Tally()
+        hidden = {*others, *self.signals}
+        seen = Block(
+            observation, self.detectors, self.samples,
+            {name: array for name, array in self.detdata.items() if name not in hidden},
+            {name: field for name, field in self.means.items() if name not in hidden},
+            self.dtype, self.buffers, again=self.again, components=components, suffix=stream[len(MAIN) :],
+        )  # fmt: skip
+        if stream in self.detdata:
+            seen.detdata[MAIN] = self.detdata[stream]
+        if stream in self.means:
+            seen.means[MAIN] = self.means[stream]
+        if stream in self.places:
+            seen.places[MAIN] = self.places[stream]
+        return seen
+
+    def take(self, stream: str, seen: Block) -> None:
+        """Put back what a step made of a signal (`alone`)."""
+        self.detdata.pop(stream, None)
+        self.means.pop(stream, None)
+        if MAIN in seen.detdata:
+            self.detdata[stream] = seen.detdata[MAIN]
+        if MAIN in seen.means:
+            self.means[stream] = seen.means[MAIN]
+        if stream == MAIN:  # what else it made
+            self.detdata.update((name, array) for name, array in seen.detdata.items() if name != MAIN)
+
     @property
     def shape(self) -> tuple[int, int]:
         return self.detectors.stop - self.detectors.start, self.samples.stop - self.samples.start
@@ -67,10 +121,10 @@ class Block:
 
     def buffer(self, name: str, shape: tuple[int, int]) -> AnyFloats:
         """An uninitialized array of `dtype`, reused between blocks under this name."""
-        size = shape[0] * shape[1]
-        held = self.buffers.get(name)
+        size, key = shape[0] * shape[1], name + self.suffix
+        held = self.buffers.get(key)
         if held is None or held.size < size or held.dtype != self.dtype:
-            held = self.buffers[name] = np.empty(size, self.dtype)
+            held = self.buffers[key] = np.empty(size, self.dtype)
         return held[:size].reshape(shape)
 
     def total(self, name: str) -> NDArray[np.float64]:

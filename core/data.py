@@ -24,8 +24,8 @@ __all__ = ["STREAMS", "Block", "Data", "Observation", "Stream", "Tally", "html_t
 class Data:
     """The scene, its observations, and what came out of them.
 
-    ``products`` maps names to whatever operators made (maps, spectra, file paths); products of a companion run (see
-    `Pipeline.runs`) carry its name and a slash: ``noiseless/map``.
+    ``products`` maps names to whatever operators made (maps, spectra, file paths); products of another signal than the
+    complete one (see `core.signal`) carry its name and a slash: ``noiseless/map``.
     """
 
     scene: Scene
@@ -35,8 +35,6 @@ class Data:
     provenance: dict[str, Any] = field(default_factory=dict)
     output: Any = None
     """Folder (Path) that products are written to; None: nothing is written."""
-    run: str = ""
-    """Name of the companion run in progress; empty in the main run."""
     threads: int = 1
     """Threads that the run may use."""
 
@@ -61,10 +59,6 @@ class Data:
     def take(self, label: str) -> Any:
         """The partial product of a step, None where it has none; it is not held here any longer."""
         return self.partial.pop(label, None)
-
-    def product(self, name: str) -> str:
-        """The key of a product of the run in progress."""
-        return f"{self.run}/{name}" if self.run else name
 
     def __repr__(self) -> str:
         return f"<Data: {len(self.observations)} observations, products {sorted(self.products)}>"

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 HOST = "zonda"
 """The distribution of the built-in plugins, which `ZONDA_PLUGINS` never shuts out."""
 
-API_VERSION = 1
+API_VERSION = 2
 """Version of the contract of plugins (`core.operator`); a plugin written for another one is refused."""
 
 RAISED = (Exception, SystemExit, GeneratorExit)

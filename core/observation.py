@@ -84,7 +84,9 @@ class Observation:
     resolved
         What operators resolved for one another. It outlives the main run: companion runs use the same.
     components
-        Names of the streams that the steps of the run in progress make before there is a signal: ``sky``, ``white`` ...
+        Names of the streams that the steps make before there is a signal: ``sky``, ``white`` ...
+    signals
+        Names of the streams of all signals that are formed, the complete one first (`core.signal`).
     tally
         What was counted or approximated.
     output
@@ -116,6 +118,7 @@ class Observation:
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None
     components: frozenset[str] = frozenset()
+    signals: tuple[str, ...] = ("signal",)
 
     def __post_init__(self) -> None:
         if not self.flags.size:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import PrivateAttr
 
 from .errors import OutputError
 from .operator import Operator
+from .signal import Signal
 from .storage.files import check_output_folder
 
 if TYPE_CHECKING:
@@ -13,7 +16,7 @@ if TYPE_CHECKING:
 
     from .data import Data, Observation
 
-Progress = Literal["pointing", "scan", "run", "runs"]
+Progress = Literal["pointing", "scan", "maps"]
 
 
 class Output(Operator):
@@ -22,11 +25,24 @@ class Output(Operator):
     Its `observe` is called before that of all other steps: what it refuses (an output folder) is refused at once.
     """
 
-    at_end: ClassVar[bool] = True
+    _shown: tuple[str, ...] = PrivateAttr(())
+
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals whose products this step reads; empty: whatever signals there are.
+
+        The pipeline adds one where none of the user's is like it. The products of such a signal are for this step alone: no other
+        writes or draws them.
+        """
+        return ()
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Names of what `signals` asks for, in its order; empty text: the complete signal."""
+        return self._shown
 
     def watch(self, data: Data, done: Progress) -> None:
-        """Called once the telescope is pointed, after every scan, and when all scans are through: time to begin, in the
-        background, with what `finalize` will do, as far as it depends on products that will not change."""
+        """Called once the telescope is pointed, after every scan, and when all maps are made: time to begin, in the background,
+        with what `finalize` will do, as far as it depends on products that will not change."""
 
 
 def output_folder(of: Data | Observation, place: str) -> Path:

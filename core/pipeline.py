@@ -5,31 +5,33 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from .data import Data, Observation
+from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
+from .hooks import manager
 from .machine import available_memory, available_threads
 from .notebook import html_table
+from .observation import Observation
 from .operator import Operator
+from .output import Output, Progress
 from .run import arguments
 from .run.ahead import Ahead
-from .run.companion import Companion
-from .run.derived import Derivation, derivable, parts_of
-from .run.memory_budget import divide
+from .run.budget import divided, least_memory, longest_of, with_scan_ahead
+from .run.execution import Execution
 from .run.order import check_order
-from .run.selection import Selection
+from .run.schedule import Chain
 from .run.settings import Settings, Timer
-from .run.simulation import Simulation
+from .run.signals import Signals, remainder
+from .scene import Scene
+from .signal import Signal, stream_of
+from .storage.files import check_output_folder
 from .versions import versions
-
-if TYPE_CHECKING:
-    from .scene import Scene
 
 
 @dataclass
@@ -41,31 +43,14 @@ class Part:
     scans
         Positions of the scans; None: all.
     layouts
-        By label: what `Operator.agree` found for all scans of all parts.
-    first
-        Whether the very first scan is among them.
+        By label: what all scans of all parts have in common (`Data.layouts`).
     prefix
         Of the names of the scans: what makes them unique among all parts.
-    packed
-        By run and label: what `Operator.pack` took out. Filled by `Pipeline.run`.
     """
 
     scans: Sequence[int] | None = None
     layouts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    first: bool = True
     prefix: str = ""
-    packed: dict[str, dict[str, Mapping[str, Any]]] = field(default_factory=dict)
-
-    def name(self, observations: Sequence[Observation]) -> None:
-        """Give scans that a pointing step has just made their unique names, before other steps see them."""
-        for observation in observations:
-            observation.name = self.prefix + observation.name
-
-    def take(self, operator: Operator, data: Data) -> None:
-        """Pack one operator's products of the run in progress."""
-        found = operator.pack(data, self.first)
-        if found is not None:
-            self.packed.setdefault(data.run, {})[operator.label] = found
 
 
 class Pipeline:
@@ -76,7 +61,10 @@ class Pipeline:
     operators
         The steps. Namesakes are numbered (``WhiteNoise``, ``WhiteNoise.2``).
     runs
-        Companion runs by name, e.g. ``{"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}``.
+        Further signals by name, e.g. ``{"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}``: what a subset of
+        the components makes, filtered and mapped beside the complete signal.
+    only
+        Components that the complete signal is narrowed to; empty: all. Levels, flags and random numbers stay those of the scene.
     name, description
         Shown in products.
     precision
@@ -93,22 +81,30 @@ class Pipeline:
         self,
         operators: Iterable[Operator],
         *,
-        runs: Mapping[str, Companion | Mapping[str, Any]] | None = None,
+        runs: Mapping[str, Signal | Mapping[str, Any]] | None = None,
+        only: Sequence[str] = (),
         name: str = "pipeline",
         description: str = "",
         precision: Literal["float32", "float64"] = "float32",
     ) -> None:
         self.operators = arguments.steps(operators, name)  # copies: labels are this pipeline's own
-        self.runs = arguments.runs(runs, name)
         self.name, self.description, self.precision = name, description, arguments.precision(precision, name)
         self._name_steps()
         if problems := check_order(self.operators):
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             cures = dict.fromkeys(p.cure for p in problems if p.cure)
             raise PipelineError("\n".join(lines), place=self.name, cure="\n".join(cures))
-        self.selection = Selection(self.operators, self.runs, self.name)
-        self.derived = derivable(self.selection, tuple(self.runs))
-        """Companion runs that are derived from the main run and these others, if the operators find nothing against it."""
+        self.signals = Signals(self.operators, arguments.runs(runs, name), only, self.name)
+
+    @property
+    def runs(self) -> dict[str, Signal]:
+        """The signals beside the complete one, by name; those that outputs need among them."""
+        return self.signals.runs
+
+    @property
+    def chain(self) -> Chain:
+        """The steps that act on every observation, with the signals that they make."""
+        return Chain(self.signals.steps, self.signals.formed, self.signals.components)
 
     def _name_steps(self) -> None:
         seen: dict[str, int] = {}
@@ -116,11 +112,6 @@ class Pipeline:
             base = operator.name or type(operator).__name__
             seen[base] = seen.get(base, 0) + 1
             operator._label = base if seen[base] == 1 else f"{base}.{seen[base]}"
-
-    @property
-    def order(self) -> list[str]:
-        """The runs in the order in which they are made: the main run (empty), what is simulated, what is derived."""
-        return ["", *(r for r in self.runs if r not in self.derived), *self.derived]
 
     @faults_named(exceptions=False)
     def run(
@@ -133,7 +124,6 @@ class Pipeline:
         ceiling: int | None = None,
         keep: Sequence[str] = (),
         provenance: Mapping[str, Any] | None = None,
-        part: Part | None = None,
     ) -> Data:
         """Observe the scene and return what came out.
 
@@ -154,137 +144,163 @@ class Pipeline:
             Streams to keep in ``observation.detdata`` (float64, mean emission included) as they stand after the last step.
         provenance
             Entries added to ``data.provenance``.
-        part
-            Run some of the scans only and pack their products instead of finishing them; nothing acts at the end.
         """
-        from .hooks import manager
-        from .storage.files import check_output_folder
-
-        numbers = {"threads": threads, "memory": memory, "ceiling": ceiling}
-        threads, memory, ceiling = arguments.check_run(scene, output, numbers, keep, self.name)
-        hooks = manager().hook
-        data = Data(scene=scene, output=None if output is None else Path(output))
-        if data.output is not None and part is None:  # a part makes a folder only when it writes there
+        data, settings = self._begin(scene, output, {"threads": threads, "memory": memory, "ceiling": ceiling}, keep, provenance)
+        if data.output is not None:
             check_output_folder(data.output)
-        data.provenance = {**self._provenance(scene), **(provenance or {})}
-        settings = Settings(
-            threads=threads or available_threads(),
-            memory=memory or available_memory() // 2,  # less, once the operators have said what they hold
-            dtype=np.float64 if self.precision == "float64" else np.float32,
-            progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
-        )
-        data.threads = settings.threads
-        listeners = hooks.zonda_before_operator.get_hookimpls() or hooks.zonda_after_operator.get_hookimpls()
-        ahead = Ahead(settings.threads > 1 and not listeners)  # who listens hears of one observation after the other
-        timer = Timer()
+        hooks, timer = manager().hook, Timer()
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:
             timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
-        for operator in sorted(self.operators, key=lambda o: not o.at_end):  # what only acts at the end may refuse at once
-            start = time.thread_time()
-            if part is None or not (operator.at_end or operator.label in part.layouts):
-                before = len(data.observations)
-                operator.observe(data)  # pointing steps append observations; map makers lay out the grid of all of them
-                if part is not None:
-                    part.name(data.observations[before:])
-            elif operator.label in part.layouts:
-                operator.lay_out(part.layouts[operator.label])
-            timer.add(operator.label, "observe", time.thread_time() - start)
-        if not data.observations:
-            raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
-        if part is not None and part.scans is not None:
-            data.observations = [data.observations[k] for k in part.scans]
-        if part is None:
-            self._meanwhile(data, "pointing")
-        if ceiling is not None or memory is None:
-            steps, parts = self.selection.steps(""), len(parts_of(self.derived))
-            divide(steps, data.observations, settings, ahead, ceiling, memory, parts, self.name, part is None)
-            if settings.threads < data.threads and part is None:
-                text = f"{settings.threads} of {data.threads} threads work: more do not fit in the memory budget"
-                warnings.warn(f"{self.name}: {text}", stacklevel=2)
-            data.threads = settings.threads
-        simulation = Simulation(self.selection, self.order, self.derived, data, keep, hooks, settings, timer, ahead)
-        derivation = Derivation(self.selection, self.derived)
-        try:
-            for run in self.order:
-                data.run = run
-                if not derivation.derive(run, data, simulation.kept_out):
-                    simulation.make(run, lambda: self._meanwhile(data, "scan") if part is None else None)
-                derivation.keep(run, data)
-                for operator in self.selection.steps(run):
-                    if part is None:
-                        self._finalize(operator, data, timer, hooks)
-                    else:
-                        part.take(operator, data)
-                if part is None:
-                    self._meanwhile(data, "run")
-        finally:
-            ahead.close()
-        data.run = ""
-        simulation.leave_main()
-        if part is None:
-            self._meanwhile(data, "runs")
-        for operator in self.operators:
-            if operator.at_end and part is None:
-                data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
-                self._finalize(operator, data, timer, hooks)
-        data.provenance["timings"] = timer.rows()
-        hooks.zonda_pipeline_end(pipeline=self, data=data)
+        for operator in sorted(self.operators, key=lambda o: not isinstance(o, Output)):  # outputs may refuse at once
+            self._timed(timer, operator, "observe", data)
+        self._execute(data, settings, tuple(keep), timer, memory)
+        self._finish(data, timer)
         return data
 
     @faults_named(exceptions=False)
-    def pack(self, data: Data, first: bool) -> dict[str, dict[str, Mapping[str, Any]]]:
-        """The partial products in ``data``, by run and label."""
-        part = Part(first=first)
-        for run in self.order:
-            data.run = run
-            for operator in self.selection.steps(run):
-                part.take(operator, data)
-        data.run = ""
-        return part.packed
-
-    @faults_named(exceptions=False)
-    def merge(self, data: Data, packed: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
-        """Add the partial products of a part to ``data``."""
-        for run in self.order:
-            data.run = run
-            for operator in self.selection.steps(run):
-                if (found := packed.get(run, {}).get(operator.label)) is not None:
-                    operator.merge(data, found)
-        data.run = ""
+    def run_part(
+        self,
+        scene: Scene,
+        part: Part,
+        *,
+        output: str | Path | None = None,
+        threads: int | None = None,
+        memory: int | None = None,
+        ceiling: int | None = None,
+        provenance: Mapping[str, Any] | None = None,
+    ) -> Data:
+        """Observe some of the scans only; their partial products stay in ``data.partial``, nothing is finished."""
+        data, settings = self._begin(scene, output, {"threads": threads, "memory": memory, "ceiling": ceiling}, (), provenance)
+        timer = Timer()
+        data.layouts, data.laid_out = dict(part.layouts), True
+        manager().hook.zonda_pipeline_start(pipeline=self, data=data)
+        for operator in self.operators:
+            if not isinstance(operator, Output):
+                before = len(data.observations)
+                self._timed(timer, operator, "observe", data)
+                for observation in data.observations[before:]:  # unique names, before other steps see them
+                    observation.name = part.prefix + observation.name
+        if part.scans is not None:
+            data.observations = [data.observations[k] for k in part.scans]
+        self._execute(data, settings, (), timer, memory, fresh=False)
+        data.provenance["timings"] = timer.rows()
+        manager().hook.zonda_pipeline_end(pipeline=self, data=data)
+        return data
 
     @faults_named(exceptions=False)
     def finish(self, data: Data) -> Data:
-        """Finish merged products, and let the operators act that act at the end."""
-        from .hooks import manager
-
-        hooks, timer = manager().hook, Timer()
-        hooks.zonda_pipeline_start(pipeline=self, data=data)
-        for run in self.order:
-            data.run = run
-            for operator in self.selection.steps(run):
-                self._finalize(operator, data, timer, hooks)
-            self._meanwhile(data, "run")
-        data.run = ""
-        self._meanwhile(data, "runs")
-        for operator in self.operators:
-            if operator.at_end:
-                self._finalize(operator, data, timer, hooks)
-        hooks.zonda_pipeline_end(pipeline=self, data=data)
+        """Finish partial products that were combined, and let the outputs act."""
+        manager().hook.zonda_pipeline_start(pipeline=self, data=data)
+        self._finish(data, Timer())
         return data
 
-    def _meanwhile(self, data: Data, done: Literal["pointing", "scan", "run", "runs"]) -> None:
+    def least_memory(self, observations: Sequence[Observation]) -> int:
+        """Bytes with which a process runs the pipeline over these observations on one thread, libraries included."""
+        observation = longest_of(observations)
+        observation.signals = tuple(s.stream for s in self.signals.formed)
+        return least_memory(self.chain, observation, Settings(dtype=self._dtype))
+
+    @property
+    def _dtype(self) -> type[np.floating[Any]]:
+        return np.float64 if self.precision == "float64" else np.float32
+
+    def _begin(
+        self, scene: Scene, output: str | Path | None, numbers: Mapping[str, Any], keep: Sequence[str], provenance: Any
+    ) -> tuple[Data, Settings]:
+        threads, memory, ceiling = arguments.check_run(scene, output, numbers, keep, self.name)
+        data = Data(scene=scene, output=None if output is None else Path(output))
+        data.provenance = {**self._provenance(scene), **(provenance or {})}
+        hooks = manager().hook
+        settings = Settings(
+            threads=threads or available_threads(),
+            memory=memory or available_memory() // 2,  # less, once the operators have said what they hold
+            dtype=self._dtype,
+            progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
+            asked=ceiling,
+        )
+        data.threads = settings.threads
+        return data, settings
+
+    def _execute(
+        self, data: Data, settings: Settings, keep: tuple[str, ...], timer: Timer, memory: int | None, fresh: bool = True
+    ) -> None:
+        """All observations, one after the other; the next is prepared meanwhile."""
+        if not data.observations:
+            raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
+        hooks, chain = manager().hook, replace(self.chain, keep=keep)
+        for observation in data.observations:
+            observation.output, observation.focalplane = data.output, observation.focalplane.copy()
+            observation.components = frozenset(map(str, self.signals.components))
+            observation.signals = tuple(s.stream for s in self.signals.formed)
+        self._watch(data, "pointing")
+        listeners = hooks.zonda_before_operator.get_hookimpls() or hooks.zonda_after_operator.get_hookimpls()
+        ahead = Ahead(settings.threads > 1 and not listeners)  # who listens hears of one observation after the other
+        settings = self._divided(chain, data, settings, ahead, memory, fresh)
+        calls = hooks.zonda_before_operator, hooks.zonda_after_operator
+        executions = [Execution(chain, o, settings, timer, *calls) for o in data.observations]
+        if self.signals.unmodelled:
+            for signal in self.signals.runs:
+                if self.signals.runs[signal].modes == "full":
+                    data.tally.state(signal, "modes", f"its own, not those of the complete signal: {self.signals.unmodelled}")
+        try:
+            for execution, following in zip(executions, [*executions[1:], None], strict=True):
+                execution.run(data, ahead, following)
+                data.tally.update(execution.observation.tally)
+                self._watch(data, "scan")
+        finally:
+            ahead.close()
+
+    def _divided(self, chain: Chain, data: Data, settings: Settings, ahead: Ahead, memory: int | None, fresh: bool) -> Settings:
+        """The settings with the memory that is left for streams and blocks."""
+        if memory is not None and settings.asked is None:
+            return settings
+        longest, most = longest_of(data.observations), settings.memory
+        settings = divided(chain, longest, settings, self.name, fresh)
+        if memory is not None:
+            settings = replace(settings, memory=min(settings.memory, most))
+        if ahead.on and len(data.observations) > 1:
+            less = with_scan_ahead(chain, longest, settings)
+            ahead.on, settings = less is not None, less or settings
+        if settings.threads < data.threads and fresh:
+            text = f"{settings.threads} of {data.threads} threads work: more do not fit in the memory budget"
+            warnings.warn(f"{self.name}: {text}", stacklevel=3)
+        data.threads = settings.threads
+        return settings
+
+    def _finish(self, data: Data, timer: Timer) -> None:
+        """Subtract the remainders, finish all products, and let the outputs act."""
+        for name, parts in self.signals.remainders.items():
+            for product in data.partial.values():
+                if product.signals and stream_of(name) not in product.signals:
+                    product.subtract(stream_of(name), [stream_of(part) for part in parts])
+            data.tally.state(name, "derived as", remainder(parts))
+        for operator in self.chain.steps:
+            self._timed(timer, operator, "finalize", data)
+        self._watch(data, "maps")
         for operator in self.operators:
-            if operator.at_end:
+            if isinstance(operator, Output):
+                data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
+                self._timed(timer, operator, "finalize", data)
+        data.provenance["timings"] = timer.rows()
+        manager().hook.zonda_pipeline_end(pipeline=self, data=data)
+
+    def _watch(self, data: Data, done: Progress) -> None:
+        for operator in self.operators:
+            if isinstance(operator, Output):
                 operator.watch(data, done)
 
-    def _finalize(self, operator: Operator, data: Data, timer: Timer, hooks: Any) -> None:
-        hooks.zonda_before_operator(operator=operator, observation=None, stage="finalize")
+    def _timed(self, timer: Timer, operator: Operator, stage: Literal["observe", "finalize"], data: Data) -> None:
+        """One call of an operator with all data, timed; who listens is told of ``finalize``."""
+        hooks = manager().hook
+        if stage == "finalize":
+            hooks.zonda_before_operator(operator=operator, observation=None, stage=stage)
         start = time.thread_time()
-        operator.finalize(data)
+        getattr(operator, stage)(data)
         used = time.thread_time() - start
-        timer.add(operator.label, "finalize", used)
-        hooks.zonda_after_operator(operator=operator, observation=None, stage="finalize", seconds=used)
+        timer.add(operator.label, stage, used)
+        if stage == "finalize":
+            hooks.zonda_after_operator(operator=operator, observation=None, stage=stage, seconds=used)
 
     def _provenance(self, scene: Scene) -> dict[str, Any]:
         return {
@@ -292,7 +308,7 @@ class Pipeline:
             "description": self.description,
             "seed": scene.seed,
             "precision": self.precision,
-            "runs": {k: self.runs[k].model_dump(exclude_none=True, exclude_defaults=True) for k in self.order[1:]},
+            "runs": {k: s.model_dump(exclude_none=True, exclude_defaults=True) for k, s in self.signals.runs.items()},
             "versions": versions(),
             "operators": [
                 (o.label, type(o).__name__, {k: str(v) for k, v in o.model_dump(mode="json", exclude_none=True).items()})

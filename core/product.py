@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, ClassVar, Self
 
+from .discovery import API_VERSION
+
 
 class Product(ABC):
     """Something that observations add to: sums in pixels, spectra, lists of files.
@@ -16,7 +18,10 @@ class Product(ABC):
     class is then found by its name in the registry (entry-point group ``zonda.products``).
     """
 
-    zonda_api: ClassVar[int] = 1
+    zonda_api: ClassVar[int] = API_VERSION
+
+    signals: tuple[str, ...] = ()
+    """Streams of the signals that it holds (`core.signal`), the complete one first; empty: it is of no signal in particular."""
 
     @abstractmethod
     def __iadd__(self, other: Self) -> Self:
@@ -31,8 +36,8 @@ class Product(ABC):
     def of(cls, arrays: Mapping[str, Any]) -> Self:
         """What `arrays` gave, put together again."""
 
-    def subtract(self, name: str, parts: Sequence[str]) -> None:
-        """Make that of the signal ``name``: that of ``signal`` minus those of the signals ``parts``, all of which are in it.
+    def subtract(self, stream: str, parts: Sequence[str]) -> None:
+        """Make that of the signal ``stream``: that of ``signal`` minus those of ``parts``, all of which are in `signals`.
 
         Only asked of products of map makers (`core.mapmaker`) that are linear.
         """

@@ -14,6 +14,7 @@ import numpy as np
 from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from .observation import Observation
+from .signal import MAIN, Component
 from .types import AnyFloats
 
 
@@ -40,6 +41,12 @@ class Stream:
     means: dict[str, SmoothField]
     threads: int
     room: int = 0
+    signal: str = MAIN
+    """Which signal it is, where it is one: ``signal/noiseless``. Its ``name`` is ``signal`` for the step that measures it."""
+    components: frozenset[Component] = frozenset()
+    """What the signal is the sum of."""
+    state: Any = None
+    """What `Operator.prepare` of the step that measures it returned."""
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -21,12 +21,14 @@ from pydantic import ValidationError
 
 from .configuration.docstrings import described
 from .configuration.time import Instant
-from .data import STREAMS, Block, Data, Observation
+from .data import STREAMS, Block, Data, Observation, Stream
 from .instrument import Band, Instrument, Telescope
+from .mapmaker import filters
 from .numerics.random import normals
 from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
+from .output import Output
 from .pipeline import Pipeline
 from .plan.planning import planning_of
 from .scene import Scene
@@ -87,7 +89,7 @@ def check_knobs(operator: Operator) -> None:
 
 def check_declared_streams(operator: Operator) -> None:
     """`exec` reads only what is declared as required or optional, makes only what is provided, and changes nothing else."""
-    if operator.at_end or "boresight" in operator.provides:
+    if isinstance(operator, Output) or "boresight" in operator.provides:
         return
     observation = _observation()
     steps = [_Given(), operator]
@@ -103,7 +105,8 @@ def check_declared_streams(operator: Operator) -> None:
         steps[0].exec(block, states[0])
         before = {name: stream.copy() for name, stream in block.detdata.items()}
         if operator.couples == "all":
-            _measured(operator, block, states[1])
+            (name,) = operator.requires - {"boresight"}
+            states[1] = operator.measure(_stream(observation, block.detdata[name], states[1], name=name))
         watched = _Watched(block.detdata)
         block.detdata = watched
         operator.exec(block, states[1])
@@ -126,31 +129,32 @@ def check_same_bits(operator: Operator) -> None:
         assert _same(one, other), f"other bits with {threads} threads and {memory / 1e6:.1f} MB"
 
 
-def check_frozen(operator: Operator) -> None:
-    """What `freeze` returns makes `exec` do to the same stream what it did, and makes it linear (``modes: full``)."""
-    if operator.couples != "all" or not operator.can_freeze:
+def check_linear(operator: Operator) -> None:
+    """A filter that says that it is `linear` makes zero of zero, and of a sum the sum of what it makes of the parts, with what
+    `Operator.measure` found in the sum (``modes: full``)."""
+    if not (operator.linear and filters(operator)):
         return
     observation = _observation()
     operator.configure(observation)
-    given, first = _given_block(observation), operator.prepare(observation)
-    _measured(operator, given, first)
-    frozen = operator.freeze(first)
+    state = operator.prepare(observation)
+    parts = [_given_signal(observation, factor) for factor in (1.0, -0.3)]
+    parts[1][:, ::7] += np.float32(2e-3)
+    whole, nothing = parts[0] + parts[1], np.zeros_like(parts[0])
+    model = operator.measure(_stream(observation, whole, state)) if operator.couples == "all" else None
 
-    def act(factor: float, state: Any = None) -> NDArray[np.float64]:
-        block = _given_block(observation, factor)
-        if state is None:
-            state = operator.prepare(observation)
-            _measured(operator, block, state, frozen)
-        operator.exec(block, state)
-        (name,) = operator.requires & operator.provides
-        return block.detdata[name].astype(np.float64)
+    def act(signal: NDArray[np.float32], own: Any = None) -> NDArray[np.float64]:
+        block = Block(observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES), {"signal": signal.copy()})
+        if operator.couples == "all" and own is None:
+            own = operator.measure(_stream(observation, signal, state, "signal/part"), model)
+        operator.exec(block, state if own is None else own)
+        return block.detdata["signal"].astype(np.float64)
 
-    if not operator.requires & operator.provides:
-        return
-    once, twice, own = act(1.0), act(2.0), act(1.0, first)
-    scale = 1e-5 * float(np.std(own)) + 1e-6 * float(np.std(next(iter(given.detdata.values()))))  # float32
-    assert np.allclose(once, own, rtol=0, atol=scale), "frozen, it does something else to the same stream"
-    assert np.allclose(twice, 2 * once, rtol=0, atol=4 * scale), "frozen, it is not linear: twice the stream gives another result"
+    made = act(whole, model)
+    scale = 1e-5 * float(np.std(made)) + 1e-6 * float(np.std(whole))  # float32
+    assert np.abs(act(nothing)).max() <= scale, "says that it is linear, but makes something of nothing"
+    assert np.allclose(act(parts[0]) + act(parts[1]), made, rtol=0, atol=4 * scale), (
+        "says that it is linear, but what it makes of two parts does not add up to what it makes of their sum"
+    )
 
 
 def check_means(operator: Operator) -> None:
@@ -160,7 +164,7 @@ def check_means(operator: Operator) -> None:
     """
     changed = operator.provides & frozenset(STREAMS)
     for name in sorted({"signal"} | ({"atmosphere"} if changed else set())):
-        if operator.at_end or name not in operator.requires | operator.optional:
+        if isinstance(operator, Output) or name not in operator.requires | operator.optional:
             continue
         beside, inside = (
             _products(operator, threads=1, memory=1 << 30, given=_Given(mean=name, beside=b), precision="float64")
@@ -185,7 +189,7 @@ CHECKS: tuple[Callable[[Operator], None], ...] = (
     check_knobs,
     check_declared_streams,
     check_same_bits,
-    check_frozen,
+    check_linear,
     check_means,
     check_finite,
 )
@@ -292,7 +296,7 @@ def _products(
     precision: Literal["float32", "float64"] = "float32",
 ) -> dict[str, Any]:
     """Everything that a run of the operator over given streams makes: streams, their means included, and products."""
-    if operator.at_end:
+    if isinstance(operator, Output):
         return {}
     pointing = "boresight" in operator.provides
     steps = [operator] if pointing else [_Point(), given or _Given(), operator]
@@ -310,22 +314,17 @@ def _products(
     return found | {name: _comparable(product) for name, product in data.products.items()}
 
 
-def _given_block(observation: Observation, factor: float = 1.0) -> Block:
-    """A whole scan of given streams, times a factor."""
+def _given_signal(observation: Observation, factor: float) -> NDArray[np.float32]:
+    """A whole scan of the given signal, times a factor."""
     block = Block(observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES))
     given = _Given()
     given.exec(block, given.prepare(observation))
-    for stream in block.detdata.values():
-        stream *= np.float32(factor)
-    return block
+    return np.asarray(block.detdata["signal"] * np.float32(factor), np.float32)
 
 
-def _measured(operator: Operator, block: Block, state: Any, frozen: Any = None) -> None:
-    from .data import Stream
-
-    (name,) = operator.requires - {"boresight"}
-    stream = Stream(name, block.observation, block.detdata[name], {}, 1)
-    operator.measure(stream, state) if frozen is None else operator.measure_frozen(stream, state, frozen)
+def _stream(observation: Observation, array: Any, state: Any, signal: str = "signal", name: str = "signal") -> Stream:
+    """A whole stream for a step that measures."""
+    return Stream(name, observation, array, {}, 1, signal=signal, state=state)
 
 
 def _small(operator: Operator) -> int:

@@ -51,7 +51,7 @@ from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.operator import Operator
-from zonda.core.run.companion import Companion
+from zonda.core.signal import Signal
 from zonda.core.types import Floats
 from zonda.operators.diagnostics.series import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStreams
@@ -72,7 +72,7 @@ class MapRms(Metric):
 
     says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
 
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Companion]) -> None:
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("map_rms", operators)
 
     def measure(self, data: Data) -> dict[str, Floats]:
@@ -107,7 +107,7 @@ class Peak(Metric):
 
     says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
 
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Companion]) -> None:
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("peak", operators)
 
     def measure(self, data: Data) -> Floats:
@@ -131,7 +131,7 @@ class Transfer(Metric):
 
     says: ClassVar[str] = "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is lost)"
 
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Companion]) -> None:
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("transfer", operators)
         if not any("sky" in o.provides for o in operators):
             raise PipelineError("the metric transfer needs a sky, and no step makes one", place="--metric", cure="add a SkyMap")
@@ -187,7 +187,7 @@ class Psd(_Binned):
 
     says: ClassVar[str] = "rms over log-frequency bins of the relative error of the signal's power spectrum"
 
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Companion]) -> None:
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         if not any("spectrum" in o.provides for o in operators):
             cure = "add a PowerSpectrum where the spectrum matters, e.g. after Efficiency"
             raise PipelineError("the metric psd needs a spectrum, and no step measures one", place="--metric", cure=cure)
@@ -211,7 +211,7 @@ class Structure(_Binned):
 
     says: ClassVar[str] = "rms relative error of the atmosphere's structure functions in time and across the field"
 
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Companion]) -> None:
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         if not any("atmosphere" in o.provides for o in operators) or not any("signal" in o.provides for o in operators):
             cure = "add AtmosphereLayers and Efficiency"
             raise PipelineError("the metric structure needs an atmosphere, and no step makes one", place="--metric", cure=cure)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from zonda.core.run.forecast import room
 
 import zonda
 from zonda.core.configuration.pipeline_file import load
 from zonda.core.errors import PipelineError
-from zonda.core.run.forecast import room
 
 DETECTORS, SECONDS = 400, 4
 
@@ -54,8 +54,9 @@ def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_wa
 
 def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     """By the forecast, without running: 372 GB of streams are kept nowhere."""
-    from zonda.core.data import Data
     from zonda.core.run.forecast import forecast
+
+    from zonda.core.data import Data
     from zonda.core.run.settings import Settings
 
     file = load("atlast_full", ())

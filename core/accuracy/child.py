@@ -94,7 +94,9 @@ def execute(file: Any, metric: Metric, threads: int | None, timed: bool) -> tupl
 
     own = [o for o in file.operators if metric.needs_end or not isinstance(o, Output)]
     more = metric.steps(list(own))
-    pipeline = Pipeline(own if timed else more, runs=file.runs, name=file.header.name, precision=file.header.precision)
+    pipeline = Pipeline(
+        own if timed else more, runs=file.runs, only=file.header.only, name=file.header.name, precision=file.header.precision
+    )
     with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:
         data = pipeline.run(file.scene(), output=folder, threads=threads)
     return data, not timed or len(more) == len(own)

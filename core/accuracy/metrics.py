@@ -17,7 +17,7 @@ from ..types import Floats
 if TYPE_CHECKING:
     from ..data import Data
     from ..operator import Operator
-    from ..run.companion import Companion
+    from ..signal import Signal
 
 
 class Metric:
@@ -34,7 +34,7 @@ class Metric:
     says: ClassVar[str] = "|m - m0| / |m0|"
     needs_end: ClassVar[bool] = False
 
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Companion]) -> None:
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         """Raise `PipelineError` where a pipeline of these steps and companion runs cannot have this metric."""
 
     def steps(self, operators: list[Operator]) -> list[Operator]:

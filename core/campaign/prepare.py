@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, ZondaError
+from ..output import Output
 from ..storage.files import product_path
 from . import parts
 from .entries import Entry, entries
@@ -258,26 +259,22 @@ def _point(file: PipelineFile, look: Look, layouts: dict[str, Mapping[str, Any]]
 
     pipeline = file.pipeline()
     data = Data(scene=scene_of(file, look.seed, look.time))
+    data.layouts = dict(layouts)
     for operator in pipeline.operators:
-        if "boresight" in operator.provides:
+        if not isinstance(operator, Output):
             operator.observe(data)
-    for operator in pipeline.operators:
-        if not operator.at_end and (agreed := operator.agree(data, layouts.get(operator.label))) is not None:
-            layouts[operator.label] = agreed
+    layouts.update(data.layouts)
     return data, tuple(o.n_detectors * o.n_samples for o in data.observations)
 
 
 def _need(file: PipelineFile, data: Data, layouts: Mapping[str, Mapping[str, Any]], folder: Path) -> int:
     """Least bytes with which a process runs a pipeline over these observations. ``folder``: the campaign's, to write to."""
-    from ..run.memory_budget import least
-
     pipeline, data.output = file.pipeline(), folder
+    data.layouts, data.laid_out = dict(layouts), True
     for operator in pipeline.operators:
-        if operator.label in layouts:
-            operator.lay_out(layouts[operator.label])
-        elif not operator.at_end and "boresight" not in operator.provides:
+        if not isinstance(operator, Output) and "boresight" not in operator.provides:
             operator.observe(data)
-    return least(pipeline, data.observations)
+    return pipeline.least_memory(data.observations)
 
 
 def _names(source: Source, entry: Entry, others: Sequence[Combination]) -> tuple[str, str]:

@@ -24,7 +24,10 @@ from .prepare import scene_of
 from .task import layouts_in, pipeline_of
 
 if TYPE_CHECKING:
-    from ..pipeline import Pipeline
+    from ..output import Output
+from ..pipeline import Pipeline
+from ..product import Product
+from ..registry import products
 
 FAN = 32
 """Parts that are added up at once."""
@@ -80,7 +83,7 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
     tasks = job.tasks_of(number)
     pipeline, data = _begin(job, folder, number, tasks)
     leaves = [(t.path(folder), t.key, digests[t.number]) for t in tasks]
-    _add(pipeline, data, _tree(pipeline, data, leaves, lambda leaf: parts.read(*leaf)))
+    _add(data, _tree(data, leaves, lambda leaf: parts.read(*leaf)))
     data.output = check_output_folder(folder / combination.folder)
     for observation in data.observations[1:]:
         observation.focalplane = data.observations[0].focalplane
@@ -96,32 +99,34 @@ def _begin(job: Job, folder: Path, number: int, tasks: Sequence[Task]) -> tuple[
     pipeline = file.pipeline()
     combination = job.combinations[number]
     layouts = layouts_in(layout_path(folder, number), combination.layout)
-    for operator in pipeline.operators:
-        if operator.label in layouts:
-            operator.lay_out(layouts[operator.label])
     scene = scene_of(file, first.seed, Instant(first.time))
+    data = Data(scene=scene, layouts=dict(layouts), laid_out=True)
+    for operator in pipeline.operators:
+        if not isinstance(operator, Output) and "boresight" not in operator.provides:
+            operator.observe(data)
     source = job.source[0] if len(job.source) == 1 else job.pipelines[first.pipeline]
     extra = {"resolved_yaml": source, "command": job.command, "plan": job.plans[first.pipeline]}
     extra["campaign"] = f"{combination.name or job.name}: {plural(len(tasks), 'task')}"
-    return pipeline, Data(scene=scene, provenance={**pipeline._provenance(scene), **extra})
+    data.provenance = {**pipeline._provenance(scene), **extra}
+    return pipeline, data
 
 
-def _tree(pipeline: Pipeline, data: Data, nodes: Sequence[Any], read: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+def _tree(data: Data, nodes: Sequence[Any], read: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
     """The sum of parts, of which there are `FAN` at once in the branches of each level; one sum is held per level."""
     depth = 1
     while FAN**depth < len(nodes):
         depth += 1
 
-    def total(low: int, level: int, first: bool) -> dict[str, Any]:
+    def total(low: int, level: int) -> dict[str, Any]:
         if level == 0:
             return read(nodes[low])
         branch = _empty(data)
         width = FAN ** (level - 1)
         for start in range(low, min(low + FAN**level, len(nodes)), width):
-            _add(pipeline, branch, total(start, level - 1, first and start == low))
-        return _packed(pipeline, branch, first)
+            _add(branch, total(start, level - 1))
+        return _packed(branch)
 
-    return total(0, depth, True)
+    return total(0, depth)
 
 
 def _empty(data: Data) -> Data:
@@ -129,14 +134,16 @@ def _empty(data: Data) -> Data:
     return Data(scene=data.scene, provenance=data.provenance)
 
 
-def _packed(pipeline: Pipeline, data: Data, first: bool) -> dict[str, Any]:
+def _packed(data: Data) -> dict[str, Any]:
     tally = data.tally
     rows = {name: [list(row) for row in getattr(tally, name)()] for name in ("counts", "totals", "figures")}
-    return {"packed": pipeline.pack(data, first), "scans": data.observations, **rows}
+    partial = {who: [type(product).__name__, product] for who, product in data.partial.items()}
+    return {"partial": partial, "scans": data.observations, **rows}
 
 
-def _add(pipeline: Pipeline, data: Data, tree: dict[str, Any]) -> None:
-    pipeline.merge(data, tree["packed"])
+def _add(data: Data, tree: dict[str, Any]) -> None:
+    for who, (kind, product) in tree["partial"].items():
+        data.add(who, product if isinstance(product, Product) else products.get(kind).of(product))
     totals = {(who, what): total for who, what, total in tree["totals"]}
     for who, what, count in tree["counts"]:
         data.tally.count(who, what, count, totals.get((who, what), 0))

@@ -111,7 +111,7 @@ def perform(order: Order) -> Outcome:
 
 
 class _NotCombined(PipelineError):
-    """A product that no operator packs."""
+    """A product that cannot be added to those of other observations."""
 
 
 @faults_named()
@@ -123,26 +123,26 @@ def _run(order: Order) -> str:
     task, folder = order.task, order.folder
     file = pipeline_of(order.pipeline)
     layouts = layouts_in(layout_path(folder, task.combination), order.layout)
-    part = Part(task.scans, layouts, first=task.before == 0, prefix=f"{task.entry:06d}-")
+    part = Part(task.scans, layouts, prefix=f"{task.entry:06d}-")
     pipeline = file.pipeline()
-    data = pipeline.run(
+    data = pipeline.run_part(
         scene_of(file, task.seed, Instant(task.time)),
+        part,
         output=folder / "entries" / f"{task.entry:06d}",  # the time streams of one entry together
         threads=order.threads,
         ceiling=order.memory,
         provenance={"resolved_yaml": order.pipeline},
-        part=part,
     )
     if data.products:
         raise _NotCombined(
             f"the product {sorted(data.products)[0]!r} cannot be combined with those of other observations",
             place=file.header.name,
-            cure="its operator needs pack() and merge() to take part in a campaign; run the observations one by one",
+            cure="its operator needs to hand a Product to Data.add; or run the observations one by one",
         )
     scans = [_thinned(o, k + task.before) for k, o in enumerate(data.observations)]
     tally = data.tally
     tree = {
-        "packed": part.packed,
+        "partial": {who: [type(product).__name__, dict(product.arrays())] for who, product in data.partial.items()},
         "scans": scans,
         "counts": [list(row) for row in tally.counts()],
         "totals": [list(row) for row in tally.totals()],

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ..plan.budget import Limits
-from ..run.companion import Companion
 from ..scene import Scene
+from ..signal import Signal
 from .parameters import Parameters, quantity
 from .units import Fraction
 
@@ -39,8 +39,10 @@ class Header(Parameters):
     """One line for `zonda pipelines`."""
     requires: list[str] = Field(default_factory=list)
     """Packages and versions this file needs, as pip writes them, e.g. zonda-toltec>=1.2."""
-    runs: dict[str, Companion] = Field(default_factory=dict)
-    """Companion runs, e.g. noiseless: {only: [sky]} or source_free: {without: [sky]}."""
+    runs: dict[str, Signal] = Field(default_factory=dict)
+    """Further signals, e.g. noiseless: {only: [sky]} or source_free: {without: [sky]}: what a subset of the components makes."""
+    only: list[str] = Field(default_factory=list)
+    """Components that the complete signal is narrowed to (`--only`), at the levels of the whole scene; where absent, all."""
     precision: Literal["float32", "float64"] = "float32"
     """Type of the time streams."""
     accuracy: Accuracy | None = None

@@ -13,8 +13,8 @@ from zonda import __version__
 from ..errors import ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline
-from ..run.companion import Companion
 from ..scene import Scene
+from ..signal import Signal
 from . import yaml_places
 from .header import KEYS, Header
 
@@ -34,7 +34,7 @@ class PipelineFile:
     Attributes
     ----------
     header
-        Name, description, companion runs, precision, folder for products.
+        Name, description, further signals, precision, folder for products.
     parameters
         The scene's parameters as the file gives them: names of site and instrument, or their definitions.
     steps
@@ -55,8 +55,8 @@ class PipelineFile:
         return [step.operator for step in self.steps]
 
     @property
-    def runs(self) -> dict[str, Companion]:
-        """Companion runs by name."""
+    def runs(self) -> dict[str, Signal]:
+        """Further signals by name."""
         return self.header.runs
 
     @property
@@ -73,7 +73,12 @@ class PipelineFile:
         """What is done: a new `Pipeline` of the operators."""
         header = self.header
         return Pipeline(
-            self.operators, runs=header.runs, name=header.name, description=header.description, precision=header.precision
+            self.operators,
+            runs=header.runs,
+            only=header.only,
+            name=header.name,
+            description=header.description,
+            precision=header.precision,
         )
 
     def resolved_yaml(self) -> str:

@@ -13,9 +13,9 @@ from .. import registry
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline
-from ..run.companion import Companion
 from ..run.order import check_order
 from ..scene import Scene
+from ..signal import Signal
 from ..weather import WeatherSource, resolve
 from . import overrides as settings
 from . import yaml_places
@@ -209,7 +209,7 @@ class _Check(Mistakes):
         return self.validate(source, given, ("weather",), "weather")
 
     def runs(self, header: Header, steps: list[Step | None]) -> None:
-        """Companion runs may name only components that the operators provide."""
+        """Signals may name only components that the operators provide."""
         operators = [step.operator for step in steps if step is not None]
         if len(operators) != len(steps) or check_order(operators):
             return
@@ -218,13 +218,13 @@ class _Check(Mistakes):
             for which in ("only", "without"):
                 for i, component in enumerate(getattr(run, which) or ()):
                     try:
-                        Pipeline(operators, runs={name: Companion.model_validate({which: [component]})})
+                        Pipeline(operators, runs={name: Signal.model_validate({which: [component]})})
                     except PipelineError as err:
                         span = self.document.mark(("runs", name, which, i)).value
                         self.wrong(err.message, span, nearest(component, components), err.cure)
         if self.found:
             return
-        for name in [*header.runs, ""]:  # the last: runs that steps ask for themselves
+        for name in [*header.runs, ""]:  # the last: signals that outputs ask for themselves
             try:
                 Pipeline(operators, runs={name: header.runs[name]} if name else {})
             except PipelineError as err:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import PipelineError
-from ..run.companion import Companion
+from ..signal import Signal
 from .context import Context
 from .coverage import DEEP
 from .decide import Decided
@@ -193,8 +193,8 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
     if not made.noise[1] or not any("white" in p for p in provided):
         return []
     air = ["atmosphere"] if any("atmosphere" in p for p in provided) else []
-    runs = {"white": Companion(only=["white", *air], filters="none")}
-    runs |= {"air": Companion(only=air, filters="none")} if air else {}
+    runs = {"white": Signal(only=["white", *air], filters="none")}
+    runs |= {"air": Signal(only=air, filters="none")} if air else {}
     part = dataclasses.replace(part, header=part.header.model_copy(update={"runs": runs}))
     try:
         products = part.pipeline().run(part.scene(), threads=threads).products
@@ -250,7 +250,7 @@ def _with_sky_given(file: PipelineFile) -> PipelineFile:
     """The file with a run of the sky that no filter has seen, beside that of the sky alone."""
     runs = dict(file.runs)
     if "sky_alone" in runs:
-        runs[GIVEN] = Companion(only=["sky"], filters="none")
+        runs[GIVEN] = Signal(only=["sky"], filters="none")
     return dataclasses.replace(file, header=file.header.model_copy(update={"runs": runs}))
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..data import Observation
 from ..operator import Operator
 from ..scene import Scene
+from ..signal import MAIN, Component, Formed
 from .estimate import Traits
 
 INSTANTS = 64
@@ -85,7 +86,7 @@ class Context:
     scene: Scene
     observations: list[Observation]
     operators: list[Operator]
-    runs: dict[str, int]
+    runs: dict[str, float]
     traits: dict[str, Traits] = field(default_factory=dict)
     coverage: Coverage | None = None
     metrics: frozenset[str] = frozenset()
@@ -95,6 +96,10 @@ class Context:
     """The white noise that the run will have."""
     readers: frozenset[str] = frozenset()
     """Labels of the operators that make a product of the time streams themselves (`Planning.reads_streams`)."""
+    signals: tuple[Formed, ...] = (Formed(MAIN, frozenset()),)
+    """Those that are formed, the complete one first."""
+    components: frozenset[Component] = frozenset()
+    """Of all signals."""
     kept_streams: frozenset[str] = frozenset()
     """Streams that some operator saves, measures or draws besides ``signal``."""
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..output import Output
-from ..run.forecast import BASE, forecast
-from ..run.repeated import affordable, alike
+from ..run.budget import BASE
+from ..run.schedule import Chain, schedule
 from ..run.settings import Settings
 from ..storage import user_cache
 from .context import Context
@@ -91,7 +91,8 @@ def measure_speed(budget: float = 0.3) -> dict[str, float]:
 def predict(
     context: Context, costs: Mapping[str, Cost | None], item: int, threads: int, memory: int, portable: bool = False
 ) -> Prediction:
-    """CPU time and memory of the pipeline, all runs. Streams that memory has no room for may be made again (`forecast`).
+    """CPU time and memory of the pipeline, all signals. Streams that memory has no room for may be made again
+    (`core.run.schedule`).
 
     Parameters
     ----------
@@ -111,14 +112,9 @@ def predict(
     after = sum(planning_of(o).memory(longest) for o in context.operators if isinstance(o, Output))
     steps = [o for o in during if "boresight" not in o.provides]
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
-    acting: dict[str, float] = {label: max(number, 1) for label, number in context.runs.items()}
-    copied = {label: names for label, names in alike(steps).items() if acting.get(label, 1) > 1}
-    kept = affordable(steps, copied, context.observations, settings)
+    acting = {label: max(number, 1.0) for label, number in context.runs.items()}
     sizes = [o.n_samples * o.n_detectors for o in context.observations]
-    share = sum(size for size, bytes_kept in zip(sizes, kept, strict=True) if bytes_kept) / max(sum(sizes), 1)
-    acting |= {label: acting[label] - (acting[label] - 1) * share for label in copied}
-    settings.memory -= sum(kept)
-    found = forecast(steps, longest, settings)
+    found = schedule(Chain(steps, context.signals, context.components), longest, settings)
     seconds = {}
     for label, cost in costs.items():
         if cost is not None:
@@ -127,5 +123,5 @@ def predict(
             seconds[label] = factors[cost.kernel] * (acting.get(label, 1) * (each + again) + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     startup = factors[STARTUP.kernel] * STARTUP.once
-    held += found.bytes + sum(kept)
+    held += found.bytes
     return Prediction(seconds, BASE + max(held, after), unknown, startup, acting, factors)

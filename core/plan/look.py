@@ -30,6 +30,10 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
     for operator in operators:
         if operator.label not in readers and not isinstance(operator, Output):
             operator.observe(data)
+    formed = tuple(pipeline.signals.all[name] for name in ["", *structure.runs] if name not in structure.derived)
+    for observation in data.observations:
+        observation.components = frozenset(map(str, pipeline.signals.components))
+        observation.signals = tuple(signal.stream for signal in formed)
     shown = _some(data.observations)
     for observation in shown:
         for operator in operators:
@@ -37,6 +41,7 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
     runs = selected(pipeline, structure)
     streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.label in readers))
     context = Context(scene, data.observations, operators, runs, readers=readers, kept_streams=streams)
+    context.signals, context.components = formed, pipeline.signals.components
     context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(operators, shown, context)
     pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]

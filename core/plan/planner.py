@@ -14,7 +14,6 @@ from ..errors import ZondaError
 from ..machine import available_memory, available_threads
 from ..output import Output
 from ..pipeline import Pipeline
-from ..run.derived import derivation
 from .budget import limits
 from .context import Context
 from .cost import predict
@@ -24,7 +23,7 @@ from .look import look
 from .planning import planning_of
 from .result import Plan
 from .slices import measured
-from .structure import Structure, prune, selected
+from .structure import Structure, prune, remainders, selected
 from .summary import Prediction
 from .whole import everything_of, without
 
@@ -68,8 +67,7 @@ def plan(
     begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
     labels = [o.label for o in pipeline.operators]
-    derived = {run: derivation(parts) for run, parts in pipeline.derived.items()}
-    everything = Structure(tuple(labels), tuple(pipeline.runs), (), derived=derived)
+    everything = Structure(tuple(labels), tuple(pipeline.runs), (), derived=remainders(pipeline, tuple(pipeline.runs)))
     structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
     context = look(pipeline, scene, structure)
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)

@@ -99,6 +99,5 @@ class _Own(Planning[Any]):
 
     def __init__(self, operator: Any) -> None:
         super().__init__(operator)
-        self.knobs, self.smaller, self.reads_streams = operator.knobs, operator.lighter, operator.main_run_only  # type: ignore[misc]
+        self.knobs = operator.knobs  # type: ignore[misc]
         self.traits, self.estimate, self.memory = operator.traits, operator.estimate, operator.memory  # type: ignore[method-assign]
-        self.sweeps = operator.sweeps  # type: ignore[method-assign]

@@ -15,7 +15,7 @@ from ..data import Data, Observation
 from ..focalplane import Focalplane
 from ..operator import Operator
 from ..output import Output
-from ..run.companion import Companion
+from ..signal import Signal
 from .cost import calibrate
 from .estimate import Cost
 from .planning import planning_of
@@ -72,7 +72,7 @@ def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, 
     sky = any("sky" in s.operator.provides for s in steps) and any(
         s.operator.provides & {"atmosphere", "white", "pink"} for s in steps
     )
-    runs = {"sky_alone": Companion(only=["sky"])} if sky else {}
+    runs = {"sky_alone": Signal(only=["sky"])} if sky else {}
     return dataclasses.replace(file, steps=tuple(steps), header=file.header.model_copy(update={"runs": runs}))
 
 

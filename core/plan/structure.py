@@ -12,11 +12,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from .. import data
+from ..mapmaker import MapMaker, filters, forms, makes_products
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
-from ..run.companion import Companion
-from ..run.derived import derivable, derivation
+from ..run.signals import remainder
+from ..signal import Signal
 from .planning import planning_of
 
 STREAMS = frozenset(data.STREAMS)
@@ -41,13 +42,13 @@ class Structure:
     operators
         Labels of the operators that act at all.
     runs
-        Companion runs that are of use.
+        Signal runs that are of use.
     rows
         What is left out, and why.
     instead
         The companion run that takes the main run's place, its name no longer needed; empty: none.
     derived
-        Companion runs that cost nothing, and how they are derived (`core.run.derived`).
+        Signal runs that cost nothing, and how they are derived (`core.run.derived`).
     """
 
     operators: tuple[str, ...]
@@ -60,14 +61,14 @@ class Structure:
 def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     """What the pipeline's outputs depend on. ``keep``: labels of operators that stay whatever depends on them."""
     rows: list[Row] = []
-    in_memory = all(o.product_only or "boresight" in o.provides or o.provides <= STREAMS for o in pipeline.operators)
+    in_memory = all(makes_products(o) or "boresight" in o.provides or o.provides <= STREAMS for o in pipeline.operators)
     needed: dict[str, dict[str, str]] = {}  # by run: label -> reason
     for run in [*pipeline.runs, ""]:  # the main run last: the others may need it
-        steps, wanted = pipeline.selection.steps(run), _wanted(pipeline, run)
+        steps, wanted = steps_of(pipeline, run), _wanted(pipeline, run)
         pinned = dict.fromkeys(keep, "asked for with --keep")
         if in_memory:
             wanted = set().union(*(o.provides for o in pipeline.operators))  # nothing is written: the products are the output
-        for frozen in [r for r in needed if not run and pipeline.selection.is_frozen(r)]:
+        for frozen in [r for r in needed if not run and pipeline.signals.all[r].model]:
             pinned |= {o.label: f"run {frozen} takes its modes" for o in steps if o.couples == "all"}
         found, left_out = _walk(steps, wanted, pinned)
         needed[run] = found
@@ -86,7 +87,7 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
         rows = [r for r in rows if r.run not in ("", instead)]
         words = "the sky alone" if pipeline.runs[instead].only == ["sky"] else f"run {instead.strip('_')}"
         reason = f"no step reads what a run of everything makes: {words} takes its place"
-        rows += [Row("", o.label, False, reason) for o in pipeline.selection.steps("") if o.label not in needed[instead]]
+        rows += [Row("", o.label, False, reason) for o in pipeline.signals.steps if o.label not in needed[instead]]
         needed[""] = needed.pop(instead)
     acting = set().union(*(set(found) for found in needed.values()))
     outside = [o for o in pipeline.operators if isinstance(o, Output) or "boresight" in o.provides]
@@ -97,7 +98,7 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     kept_rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     kept = tuple(o.label for o in pipeline.operators if o.label in acting)
     runs = tuple(r for r in pipeline.runs if r in needed)
-    derived = {} if instead else {run: derivation(parts) for run, parts in derivable(pipeline.selection, runs).items()}
+    derived = {} if instead else remainders(pipeline, runs)
     return Structure(kept, runs, tuple(kept_rows), instead, derived)
 
 
@@ -105,21 +106,21 @@ def _wanted(pipeline: Pipeline, run: str) -> set[str]:
     """Products of a run that steps at the end read: those that need certain runs in these, the others in all but their own."""
     found: set[str] = set()
     for o in pipeline.operators:
-        if isinstance(o, Output) and (run in o.runs if o.needs() or run.startswith("_") else True):
+        if isinstance(o, Output) and (run in o.shown if o.signals() or run.startswith("_") else True):
             found |= o.requires | o.optional
     return found
 
 
 def _in_place_of_main(pipeline: Pipeline, needed: Mapping[str, Mapping[str, str]], wanted: set[str], keep: set[str]) -> str:
     """A run whose components hold those of all other needed runs, where nothing reads what the main run makes; else empty."""
-    selection = pipeline.selection
-    main = [o for o in selection.steps("") if o.label in needed[""]]
-    if any(_makes_something(o, wanted) or o.label in keep for o in main) or any(selection.is_frozen(run) for run in needed):
+    signals = pipeline.signals
+    main = [o for o in signals.steps if o.label in needed[""]]
+    if any(_makes_something(o, wanted) or o.label in keep for o in main) or any(signals.all[run].model for run in needed):
         return ""
     others = [run for run in needed if run and pipeline.runs[run].only is not None]
     for run in others:
-        components, filters = selection.components(run), pipeline.runs[run].filters
-        if filters == "all" and len(others) == len(needed) - 1 and all(selection.components(r) <= components for r in others):
+        made, filtered = signals.makers(run), signals.all[run].filtered
+        if filtered and len(others) == len(needed) - 1 and all(signals.makers(r) <= made for r in others):
             return run
     return ""
 
@@ -139,7 +140,7 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
         elif made and made <= STREAMS and type(operator).finalize is Operator.finalize:
             left_out[operator.label] = f"no step that is needed reads {' or '.join(sorted(made))}"
             continue
-        elif operator.product_only and not made & wanted:
+        elif makes_products(operator) and not made & wanted:
             left_out[operator.label] = f"no step writes or draws its {' or '.join(sorted(made))}"
             continue
         else:
@@ -158,7 +159,7 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
 
 def _makes_something(operator: Operator, wanted: set[str]) -> bool:
     made = operator.provides - STREAMS - {"boresight"}
-    return bool(made & wanted) or bool(made and not operator.product_only) or (not operator.provides)
+    return bool(made & wanted) or bool(made and not makes_products(operator)) or (not operator.provides)
 
 
 def _anything_made(steps: Sequence[Operator]) -> bool:
@@ -171,7 +172,7 @@ def _not_in_run(pipeline: Pipeline, run: str, steps: Sequence[Operator]) -> list
         return []
     taking = {o.label for o in steps}
     rows = []
-    for o in pipeline.selection.steps(""):
+    for o in pipeline.signals.steps:
         if o.label not in taking:
             why = "belongs to the main run only" if planning_of(o).reads_streams else f"the run has {_words(pipeline.runs[run])}"
             if not planning_of(o).reads_streams and pipeline.runs[run].keeps(o.provides) | ("signal" in o.provides):
@@ -180,18 +181,44 @@ def _not_in_run(pipeline: Pipeline, run: str, steps: Sequence[Operator]) -> list
     return rows
 
 
-def _words(companion: Companion) -> str:
+def _words(companion: Signal) -> str:
     if companion.only is not None:
         return f"only {' and '.join(companion.only)}"
     return f"no {' or '.join(companion.without or ())}"
 
 
-def selected(pipeline: Pipeline, structure: Structure) -> dict[str, int]:
-    """Number of runs in which each operator takes part, by label."""
-    counts: Mapping[str, int] = {}
-    counts = dict.fromkeys(structure.operators, 0)
-    for run in ["", *(r for r in structure.runs if r not in structure.derived)]:
-        for operator in pipeline.selection.steps(run):
-            if operator.label in counts:
-                counts[operator.label] += 1
-    return dict(counts)
+def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
+    """The steps that act on a signal (empty: the complete one)."""
+    signals = pipeline.signals
+    if not name:
+        return signals.steps
+    signal, made = signals.all[name], signals.makers(name)
+    generators = [o for o in signals.steps if o.label in made or (signals.components_of(o) & signal.components)]
+    found = []
+    for o in signals.steps:
+        changes = filters(o) and signal.filtered
+        if o in generators or forms(o) or changes or isinstance(o, MapMaker):
+            found.append(o)
+    return found
+
+
+def remainders(pipeline: Pipeline, names: Sequence[str]) -> dict[str, str]:
+    """Of these signals, those that are not formed, and how they follow from others."""
+    found = pipeline.signals.remainders.items()
+    return {name: remainder(parts) for name, parts in found if {name, *parts} <= {*names}}
+
+
+OTHER = {"filter": 1.0, "form": 0.3, "map": 0.35}
+"""What a further signal costs beside the first, as a share of that."""
+
+
+def selected(pipeline: Pipeline, structure: Structure) -> dict[str, float]:
+    """How often each operator does its work, by label: once for components, for each signal that it forms, filters or maps."""
+    formed = [pipeline.signals.all[name] for name in ["", *structure.runs] if name not in structure.derived]
+    others, filtered = len(formed) - 1, sum(s.filtered for s in formed) - 1
+    counts = dict.fromkeys(structure.operators, 1.0)
+    for o in pipeline.signals.steps:
+        if o.label in counts:
+            more = OTHER["form"] * others if forms(o) else OTHER["filter"] * filtered if filters(o) else 0.0
+            counts[o.label] += OTHER["map"] * others if isinstance(o, MapMaker) else more
+    return counts

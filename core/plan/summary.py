@@ -67,7 +67,7 @@ def apply(
     file: PipelineFile, operators: Collection[str], names: Collection[str], settings: Mapping[str, Mapping[str, Any]]
 ) -> PipelineFile:
     """``file`` with these operators (labels) and companion runs only, parameters changed by ``settings``."""
-    labels = [o.label for o in Pipeline(file.operators, runs=file.runs).operators]
+    labels = [o.label for o in file.pipeline().operators]
     steps, kept = [], []
     for label, step in zip(labels, file.steps, strict=True):
         if label in operators:

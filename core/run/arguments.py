@@ -12,7 +12,7 @@ from ..configuration.diagnostics import nearest
 from ..errors import PipelineError
 from ..operator import Operator
 from ..scene import Scene
-from .companion import Companion
+from ..signal import Signal
 
 PRECISIONS = ("float32", "float64")
 
@@ -34,16 +34,16 @@ def steps(operators: Any, name: str) -> list[Operator]:
     return made
 
 
-def runs(given: Any, name: str) -> dict[str, Companion]:
-    """The companion runs by name. Raises PipelineError for what is not a mapping of runs."""
+def runs(given: Any, name: str) -> dict[str, Signal]:
+    """The signals by name. Raises PipelineError for what is not a mapping of them."""
     cure = "write runs={'noiseless': {'only': ['sky']}, 'source_free': {'without': ['sky']}}"
     if given is not None and not isinstance(given, Mapping):
-        raise PipelineError(f"runs is a dict of companion runs by their names, not {_what(given)}", place=name, cure=cure)
+        raise PipelineError(f"runs is a dict of signals by their names, not {_what(given)}", place=name, cure=cure)
     made = {}
     for key, value in (given or {}).items():
-        if not isinstance(value, Companion | Mapping):
+        if not isinstance(value, Signal | Mapping):
             raise PipelineError(f"run {key} is a dict, not {_what(value)}", place=name, cure=cure)
-        made[key] = value if isinstance(value, Companion) else Companion(**value)
+        made[key] = value if isinstance(value, Signal) else Signal(**value)
     return made
 
 

@@ -1,26 +1,37 @@
-"""Makes the blocks of one observation: a segment's operators, carried out on a rectangle of detectors x samples."""
+"""Makes the blocks of one observation: a segment's steps, carried out on a rectangle of detectors x samples.
+
+A step acts on a block in one of four ways: it forms every signal of its components; it filters each signal, as if that were the
+only one; it maps all of them (`core.mapmaker`); or it makes or reads components, and of the signals sees the complete one.
+"""
 
 from __future__ import annotations
 
 import copy
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..data import STREAMS, Block, Observation, Stream, Tally
+from ..block import Block
+from ..compilation.jit import nb
 from ..faults import PluginError, whose
+from ..mapmaker import MapMaker, filters, forms
 from ..numerics.tiles import TILE_SAMPLES
 from ..operator import Operator
+from ..signal import MAIN, Formed
+from ..stream import Stream
+from ..tally import Tally
 from ..types import AnyFloats
 from .blocks import pieces, trimmed, within
-from .repeated import Repeated
-from .same_air import SameAir
-from .settings import Settings, Timer
+from .schedule import Schedule, unused
+from .settings import Timer
 from .streams import Ledger, Stage
 from .whole import exec_whole, knows_means, means_of, names_of
+
+Measured = dict[tuple[str, str], Any]
+"""By label and signal: what `Operator.measure` found."""
 
 
 class BlockMaker:
@@ -30,117 +41,187 @@ class BlockMaker:
     ----------
     states
         By label: what `Operator.prepare` returned. It fills up before the first block.
-    streams
-        As in `Layout`.
+    measured
+        What steps that measure found; it fills up as they do.
     stopped
         True: what is made is of no use any more.
-    repeated
-        Streams that this run keeps for later ones, or that it finds there.
     """
 
     def __init__(
         self,
-        operators: Sequence[Operator],
-        observation: Observation,
-        settings: Settings,
+        schedule: Schedule,
         states: Mapping[str, Any],
-        streams: Collection[str],
+        measured: Measured,
         timer: Timer,
         ledger: Ledger,
         stopped: Callable[[], bool],
-        repeated: Repeated | None = None,
     ) -> None:
-        self._observation, self._dtype, self._states = observation, settings.dtype, states
-        self._streams, self._timer, self._ledger, self._stopped = frozenset(streams), timer, ledger, stopped
-        self._repeated = repeated
-        self._labels = {id(operator): operator.label for operator in operators}  # the property is slow
-        acting = [o for o in operators if type(o).exec is not Operator.exec]
+        chain, settings = schedule.chain, schedule.settings
+        self._chain, self._observation, self._dtype = chain, schedule.observation, settings.dtype
+        self._states, self._measured, self._streams = states, measured, schedule.streams
+        self._timer, self._ledger, self._stopped = timer, ledger, stopped
+        self._schedule = schedule
+        self._labels = {id(step): step.label for step in chain.steps}  # the property is slow
+        acting = [o for o in chain.steps if type(o).exec is not Operator.exec]
         self._declared = {o.label: names_of(o) for o in acting if not knows_means(o)}
         self._due: dict[str, frozenset[str]] = {}
         """By label: streams that a step must have made, for a later one requires them."""
         required = frozenset[str]()
-        for operator in reversed(operators):
-            takes_away = isinstance(operator, SameAir)
-            self._due[operator.label] = frozenset() if takes_away else operator.provides & required & frozenset(STREAMS)
-            required |= operator.requires if operator in acting else frozenset()
+        for step in reversed(chain.steps):
+            self._due[step.label] = frozenset(n for n in step.provides & required if unused(n))
+            required |= step.requires if step in acting else frozenset()
         self._local = threading.local()
 
-    def let_go(self) -> None:
-        """Blocks are done with: their threads have ended."""
+    @property
+    def _apart(self) -> set[str]:
+        """Streams of the signals that are made again where they are mapped."""
+        return {s.stream for s in self._schedule.made_again}
+
+    def release(self) -> None:
+        """Forget the blocks: their threads have ended."""
         self._local = threading.local()
         self._ledger.drop("blocks")
 
-    def make(self, stage: Stage, detectors: slice, samples: slice, made: dict[str, Stream], *, again: bool) -> Block:
-        """A block with the segment's operators, and those of the stages before it, carried out."""
+    def make(
+        self,
+        stage: Stage,
+        detectors: slice,
+        samples: slice,
+        made: dict[str, Stream],
+        *,
+        again: bool,
+        signals: Sequence[Formed] | None = None,
+    ) -> Block:
+        """A block with the segment's steps, and those of the stages before it, carried out.
+
+        ``signals``: those that are of use in it; None: all that are not made again where they are mapped.
+        """
         segment, again = stage.segment, again or stage.swept
+        if signals is None:
+            signals = [s for s in self._chain.signals if s.stream not in self._apart]
         n_samples = self._observation.n_samples
         margin = -(-segment.halo // TILE_SAMPLES) * TILE_SAMPLES
         reach = slice(max(0, samples.start - margin), min(n_samples, samples.stop + margin))
         first, rest = segment.split()
         # whole scans, and what is only taken in pieces, are worked on where they are kept
         in_place = bool(made) and not segment.halo and (not rest or reach == slice(0, n_samples))
-        passed_on = set(stage.wanted).union(*(o.requires | o.optional for o in rest))
+        passed_on = set(stage.wanted).union(*(self._chain.expanded(o.requires | o.optional) for o in rest))
         if again:
-            first, rest = ([o for o in some if o.provides & self._streams] for some in (first, rest))
-        copied = not first or bool(rest)
-        block = self._block(stage, detectors, reach, samples, made if in_place else {}, again, copied)
+            first, rest = ([o for o in part if self._is_of_use(o, signals)] for part in (first, rest))
+        else:
+            first, rest = ([o for o in part if not o.provides or self._is_read(o)] for part in (first, rest))
+        block = self._block(stage, detectors, reach, samples, made if in_place else {}, again, not first or bool(rest), signals)
+        if self._apart and any(isinstance(o, MapMaker) for o in segment.operators):
+            self._add_unfiltered(block)
         if first:
-            self._in_pieces(first, block, passed_on)
-        self._exec(rest[:1], block)
+            self._in_pieces(first, block, passed_on, signals)
+        self._exec(rest[:1], block, signals)
         if reach != samples:
             block = trimmed(block, samples)
-        self._exec(rest[1:], block)
+        self._exec(rest[1:], block, signals)
         held = self._local.__dict__
         buffers = [*held.get("blocks", {}).values(), held.get("pieces", {}), held.get("whole", {})]
         size = sum(array.nbytes for held in buffers for array in held.values())
         self._ledger.note(("blocks", threading.get_ident()), size)
         return block
 
-    def _exec(self, operators: list[Operator], block: Block) -> None:
+    # ---- which steps act
+
+    def _is_read(self, step: Operator) -> bool:
+        """Whether anybody reads one of a step's streams; a step that makes products is read by nobody, and acts."""
+        streams = [n for n in step.provides if unused(n)]
+        return len(streams) < len(step.provides) or any(n in self._streams for n in streams)
+
+    def _is_of_use(self, step: Operator, signals: Sequence[Formed]) -> bool:
+        """Whether a step changes the streams of a block that is made again, of which only ``signals`` are of use."""
+        if not step.provides & self._streams:
+            return False
+        few = len(signals) < len(self._chain.signals)
+        return not few or MAIN in step.provides or step in self._chain.needed_for(signals)
+
+    # ---- steps
+
+    def _exec(self, steps: list[Operator], block: Block, signals: Sequence[Formed]) -> None:
         start = time.thread_time()
-        for operator in operators:
+        for step in steps:
             if self._stopped():
                 return
-            label = self._labels[id(operator)]
-            alike = self._repeated if self._repeated is not None and label in self._repeated.names else None
-            if alike is not None and alike.complete:
-                alike.repeat(label, block)
+            label = self._labels[id(step)]
+            if forms(step):
+                self._form(step, label, block, signals)
+            elif filters(step):
+                self._filter(step, label, block)
             else:
-                self._act(operator, label, block)
-                if alike is not None:
-                    alike.record(label, block)
+                self._act(step, block, self._states[label])
             now = time.thread_time()
             self._timer.add(label, "exec", now - start)
             start = now
 
-    def _act(self, operator: Operator, label: str, block: Block) -> None:
+    def _form(self, step: Operator, label: str, block: Block, signals: Sequence[Formed]) -> None:
+        """Let a step form each signal of its components, and give all of them the same mask."""
+        for signal in signals:
+            self._on_one(step, block, signal, self._states[label])
+        if len(signals) > 1:
+            share_mask(block, [s.stream for s in signals])
+
+    def _filter(self, step: Operator, label: str, block: Block) -> None:
+        """Let a step filter each signal."""
+        here = [s for s in self._chain.signals if s.stream in block.detdata and s.filtered]
+        for signal in here:
+            found = (label, signal.stream)
+            self._on_one(step, block, signal, self._measured[found] if found in self._measured else self._states[label])
+        if len(here) > 1 and not step.linear:
+            share_mask(block, [s.stream for s in here])
+
+    def _on_one(self, step: Operator, block: Block, signal: Formed, state: Any) -> None:
+        """Let a step act on one signal, as if it were the only one."""
+        if len(self._chain.signals) == 1 and signal.components == self._chain.components:
+            block.components = signal.components
+            self._act(step, block, state)
+            return
+        seen = block.alone(signal.stream, signal.components, self._chain.components - signal.components)
+        self._act(step, seen, state)
+        block.take(signal.stream, seen)
+
+    def _act(self, step: Operator, block: Block, state: Any) -> None:
         """`Operator.exec`, and a look at what it left."""
+        label = self._labels[id(step)]
 
         def work(block: Block) -> None:
             before = dict(block.detdata)
-            operator.exec(block, self._states[label])
-            check_left(operator, block, before, self._due[label])
+            step.exec(block, state)
+            check_left(step, block, before, self._due[label])
 
         fields = {}
         if names := self._declared.get(label, frozenset()) & block.detdata.keys():
             fields = means_of(self._observation, block.means, names)
         if fields:
-            exec_whole(block, operator, fields, self._local.__dict__.setdefault("whole", {}), work)
+            exec_whole(block, step, fields, self._local.__dict__.setdefault("whole", {}), work)
         else:
             work(block)
 
+    # ---- what is in a block
+
     def _block(
-        self, stage: Stage, detectors: slice, reach: slice, samples: slice, made: dict[str, Stream], again: bool, copied: bool
+        self,
+        stage: Stage,
+        detectors: slice,
+        reach: slice,
+        samples: slice,
+        made: dict[str, Stream],
+        again: bool,
+        copied: bool,
+        signals: Sequence[Formed],
     ) -> Block:
         """A block with its sources in it: where they are kept (as ``made`` says), copies, or made again.
 
-        With margins never in place: others read them too. Not ``copied``: operators work on copies of parts of it alone.
+        With margins never in place: others read them too. Not ``copied``: steps work on copies of parts of it alone.
         """
         source, observation = stage.source, self._observation
         if again:
             observation = copy.copy(observation)
             observation.tally = Tally()
-        buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(stage.depth, {})
+        buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(stage.place, {})
         block = Block(observation, detectors, reach, dtype=self._dtype, buffers=buffers, again=again)
         block.places = {name: stream.array[detectors, reach] for name, stream in made.items()}
         for name, stream in source.streams.items():
@@ -156,8 +237,8 @@ class BlockMaker:
         for part, known in ((margins[0], True), (samples, again), (margins[1], True)):
             if part.start == part.stop:
                 continue
-            before = self.make(source.stage, detectors, part, {}, again=known)
-            for name in source.names:
+            before = self.make(source.stage, detectors, part, {}, again=known, signals=signals)
+            for name in source.names & before.detdata.keys():
                 if reach == samples:
                     block.detdata[name] = before.detdata[name]
                     continue
@@ -167,8 +248,18 @@ class BlockMaker:
             block.means.update(before.means)
         return block
 
-    def _in_pieces(self, operators: list[Operator], block: Block, passed_on: set[str]) -> None:
-        """Let operators that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
+    def _add_unfiltered(self, block: Block) -> None:
+        """Put the signals that pass no filter into a block of a map maker, made again from their components."""
+        signals = [s for s in self._chain.signals if s.stream in self._apart]
+        stage = Stage.without_filters(self._chain.needed_for(signals), frozenset(self._apart))
+        found = self.make(stage, block.detectors, block.samples, {}, again=True, signals=signals)
+        for name in self._apart:
+            block.detdata[name] = found.detdata[name]
+            if name in found.means:
+                block.means[name] = found.means[name]
+
+    def _in_pieces(self, steps: list[Operator], block: Block, passed_on: set[str], signals: Sequence[Formed]) -> None:
+        """Let steps that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
         given, means, made = block.detdata, block.means, dict[str, AnyFloats]()
         buffers = self._local.__dict__.setdefault("pieces", {})
         for detectors, samples in pieces(block.detectors, block.samples):
@@ -179,7 +270,7 @@ class BlockMaker:
             for name, stream in given.items():
                 piece.detdata[name] = piece.buffer(name, piece.shape)
                 piece.detdata[name][...] = stream[where]
-            self._exec(operators, piece)
+            self._exec(steps, piece, signals)
             for name in passed_on & piece.detdata.keys():
                 if name not in made:
                     made[name] = block.places[name] if name in block.places else block.buffer(name, block.shape)
@@ -188,7 +279,26 @@ class BlockMaker:
         block.detdata = {**given, **made}
 
 
-def check_left(operator: Operator, block: Block, before: Mapping[str, AnyFloats], due: frozenset[str]) -> None:
+def share_mask(block: Block, streams: Sequence[str]) -> None:
+    """Make samples NaN in all signals that are not finite in one: their maps have the same hits, and remainders hold."""
+    arrays = tuple(block.detdata[name] for name in streams)
+    for d in range(block.shape[0]):
+        if not all(_finite(array[d]) for array in arrays):
+            bad = np.logical_or.reduce([~np.isfinite(array[d]) for array in arrays])
+            for array in arrays:
+                array[d, bad] = np.nan
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+def _finite(row):  # type: ignore[no-untyped-def]
+    """Whether all samples of a row are finite."""
+    total = row.dtype.type(0)
+    for t in range(row.size):
+        total += row[t] - row[t]
+    return total == 0
+
+
+def check_left(step: Operator, block: Block, before: Mapping[str, AnyFloats], due: frozenset[str]) -> None:
     """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of the block's shape and type.
 
     Parameters
@@ -217,14 +327,14 @@ def check_left(operator: Operator, block: Block, before: Mapping[str, AnyFloats]
             continue
         raise PluginError(
             f"exec left the stream {name!r} as {found}; it must be {wanted}",
-            place=whose(operator),
+            place=whose(step),
             cure=f"fill it in place: block.new({name!r})[...] = values",
         )
-    gone = (due - block.detdata.keys()) | (before.keys() - operator.provides - block.detdata.keys())
+    gone = (due - block.detdata.keys()) | (before.keys() - step.provides - block.detdata.keys())
     if gone:
         name = min(gone)
         raise PluginError(
-            f"exec left no stream {name!r}, which {'it provides' if name in operator.provides else 'others read'}",
-            place=whose(operator),
+            f"exec left no stream {name!r}, which {'it provides' if name in step.provides else 'others read'}",
+            place=whose(step),
             cure=f"make it with block.new({name!r}), or leave it out of provides" if name in due else "leave it in block.detdata",
         )

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from ..data import STREAMS, Data
+from ..mapmaker import makes_products
 from ..operator import Operator
 from ..pipeline import Pipeline
 
@@ -31,4 +32,6 @@ def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[
 
 def writes(operators: Iterable[Operator]) -> bool:
     """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its products in memory."""
-    return any(not (o.product_only or "boresight" in o.provides or (o.provides and o.provides <= {*STREAMS})) for o in operators)
+    return any(
+        not (makes_products(o) or "boresight" in o.provides or (o.provides and o.provides <= {*STREAMS})) for o in operators
+    )

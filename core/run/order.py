@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ..mapmaker import place_of_signal
 from ..operator import Operator
+from ..output import Output
 from ..registry import makers
-from ..sky_signal import place_of_signal
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                 message = f"{name} needs {what}, which no step provides"
                 problems.append(OrderProblem(index, message, f"add a step that provides {what} above", cure))
         for what in sorted((operator.optional - operator.requires) & set(later)):
-            if not operator.at_end:
+            if not isinstance(operator, Output):
                 problems.append(
                     OrderProblem(
                         index, f"{later[what]} provides {what} only after {name} has used it", f"move {name} below {later[what]}"

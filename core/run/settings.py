@@ -5,15 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ..types import AnyFloats
-from .streams import Held
+
+Held = Literal["kept", "spilled", "again"]
+"""Streams between two segments: in memory, in a temporary file, or nowhere, to be made again block by block."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Settings:
     """How to execute.
 
@@ -34,11 +36,9 @@ class Settings:
     prefer
         What is done with streams that do not fit in memory where there is a choice; None: what is quicker.
     progress
-        Whom to tell.
+        Progress callback.
     spare
         Memory to use again.
-    kept
-        Memory of streams kept for later runs (`core.run.repeated`), which neither ``memory`` nor ``ceiling`` count.
     """
 
     threads: int = 1
@@ -46,7 +46,6 @@ class Settings:
     dtype: type[np.floating[Any]] = np.float32
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
     spare: list[AnyFloats] = field(default_factory=list)
-    kept: list[AnyFloats] = field(default_factory=list)
     ceiling: int | None = None
     prefer: Held | None = None
     asked: int | None = None

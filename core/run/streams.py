@@ -21,7 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -29,12 +29,10 @@ from ..data import Observation, Stream
 from ..errors import OutputError, PipelineError
 from ..numerics.chunks import empty
 from ..numerics.smooth import SmoothField
+from ..operator import Operator
 from ..types import AnyFloats
-
-if TYPE_CHECKING:
-    from .blocks import Segment
-
-Held = Literal["kept", "spilled", "again"]
+from .blocks import Segment
+from .settings import Held
 
 DISK_RATE = 4e8
 """Bytes per second to and from the temporary folder where it is not measured."""
@@ -87,6 +85,18 @@ class Stage:
     source: Source
     wanted: frozenset[str]
     swept: bool = False
+    apart: bool = False
+    """It makes unfiltered signals again, beside the other streams of a block."""
+
+    @classmethod
+    def without_filters(cls, steps: list[Operator], wanted: frozenset[str]) -> Stage:
+        """Of the steps up to the one that forms signals."""
+        return cls(Segment(steps), Source(), wanted, swept=True, apart=True)
+
+    @property
+    def place(self) -> int:
+        """Which buffers its blocks use: those that are worked on at the same time differ."""
+        return -1 if self.apart else self.depth
 
     @property
     def span(self) -> str:
@@ -151,7 +161,7 @@ class StreamMadeAgain(Stream):
         raise PipelineError(
             f"the stream {self.name} is made again when it is read and is nowhere held as a whole",
             place=self.observation.name,
-            cure="an operator whose `sweeps` is not 0 reads it with `Stream.sweep`",
+            cure="a step whose planning has `sweeps` reads it with `Stream.sweep`",
         )
 
     @property
@@ -243,7 +253,9 @@ class Store:
         try:
             if self._folder is None:
                 self._folder = tempfile.TemporaryDirectory(prefix="zonda-")
-            handle, path = tempfile.mkstemp(".stream", name, self._folder.name)  # a new file: the old one may still be read
+            handle, path = tempfile.mkstemp(
+                ".stream", name.replace("/", "-"), self._folder.name
+            )  # a new file: the old one may still be read
             try:
                 _reserve(handle, size)
             finally:
@@ -314,31 +326,28 @@ def disk_rate(size: int = 64 << 20) -> float:
 def choose(
     what: str,
     size: int,
-    samples: int,
     *,
+    spill_seconds: float,
     readings: int,
+    again_seconds: float,
     hindrance: str,
-    threads: int,
     prefer: Held | None,
-    rate: float,
-    cost: float,
-    place: str,
-    ceiling: str,
+    refusal: tuple[str, str],
 ) -> tuple[Held, str]:
     """Spill or make again, equation (1), and why.
 
     Parameters
     ----------
-    what, size, samples
-        Streams in words; their bytes and samples.
-    readings
-        k of equation (1).
+    what, size
+        Streams in words; their bytes.
+    spill_seconds
+        Left side of equation (1).
+    readings, again_seconds
+        k, and what each reading takes: the right side is their product.
     hindrance
         Why they cannot be made again; empty: they can.
-    rate, cost
-        D and c of equation (1).
-    ceiling
-        What ``--memory`` would have to be for all streams to be kept.
+    refusal
+        Place, and what ``--memory`` would have to be for all streams to be kept.
 
     Raises
     ------
@@ -346,8 +355,8 @@ def choose(
         Where neither is possible.
     """
     disk = free_disk()
-    spill, again = 2 * size / rate, readings * samples * cost / threads
     if hindrance and size > disk:
+        place, ceiling = refusal
         raise PipelineError(
             f"{what} takes {size / 1e9:.3g} GB, which fit neither in memory nor on the disk ({disk / 1e9:.3g} GB free in "
             f"{tempfile.gettempdir()}), and cannot be made again when it is read: {hindrance}",
@@ -358,5 +367,6 @@ def choose(
         return "again", f"{size / 1e9:.3g} GB; the disk has room for {disk / 1e9:.3g} GB"
     if hindrance:
         return "spilled", f"{size / 1e9:.2f} GB: {hindrance}"
-    costs = f"{size / 1e9:.3g} GB: about {spill:.2g} s by disk, {again:.2g} s to make {readings} times more"
-    return (prefer or ("spilled" if spill <= again else "again")), costs
+    again = readings * again_seconds
+    costs = f"{size / 1e9:.3g} GB: about {spill_seconds:.2g} s by disk, {again:.2g} s to make {readings} times more"
+    return (prefer or ("spilled" if spill_seconds <= again else "again")), costs

@@ -12,7 +12,6 @@ elevation of the ray (`response`). All of it is smooth, so it is computed at nod
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import partial
 from typing import Any, ClassVar
 
@@ -25,7 +24,7 @@ from zonda.core.errors import PointingError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.observation import Observation
 
-from .drawing import draw, in_time_order, state_drawn
+from .drawing import draw, state_drawn
 from .fluctuations import AtNodes, OfDetectors
 from .model import AtmosphereModel, Models, expected_load
 from .parameters import LayerParameters
@@ -51,8 +50,6 @@ class AtmosphereLayers(LayerParameters):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[Any] = _Provides()
     knows_means: ClassVar[bool] = True
-    prepares_ahead: ClassVar[bool] = True
-    only_tells: ClassVar[bool] = True
 
     _models: Models = PrivateAttr(default_factory=Models)
 
@@ -61,16 +58,12 @@ class AtmosphereLayers(LayerParameters):
         return self._models.of(self, observation)
 
     def observe(self, data: Data) -> None:
-        """Note when the run begins and how its scans follow each other: all of them look through the same drifting air."""
-        self.agree(data)
-        self._models.follow(data.observations)
-
-    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> Mapping[str, Any] | None:
-        """Say what the load will be about: map makers lay out their sums for the noise that follows from it."""
+        """Note when the run begins and how its scans follow each other: all of them look through the same drifting atmosphere.
+        Say what the load will be about: map makers lay out their sums for the noise that follows from it."""
         self._models.take(data)
         for observation in data.observations:
             observation.expected_load = partial(expected_load, self._models, self, observation)
-        return None
+        self._models.follow(data.observations)
 
     def configure(self, observation: Observation) -> None:
         """Set the smooth means: noise levels that follow from the load need them before any step is prepared."""
@@ -105,10 +98,6 @@ class AtmosphereLayers(LayerParameters):
     def collect(self, data: Data, observation: Observation, state: AtNodes | OfDetectors) -> None:
         """Report the mean and rms of the PWV that was drawn while the blocks were worked on."""
         state_drawn(self.model(observation), self.label, state)
-
-    def in_time_order(self, observation: Observation, state: AtNodes | OfDetectors) -> bool:
-        """Where detectors are evaluated one by one and the scan is long, all of them share the air of the moment."""
-        return in_time_order(self.model(observation))
 
 
 def _check_pointing(observation: Observation) -> None:

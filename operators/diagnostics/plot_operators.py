@@ -54,7 +54,7 @@ class Plots(Output):
     """Pictures of the products, as PNG files in the output folder.
 
     ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``, ``power_spectra.png``, ``tod.png``,
-    ``scan.png``, ``transfer_function.png``, each where there is something to show. Acts after all runs; the report shows the same
+    ``scan.png``, ``transfer_function.png``, each where there is something to show. Acts after all maps; the report shows the same
     pictures.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
@@ -85,8 +85,7 @@ class Plots(Output):
         """Begin with the pictures of what will not change any more."""
         if self._artist is not None:
             for drawing in _drawings(data, self.style()):
-                settled = drawing.settled == "at once" or (done == "run" and drawing.settled != "") or done == "runs"
-                if settled and drawing.key not in self._begun:
+                if (drawing.at_once or done == "maps") and drawing.key not in self._begun:
                     self._begun[drawing.key] = self._artist.submit(drawing.function, *drawing.arguments())
 
     def finalize(self, data: Data) -> None:
@@ -118,13 +117,13 @@ class Plots(Output):
 
 @dataclass(frozen=True)
 class Drawing:
-    """Pictures to be made by ``function(*arguments())``; ``settled``: whether nothing that follows changes what they show, once
-    there is anything to show (``at once``), once a run has ended (``run``), or not before all have ended (empty)."""
+    """Pictures to be made by ``function(*arguments())``; ``at_once``: nothing that follows changes what they show, once there is
+    anything to show."""
 
     key: str
     function: Callable[..., list[Picture]]
     arguments: Callable[[], tuple[Any, ...]]
-    settled: Literal["at once", "run", ""] = "run"
+    at_once: bool = False
 
 
 def _write(path: Path, png: bytes) -> None:
@@ -167,19 +166,17 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
     before = _steps_before(data)
     for name, image in data.products.items():
         if isinstance(image, Image) and "/" not in name:
-            yield Drawing(f"input {name}", draw_input, partial(_input, name, image), "at once")
+            yield Drawing(f"input {name}", draw_input, partial(_input, name, image), True)
     for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
         if not name.startswith("source_free/") and maps[name].contents == "all":
             yield Drawing(f"map {name}", draw_map, partial(_map, name, maps[name], style))
-    runs = data.provenance.get("runs", {})
     for name, product in maps.items():
         if "/" not in name:
             yield Drawing(f"coverage {name}", draw_coverage, partial(_coverage, name, product))
         if sources := noise_sources(maps, name):
-            complete = "source_free" in sources or "source_free" not in runs
-            yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style), "run" if complete else "")
+            yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style))
     if data.observations:
-        yield Drawing("scan", draw_scan, lambda: ([Track.of(o) for o in data.observations],), "at once")
+        yield Drawing("scan", draw_scan, lambda: ([Track.of(o) for o in data.observations],), True)
     early = {p.product: p for p in data.partial.values() if isinstance(p, TimeStream)}
     for name, product in (data.products | early).items():
         file = product_path("", name).name
@@ -188,7 +185,7 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
             yield Drawing(f"spectra {name}", draw_spectra, partial(tuple, (file, product, before.get(product.label, ""))))
         elif isinstance(product, TimeStream):
             file = "tod" if name == "time_streams" else f"tod_{file}"
-            yield Drawing(f"streams {name}", draw_streams, partial(_streams, file, product, before), "at once")
+            yield Drawing(f"streams {name}", draw_streams, partial(_streams, file, product, before), True)
         elif isinstance(product, Transfer):
             yield Drawing(f"transfer function {name}", draw_transfer, partial(tuple, (file, product)))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, cast
 
@@ -159,11 +159,8 @@ class PowerSpectrum(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
     knows_means: ClassVar[bool] = True
-    prepares_ahead: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
-    main_run_only: ClassVar[bool] = True
-    product_only: ClassVar[bool] = True
 
     streams: list[StreamName] | None = Field(None, min_length=1)
     """Streams to measure; where absent, `signal` and every component but `transmission` that reaches this step."""
@@ -202,15 +199,6 @@ class PowerSpectrum(Operator):
             what = "scans of another length left out of the mean spectrum"
             data.tally.count(self.label, what, mean.of_another_length)
             data.products[product_name(self, "spectrum")] = mean
-
-    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
-        """The mean so far."""
-        mean: Spectrum | None = data.take(self.label)
-        return None if mean is None else mean.arrays()
-
-    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
-        """Into the mean of all scans."""
-        data.add(self.label, Spectrum.of(part))
 
 
 def in_order(streams: Iterable[str]) -> list[str]:

@@ -57,7 +57,7 @@ class Report(Output):
 
     def watch(self, data: Data, done: Progress) -> None:
         """Write what no later step changes while the last pictures are drawn."""
-        if done == "runs":
+        if done == "maps":
             self._known = None
             with suppress(Exception):  # `finalize` says so, when the maps are written
                 self._known = _known(data, self.central_diameter)
@@ -72,7 +72,7 @@ class Report(Output):
 
 
 def _known(data: Data, central_diameter: float) -> dict[str, str]:
-    """The sections that are settled once all runs have ended."""
+    """The sections that are settled once all maps are made."""
     return {"results": results(data, central_diameter), "scene": _scene(data), "scans": _scans(data), "steps": _steps(data)}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -26,10 +25,7 @@ class TimeStreams(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
     knows_means: ClassVar[bool] = True
-    prepares_ahead: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
-    main_run_only: ClassVar[bool] = True
-    product_only: ClassVar[bool] = True
 
     streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
     """Streams to keep; those absent at this step are skipped and counted."""
@@ -81,12 +77,3 @@ class TimeStreams(Operator):
         kept: TimeStream | None = data.take(self.label)
         if kept is not None:
             data.products[kept.product] = kept
-
-    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
-        """The streams."""
-        kept: TimeStream | None = data.take(self.label)
-        return None if kept is None else kept.arrays()
-
-    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
-        """Keep those of the first part that has any."""
-        data.add(self.label, TimeStream.of(part))

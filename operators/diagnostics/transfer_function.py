@@ -35,7 +35,7 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.notebook import html_table
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
-from zonda.core.run.companion import Companion
+from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
@@ -48,7 +48,7 @@ class TransferFunction(Output):
     """Transfer function of the filters: the share of the sky that they leave in the map at each angular scale.
 
     The map of the sky alone is compared with the same map binned without filters: the ratio of their cross spectrum to the
-    spectrum of the latter, in rings of equal width in the logarithm of the scale. The two runs are made for this step, unless
+    spectrum of the latter, in rings of equal width in the logarithm of the scale. The two signals are made for this step, unless
     `runs` has them. Makes the product ``transfer_function`` (a `Transfer`), or one under this step's own name where it has one;
     where there is an output folder, it is written there as a table (ECSV).
     """
@@ -79,14 +79,14 @@ class TransferFunction(Output):
             raise ValueError("largest must be larger than smallest")
         return self
 
-    def needs(self) -> tuple[Companion, ...]:
+    def signals(self) -> tuple[Signal, ...]:
         """The sky alone through the filters, and without them."""
         modes: Literal["own", "full"] = "full" if self.modes == "full" else "own"
-        return Companion(only=["sky"], modes=modes), Companion(only=["sky"], modes=modes, filters="none")
+        return Signal(only=["sky"], modes=modes), Signal(only=["sky"], modes=modes, filters="none")
 
     def finalize(self, data: Data) -> None:
         """Compare the two maps. Raises PipelineError where there is none, or none that can be compared."""
-        after, before = (self._map(data, run) for run in self.runs)
+        after, before = (self._map(data, name) for name in self.shown)
         window = window_of(before, self.radius, self.taper, self.least_coverage)
         if not window.any():
             raise PipelineError("no pixel is left in the window", place=self.label, cure="choose a larger radius")
@@ -105,15 +105,15 @@ class TransferFunction(Output):
         data.tally.count(self.label, "rings without modes or power: NaN", empty)
         data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
         if self.modes == "full":
-            what = "of the complete data, which are the sky alone" if not self.runs[0] else "of the complete data"
+            what = "of the complete data, which are the sky alone" if not self.shown[0] else "of the complete data"
             data.tally.state(self.label, "singular modes", what)
         key = self.name or ("transfer_function" if self.label == type(self).__name__ else self.label)
         data.products[key] = found
         if data.output is not None:
             found.write(product_path(data.output, key, ".ecsv"), data.provenance)
 
-    def _map(self, data: Data, run: str) -> MapProduct:
-        product = data.products.get(f"{run}/{self.map}" if run else self.map)
+    def _map(self, data: Data, name: str) -> MapProduct:
+        product = data.products.get(product_name(stream_of(name), self.map))
         if not isinstance(product, MapProduct):
             raise PipelineError(
                 f"there is no map {self.map!r}", place=self.label, cure="set map to BinMap's product, or BinMap.product to map"

@@ -11,7 +11,7 @@ G is never formed (`gram`); the modes are iterated (`lanczos`) until
 The detectors' mean (`method: mean`) is found in one reading (`focal_plane_mean`), so that the stream may be larger than memory
 and disk; the iteration needs it whole.
 
-The u_i depend on A. Frozen, those of the complete data A act on another stream B (the sky alone):
+The u_i depend on A. With `modes: full` those of the complete data A act on another signal B (the sky alone):
 
     B <- B - sum_i u_i (B^T u_i)^T.                                                                          (3)
 
@@ -34,6 +34,7 @@ from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
 from zonda.core.operator import Operator
+from zonda.core.signal import MAIN
 from zonda.core.types import Floats
 
 from . import focal_plane_mean
@@ -50,15 +51,13 @@ ROUNDING = 2.0**-24 / np.sqrt(3.0)
 class CommonModeFilter(Operator):
     """Remove the first singular modes of each scan: equation (1). Flagged samples and detectors take no part.
 
-    Detectors whose signal is not finite are flagged, and those whose signal is constant: they are dead. In a run without noise
-    (the sky alone) a constant signal is that of a detector that sees nothing: a valid zero, which takes part. Flagged are then
-    those that were dead in the main run, where that has noise.
+    Detectors whose complete signal is not finite are flagged, and those whose complete signal is constant: they are dead. In a
+    scene of the sky alone a constant signal is a valid zero, which takes part.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     knows_means: ClassVar[bool] = True
-    prepares_ahead: ClassVar[bool] = True
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
 
@@ -82,13 +81,14 @@ class CommonModeFilter(Operator):
             raise ValueError(f"{sorted(of_svd)[0]} belongs to method: svd; the detectors' mean is exact and always determined")
         return self
 
-    def prepare(self, observation: Observation) -> Modes:
-        """Empty modes, filled by `measure`."""
-        return Modes(np.zeros((0, observation.n_detectors)), np.zeros((0, observation.n_samples)))
+    def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
+        """Find the modes; given those of the complete signal (``model``), what they are in this one.
 
-    def measure(self, stream: Stream, state: Modes) -> None:
-        """Find the modes. Raises PipelineError where float32 cannot carry the remainder."""
+        Raises PipelineError where float32 cannot carry the remainder.
+        """
         observation, tally, who = stream.observation, stream.observation.tally, self.label
+        if model is not None:
+            return Modes(model.detectors, self._times(stream, model.detectors))
         place = f"{who}, {observation.name}"
         if stream.means.get("signal") is not None and stream.dtype != np.float64:
             raise PipelineError(
@@ -101,12 +101,11 @@ class CommonModeFilter(Operator):
             gram, found = self._mean(stream)
         else:
             with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-                gram = Gram(stream, pool, noiseless=self._same_as_main(observation))
-                self._flag(gram, observation)
+                gram = Gram(stream, pool, noiseless=_sees_nothing(stream))
+                self._flag(gram, stream)
                 found = lanczos(gram, self.modes, self.residual, None if self.on_undetermined == "remove" else self.gap)
                 found.count = self._choose(found, gram, observation)
         count = found.count
-        state.detectors, state.times = found.detectors[:count], found.times[:count]
         sizes = np.sqrt(np.maximum(found.values[: self.modes + 1], 0.0) / max(1, gram.n_good * gram.n_used))
         values = ", ".join(f"{s:.4g}" for s in sizes)
         worst = found.residuals[:count].max(initial=0.0)
@@ -114,34 +113,25 @@ class CommonModeFilter(Operator):
         tally.state(who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps")
         tally.state(who, f"{observation.name}: modes removed", f"{count} ({found.what})")
         self._check_precision(found, count, gram, stream, place)
+        return Modes(found.detectors[:count], found.times[:count])
 
-    def _flag(self, found: Gram | Usable, observation: Observation) -> None:
-        for name, dead in (("not finite", found.not_finite), ("constant", found.constant)):
-            observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
-            observation.detector_flags[dead] |= DEAD
-        if not _noiseless(observation):
-            # the main run comes first; of companion runs with noise none says which are dead in it
-            observation.resolved.setdefault(f"{self.label}: dead", found.not_finite | found.constant)
-
-    def _same_as_main(self, observation: Observation) -> bool:
-        """Whether the run has no noise; detectors that were dead in a main run that has it are then flagged."""
-        if not _noiseless(observation):
-            return False
-        dead = observation.resolved.get(f"{self.label}: dead")
-        if dead is not None:
-            observation.tally.count(self.label, "detectors flagged: dead in the main run", int(dead.sum()))
-            observation.detector_flags[dead] |= DEAD
-        return True
+    def _flag(self, found: Gram | Usable, stream: Stream) -> None:
+        """Flag dead detectors: the complete signal shows which they are."""
+        observation = stream.observation
+        if stream.signal == MAIN:
+            for name, dead in (("not finite", found.not_finite), ("constant", found.constant)):
+                observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
+                observation.detector_flags[dead] |= DEAD
 
     def _mean(self, stream: Stream) -> tuple[Usable, Ritz]:
         """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
         observation = stream.observation
-        noiseless, good = self._same_as_main(observation), observation.good_samples
+        noiseless, good = _sees_nothing(stream), observation.good_samples
         usable = Usable(observation.good_detectors, int(good.sum()))
         reading = focal_plane_mean.read(stream, usable.use, good)
         if usable.judge(reading.sums, reading.squares, noiseless):
             reading = focal_plane_mean.read(stream, usable.use, good)
-        self._flag(usable, observation)
+        self._flag(usable, stream)
         if usable.n_good == 0:
             found = Ritz.nothing(usable.use.size, stream.shape[1])
         else:
@@ -154,23 +144,17 @@ class CommonModeFilter(Operator):
         observation.tally.count(self.label, kept, 1 - found.count)
         return usable, found
 
-    def freeze(self, state: Modes) -> Floats:
-        """The modes over detectors, (k, n_det)."""
-        return state.detectors
-
-    def measure_frozen(self, stream: Stream, state: Modes, frozen: Floats) -> None:
+    def _times(self, stream: Stream, modes: Floats) -> Floats:
         """Equation (3): v_i = B^T u_i."""
-        use, good = np.asarray(frozen.any(axis=0)), stream.observation.good_samples
+        use, good = np.asarray(modes.any(axis=0)), stream.observation.good_samples
         if self.method == "mean":
             total = focal_plane_mean.read(stream, use, good).total
-            times = [total * u.max(initial=0.0) for u in frozen]
+            times = [total * u.max(initial=0.0) for u in modes]
         else:
             with ThreadPoolExecutor(max(1, stream.threads)) as pool:
                 gram = Gram(stream, pool, use)
-                times = [gram.apply(u)[1] for u in frozen]
-        state.detectors, state.times = frozen, np.array(times).reshape(len(frozen), stream.shape[1])
-        what = f"{stream.observation.name}: modes removed"
-        stream.observation.tally.state(self.label, what, f"{len(frozen)} (those of the complete data)")
+                times = [gram.apply(u)[1] for u in modes]
+        return np.array(times).reshape(len(modes), stream.shape[1])
 
     def _choose(self, found: Ritz, gram: Gram, observation: Observation) -> int:
         """Number of modes to remove; may replace the modes by the detectors' mean."""
@@ -214,9 +198,10 @@ class CommonModeFilter(Operator):
             _remove(signal, u[block.detectors], v[block.samples])
 
 
-def _noiseless(observation: Observation) -> bool:
-    """Whether all that the run in progress simulates is the sky."""
-    return bool(observation.components) and observation.components <= OF_THE_SKY
+def _sees_nothing(stream: Stream) -> bool:
+    """Whether a constant signal may be that of a detector in order: where it is the sky alone, or not the complete signal, which
+    shows what is dead."""
+    return stream.signal != MAIN or (bool(stream.components) and stream.components <= OF_THE_SKY)
 
 
 @dataclass

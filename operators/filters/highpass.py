@@ -34,7 +34,6 @@ class HighpassFilter(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     knows_means: ClassVar[bool] = True
-    prepares_ahead: ClassVar[bool] = True
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
@@ -102,7 +101,3 @@ class HighpassFilter(Operator):
         plan, bad = state
         spoilt = plan.apply(block.detdata["signal"], bad)
         block.observation.tally.count(self.label, SPOILT, spoilt)
-
-    def keep_out(self, observation: Observation, state: tuple[HighpassPlan, NDArray[np.intp]]) -> bool | None:
-        """True where samples were not finite: they were bridged, which a run that has them would not do."""
-        return True if observation.tally.get(self.label, SPOILT) else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
@@ -67,9 +66,7 @@ class SaveTOD(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
-    provides: ClassVar[frozenset[str]] = frozenset({"tod_file"})
     knows_means: ClassVar[bool] = True
-    main_run_only: ClassVar[bool] = True
 
     format: Literal["hdf5", "fits"] = "hdf5"
     """File format: hdf5 (TOAST's layout) or fits (binary tables)."""
@@ -139,15 +136,6 @@ class SaveTOD(Operator):
         except InputError as err:
             observation.tally.state(self.label, "weather is not written", str(err).splitlines()[0])
             return None
-
-    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
-        """The names of the files."""
-        files: Files | None = data.take(self.label)
-        return None if files is None else files.arrays()
-
-    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
-        """Add to the list of files."""
-        data.add(self.label, Files.of(part))
 
     def discard(self, observation: Observation, state: _State) -> None:
         state.writer.close()

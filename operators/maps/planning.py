@@ -26,9 +26,10 @@ class BinMapPlanning(Planning[BinMap]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        n = self.operator.n_pixels
+        n = self.operator.grid.n_pixels
         return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9))
 
     def memory(self, observation: Observation) -> int:
-        """Sums of two threads, their total, two halves, the product; and the pointing, twice while it is laid out."""
-        return 128 * self.operator.n_pixels + 150 * observation.n_samples
+        """Sums of two threads, two halves, the products of all signals; and the pointing, twice while it is laid out."""
+        others = len(observation.signals) - 1
+        return (128 + 72 * others) * self.operator.grid.n_pixels + 150 * observation.n_samples

@@ -34,8 +34,6 @@ class PinkNoise(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"pink"})
-    prepares_ahead: ClassVar[bool] = True
-    only_tells: ClassVar[bool] = True
 
     net: KelvinRootSecond | None = Field(None, ge=0)
     """White level that the knee refers to; None: that of `WhiteNoise`, or the instrument's where there is none."""

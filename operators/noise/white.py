@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numba import uint64
@@ -41,8 +40,6 @@ class WhiteNoise(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"white"})
-    prepares_ahead: ClassVar[bool] = True
-    only_tells: ClassVar[bool] = True
 
     net: KelvinRootSecond | None = Field(None, ge=0)
     """Noise-equivalent temperature: the rms of one second of integration; None: the instrument's."""
@@ -66,10 +63,6 @@ class WhiteNoise(Operator):
         for observation in data.observations:
             level = NoiseLevel(self.model or FixedNet.of(self.net, self.reference), self.scatter, self.label)
             observation.noise_levels.setdefault(self.label, level)
-
-    def agree(self, data: Data, before: Mapping[str, Any] | None = None) -> None:
-        """See `observe`."""
-        self.observe(data)
 
     def prepare(self, observation: Observation) -> _State:
         """Resolve the level."""

@@ -12,6 +12,7 @@ M, tens of kelvin, stays beside the stream as a float64 `SmoothField`; everythin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -29,9 +30,12 @@ from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
 from zonda.core.operator import Operator
-from zonda.core.types import Floats
+from zonda.core.types import AnyFloats, Floats
 
 from .quotient import AT_ONCE, knots_of, quotient
+
+KNOWN = frozenset({"atmosphere", "transmission", "white", "pink"})
+"""Components at the detector that equation (1) names."""
 
 
 class Efficiency(Operator):
@@ -39,7 +43,6 @@ class Efficiency(Operator):
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     knows_means: ClassVar[bool] = True
-    prepares_ahead: ClassVar[bool] = True
     linear: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
 
@@ -108,15 +111,17 @@ class Efficiency(Operator):
             )
         signal = block.buffer("signal", shape)
         absent = np.empty((0, 0), block.dtype)
-        nothing = Series(absent, 0, np.ones(1, block.dtype))
-        divisor = mean = nothing
-        noisy = any(name in have for name in ("atmosphere", "white", "pink"))
+        divisor = mean = Series(absent, 0, np.ones(1, block.dtype))
+        own = None if block.components and "atmosphere" not in block.components else state.mean
+        sky = _sum(block, "sky", [n for n in block.entering("above the atmosphere") if n not in ("sky", "transmission")])
+        pink = _sum(block, "pink", [n for n in block.entering("at the detector") if n not in KNOWN])
+        noisy = pink.size > 0 or any(name in have for name in ("atmosphere", "white"))
         if state.transmission is not None and noisy:
             divisor = state.transmission.series(rows, block.samples, signal.dtype)
         instantaneous = self.calibration == "instantaneous" and "transmission" in have
-        if instantaneous and state.mean is not None:
-            mean = state.mean.series(rows, block.samples, signal.dtype)
-        streams = [have.get(name, absent) for name in ("sky", "transmission", "atmosphere", "white", "pink")]
+        if instantaneous and own is not None:
+            mean = own.series(rows, block.samples, signal.dtype)
+        streams = [sky, *(have.get(name, absent) for name in ("transmission", "atmosphere", "white")), pink]
         first = np.array([block.samples.start, divisor.first, mean.first], np.int64)
         smooth = divisor.lines, divisor.inside, mean.lines, mean.inside
         factors = np.array([a[rows] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
@@ -125,10 +130,24 @@ class Efficiency(Operator):
             block.observation.tally.count(
                 self.label, f"samples whose fluctuating e^-tau was raised to {LEAST_TRANSMISSION:g}", clipped
             )
+        for name in block.entering("calibrated"):
+            signal += have[name]
         have["signal"] = signal
         block.means.pop("signal", None)
-        if state.mean is not None:
-            block.means["signal"] = state.mean
+        if own is not None:
+            block.means["signal"] = own
+
+
+def _sum(block: Block, name: str, others: Sequence[str]) -> AnyFloats:
+    """A stream and others that enter where it does; without rows where there are none."""
+    names = [n for n in (name, *others) if n in block.detdata]
+    if len(names) < 2:
+        return block.detdata[names[0]] if names else np.empty((0, 0), block.dtype)
+    total = block.buffer(f"{name} and others", block.shape)
+    total[...] = block.detdata[names[0]]
+    for other in names[1:]:
+        total += block.detdata[other]
+    return total
 
 
 @dataclass(frozen=True)
@@ -168,6 +187,10 @@ def _calibrate(sky, wet, air, white, pink, first, divisor, inside, mean, mean_in
             w = white[d, begin : begin + m] if white.shape[0] else nothing[:m]
             p = pink[d, begin : begin + m] if pink.shape[0] else nothing[:m]
             row = out[d, begin : begin + m]
+            if not noisy and not at_once:
+                for t in range(m):
+                    row[t] = gain[d] * s[t] * (one + x[t])
+                continue
             scale[:] = one
             if divisor.shape[0]:
                 series_into(divisor[d], cell, inside, start + begin, scale[:m])

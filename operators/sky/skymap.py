@@ -20,6 +20,7 @@ from zonda.core.hooks import manager
 from zonda.core.maps.image import Image
 from zonda.core.numerics.projection import share_outside
 from zonda.core.operator import Operator
+from zonda.core.product import Product
 from zonda.core.storage.fits_image import Cards
 from zonda.core.types import Floats
 
@@ -42,6 +43,25 @@ LARGE = 1 << 26
 """Bytes of a file above which the progress bar shows that it is read."""
 
 
+class InputImage(Product):
+    """The input of the first observation."""
+
+    def __init__(self, image: Image) -> None:
+        self.image = image
+
+    def __iadd__(self, other: InputImage) -> InputImage:
+        return self
+
+    def arrays(self) -> Mapping[str, Any]:
+        """See `Product.arrays`."""
+        return {"values": self.image.values, "header": dict(self.image.header.items())}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any]) -> InputImage:
+        """See `Product.of`."""
+        return cls(Image(arrays["values"], Cards(arrays["header"].items())))
+
+
 class SkyMap(Operator):
     """Signal of the sky above the atmosphere (K_RJ), from a FITS or HEALPix map: averaged over the band, convolved with the beam.
 
@@ -52,9 +72,6 @@ class SkyMap(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
-    prepares_ahead: ClassVar[bool] = True
-    only_tells: ClassVar[bool] = True
-    same_in_all_runs: ClassVar[bool] = True
 
     file: InputPath
     """FITS image (with or without a celestial WCS) or HEALPix table. A relative path starts at the pipeline file's folder."""
@@ -163,24 +180,21 @@ class SkyMap(Operator):
             )
         if behind:
             observation.tally.count(self.label, "samples more than 90 deg from the input map's centre", behind, total)
-        first = data.products.get("input")  # of the first observation, and of the first SkyMap in the pipeline
-        key = "input" if first is None or first.header.get("OPERATOR") == self.label else f"input.{self.label}"
-        if key not in data.products:
-            data.products[key] = state.sky.image(self.label)
+        if self.label not in data.partial:
+            image = state.sky.image(self.label)
+            data.add(self.label, InputImage(image))
+            if not data.laid_out:  # pictures of it may be begun
+                self._show(data, image)
 
-    def pack(self, data: Data, first: bool) -> Mapping[str, Any] | None:
-        """The input of the very first observation."""
-        for key in ("input", f"input.{self.label}"):
-            image = data.products.get(key)
-            if image is not None and image.header.get("OPERATOR") == self.label:
-                del data.products[key]
-                wanted = first and not data.run
-                return {"key": key, "values": image.values, "header": dict(image.header.items())} if wanted else None
-        return None
+    def finalize(self, data: Data) -> None:
+        """Keep the input of the first observation as the product ``input``, or ``input.LABEL`` of a further map."""
+        found = data.take(self.label)
+        if found is not None:
+            self._show(data, found.image)
 
-    def merge(self, data: Data, part: Mapping[str, Any]) -> None:
-        """Put it among the products."""
-        data.products.setdefault(part["key"], Image(part["values"], Cards(part["header"].items())))
+    def _show(self, data: Data, image: Image) -> None:
+        taken = "input" in data.products and data.products["input"].header.get("OPERATOR") != self.label
+        data.products.setdefault(f"input.{self.label}" if taken else "input", image)
 
     # -- what planning looks at, too --
 

@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from zonda.core.run.companion import Companion
 
 import zonda
 from zonda.core.errors import ZondaError
@@ -16,7 +17,6 @@ from zonda.core.plan.audit import Checked, audit
 from zonda.core.plan.context import Depth
 from zonda.core.plan.only import only
 from zonda.core.plan.whole import NAME
-from zonda.core.run.companion import Companion
 
 SCENE = """
 site: chajnantor

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from zonda.core.run.companion import Companion
 
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.operator import Operator
@@ -10,7 +11,6 @@ from zonda.core.output import Output
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.planner import plan
 from zonda.core.plan.structure import prune, selected
-from zonda.core.run.companion import Companion
 
 
 def kind(name, requires=(), provides=(), optional=(), base=Operator, **attributes):

@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from zonda.core.run.derived import derivable
 
 import zonda
 from zonda.core.data import Block, Data
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Part, Pipeline
-from zonda.core.run.derived import derivable
 from zonda.plugins.checks import scenes
 from zonda.plugins.checks.scenes import camera, scan, sky_file
 

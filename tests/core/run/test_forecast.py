@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from zonda.core.run.forecast import BASE, forecast, need, room
 
 from tests.core.run.test_execution import CHAIN, Demean, Level, Scale, Sink, Source, execute, observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.run.forecast import BASE, forecast, need, room
 from zonda.core.run.settings import Settings
 
 

@@ -7,14 +7,14 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from pydantic import PrivateAttr
+from zonda.core.run.companion import Companion
+from zonda.core.run.frozen import Frozen
 
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError, ZondaError
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.core.run.companion import Companion
-from zonda.core.run.frozen import Frozen
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap

@@ -5,6 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from zonda.core.run.forecast import forecast, spares
+from zonda.core.run.layout import Layout
+from zonda.core.run.repeated import Repeated, affordable, alike
 
 import zonda
 from tests.core.run.test_derived import BOTH, FILTERS, MAP, SKY, Several, observed, steps
@@ -16,9 +19,6 @@ from zonda.core.numerics import chunks
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.planner import plan
 from zonda.core.run import repeated
-from zonda.core.run.forecast import forecast, spares
-from zonda.core.run.layout import Layout
-from zonda.core.run.repeated import Repeated, affordable, alike
 from zonda.core.run.settings import Settings
 
 RUNS = {"sky": SKY, "own": {"only": ["sky"]}, "unfiltered": {"only": ["sky"], "filters": "none"}}

@@ -1,0 +1,70 @@
+"""Kinds of steps that the executor treats in a way of their own: map makers, and the step that makes the sky the signal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from .block import Block
+from .operator import Operator
+from .output import Output
+from .signal import BUILT_IN, MAIN, Component
+
+
+class MapMaker(Operator):
+    """A step that makes products of every signal: its `exec` sees all of them, under the names `Block.signals`.
+
+    Where it is `linear`, the product of a remainder is subtracted (`core.product.Product.subtract`), not simulated.
+    """
+
+
+class SkySignal(Operator):
+    """Makes the sky the signal: there is nothing to calibrate where no step makes anything else.
+
+    The pipeline puts it before the first step that reads ``signal``, where no step provides that and all that is provided up to
+    there is ``sky``. It is not one of the pipeline's own steps.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"sky"})
+    provides: ClassVar[frozenset[str]] = frozenset({MAIN})
+    linear: ClassVar[bool] = True
+    knows_means: ClassVar[bool] = True
+
+    @property
+    def label(self) -> str:
+        """In timings."""
+        return "(sky as signal)"
+
+    def exec(self, block: Block, state: Any) -> None:
+        block.new(MAIN, zero=False)[...] = block.detdata["sky"]
+        if "sky" in block.means:
+            block.means[MAIN] = block.means["sky"]
+
+
+def place_of_signal(operators: Sequence[Operator]) -> int | None:
+    """Index of the first step that reads ``signal`` where the sky alone is to be the signal, else None."""
+    if any(forms(o) for o in operators):
+        return None
+    for index, operator in enumerate(operators):
+        if MAIN in operator.requires:
+            made = set().union(*(o.provides for o in operators[:index])) - {"boresight"}
+            return index if made == {"sky"} else None
+    return None
+
+
+def forms(operator: Operator) -> bool:
+    """Whether it makes signals of their components."""
+    return MAIN in operator.provides and MAIN not in operator.requires
+
+
+def filters(operator: Operator) -> bool:
+    """Whether it changes signals."""
+    return MAIN in operator.provides and MAIN in operator.requires
+
+
+def makes_products(operator: Operator) -> bool:
+    """Whether all that it makes are products in memory: map makers, spectra. (What a step writes while it runs, it does not
+    provide.)"""
+    streams = {"boresight", *BUILT_IN, MAIN}
+    names = operator.provides
+    return bool(names) and not any(n in streams or isinstance(n, Component) for n in names) and not isinstance(operator, Output)

@@ -1,0 +1,363 @@
+"""The schedule of one observation: its segments, what becomes of the streams between them, and the blocks that are cut.
+
+It is made once for an observation, without running or allocating anything, and then followed; the forecast of a run is the
+schedule that would be followed with its budget.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..block import STREAMS
+from ..errors import PipelineError
+from ..mapmaker import MapMaker, forms
+from ..numerics.tiles import TILE_DETECTORS
+from ..observation import Observation
+from ..operator import Operator
+from ..plan.planning import planning_of
+from ..signal import MAIN, Formed, is_signal
+from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, whole_span
+from .settings import Held, Settings
+from .streams import DISK_RATE, SAMPLE_COST, WORTH_MEASURING, Source, Stage, choose, disk_rate
+from .whole import knows_means, may_have_means, names_of
+
+SCRATCH_STREAMS = 2
+"""Block-sized arrays assumed for operators' own scratch when the budget is divided."""
+
+COMPLETE = (Formed(MAIN, frozenset()),)
+"""The complete signal alone."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The steps that act on an observation, and the signals that they make.
+
+    Attributes
+    ----------
+    steps
+        In order.
+    signals
+        Those that are formed, the complete one first.
+    components
+        Names of all streams that become part of a signal.
+    keep
+        Streams that the user asked for.
+    """
+
+    steps: Sequence[Operator]
+    signals: tuple[Formed, ...] = COMPLETE
+    components: frozenset[str] = frozenset()
+    keep: tuple[str, ...] = ()
+
+    def expanded(self, names: Collection[str]) -> frozenset[str]:
+        """Names of streams, with those of all signals in place of ``signal``."""
+        return frozenset(names) | {s.stream for s in self.signals} if MAIN in names else frozenset(names)
+
+    @property
+    def read(self) -> frozenset[str]:
+        """Names of the streams that are of use: what steps read in `Operator.exec`, and what is to be kept."""
+        names = frozenset(self.keep)
+        for step in self.steps:
+            if type(step).exec is not Operator.exec:
+                names |= self.of(step, self.signals) if forms(step) else step.requires | step.optional
+        return self.expanded(names - {"boresight"})
+
+    def of(self, step: Operator, signals: Collection[Formed]) -> frozenset[str]:
+        """Names of the streams that a step which forms signals reads for these."""
+        unknown = not self.components
+        parts = frozenset[str]().union(*(s.components for s in signals))
+        return frozenset(n for n in step.requires | step.optional | parts if unknown or n in parts or n not in self.components)
+
+    def needed_for(self, signals: Collection[Formed]) -> list[Operator]:
+        """The steps up to the one that forms signals, without those that make nothing for these."""
+        found: list[Operator] = []
+        names = frozenset[str]()
+        last = next(k for k, o in enumerate(self.steps) if forms(o))
+        for step in reversed(self.steps[: last + 1]):
+            if forms(step):
+                names |= self.of(step, signals)
+            elif step.provides & names:
+                names |= step.requires | step.optional
+            else:
+                continue
+            found.insert(0, step)
+        return found
+
+
+@dataclass
+class Planned:
+    """A segment as it will be carried out.
+
+    Attributes
+    ----------
+    stage
+        Names and sizes; its streams are empty.
+    how, why
+        What becomes of the streams that it makes new.
+    held
+        Bytes of streams that are held beside it.
+    """
+
+    stage: Stage
+    how: Held = "kept"
+    why: str = ""
+    held: int = 0
+
+    @property
+    def segment(self) -> Segment:
+        """Its steps."""
+        return self.stage.segment
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Names of the streams that it passes on."""
+        return self.stage.wanted
+
+
+@dataclass
+class Schedule:
+    """What is done with one observation, and what that takes.
+
+    Attributes
+    ----------
+    planned
+        The segments in order.
+    made_again
+        Signals that are passed to map makers as they were formed, made again from their components where they are mapped.
+    bytes, least
+        Bytes that streams and blocks take at once; the least budget that would do.
+    elsewhere
+        Streams that are kept nowhere or on disk, in words.
+    again
+        How many times more the operators, by label, act whose streams are made again when they are read.
+    """
+
+    chain: Chain
+    observation: Observation
+    settings: Settings
+    planned: list[Planned] = field(default_factory=list)
+    made_again: tuple[Formed, ...] = ()
+    bytes: int = 0
+    least: int = 0
+    elsewhere: tuple[str, ...] = ()
+    again: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.streams, self.means = self.chain.read, self.chain.expanded(may_have_means(self.chain.steps))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(detectors, samples) of the observation."""
+        return self.observation.n_detectors, self.observation.n_samples
+
+    @property
+    def stream_size(self) -> int:
+        """Bytes of a whole stream."""
+        return self.shape[0] * self.shape[1] * np.dtype(self.settings.dtype).itemsize
+
+    def blocks(self, planned: Planned) -> list[tuple[slice, slice]]:
+        """The blocks in which a segment works.
+
+        Raises
+        ------
+        PipelineError
+            Where the least one does not fit.
+        """
+        stage, held = planned.stage, planned.held
+        rows, columns = least_block(stage.span, self.shape)
+        share = self._share(stage, held)
+        if rows * columns > share:
+            settings, need = self.settings, self._least_blocks(stage)
+            raise PipelineError(
+                f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on each of {settings.threads} "
+                f"threads, the memory budget has {(settings.memory - held) / 1e6:.1f} MB for all of them",
+                place=self.observation.name,
+                cure=f"raise --memory to {self._ceiling_for(need + held)}, use fewer --threads, or make the scan shorter",
+            )
+        return list(blocks(stage.span, stage.in_time_order, self.shape, share))
+
+    # ---- made once
+
+    def make(self, cost: Callable[[Planned], float] | None) -> None:
+        """Walk through the segments. ``cost`` as in `schedule`."""
+        steps = self.chain.steps
+        ordered = [o.label for o in steps if planning_of(o).in_time_order(self.observation)]
+        segments = cut(steps, self.observation, ordered)
+        self.made_again = self._made_again(segments)
+        apart = {s.stream for s in self.made_again}
+        source, held, elsewhere, again = Source(), 0, list[str](), dict[str, int]()
+        for number, segment in enumerate(segments):
+            later = segments[number + 1 :]
+            wanted = frozenset(self.chain.keep).union(*(o.requires | o.optional for s in later for o in s.operators))
+            made = source.names.union(*(self.chain.expanded(o.provides) for o in segment.operators))
+            stage = Stage(segment, source, made & self.chain.expanded(wanted) & self.streams - apart)
+            new = stage.wanted if segment.halo else stage.wanted - (frozenset() if source.stage else source.names)
+            size, how, why = len(new) * self.stream_size, "kept", ""
+            planned = Planned(stage)
+            if later and new and not self._keeps(stage, size, held, later):
+                how, why = self._where(planned, sorted(new), size, held, later, cost)
+                elsewhere += [f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}" for name in sorted(new)]
+            planned.how, planned.why = how, why  # type: ignore[assignment]
+            self.planned.append(planned)
+            if how == "again":
+                times = self._readings(later)
+                again.update(
+                    {o.label: max(times, again.get(o.label, 0)) for o in segment.operators if not isinstance(o, MapMaker)}
+                )
+                source = Source({}, stage, stage.wanted)
+                continue
+            size = 0 if how == "spilled" else size
+            planned.held = held + (size if later else 0)
+            smallest = self._least_blocks(stage)
+            largest = max(self._largest_blocks(stage, planned.held), smallest)
+            self.bytes, self.least = max(self.bytes, held + size + largest), max(self.least, smallest)
+            held = planned.held
+            source = Source(names=stage.wanted)
+        self.elsewhere, self.again = tuple(elsewhere), again
+
+    def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
+        """Unfiltered signals, where a filter measures whole streams on the way to the maps, and blocks are not bound to a
+        span."""
+        unfiltered = tuple(s for s in self.chain.signals if not s.filtered)
+        if not unfiltered:
+            return ()
+        before = [k for k, s in enumerate(segments) if any(forms(o) for o in s.operators)]
+        mapped = [k for k, s in enumerate(segments) if any(isinstance(o, MapMaker) for o in s.operators)]
+        spans = {o.couples for o in self.chain.needed_for(unfiltered)}
+        return unfiltered if before and mapped and min(mapped) > before[0] and spans == {"sample"} else ()
+
+    def _keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
+        """Whether ``size`` bytes of streams beside those held stay in memory: in half of it, and leave room for blocks."""
+        following = Stage(later[0], Source(names=stage.wanted), frozenset())
+        least = max(self._least_blocks(stage), self._least_blocks(following))
+        return held + size <= min(self.settings.memory // 2, self.settings.memory - least)
+
+    def _where(
+        self,
+        planned: Planned,
+        new: list[str],
+        size: int,
+        held: int,
+        later: list[Segment],
+        cost: Callable[[Planned], float] | None,
+    ) -> tuple[Held, str]:
+        """What becomes of streams that do not fit in memory beside ``held`` bytes, and why."""
+        stage, following = planned.stage, later[0]
+        head, span = following.operators[0], stage.span
+        hindrance = ""
+        if head.couples == "all" and not planning_of(head).sweeps(self.observation):
+            hindrance = f"{head.label} reads it as a whole"
+        elif {span, following.span} == {"time", "detectors"}:
+            hindrance = f"{head.label} needs the other direction whole"
+        # what is made in order of time at little cost would cost much in any other
+        slow = stage.in_time_order and whole_span(following.span, span) == "time"
+        rate, sample_cost = DISK_RATE, SAMPLE_COST
+        if cost is not None and size >= WORTH_MEASURING and not hindrance:
+            rate, sample_cost = disk_rate(), cost(planned)
+        return choose(
+            f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
+            size,
+            spill_seconds=2 * size / rate,
+            readings=self._readings(later),
+            again_seconds=self.shape[0] * self.shape[1] * sample_cost / self.settings.threads,
+            hindrance=hindrance,
+            prefer="spilled" if slow else self.settings.prefer,
+            refusal=(self.observation.name, self._ceiling_for(2 * (held + size))),
+        )
+
+    def _readings(self, later: Sequence[Segment]) -> int:
+        """How often, beyond once, the segments to come read what is passed on to the first of them."""
+        heads = [s.operators[0] for s in later]
+        swept = sum(planning_of(o).sweeps(self.observation) for o in heads if o.couples == "all")
+        swept *= sum(s.filtered for s in self.chain.signals)
+        return swept + round(2 * later[0].halo / PIECE + 0.4)
+
+    # ---- sizes of blocks
+
+    def _least_blocks(self, stage: Stage) -> int:
+        """Bytes of the smallest blocks, on all threads."""
+        rows, columns = least_block(stage.span, self.shape)
+        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
+
+    def _largest_blocks(self, stage: Stage, held: int) -> int:
+        """Bytes of the blocks that would be cut beside ``held`` bytes of streams, on all threads."""
+        share = max(self._share(stage, held), 1)
+        first = next(iter(blocks(stage.span, stage.in_time_order, self.shape, share)))
+        rows, columns = (s.stop - s.start for s in first)
+        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
+
+    def _share(self, stage: Stage, held: int) -> int:
+        """Samples that a block may hold beside ``held`` bytes of streams: within half of the budget, or all that is left."""
+        settings, (whole, part) = self.settings, self._streams_in_block(stage)
+        rows, columns = least_block(stage.span, self.shape)
+        each = settings.threads * np.dtype(settings.dtype).itemsize
+        share = block_share(settings.memory // 2 // each, whole, part)
+        return share if share >= rows * columns else block_share((settings.memory - held) // each, whole, part)
+
+    def _bytes(self, stage: Stage, block: int, piece: int) -> int:
+        whole, part = self._streams_in_block(stage)
+        return self.settings.threads * np.dtype(self.settings.dtype).itemsize * (whole * block + part * piece)
+
+    def _streams_in_block(self, stage: Stage | None) -> tuple[int, int]:
+        """Numbers of block-sized and of piece-sized arrays that a stage and those before it hold."""
+        if stage is None:
+            return 0, 0
+        first, rest = stage.segment.split()
+        expanded = self.chain.expanded
+        names = set(stage.source.names | stage.wanted).union(*(expanded(o.requires | o.optional | o.provides) for o in rest))
+        every = names.union(*(expanded(o.requires | o.optional | o.provides) for o in first)) if first else set()
+        before = self._streams_in_block(stage.source.stage)
+        whole, part = len(names & self.streams), len(every & self.streams)
+        scratch = SCRATCH_STREAMS if rest else 0
+        margins = 2 if stage.segment.halo else 1  # a block with margins is trimmed to a copy
+        whole, part = margins * whole + scratch, part + (SCRATCH_STREAMS if first else 0)
+        return before[0] + whole + self._copies(rest), max(before[1], part + self._copies(first))
+
+    def _copies(self, operators: Sequence[Operator]) -> int:
+        """Arrays of the run's precision that whole streams and one mean take, float64, where a step does not know of means."""
+        each = 8 // np.dtype(self.settings.dtype).itemsize
+        paying = [o for o in operators if (o.requires | o.optional) & self.means and not knows_means(o)]
+        return each * (1 + max(len(names_of(o) & self.streams) for o in paying)) if paying else 0
+
+    def _ceiling_for(self, need: int) -> str:
+        """``--memory`` with which streams and blocks may take ``need`` bytes."""
+        settings = self.settings
+        fixed = max(settings.asked - settings.memory, 0) if settings.asked else 0
+        return f"{-(-(need + fixed) * 21 // 20_000_000)}MB"
+
+
+def schedule(
+    chain: Chain, observation: Observation, settings: Settings, cost: Callable[[Planned], float] | None = None
+) -> Schedule:
+    """The schedule of an observation.
+
+    ``cost``: measures what a sample of a segment costs (CPU s); None: nothing is tried, neither operators nor the disk.
+
+    Raises
+    ------
+    PipelineError
+        Where a stream fits neither in memory nor on the disk and cannot be made again.
+    """
+    made = Schedule(chain, observation, settings)
+    made.make(cost)
+    return made
+
+
+def spares(chain: Chain, observation: Observation, settings: Settings, size: int) -> bool:
+    """Whether streams and blocks do the same with ``size`` bytes less than ``settings.memory``."""
+    if settings.memory <= size:
+        return False
+    less = replace(settings, memory=settings.memory - size)
+    try:
+        with_all, with_less = (schedule(chain, observation, s) for s in (settings, less))
+    except PipelineError:  # a stream would go to a disk that has no room for it
+        return False
+    return with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
+
+
+def unused(name: str) -> bool:
+    """Whether a stream is nothing but a component or a signal: its only use is to be read by a later step."""
+    return name in STREAMS or is_signal(name)

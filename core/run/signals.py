@@ -1,0 +1,204 @@
+"""Which signals a pipeline makes, of which components, and which of them follow from others.
+
+With the complete data's modes and the same transmission of the atmosphere (``modes: full``) a pipeline of linear steps is a
+linear map L of the components. For a signal of the components C and others of P_1, P_2 ..., which together are all the rest,
+
+    L(C) = L(all) - L(P_1) - L(P_2) - ...                                                                        (1)
+
+Such a *remainder* is neither formed nor filtered: its sums in the pixels of a map are those of the complete signal minus those of
+the others, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+from ..configuration.diagnostics import nearest
+from ..errors import PipelineError
+from ..mapmaker import MapMaker, SkySignal, filters, forms, place_of_signal
+from ..operator import Operator
+from ..output import Output
+from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, stream_of
+
+MOST_PARTS = 4
+"""Signals that may be taken from the complete one: each adds its rounding."""
+
+
+class Signals:
+    """The signals of a pipeline.
+
+    Parameters
+    ----------
+    operators
+        The pipeline's steps, named.
+    runs
+        Signals by name, those of the pipeline file. What outputs need (`Output.signals`) is added.
+    only
+        Components that the complete signal is narrowed to (``--only``); empty: all.
+    place
+        The pipeline's name, for errors.
+
+    Raises
+    ------
+    PipelineError
+        For a signal that cannot be made of these steps.
+
+    Attributes
+    ----------
+    all
+        By name (empty: the complete one).
+    formed
+        Those that are made of their components, the complete one first.
+    remainders
+        By name of the others: the names of the signals that are taken from the complete one, equation (1).
+    unmodelled
+        Why signals with ``modes: full`` have modes of their own; empty: they have not.
+    """
+
+    def __init__(self, operators: Sequence[Operator], runs: Mapping[str, Signal], only: Sequence[str], place: str) -> None:
+        self.operators, self.runs, self._place = list(operators), dict(runs), place
+        self._generators = _generators(operators)
+        former = next((o for o in operators if forms(o)), None)
+        self._inputs = frozenset[str]() if former is None else (former.requires | former.optional) - {"boresight"}
+        self.components = frozenset[Component]().union(*(self.components_of(o) for o in self._generators))
+        self._only = Signal(only=list(only)) if only else None
+        for name, signal in self.runs.items():
+            if not name.isidentifier() or name.startswith("_"):
+                cure = "use letters, digits and underscores, the first a letter"
+                raise PipelineError(f"{name!r} cannot name a run", place=place, cure=cure)
+            self._check_components(signal, f"run {name} names")
+        if self._only:
+            self._check_components(self._only, "--only names")
+            self.runs = {name: s for name, s in self.runs.items() if self._is_left(s)}
+        self._add_needed()
+        stranger = next((o.label for o in operators if filters(o) and not o.linear), "")
+        self.unmodelled = f"{stranger} is not linear" if stranger else ""
+        self.all = {name: self._formed(name, signal) for name, signal in [("", None), *self.runs.items()]}
+        self.remainders = {} if stranger else self._remainders()
+        self.formed = tuple(f for name, f in self.all.items() if name not in self.remainders)
+
+    # ---- steps
+
+    @property
+    def steps(self) -> list[Operator]:
+        """The operators that act on observations, in order."""
+        steps = [o for o in self.operators if not isinstance(o, Output) and "boresight" not in o.provides]
+        if place_of_signal(self.operators) is not None:
+            steps.insert(place_of_signal(steps) or 0, SkySignal())
+        return steps
+
+    def makers(self, name: str) -> frozenset[str]:
+        """Labels of the steps whose components a signal consists of."""
+        signal = self.runs[name] if name else None
+        return frozenset(o.label for o in self._generators if self._keeps(signal, o))
+
+    def components_of(self, operator: Operator) -> frozenset[Component]:
+        """The components that a step makes: those of `core.signal`, and what the step that forms the signal reads."""
+        known = {*BUILT_IN, *(c for c in operator.provides if isinstance(c, Component))}
+        made = operator.provides & (known | self._inputs)
+        named = {c: c for c in known}
+        return frozenset(named.get(name) or Component(name) for name in made)  # type: ignore[call-overload]
+
+    # ---- what a signal is
+
+    def _keeps(self, signal: Signal | None, operator: Operator) -> bool:
+        within = self._only is None or self._only.keeps(operator.provides)
+        return within and (signal is None or signal.keeps(operator.provides))
+
+    def _formed(self, name: str, signal: Signal | None) -> Formed:
+        kept = [o for o in self._generators if self._keeps(signal, o)]
+        components = frozenset[Component]().union(*(self.components_of(o) for o in kept))
+        model = signal is not None and signal.modes == "full"
+        if signal is not None and model and TRANSMISSION not in (signal.without or ()):
+            components |= {c for c in self.components if c == TRANSMISSION}
+        filtered = signal is None or signal.filters == "all"
+        return Formed(stream_of(name), components, model and not self.unmodelled and len(kept) < len(self._generators), filtered)
+
+    def _is_left(self, signal: Signal) -> bool:
+        """Whether a signal is another than the narrowed complete one, and not empty."""
+        kept = [o for o in self._generators if self._keeps(signal, o)]
+        every = [o for o in self._generators if self._keeps(None, o)]
+        return bool(kept) and (len(kept) < len(every) or signal.filters == "none")
+
+    def _check_components(self, signal: Signal, who: str) -> None:
+        for what in [*(signal.only or ()), *(signal.without or ())]:
+            if what not in self.components:
+                cure = nearest(what, sorted(self.components)) or f"choose from: {', '.join(sorted(self.components))}"
+                raise PipelineError(f"{who} {what!r}, which no step provides", place=self._place, cure=cure)
+
+    def _add_needed(self) -> None:
+        """Find for each output the signals that it reads; add those that are not there."""
+        for operator in self.operators:
+            if not isinstance(operator, Output):
+                continue
+            names = []
+            for wanted in operator.signals():
+                self._check_components(wanted, f"{operator.label} needs")
+                kind = self._kind(wanted)
+                same = [name for name, signal in self.runs.items() if self._kind(signal) == kind]
+                if kind == self._kind(None):
+                    names.append("")
+                elif same:
+                    names.append(same[0])
+                else:
+                    parts = [*(wanted.only or ["without", *(wanted.without or ())])]
+                    parts += ["unfiltered"] * (wanted.filters == "none") + ["full"] * (wanted.modes == "full")
+                    names.append("_" + "_".join(parts))
+                    self.runs[names[-1]] = wanted
+            operator._shown = tuple(names)
+
+    def _kind(self, signal: Signal | None) -> tuple[frozenset[str], bool, bool]:
+        """What tells signals apart: steps of components, filters, whether modes and transmission are the complete data's."""
+        kept = frozenset(o.label for o in self._generators if self._keeps(signal, o))
+        changing = [o for o in self.operators if filters(o)]
+        filtered = signal is None or signal.filters == "all" or not changing
+        full = signal is not None and signal.modes == "full" and len(kept) < len(self._generators)
+        gone = any(TRANSMISSION in o.provides and o.label not in kept for o in self._generators)
+        return kept, filtered, full and (gone or any(o.couples == "all" for o in changing))
+
+    # ---- remainders
+
+    def _remainders(self) -> dict[str, tuple[str, ...]]:
+        makers = [o for o in self.operators if isinstance(o, MapMaker)]
+        if not all(o.linear for o in makers) or not all(o.linear for o in self.operators if forms(o)):
+            return {}
+        every = self.makers("")
+        made = {name: self.makers(name) for name in self.runs if self._fits(name)}
+        found: dict[str, tuple[str, ...]] = {}
+        taken: set[str] = set()
+        for name in sorted(made, key=lambda n: -len(made[n])):
+            if name in taken:
+                continue
+            rest = every - made[name]
+            others = [other for other in made if other != name and other not in found and made[other] <= rest]
+            for parts in (p for n in range(1, MOST_PARTS + 1) for p in combinations(others, n)):
+                if sum(len(made[p]) for p in parts) == len(rest) and frozenset().union(*(made[p] for p in parts)) == rest:
+                    found[name] = parts
+                    taken.update(parts)
+                    break
+        return found
+
+    def _fits(self, name: str) -> bool:
+        """Whether a signal is a term of equation (1)."""
+        signal, kept = self.runs[name], self.makers(name)
+        names_it = TRANSMISSION in [*(signal.only or ()), *(signal.without or ())]
+        narrowed = self._only is not None
+        whole = kept == self.makers("")
+        return signal.modes == "full" and signal.filters == "all" and not names_it and bool(kept) and not whole and not narrowed
+
+
+def _generators(operators: Sequence[Operator]) -> list[Operator]:
+    """The steps that make components: those before ``signal`` is formed, pointing apart."""
+    found = []
+    for operator in operators:
+        if MAIN in operator.provides | operator.requires:
+            break
+        if operator.provides and "boresight" not in operator.provides:
+            found.append(operator)
+    return found
+
+
+def remainder(parts: Sequence[str]) -> str:
+    """How a remainder follows, e.g. ``the complete signal minus noiseless``."""
+    return f"the complete signal minus {' and '.join(parts)}"

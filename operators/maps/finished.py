@@ -1,0 +1,97 @@
+"""Makes the map of a signal from its sums."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.chunks import empty
+from zonda.core.tally import Tally
+from zonda.core.types import Floats
+
+from .grid import Grid, TangentGrid
+from .map_sums import MapSums
+from .parameters import MapParameters
+from .sums import DATA, HITS, NOISE, VALUE, WEIGHT, WEIGHTS, Sums
+
+AT_ONCE = 1 << 15
+"""Pixels whose maps are made at a time: what is only used for a moment stays in the cache."""
+
+
+def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: MapSums, stream: str) -> MapProduct:
+    """The map of the signal ``stream``."""
+    n, variance = grid.n_pixels, layout["variance"]
+    unit = variance if step.weights == "inverse_variance" else 1.0
+    hits, signal, weight, noise = (empty((n, 1), kind).reshape(n) for kind in (np.int64, float, float, float))
+    halves = step.half_difference and len(sums.scans) >= 2 and step.contents == "all"
+    half = empty((n, 1), float).reshape(n) if halves else None
+    for start in range(0, n, AT_ONCE):
+        part = slice(start, start + AT_ONCE)
+        total = sums.total(stream, part)
+        hits[part] = total[:, HITS]
+        if step.contents == "hits":
+            signal[part], noise[part], weight[part] = np.nan, np.nan, hits[part] / unit
+            continue
+        signal[part], w = _mean(total)
+        weight[part], noise[part] = w / unit, _noise(total, signal[part], w, variance, step.noise == "scatter")
+        if half is not None:
+            (even, w_even), (odd, w_odd) = (_mean(sums.half(stream, k, part)) for k in (0, 1))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                half[part] = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
+    image = isinstance(grid, TangentGrid)
+    keep = slice(None) if image else hits > 0
+    planes: list[NDArray[Any]] = [signal, hits, weight, noise] + ([half] if half is not None else [])
+    planes = [plane[keep].reshape(grid.shape if isinstance(grid, TangentGrid) else -1) for plane in planes]
+    common: dict[str, Any] = {
+        "frame": step.frame, "weighting": step.weights, "noise_from": step.noise, "fwhm": layout["fwhm"], "scans":
+        list(sums.scans), "centre": tuple(layout["middle"]), "half_difference": planes[4] if half is not None else None,
+        "contents": step.contents, "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
+    }  # fmt: skip
+    if isinstance(grid, TangentGrid):
+        header = grid.wcs.to_header(relax=True)
+        return MapProduct(planes[0], planes[1], planes[2], planes[3], header=header, pixel=grid.pixel, **common)
+    size = math.sqrt(4 * math.pi / (12 * grid.nside**2))
+    return MapProduct(
+        planes[0], planes[1], planes[2], planes[3], header=None, pixel=size, nside=grid.nside, nest=grid.nest,
+        pixels=grid.pixels_covered[keep], **common,
+    )  # fmt: skip
+
+
+def state_choices(step: MapParameters, product: MapProduct, sums: MapSums, tally: Tally) -> None:
+    """Tell how the map was made, and what is approximate about it."""
+    if step.noise == "scatter":
+        alone = int(np.count_nonzero(product.hits == 1))
+        tally.count(step.label, "pixels with one sample, whose scatter is unknown: noise NaN", alone)
+        equal = int(np.count_nonzero((product.hits > 1) & (product.noise == 0)))
+        tally.count(step.label, "pixels whose samples scatter by less than rounding: noise 0", equal)
+        if step.smooth is not None:
+            tally.count(step.label, "of them left out of the smoothed noise, which is too low around them", alone)
+    if sums.unknown_variance:
+        tally.state(step.label, "weights", "uniform: every NET is 0")
+    tally.state(step.label, "fixed-point step of the sums", f"{1 / VALUE:.1e} K per sample")
+    if step.half_difference and len(sums.scans) < 2:
+        tally.state(step.label, "half-difference", "not made: it needs two scans")
+
+
+def _mean(sums: Sums) -> tuple[Floats, Floats]:
+    """(signal, weight) of fixed-point sums (n_pixel, 4); NaN where there are no hits."""
+    weight = sums[:, WEIGHTS] / WEIGHT
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(sums[:, HITS] > 0, sums[:, DATA] / VALUE / weight, np.nan), weight
+
+
+def _noise(total: Sums, signal: Floats, weight: Floats, variance: float, scatter: bool) -> Floats:
+    """Standard deviation of each pixel's mean: from the NET, or from the scatter of the samples."""
+    term = total[:, NOISE] / WEIGHT * variance
+    hits = total[:, HITS]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if not scatter:
+            return np.where(hits > 0, np.sqrt(term) / weight, np.nan)
+        # equal samples leave the rounding of their squares, of either sign: a scatter below it is counted, and 0
+        found = np.maximum(term / weight - signal**2, 0.0)
+        return np.where(hits > 1, np.sqrt(found / (hits - 1)), np.nan)

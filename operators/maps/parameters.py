@@ -1,0 +1,82 @@
+"""The parameters of `BinMap`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.target import Target
+from zonda.core.configuration.units import Angle
+from zonda.core.mapmaker import MapMaker
+
+WIDEST_SMOOTH = 0.1
+"""FWHM of a map's smoothing, rad."""
+
+
+class MapParameters(MapMaker):
+    """Which map is made of the samples."""
+
+    pixel: Angle = quantity("2 arcsec", gt=0)
+    """Side of a pixel."""
+    width: Angle | None = Field(None, gt=0)
+    """Width of the map; where absent, it covers the scans."""
+    height: Angle | None = Field(None, gt=0)
+    """Height of the map; where absent, the width if that is given, else it covers the scans."""
+    centre: Target | None = None
+    """Centre of the map; where absent, the first scan's target."""
+    projection: Literal["TAN"] = "TAN"
+    """Projection of the image."""
+    frame: Literal["icrs", "galactic"] = "icrs"
+    """Celestial frame of the map."""
+    nside: int | None = Field(None, ge=1, le=2**20)
+    """Make a HEALPix map of this resolution (a power of two) instead of an image."""
+    ordering: Literal["ring", "nested"] = "ring"
+    """HEALPix pixel order."""
+    weights: Literal["uniform", "inverse_variance"] = "inverse_variance"
+    """Weigh samples alike, or by the inverse variance that follows from each detector's NET."""
+    noise: Literal["net", "scatter"] = "net"
+    """Noise of each pixel: from the detectors' NET, or from the scatter of its samples. From the NET also where the scene has no
+    white noise; the tally then says so."""
+    contents: Literal["all", "hits"] = "all"
+    """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
+    half_difference: bool = True
+    """Keep even and odd scans apart and make a noise map of their difference (needs two scans)."""
+    smooth: Angle | Literal["beam"] | None = None
+    """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam; the resolution is then that of both, added in
+    quadrature."""
+    product: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
+    """Name of the map among the products."""
+
+    @field_validator("nside")
+    @classmethod
+    def _power_of_two(cls, value: int | None) -> int | None:
+        if value is not None and value & (value - 1):
+            raise ValueError(f"nside must be a power of two, got {value}")
+        return value
+
+    @field_validator("centre")
+    @classmethod
+    def _on_the_sky(cls, value: Target | None) -> Target | None:
+        if value is not None and value.frame == "horizontal":
+            raise ValueError("the centre of a map must be fixed on the sky; give ICRS or galactic coordinates")
+        return value
+
+    @field_validator("smooth")
+    @classmethod
+    def _positive(cls, value: float | str | None) -> float | str | None:
+        if isinstance(value, float) and value <= 0:
+            raise ValueError("smooth must be positive; leave it out for no smoothing")
+        if isinstance(value, float) and value > WIDEST_SMOOTH:
+            raise ValueError(f"smooth must be at most {WIDEST_SMOOTH:g} rad (5.7 deg): the kernel would be wider than any map")
+        return value
+
+    @model_validator(mode="after")
+    def _one_grid(self) -> MapParameters:
+        image_only = {"pixel", "width", "height", "centre", "projection"} & self.model_fields_set
+        if self.nside is not None and image_only:
+            raise ValueError(f"{sorted(image_only)[0]} belongs to an image, nside to a HEALPix map; give one of them")
+        if self.nside is None and "ordering" in self.model_fields_set:
+            raise ValueError("ordering belongs to a HEALPix map; give nside too")
+        return self
