@@ -60,6 +60,12 @@ def _inverse_taps(reach: int) -> NDArray[np.float64]:
     return np.asarray(taps / (taps[0] + 2 * taps[1:].sum()), np.float64)
 
 
+def spline_basis(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The four cubic B-splines that reach a point of a cell, at ``u`` (n,), 0 to 1 of the way through it: (4, n)."""
+    v = 1.0 - u
+    return np.array([v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6])
+
+
 def coarse_times(n_samples: int, step: int) -> NDArray[np.int64]:
     """Sample indices (may be negative or past the end) of the coefficients that cover ``n_samples`` samples.
 

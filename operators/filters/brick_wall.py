@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from zonda.core.compilation.jit import nb
 from zonda.core.numerics.chunks import chunks, empty
-from zonda.core.numerics.smooth import product
+from zonda.core.numerics.smooth import product, spline_basis
 from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.numerics.transforms import cosine_transform, fast_length
 from zonda.core.types import AnyFloats
@@ -36,10 +36,10 @@ SHORTEST_STEP = 8
 """Samples per coarse knot below which the full DCT is cheaper and is used instead."""
 
 GROUP = 16
-"""Samples that are taken together: their low part comes from the same five knots, or six where knots lie closer."""
+"""Samples that are worked on together: five knots reach all of them, or six where knots lie closer."""
 
 FEW, CLOSE = 128, 1 << 12
-"""Cosines, and knots, up to which sums over them are quicker than transforms, and their matrices (4 MB) small."""
+"""Largest numbers of cosines and knots for which sums over them are faster than transforms, and their matrices small (4 MB)."""
 
 ABREAST = TILE_DETECTORS
 """Rows whose sums are formed side by side."""
@@ -115,10 +115,10 @@ class HighpassPlan:
     def _spread(self, rows: AnyFloats) -> AnyFloats:
         s = np.empty((len(rows), self.knots + 3))
         for start in range(0, len(rows), ABREAST):
-            some = rows[start : start + ABREAST]
+            part = rows[start : start + ABREAST]
             sums = np.zeros((self._columns, ABREAST))
-            _spread(some, self.first, self.weights(rows.dtype), sums)
-            s[start : start + ABREAST] = sums[: s.shape[1], : len(some)].T
+            _spread(part, self.first, self.weights(rows.dtype), sums)
+            s[start : start + ABREAST] = sums[: s.shape[1], : len(part)].T
         return s
 
     def _subtract(self, rows: AnyFloats, coarse: AnyFloats) -> None:
@@ -128,12 +128,12 @@ class HighpassPlan:
 
     @property
     def _columns(self) -> int:
-        """Of s and c, with those that weigh nothing."""
+        """Columns of s and c, with those of no weight."""
         return self.knots - 1 + self.taps
 
     def weights(self, kind: np.dtype[Any]) -> AnyFloats:
         """(n_group, taps, `GROUP`) of type ``kind``: B at the groups' knots at their samples; 0 past the end."""
-        with self._lock:  # threads that begin together make them once
+        with self._lock:
             if kind not in self._weights:
                 self._weights[kind] = _weights(self.n, self.knots, self.first, self.taps, kind)
         return self._weights[kind]
@@ -240,9 +240,7 @@ def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], AnyF
     """Each sample's interval (m,), counted from the first knot, and B at the four knots around it (4, m)."""
     position = (np.arange(samples.start, samples.stop) + 0.5) * (knots / n)
     cell = position.astype(np.int64)
-    u = position - cell
-    v = 1.0 - u
-    return cell, np.array([v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6])
+    return cell, spline_basis(position - cell)
 
 
 def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
@@ -255,10 +253,10 @@ def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
 def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]) -> AnyFloats:
     """See `HighpassPlan.weights`."""
     found: AnyFloats = empty((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
-    for some in chunks(first.size * GROUP):
-        cell, weights = _around(some, n, knots)
-        weights[:, max(n - some.start, 0) :] = 0.0
-        part = slice(some.start // GROUP, some.stop // GROUP)
+    for samples in chunks(first.size * GROUP):
+        cell, weights = _around(samples, n, knots)
+        weights[:, max(n - samples.start, 0) :] = 0.0
+        part = slice(samples.start // GROUP, samples.stop // GROUP)
         later, each = cell.reshape(-1, GROUP) - first[part, None], weights.reshape(4, -1, GROUP)
         for k in range(taps):
             found[part, k] = sum(np.where(later == k - j, each[j], 0.0) for j in range(max(0, k + 4 - taps), min(4, k + 1)))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
-from zonda.core.numerics.smooth import SmoothField, interpolating
+from zonda.core.numerics.smooth import SmoothField, interpolating, spline_basis
 from zonda.core.types import Floats
 
 AT_ONCE = 4096
@@ -91,26 +90,26 @@ def knots_of(field: SmoothField, step: int, offset: float = 0.0) -> Floats:
     ``step`` divides the field's own; all cells' edges (offset 0), or one point inside each (0 < offset < 1).
     """
     cells = -(-field.n_samples // step)
-    m, u, v = _cells(field, (np.arange(cells + (offset == 0), dtype=np.float64) + offset) * step)
-    value = (v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6)
-    return _sum(field, m, value)
+    m, u = _cells(field, (np.arange(cells + (offset == 0), dtype=np.float64) + offset) * step)
+    return _sum(field, m, spline_basis(u))
 
 
 def _end_slopes(field: SmoothField, step: int) -> Floats:
     """Derivatives of the node values per ``step`` at the first and at the last of `knots_of`: (n_node, 2)."""
-    m, u, v = _cells(field, np.array([0.0, -(-field.n_samples // step) * step]))
-    slope = (-v * v / 2, u * (3 * u - 4) / 2, -v * (3 * v - 4) / 2, u * u / 2)
+    m, u = _cells(field, np.array([0.0, -(-field.n_samples // step) * step]))
+    v = 1.0 - u
+    slope = np.array([-v * v / 2, u * (3 * u - 4) / 2, -v * (3 * v - 4) / 2, u * u / 2])
     return _sum(field, m, slope) * (step / field.step)
 
 
-def _cells(field: SmoothField, sample: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """The cells that samples lie in, how far into the cell they are (0 to 1), and how far from its end."""
+def _cells(field: SmoothField, sample: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """The cells that samples lie in, and how far into the cell they are (0 to 1)."""
     position = sample / field.step
     m = np.minimum(position.astype(np.int64), field.coefficients.shape[1] - 4)
-    return m, position - m, 1.0 - (position - m)
+    return m, position - m
 
 
-def _sum(field: SmoothField, m: NDArray[np.int64], weights: Sequence[Floats]) -> Floats:
+def _sum(field: SmoothField, m: NDArray[np.int64], weights: Floats) -> Floats:
     c = field.coefficients.astype(np.float64, copy=False)
     return np.asarray(sum(w * c[:, m + j] for j, w in enumerate(weights)))
 
