@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def blocks(language):
@@ -121,3 +121,15 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     left, _ = signal(demean)
     true = plain - plain.mean(axis=1, keepdims=True)
     assert np.abs(left - true).max() < 2.0**-24 * np.abs(true).max()
+
+
+def test_the_operator_that_contributing_shows_keeps_the_contract(tmp_path, monkeypatch):
+    import textwrap
+
+    import zonda.testing
+
+    text = re.search(r"   ```py\n(.*?)   ```", (ROOT / "CONTRIBUTING.md").read_text(), re.S)[1]
+    (tmp_path / "page_for_contributors.py").write_text(textwrap.dedent(text))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    page = importlib.import_module("page_for_contributors")
+    zonda.testing.check_operator(page.GainDrift(period="20 s"))
