@@ -1,9 +1,9 @@
-"""Processes that steps want, started before anything of the pipeline file but its text is looked at.
+"""Helper processes of operators, started before the pipeline file is parsed.
 
-A step names a function in the entry-point group ``zonda.processes`` under its own name; what the function returns has
-``close()``. It is called where a pipeline file seems to have that step and there is a second processor, and imports next to
-nothing: the process makes itself ready while this one imports, reads and plans. The step asks for it with `take`; what nobody
-took is closed.
+An operator registers a function in the entry-point group ``zonda.processes`` under its class name; what the function returns has
+``close()``. The function is called where a pipeline file seems to use the operator and there is a second processor. It should
+import next to nothing: the process gets ready while this one imports, reads and plans. The operator asks for the process with
+`take`; one that nobody took is closed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GROUP = "zonda.processes"
 
 
 class Process(Protocol):
-    """What runs beside this process."""
+    """A helper process."""
 
     def close(self) -> None:
         """End it."""
@@ -31,7 +31,7 @@ _waiting: dict[Callable[[], Any], Any] = {}
 
 
 def begin(path_or_name: str) -> None:
-    """Start what the steps of a pipeline file want; nothing where that is not to be had. Call `end` in any case."""
+    """Start the helper processes of a pipeline file's operators, as far as they can be found out. Always call `end`."""
     from .configuration.locate import locate, read
 
     with suppress(*RAISED):  # no such file, a broken plugin: whoever needs it says so
@@ -54,7 +54,7 @@ def take(start: Callable[[], P]) -> P:
 
 
 def end() -> None:
-    """Close what nobody took."""
+    """Close the helper processes that nobody took."""
     while _waiting:
         with suppress(*RAISED):
             _waiting.popitem()[1].close()

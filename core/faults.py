@@ -1,9 +1,9 @@
 """Errors of plugins: code of a plugin that raised, or left an invalid stream, is named.
 
-What a plugin raises is no user's mistake and no fault of zonda; it is told as one error that names the step, the function and the
-distribution. The traceback shows whose code it was, so that no call of a plugin needs to be guarded: not one of the methods of an
-operator, nor a noise model, a validator, a metric, in whatever thread it ran. ``sys.exit`` is such a fault, too: it would end the
-command as if all had gone well. Ctrl-C and signals are none, nor is a want of memory.
+What a plugin raises is neither a user's mistake nor a fault of zonda: it is reported as one error that names the step, the
+function and the distribution. The traceback shows whose code it was, so that no call of a plugin needs to be guarded: neither the
+methods of an operator, nor a noise model, a validator or a metric, in whatever thread it ran. ``sys.exit`` in a plugin is such a
+fault, too: it would end the command as if all had gone well. Ctrl-C, signals and lack of memory are not.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def faults_named(*, exceptions: bool = True) -> Iterator[None]:
 
 
 def fault(err: BaseException) -> PluginError | None:
-    """What to tell of an exception that came through plugin code; None where it did not.
+    """The error to report for an exception that came through plugin code; None where it did not.
 
     A plugin's own command is not zonda's to judge: it is called by click, not by zonda.
     """

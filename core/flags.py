@@ -49,7 +49,7 @@ SAMPLE_FLAGS = (
     Flag(IRREGULAR, "irregular", "no regular scan: an elevation nod", True, IRREGULAR),
     Flag(SUN_UP, "sun up", "the Sun is above the horizon", False, SUN_UP),
     Flag(SUN_CLOSE, "sun close", "the Sun is near", False, SUN_CLOSE),
-    Flag(OPAQUE, "opaque", "the air lets nothing through in the band of a detector", True, INVALID),
+    Flag(OPAQUE, "opaque", "the atmosphere is opaque in the band of a detector", True, INVALID),
     Flag(NOT_RECORDED, "not recorded", "in a gap of a recorded scan, or its row is not a number", True, INVALID),
 )
 """Of samples (`Observation.flags`)."""
@@ -57,7 +57,7 @@ DETECTOR_FLAGS = (
     Flag(INVALID, "invalid", "do not use", True, INVALID),
     Flag(PROCESSING, "processing", "left out by a step", True, PROCESSING),
     Flag(SOLAR_SYSTEM_OBJECT, "solar-system object", "a planet is in the beam", True, SOLAR_SYSTEM_OBJECT),
-    Flag(OPAQUE, "opaque", "the air lets nothing through in its band most of the time", True, INVALID),
+    Flag(OPAQUE, "opaque", "the atmosphere is opaque in its band most of the time", True, INVALID),
     Flag(DEAD, "dead", "its signal is constant or not finite", True, INVALID),
 )
 """Of detectors (`Observation.detector_flags`)."""

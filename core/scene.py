@@ -35,7 +35,8 @@ class Scene(Parameters):
     """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or {az: 180 deg, el: 60 deg};
     in a pipeline file also map, the centre of the input map."""
     weather: Annotated[SerializeAsAny[WeatherSource], BeforeValidator(weather_source)] | None = None
-    """The air: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: air.csv}; None: the climatology's median."""
+    """The atmosphere: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: air.csv}; None: the
+    climatology's median."""
     seed: int = Field(0, ge=0, lt=2**63)
     """Root of every random stream; the same seed gives the same bits."""
 
@@ -65,6 +66,6 @@ def elsewhere(scene: Scene) -> str:
     if distance < NEAR:
         return ""
     return (
-        f"{telescope.name} stands at {home.name}, {distance / 1e3:.0f} km away: here it looks through the air of "
+        f"{telescope.name} stands at {home.name}, {distance / 1e3:.0f} km away: here it looks through the atmosphere of "
         f"{scene.site.name}; write 'site: {telescope.site}' for its own"
     )

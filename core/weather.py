@@ -1,4 +1,4 @@
-"""What the scene says of the weather: a source of air, and how much water is in it."""
+"""The weather of a scene: where the state of the atmosphere comes from, and how much water vapour it holds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 PWV_MAX = 60e-3
-"""m: more water than any air on Earth holds above a telescope."""
+"""m: more water vapour than any atmosphere on Earth holds above a telescope."""
 
 SHORTHAND = {"file": "era5", "table": "table"}
 """Keys that name their source by themselves; where there is none, and no `source`, it is the climatology."""
@@ -96,7 +96,7 @@ class GroundWeather:
 
 @dataclass(frozen=True)
 class Column:
-    """The air above a place on levels, from the lowest up: what a weather source delivers.
+    """The atmosphere above a place on levels, from the lowest up: what a weather source delivers.
 
     Attributes
     ----------
@@ -113,9 +113,9 @@ class Column:
         Standard deviation of ln(PWV) below and above its median, as shares of what ``log_vapour_spread`` would give if all
         levels varied together; None: 0.77 both.
     ground_temperature
-        K of the air on the ground, where an inversion lies there that the levels do not resolve; None: as the levels have it.
+        K on the ground, where an inversion lies there that the levels do not resolve; None: as the levels have it.
     stated
-        One line for the reports: where this air comes from.
+        One line for the reports: where these levels come from.
     """
 
     pressure: Array
@@ -140,13 +140,13 @@ class WeatherSource(Parameters):
     source: str = ""
     """Registered name of the source: `climatology`, `era5`, `table`, `standard`, or a plugin's."""
     pwv: Pwv | None = None
-    """Water at zenith: a value (1.2 mm), a quantile for the season and hour (25 %), or random; None: as the source has it."""
+    """PWV at zenith: a value (1.2 mm), a quantile for the season and hour (25 %), or random; None: as the source has it."""
     wind: Literal["typical", "median", "random"] = "typical"
     """Of a source that knows the spread of the winds: the median speed along the median direction, the medians of the
     components (slower), or a draw with the scene's seed."""
 
     def column(self, site: Site, time: Instant) -> Column:
-        """The air above ``site`` at ``time``.
+        """The atmosphere above ``site`` at ``time``.
 
         Raises
         ------

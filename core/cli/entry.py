@@ -92,18 +92,18 @@ def _stoppable() -> Iterator[None]:
 def _plain_warnings() -> Iterator[None]:
     """Warnings as one line without the source that raised them.
 
-    One that differs in its figures alone from one before is not shown: the first look at a pipeline has told it already.
+    A warning that differs from an earlier one in its figures alone is not shown again.
     """
     usual, usual_show = warnings.formatwarning, warnings.showwarning
-    told: set[str] = set()
+    shown: set[str] = set()
 
     def one_line(message: Any, category: Any, filename: str, lineno: int, line: str | None = None) -> str:
         return f"warning: {message}\n"
 
     def show(message: Any, *place: Any, **more: Any) -> None:
         text = _FIGURES.sub("#", str(message))
-        if text not in told:
-            told.add(text)
+        if text not in shown:
+            shown.add(text)
             usual_show(message, *place, **more)
 
     warnings.formatwarning, warnings.showwarning = one_line, show

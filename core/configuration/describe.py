@@ -30,14 +30,13 @@ _WORDS: dict[Any, str] = {
 
 def choices(field: FieldInfo) -> tuple[Any, ...]:
     """The values of a Literal that a parameter takes; empty where it takes others."""
-    return tuple(dict.fromkeys(v for t in _types(field.annotation) if get_origin(t) is Literal for v in get_args(t)))
+    return tuple(dict.fromkeys(v for t in types_in(field.annotation) if get_origin(t) is Literal for v in get_args(t)))
 
 
 def kind(field: FieldInfo) -> str:
     """What a parameter takes: a kind of quantity with an example, its choices, or a type in words."""
     members = _members(field)
-    metadata = [*field.metadata, *(m for t in _types(field.annotation) for m in getattr(t, "__metadata__", ()))]
-    unit = next((m for m in metadata if isinstance(m, Unit)), None)
+    unit = unit_of(field)
     words = [f"{unit.kind.noun} such as '{unit.example}'"] if unit and float in members else []
     chosen = [repr(value) for value in choices(field)]
     words += [f"{', '.join(chosen[:-1])} or {chosen[-1]}" if len(chosen) > 1 else chosen[0]] if chosen else []
@@ -51,6 +50,12 @@ def kind(field: FieldInfo) -> str:
         elif isinstance(member, type) and member in _WORDS and not (unit and member is float):
             words.append(_WORDS[member])
     return ", or ".join(dict.fromkeys(words)) or "see below"
+
+
+def unit_of(field: FieldInfo) -> Unit | None:
+    """The unit that a parameter is annotated with."""
+    everything = [*field.metadata, *(m for t in types_in(field.annotation) for m in getattr(t, "__metadata__", ()))]
+    return next((m for m in everything if isinstance(m, Unit)), None)
 
 
 def document(cls: type[BaseModel]) -> str:
@@ -80,7 +85,7 @@ def written_choices(field: FieldInfo) -> str:
         return ""
     others = [m for m in _members(field) if m is not NoneType and get_origin(m) is not Literal]
     named = f"one of {', '.join(chosen)}" if len(chosen) > 1 else chosen[0]
-    if any(get_origin(t) is Literal for other in others for t in _types(other)):
+    if any(get_origin(t) is Literal for other in others for t in types_in(other)):
         named, others = f"one or several of {', '.join(chosen)}", []
     return f"Or {named}." if others else f"{named[0].upper()}{named[1:]}{'.' if len(chosen) > 1 else ' only.'}"
 
@@ -100,8 +105,9 @@ def _members(field: FieldInfo) -> tuple[Any, ...]:
     return tuple(get_args(m)[0] if get_origin(m) is Annotated else m for m in members)
 
 
-def _types(annotation: Any) -> Iterator[Any]:
+def types_in(annotation: Any) -> Iterator[Any]:
+    """An annotation and all types that it is made of."""
     yield annotation
     if get_origin(annotation) is not Literal:
         for argument in get_args(annotation):
-            yield from _types(argument)
+            yield from types_in(argument)

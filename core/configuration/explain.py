@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from typing import Any, get_args
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from .describe import types_in, unit_of
 from .diagnostics import ConfigurationError, Diagnostic, nearest
 from .docstrings import described
 from .units import Unit
@@ -70,10 +71,11 @@ def explain(
     python
         Whether it was called in Python: cures are then written so.
     """
+    validated = _Validated(model, document, at, who, list(keys), python)
     found: list[Diagnostic] = []
     branches: dict[Span, int] = {}
     for e in error.errors():
-        new = _one(e, model, document, at, who, keys, python)
+        new = validated.diagnostic(e)
         if new.span not in branches or e["type"] in ("missing", "extra_forbidden"):
             branches[new.span] = len(found)
             found.append(new)
@@ -108,60 +110,81 @@ def _missing(diagnostic: Diagnostic) -> str:
     return diagnostic.message.rpartition(" needs ")[2]
 
 
-def _one(e: Any, model: type[BaseModel], document: Document, at: Path, who: str, keys: Iterable[str], python: bool) -> Diagnostic:
-    path, loc = at, []
-    kind, context = e["type"], e.get("ctx", {})
-    for part in e["loc"][:-1] if kind == "missing" else e["loc"]:  # leaves out tags of unions
-        if (*path, part) in document.marks:
-            path = (*path, part)
-            loc.append(part)
-    mark = document.marks[path]
-    if kind == "extra_forbidden":
-        owner, _ = _field(model, loc[:-1])
-        options = list(keys if keys and len(loc) == 1 else (owner or model).model_fields)
-        inside = who if len(loc) == 1 else f"{who}, {'.'.join(map(str, loc[:-1]))}"
-        name = e["loc"][-1]
-        meant = SYNONYMS.get(str(name).lower(), "")
-        hint = glued(name, options) or (
-            f"did you mean '{meant}'?" if meant in options else nearest(name, options, "not a known key")
-        )
-        message = f"unknown {'parameter' if python else 'key'} '{e['loc'][-1]}' for {inside}"
-        return Diagnostic(message, mark.start, hint, f"{inside} takes: {', '.join(options)}")
-    if kind == "missing":
-        name = str(e["loc"][-1])
-        _, field = _field(model, [*loc, name])
-        unit = _unit(field)
-        if python and not loc:
+@dataclass(frozen=True)
+class _Validated:
+    """What was validated, and where it stands: the arguments of `explain`."""
+
+    model: type[BaseModel]
+    document: Document
+    at: Path
+    who: str
+    keys: list[str]
+    python: bool
+
+    def diagnostic(self, e: Any) -> Diagnostic:
+        """One of pydantic's errors."""
+        path, loc = self.at, []
+        for part in e["loc"][:-1] if e["type"] == "missing" else e["loc"]:  # leaves out tags of unions
+            if (*path, part) in self.document.marks:
+                path = (*path, part)
+                loc.append(part)
+        if e["type"] == "extra_forbidden":
+            return self.unknown(e["loc"][-1], loc, self.document.marks[path].start)
+        if e["type"] == "missing":
+            return self.missing(str(e["loc"][-1]), loc, self.document.marks[path].start)
+        return self.value(e, path, loc)
+
+    def name(self, loc: list[Any]) -> str:
+        """How messages call what is at ``loc``."""
+        return f"{self.who}, {'.'.join(map(str, loc))}" if loc else self.who
+
+    def unknown(self, key: Any, loc: list[Any], span: Span) -> Diagnostic:
+        owner, _ = _field(self.model, loc[:-1])
+        options = list(self.keys if self.keys and len(loc) == 1 else (owner or self.model).model_fields)
+        meant = SYNONYMS.get(str(key).lower(), "")
+        hint = f"did you mean '{meant}'?" if meant in options else nearest(key, options, "not a known key")
+        inside = self.name(loc[:-1])
+        message = f"unknown {'parameter' if self.python else 'key'} '{key}' for {inside}"
+        return Diagnostic(message, span, glued(key, options) or hint, f"{inside} takes: {', '.join(options)}")
+
+    def missing(self, name: str, loc: list[Any], span: Span) -> Diagnostic:
+        _, field = _field(self.model, [*loc, name])
+        unit = unit_of(field) if field else None
+        if self.python and not loc:
             label = f"add {name}={unit.example!r}" if unit and unit.unit else f"add {name}={unit.example if unit else '...'}"
         else:
             label = f"add '{name}: {unit.example}'" if unit else f"add '{name}:'"
-        inside = f"{who}, {'.'.join(map(str, loc))}" if loc else who
-        return Diagnostic(f"{inside} needs '{name}'", mark.start, label, _description(field))
-    _, field = _field(model, loc)
-    if isinstance(inner := context.get("error"), ConfigurationError) and inner.diagnostics:  # a call within
-        first = inner.diagnostics[0]
-        where = f"{who}, {'.'.join(map(str, loc))}" if loc else who
-        return Diagnostic(f"{where}: {first.message}", mark.value, first.label, first.help)
-    span, label = mark.value, context.get("label") or ""
-    if caret := context.get("caret"):
-        offset, length = caret
-        span = span.inner(offset + 1, length) if python and isinstance(e["input"], str) else span.part(offset, length)
-    message = str(context.get("error") or e["msg"])
-    if kind in _LIMITS:
-        message = _limit(e, _unit(field), document, path)
-    elif kind == "literal_error":
-        message = f"must be {context.get('expected', '')}, got {e['input']!r:.60}"
-        label = nearest(e["input"], re.findall(r"'([^']*)'", context.get("expected", "")))
-    elif kind == "string_pattern_mismatch":
-        message = f"{e['input']!r:.60} has a character that is not allowed here"
-        label = "use letters, digits and '_'" + (", '.', '+', '-' and spaces within" if " " in context.get("pattern", "") else "")
-    elif kind.endswith(("_parsing", "_type", "_from_float")) and kind.split("_")[0] in _WANTED and e["msg"].startswith("Input"):
-        wanted = _WANTED[kind.split("_")[0]]
-        message = f"expected {_IN_PYTHON.get(wanted, wanted) if python else wanted}, got {e['input']!r:.60}"
-    message = message[:1].lower() + message[1:] if not message[:2].isupper() else message
-    where = f"{who}, {'.'.join(map(str, loc))}" if loc else who
-    text = "\n".join(filter(None, (context.get("help"), _description(field))))
-    return Diagnostic(f"{where}: {message}", span, label, text)
+        return Diagnostic(f"{self.name(loc)} needs '{name}'", span, label, _description(field))
+
+    def value(self, e: Any, path: Path, loc: list[Any]) -> Diagnostic:
+        _, field = _field(self.model, loc)
+        context, span = e.get("ctx", {}), self.document.marks[path].value
+        if isinstance(inner := context.get("error"), ConfigurationError) and inner.diagnostics:  # a call within
+            first = inner.diagnostics[0]
+            return Diagnostic(f"{self.name(loc)}: {first.message}", span, first.label, first.help)
+        if caret := context.get("caret"):
+            quoted = self.python and isinstance(e["input"], str)
+            span = span.inner(caret[0] + 1, caret[1]) if quoted else span.part(*caret)
+        message, label = self.message(e, unit_of(field) if field else None, path)
+        message = message[:1].lower() + message[1:] if not message[:2].isupper() else message
+        text = "\n".join(filter(None, (context.get("help"), _description(field))))
+        return Diagnostic(f"{self.name(loc)}: {message}", span, label, text)
+
+    def message(self, e: Any, unit: Unit | None, path: Path) -> tuple[str, str]:
+        """(message, label) for a mistaken value."""
+        kind, context, given = e["type"], e.get("ctx", {}), f"{e['input']!r:.60}"
+        if kind in _LIMITS:
+            return _limit(e, unit, self.document, path), ""
+        if kind == "literal_error":
+            expected = context.get("expected", "")
+            return f"must be {expected}, got {given}", nearest(e["input"], re.findall(r"'([^']*)'", expected))
+        if kind == "string_pattern_mismatch":
+            within = ", '.', '+', '-' and spaces within" if " " in context.get("pattern", "") else ""
+            return f"{given} has a character that is not allowed here", f"use letters, digits and '_'{within}"
+        wanted = _WANTED.get(kind.split("_")[0])
+        if wanted and kind.endswith(("_parsing", "_type", "_from_float")) and e["msg"].startswith("Input"):
+            return f"expected {_IN_PYTHON.get(wanted, wanted) if self.python else wanted}, got {given}", ""
+        return str(context.get("error") or e["msg"]), context.get("label") or ""
 
 
 def glued(key: object, options: Iterable[str]) -> str:
@@ -193,21 +216,8 @@ def _field(model: type[BaseModel], loc: Iterable[Any]) -> tuple[type[BaseModel] 
     for part in loc:
         if owner is not None and part in owner.model_fields:
             field = described(owner)[part]
-            owner = next((t for t in _types(field.annotation) if isinstance(t, type) and issubclass(t, BaseModel)), None)
+            owner = next((t for t in types_in(field.annotation) if isinstance(t, type) and issubclass(t, BaseModel)), None)
     return owner, field
-
-
-def _unit(field: FieldInfo | None) -> Unit | None:
-    if field is None:
-        return None
-    everything = [*field.metadata, *(m for t in _types(field.annotation) for m in getattr(t, "__metadata__", ()))]
-    return next((m for m in everything if isinstance(m, Unit)), None)
-
-
-def _types(annotation: Any) -> Iterator[Any]:
-    yield annotation
-    for argument in get_args(annotation):
-        yield from _types(argument)
 
 
 def _description(field: FieldInfo | None) -> str:

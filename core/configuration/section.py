@@ -26,7 +26,7 @@ class Section:
     def mistakes(
         document: Document, value: Any, known: list[Diagnostic], check: Callable[[Document], list[Diagnostic]]
     ) -> list[Diagnostic]:
-        """All mistakes of a document: ``known`` ones, perhaps told better, and those in the section's ``value``.
+        """All mistakes of a document: ``known`` ones, perhaps reworded, and those in the section's ``value``.
 
         ``check`` lists the mistakes of a document without the section.
         """

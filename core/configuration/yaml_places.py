@@ -36,7 +36,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of a source; lines and columns count from 0, the end is exclusive."""
+    """A part of a source; lines and columns count from 0, the end is exclusive."""
 
     source: Source
     line: int = 0
@@ -45,7 +45,7 @@ class Span:
     end_column: int = 1
 
     def part(self, offset: int, length: int) -> Span:
-        """``length`` characters from ``offset`` on, where the stretch lies on one line and is not quoted."""
+        """``length`` characters from ``offset`` on, where the span lies on one line and is not quoted."""
         rows = self.source.text.splitlines()
         first = rows[self.line][self.column : self.column + 1] if self.line < len(rows) else ""
         if self.line != self.end_line or first in ("'", '"'):

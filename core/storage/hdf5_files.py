@@ -38,7 +38,7 @@ def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> It
 
 def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
     """Let a process of its own look at the file first (`hdf5_survey`). `InputError` where that hangs, crashes or fails."""
-    with open(path, "rb"):  # not there, not readable: told as it is
+    with open(path, "rb"):  # not there, not readable: OSError says so
         pass
     command = children.command("zonda.core.storage.hdf5_survey", "main", os.path.abspath(os.fspath(path)))
     try:

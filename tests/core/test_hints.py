@@ -130,7 +130,7 @@ def test_check_warns_of_a_telescope_on_another_site(tmp_path: Path, capsys: pyte
     (tmp_path / "p.yaml").write_text(PIPELINE.format(site="mauna_kea", instrument="mustang2"))
     assert main(["check", str(tmp_path / "p.yaml")]) == 0
     error = capsys.readouterr().err
-    assert "warning: GBT stands at green_bank, 7430 km away: here it looks through the air of mauna_kea" in error
+    assert "warning: GBT stands at green_bank, 7430 km away: here it looks through the atmosphere of mauna_kea" in error
     assert "write 'site: green_bank' for its own" in error
     (tmp_path / "p.yaml").write_text(PIPELINE.format(site="GreenBank", instrument="mustang2"))
     assert main(["check", str(tmp_path / "p.yaml")]) == 0
