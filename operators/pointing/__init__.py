@@ -1,1 +1,1 @@
-"""Where the telescope looks."""
+"""Pointing: simulated and recorded scans, and the transformation between the sky and the horizon."""

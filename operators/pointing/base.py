@@ -1,4 +1,4 @@
-"""What all scans share: target, times, offsets, the telescope's limits, and the `Observation`s they append."""
+"""Base of the simulated scans: target, times, offsets, the telescope's limits, and the `Observation`s that they append."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Pointing(Operator):
     jitter: Seconds = quantity("0 s", ge=0, le=1)
     """rms by which samples are taken early or late (Gaussian, known: the times in the products are the true ones)."""
     check_limits: Literal["error", "warn"] = "error"
-    """What a scan beyond the telescope's speed, acceleration or jerk is: an error, or a warning that the report repeats."""
+    """Whether a scan beyond the telescope's largest speed, acceleration or jerk is an error, or a warning."""
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
     """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
 
@@ -113,7 +113,7 @@ class Pointing(Operator):
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
         """Offsets (x, y) [rad] from the scan's centre on its tangent plane, each (n,).
 
-        Every instant by itself: of a long scan ``seconds`` are some.
+        Each instant is independent of the others: a long scan is worked on in chunks.
         """
         raise NotImplementedError
 
@@ -158,13 +158,13 @@ class Pointing(Operator):
         if self.scans * self.scan_duration * rate > LONG:
             from zonda.core.data import Data
 
-            with warnings.catch_warnings():  # the scans themselves will tell, with better figures
+            with warnings.catch_warnings():  # observing warns again, with better figures
                 warnings.simplefilter("ignore")
                 self.check(Data(scene=data.scene, observations=list(data.observations)))
         self._observe(data, range(self.scans), rate)
 
     def check(self, data: Data) -> list[str]:
-        """Some of the scans at some instants: elevation, speed and acceleration, samples per beam."""
+        """A selection of scans and instants: elevation, speed and acceleration, samples per beam."""
         rate = self.sample_rate or data.scene.instrument.sample_rate
         looked = sorted({round(k) for k in np.linspace(0, self.scans - 1, min(self.scans, SCANS_LOOKED_AT))})
         coarse = min(rate, max(INSTANTS_LOOKED_AT / (len(looked) * self.scan_duration), 1 / self.scan_duration))

@@ -1,4 +1,4 @@
-"""What a telescope cannot do: elevations out of its reach, motions too fast. The errors say what would be possible."""
+"""Limits of a telescope: elevations, and speed, acceleration and jerk of its axes. Errors say what would be possible."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class LargestMotion:
                 self._found[q], self._where[q] = peak, name
 
     def too_fast(self, quantity: Quantity, found: dict[Quantity, Peak], name: str = "the scan") -> str:
-        """What the scan does that the telescope does not."""
+        """The message about a limit that the scan exceeds."""
         (axis, order), peak = quantity, found[quantity]
         word = WORDS[order]
         where = f"{peak.second:.4g} s after its start, at elevation {np.degrees(peak.elevation):.2f} deg"

@@ -1,4 +1,4 @@
-"""How fast a scan moves: speed, acceleration and jerk of the axes, and of the beam on the sky, from its track.
+"""Speed, acceleration and jerk of a scan: of the axes, and of the beam on the sky, from its track.
 
 Finite differences of the track over a step h are means of the derivatives over at most k h: they never exceed the largest
 derivative (mean value theorem), and fall short of it by O(h^2). What is missing is estimated from steps h and 2 h (Richardson),

@@ -1,4 +1,4 @@
-"""What every pointing step makes of directions at instants: an `Observation`, and what must be said of it."""
+"""From directions at instants to an `Observation` with its entries in the tally: what all pointing steps share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scan that a telescope really made."""
+"""Pointing that was recorded at a telescope."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ANOTHER_DAY = 86400.0
 
 
 FAR = np.radians(0.1)
-"""rad between recorded and recomputed directions on the sky from which a run warns: no convention explains it."""
+"""rad between recorded and recomputed directions on the sky from which a run warns: no difference of conventions is as large."""
 
 
 class PointingRecorded(Operator):

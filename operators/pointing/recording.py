@@ -94,7 +94,7 @@ class Comb:
 def comb(recording: Recording, split: float, place: str) -> Comb:
     """Lay a recording out on combs of samples; a gap longer than ``split`` [s] begins another scan.
 
-    As few rows are dropped as leave the times in order (`longest_rising`): one stamp that jumps, ahead or back, goes alone.
+    Drops the fewest rows that leave the times in order (`longest_rising`): a single stamp that jumps ahead or back goes alone.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def _scan(
 
 
 def _turned(every: NDArray[np.intp], at: NDArray[np.intp], quaternions: Floats) -> Floats:
-    """Quaternions (n, 4) at ``every`` slot, of those known ``at`` some: as they are there, interpolated between."""
+    """Quaternions (n, 4) at ``every`` slot from those known ``at`` some slots: unchanged there, interpolated between."""
     turn = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0, -1.0, 1.0)
     steady = quaternions * np.cumprod(np.r_[1.0, turn])[:, None]  # q and -q are one rotation
     found = np.stack([np.interp(every, at, q) for q in steady.T], axis=1)

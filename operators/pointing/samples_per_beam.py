@@ -1,4 +1,4 @@
-"""How many samples there are in a beam, and what too few of them cost."""
+"""Samples per beam, and what too few of them cost."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 SIDEREAL_RATE = 2 * np.pi * 1.00273781191135448 / 86400
 """Rate of the Earth rotation angle, rad/s of UT1."""
 NODE_SPACING = 600.0
-"""First spacing of the nodes, s: leaves some 1e-12 rad."""
+"""First spacing of the nodes, s: leaves about 1e-12 rad."""
 CONVERGED = 5e-11
 """Last step [rad] of an inversion: what it leaves is 1e-4 of that."""
 
@@ -152,7 +152,7 @@ class CelestialTransform:
     def follow(self, icrs: Callable[[Floats], Floats], seconds: Floats) -> Boresight:
         """The `boresight` along a celestial path, at half the cost: nothing is inverted.
 
-        ``icrs``: the unit vectors (m, 3) at some of the ``seconds`` (n,).
+        ``icrs``: the unit vectors (m, 3) at a chunk of the ``seconds`` (n,).
         """
         n, upright = len(seconds), Upright()
         horizontal, azel, radec = (series(k, n) for k in (3, 4, 4))

@@ -1,1 +1,1 @@
-"""What is in the sky."""
+"""The sky: input maps, beams and sampling."""

@@ -173,7 +173,7 @@ def _lost(image: WcsMap) -> int:
 
 
 def too_bright(peak: float, conversion: str) -> str:
-    """What to say of a sky whose brightness in the beam is up to ``peak`` [K_RJ]; empty where that is possible."""
+    """The warning about a sky whose brightness in the beam is up to ``peak`` [K_RJ]; empty where that is plausible."""
     if peak <= BRIGHT:
         return ""
     return (

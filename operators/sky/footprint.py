@@ -65,7 +65,7 @@ class Footprint:
 
 
 def footprint(path: Path, pixel_size: float | None, centre: Target | None, hdu: int | str | None = None) -> Footprint | None:
-    """Of an image of a FITS file; None where it has no place of its own: HEALPix, or an image without a WCS.
+    """The footprint of an image in a FITS file; None where it has no place of its own: HEALPix, or an image without a WCS.
 
     ``pixel_size`` [rad], ``centre`` and ``hdu`` as `SkyMap` has them. Raises `InputError` as `read.read_map`.
     """
@@ -124,7 +124,7 @@ def _header(path: Path, wanted: int | str | None, place: str) -> tuple[Any, tupl
 
 
 def off_the_map(found: Footprint, centre: tuple[float, float], label: str) -> str:
-    """What to say of a scan about ``centre``, ICRS (ra, dec) [rad], that is not on the map; empty where it is."""
+    """The warning about a scan about ``centre``, ICRS (ra, dec) [rad], that is not on the map; empty where it is."""
     ra, dec = centre
     direction = unit_vectors(ra, dec)
     if found.holds(direction):

@@ -1,4 +1,4 @@
-"""HEALPix maps in FITS tables, whole or of some pixels only."""
+"""HEALPix maps in FITS tables, of the full sky or of a part of it."""
 
 from __future__ import annotations
 

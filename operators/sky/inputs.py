@@ -1,4 +1,4 @@
-"""What is read of a sky map's file: an image or a HEALPix map; and what the user says of it."""
+"""Sky maps as their files have them (images and HEALPix maps), and the user's options for reading them."""
 
 from __future__ import annotations
 
@@ -16,26 +16,14 @@ Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user says of a file.
+    """What the user says of a file: the parameters of `SkyMap` of these names, angles in rad, and whether the map is centred.
 
     Attributes
     ----------
-    unit
-        Unit of the pixels; None: the header's BUNIT (TUNIT1 of a HEALPix table).
-    pixel_size
-        rad; replaces the header's scale, its orientation (signs, rotation) is kept.
     centred
         True where the caller says where the map's centre lies: then the header's position is not needed.
-    missing
-        What a NaN or infinite pixel does: an error, or it becomes zero.
-    input_beam
-        FWHM [rad] of the beam of a map in Jy/beam; None: the header's BMAJ and BMIN.
-    coordsys
-        Coordinates of a HEALPix map; None: the header's COORDSYS.
     plane
         Of a cube, counted from 1; one number for each axis that is longer than one. None: the only one, or that of Stokes I.
-    hdu
-        Extension by number (0: the primary HDU) or name; None: the first image or HEALPix table.
     """
 
     unit: str | None = None

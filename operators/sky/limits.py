@@ -1,4 +1,4 @@
-"""Largest and smallest values accepted in a sky map: beyond them arithmetic overflows, and nothing on the sky is like that."""
+"""Largest and smallest values accepted in a sky map: beyond them arithmetic overflows, and no sky has them."""
 
 from __future__ import annotations
 

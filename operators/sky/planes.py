@@ -1,4 +1,4 @@
-"""Which image of a file and which plane of a cube is read: what the user says, or the only one that it can be."""
+"""Which image of a file and which plane of a cube is read: the one that the user names, or the only possible one."""
 
 from __future__ import annotations
 

@@ -118,10 +118,10 @@ class SkyPlanning(Planning[SkyMap]):
         choices = [full("cubic B-spline")]
         wanted = 2 * points * math.ceil(n / points - 1e-9)
         if points >= 2 and wanted <= 16:  # the finest grid that the operator makes
-            dearer = CONVOLUTION * float(np.prod(grid.shape)) * 3 / runs
+            extra = CONVOLUTION * float(np.prod(grid.shape)) * 3 / runs
             settings = {"interpolation": "linear", "pixels_per_fwhm": min(wanted, 16.0)}
             bound, what = context.sky_error(LINEAR / wanted**2), "linear, on twice as fine a grid"
-            choices.append(Choice("coarse", what, settings, bound=bound, formula=text, seconds=saved - dearer))
+            choices.append(Choice("coarse", what, settings, bound=bound, formula=text, seconds=saved - extra))
         bound = context.sky_error(LINEAR / n**2)
         choices.append(Choice("coarse", "linear", {"interpolation": "linear"}, bound=bound, formula=text, seconds=saved))
         return Effect("sampling order", tuple(choices), bound, text)

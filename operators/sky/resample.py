@@ -42,7 +42,7 @@ class _Block:
 def _blocks(target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1) -> Iterator[_Block]:
     """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True, where given.
 
-    ``thin``: every so manieth point along each axis only.
+    ``thin``: only every ``thin``-th point along each axis.
     """
     nx, ny = target.pixel_shape
     to_sky = np.linalg.inv(pixel_matrix(target)).T

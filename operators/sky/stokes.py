@@ -1,4 +1,4 @@
-"""Of a map of Stokes parameters I is read. Streams have no polarization: Q, U and V are not used, which a note says."""
+"""Maps of Stokes parameters: I is read. Streams have no polarization, so Q, U and V are not used, and a note says so."""
 
 from __future__ import annotations
 
