@@ -10,24 +10,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..data import Data, Observation
 from ..errors import ZondaError
 from ..faults import faults_named
+from ..output import Output
+from ..pipeline import Pipeline
+from ..product import Product
+from ..registry import products
 from ..storage.files import check_output_folder
 from . import parts
 from .job import Job, Task, layout_path, plural
 from .prepare import scene_of
 from .task import layouts_in, pipeline_of
-
-if TYPE_CHECKING:
-    from ..output import Output
-from ..pipeline import Pipeline
-from ..product import Product
-from ..registry import products
 
 FAN = 32
 """Parts that are added up at once."""
