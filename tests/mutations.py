@@ -91,7 +91,7 @@ def gaps_that_ring(patch: Patch) -> None:
 
 
 def modes_beyond_the_rank(patch: Patch) -> None:
-    patch.setattr(common_mode.CommonModeFilter, "_choose", lambda self, found, gram, observation: self.modes)
+    patch.setattr(common_mode, "_choose", lambda step, found, gram, observation: step.modes)
 
 
 def dead_detectors_that_take_part(patch: Patch) -> None:
@@ -106,7 +106,7 @@ def dead_detectors_that_take_part(patch: Patch) -> None:
 
 
 def float32_whatever_the_ratio(patch: Patch) -> None:
-    patch.setattr(common_mode.CommonModeFilter, "_check_precision", lambda *arguments: None)
+    patch.setattr(common_mode, "_check_precision", lambda *arguments: None)
 
 
 def mean_emission_in_float32(patch: Patch) -> None:

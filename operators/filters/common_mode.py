@@ -42,10 +42,13 @@ from .gram import Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
 
 OF_THE_SKY = frozenset({"sky", "transmission"})
-"""Streams of which a detector in order may see nothing. All see the air."""
+"""Components that a working detector may not see at all. All see the atmosphere."""
 
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
+
+KEPT = "modes kept because the data do not determine them (rank)"
+"""A count of the log."""
 
 
 class CommonModeFilter(Operator):
@@ -82,110 +85,20 @@ class CommonModeFilter(Operator):
         return self
 
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
-        """Find the modes; given those of the complete signal (``model``), what they are in this one.
-
-        Raises PipelineError where float32 cannot carry the remainder.
-        """
-        observation, tally, who = stream.observation, stream.observation.tally, self.label
+        """Find the modes; given those of the complete signal (``model``), their times in this one."""
         if model is not None:
-            return Modes(model.detectors, self._times(stream, model.detectors))
-        place = f"{who}, {observation.name}"
+            return Modes(model.detectors, _times(stream, model.detectors, self.method))
+        place = f"{self.label}, {stream.observation.name}"
         if stream.means.get("signal") is not None and stream.dtype != np.float64:
             raise PipelineError(
                 "the mean emission, tens of kelvin, is still part of the signal and float32 cannot carry it",
                 place=place,
                 cure="put a HighpassFilter before, or set precision: float64",
             )
-        gram: Gram | Usable
-        if self.method == "mean":
-            gram, found = self._mean(stream)
-        else:
-            with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-                gram = Gram(stream, pool, noiseless=_sees_nothing(stream))
-                self._flag(gram, stream)
-                found = lanczos(gram, self.modes, self.residual, None if self.on_undetermined == "remove" else self.gap)
-                found.count = self._choose(found, gram, observation)
-        count = found.count
-        sizes = np.sqrt(np.maximum(found.values[: self.modes + 1], 0.0) / max(1, gram.n_good * gram.n_used))
-        values = ", ".join(f"{s:.4g}" for s in sizes)
-        worst = found.residuals[:count].max(initial=0.0)
-        tally.state(who, f"{observation.name}: singular values / sqrt(detectors x samples)", f"{values or 'none'} K")
-        tally.state(who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps")
-        tally.state(who, f"{observation.name}: modes removed", f"{count} ({found.what})")
-        self._check_precision(found, count, gram, stream, place)
-        return Modes(found.detectors[:count], found.times[:count])
-
-    def _flag(self, found: Gram | Usable, stream: Stream) -> None:
-        """Flag dead detectors: the complete signal shows which they are."""
-        observation = stream.observation
-        if stream.signal == MAIN:
-            for name, dead in (("not finite", found.not_finite), ("constant", found.constant)):
-                observation.tally.count(self.label, f"detectors flagged: signal {name}", int(dead.sum()))
-                observation.detector_flags[dead] |= DEAD
-
-    def _mean(self, stream: Stream) -> tuple[Usable, Ritz]:
-        """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
-        observation = stream.observation
-        noiseless, good = _sees_nothing(stream), observation.good_samples
-        usable = Usable(observation.good_detectors, int(good.sum()))
-        reading = focal_plane_mean.read(stream, usable.use, good)
-        if usable.judge(reading.sums, reading.squares, noiseless):
-            reading = focal_plane_mean.read(stream, usable.use, good)
-        self._flag(usable, stream)
-        if usable.n_good == 0:
-            found = Ritz.nothing(usable.use.size, stream.shape[1])
-        else:
-            root = np.sqrt(usable.n_good)
-            v = reading.total / root
-            rank = 1 + (reading.least_left > NOTHING * usable.energy)
-            found = Ritz(np.array([v @ v]), (usable.use / root)[None], v[None], np.zeros(1), rank, 1, "detector mean")
-        found.count = min(1, max(0, found.rank - 1))
-        kept = "modes kept because the data do not determine them (rank)"
-        observation.tally.count(self.label, kept, 1 - found.count)
-        return usable, found
-
-    def _times(self, stream: Stream, modes: Floats) -> Floats:
-        """Equation (3): v_i = B^T u_i."""
-        use, good = np.asarray(modes.any(axis=0)), stream.observation.good_samples
-        if self.method == "mean":
-            total = focal_plane_mean.read(stream, use, good).total
-            times = [total * u.max(initial=0.0) for u in modes]
-        else:
-            with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-                gram = Gram(stream, pool, use)
-                times = [gram.apply(u)[1] for u in modes]
-        return np.array(times).reshape(len(modes), stream.shape[1])
-
-    def _choose(self, found: Ritz, gram: Gram, observation: Observation) -> int:
-        """Number of modes to remove; may replace the modes by the detectors' mean."""
-        tally = observation.tally
-        wanted = min(self.modes, max(0, found.rank - 1))
-        tally.count(self.label, "modes kept because the data do not determine them (rank)", self.modes - wanted)
-        size = np.sqrt(np.maximum(found.values, 0.0))
-        following = np.append(size, 0.0)[1:]
-        open_gaps = [i + 1 for i in range(wanted) if following[i] <= self.gap * size[i]]
-        determined = max(open_gaps, default=0)
-        tally.count(self.label, "modes not determined (gap closed)", wanted - determined)
-        if determined == wanted or self.on_undetermined == "remove":
-            return wanted
-        if self.on_undetermined == "mean" and determined == 0:
-            mean = Ritz.of_mean(gram)
-            found.detectors, found.times, found.residuals = mean.detectors, mean.times, mean.residuals
-            found.what = "detector mean, because the gap is closed"
-            return 1
-        return determined
-
-    def _check_precision(self, found: Ritz, count: int, gram: Gram | Usable, stream: Stream, place: str) -> None:
-        if stream.dtype != np.float32 or not count or gram.energy <= 0:
-            return
-        left = max(gram.energy - float(found.energies[:count].sum()), 0.0) / gram.energy
-        if 0.01 * np.sqrt(left) < ROUNDING:
-            rms, ratio = np.sqrt(gram.energy / (gram.n_good * gram.n_used)), 1 / max(np.sqrt(left), 1e-30)
-            raise PipelineError(
-                f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than float32 can carry",
-                place=place,
-                cure="set precision: float64",
-            )
+        detectors, found = _mean_mode(self, stream) if self.method == "mean" else _singular_modes(self, stream)
+        _tell(self, stream, detectors, found)
+        _check_precision(found, detectors, stream, place)
+        return Modes(found.detectors[: found.count], found.times[: found.count])
 
     def exec(self, block: Block, state: Modes) -> None:
         """Equation (1) on one block."""
@@ -196,6 +109,93 @@ class CommonModeFilter(Operator):
             del block.means["signal"]
         for u, v in zip(state.detectors, state.times, strict=True):
             _remove(signal, u[block.detectors], v[block.samples])
+
+
+def _singular_modes(step: CommonModeFilter, stream: Stream) -> tuple[Usable, Ritz]:
+    """The leading singular modes, with the number of those to remove."""
+    with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+        gram = Gram(stream, pool, noiseless=_sees_nothing(stream))
+        found = lanczos(gram, step.modes, step.residual, None if step.on_undetermined == "remove" else step.gap)
+        found.count = _choose(step, found, gram, stream.observation)
+    return gram, found
+
+
+def _mean_mode(step: CommonModeFilter, stream: Stream) -> tuple[Usable, Ritz]:
+    """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
+    observation = stream.observation
+    good = observation.good_samples
+    detectors = Usable(observation.good_detectors, int(good.sum()))
+    reading = focal_plane_mean.read(stream, detectors.use, good)
+    if detectors.judge(reading.sums, reading.squares, _sees_nothing(stream)):
+        reading = focal_plane_mean.read(stream, detectors.use, good)
+    if detectors.n_good == 0:
+        found = Ritz.nothing(detectors.use.size, stream.shape[1])
+    else:
+        root = np.sqrt(detectors.n_good)
+        v = reading.total / root
+        rank = 1 + (reading.least_left > NOTHING * detectors.energy)
+        found = Ritz(np.array([v @ v]), (detectors.use / root)[None], v[None], np.zeros(1), rank, 1, "detector mean")
+    found.count = min(1, max(0, found.rank - 1))
+    observation.tally.count(step.label, KEPT, 1 - found.count)
+    return detectors, found
+
+
+def _choose(step: CommonModeFilter, found: Ritz, gram: Gram, observation: Observation) -> int:
+    """Number of modes to remove; may replace the modes by the detectors' mean."""
+    wanted = min(step.modes, max(0, found.rank - 1))
+    size = np.append(np.sqrt(np.maximum(found.values, 0.0)), 0.0)
+    determined = max((i + 1 for i in range(wanted) if size[i + 1] <= step.gap * size[i]), default=0)
+    observation.tally.count(step.label, KEPT, step.modes - wanted)
+    observation.tally.count(step.label, "modes not determined (gap closed)", wanted - determined)
+    if determined == wanted or step.on_undetermined == "remove":
+        return wanted
+    if step.on_undetermined == "mean" and determined == 0:
+        u = gram.use / np.sqrt(gram.n_good)
+        found.detectors, found.times, found.residuals = u[None], gram.apply(u)[1][None], np.zeros(1)
+        found.what = "detector mean, because the gap is closed"
+        return 1
+    return determined
+
+
+def _times(stream: Stream, modes: Floats, method: str) -> Floats:
+    """Equation (3): v_i = B^T u_i."""
+    use, good = np.asarray(modes.any(axis=0)), stream.observation.good_samples
+    if method == "mean":
+        total = focal_plane_mean.read(stream, use, good).total
+        times = [total * u.max(initial=0.0) for u in modes]
+    else:
+        with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+            gram = Gram(stream, pool, use)
+            times = [gram.apply(u)[1] for u in modes]
+    return np.array(times).reshape(len(modes), stream.shape[1])
+
+
+def _tell(step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz) -> None:
+    """State what was found; flag the dead detectors, which the complete signal shows."""
+    observation, tally, who = stream.observation, stream.observation.tally, step.label
+    if stream.signal == MAIN:
+        for name, dead in (("not finite", detectors.not_finite), ("constant", detectors.constant)):
+            tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
+            observation.detector_flags[dead] |= DEAD
+    sizes = np.sqrt(np.maximum(found.values[: step.modes + 1], 0.0) / max(1, detectors.n_good * detectors.n_used))
+    values = ", ".join(f"{s:.4g}" for s in sizes)
+    worst = found.residuals[: found.count].max(initial=0.0)
+    tally.state(who, f"{observation.name}: singular values / sqrt(detectors x samples)", f"{values or 'none'} K")
+    tally.state(who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps")
+    tally.state(who, f"{observation.name}: modes removed", f"{found.count} ({found.what})")
+
+
+def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str) -> None:
+    if stream.dtype != np.float32 or not found.count or detectors.energy <= 0:
+        return
+    left = max(detectors.energy - float(found.energies[: found.count].sum()), 0.0) / detectors.energy
+    if 0.01 * np.sqrt(left) < ROUNDING:
+        rms, ratio = np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)), 1 / max(np.sqrt(left), 1e-30)
+        raise PipelineError(
+            f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than float32 can carry",
+            place=place,
+            cure="set precision: float64",
+        )
 
 
 def _sees_nothing(stream: Stream) -> bool:

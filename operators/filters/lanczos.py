@@ -7,7 +7,7 @@ One step reads the stream once and gives A^T q and A A^T q together. It starts n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Ritz:
     Attributes
     ----------
     values
-        sigma_i^2; may be longer than ``detectors``. `energies`: |v_i|^2 of the modes at hand.
+        sigma_i^2; may be longer than ``detectors``.
     detectors, times
         u_i (k, n_det) and v_i = A^T u_i (k, n_samp).
     residuals
@@ -48,21 +48,11 @@ class Ritz:
     what: str = "singular modes"
     count: int = 0
     """How many of them are removed."""
-    energies: Floats = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.energies = np.einsum("kt,kt->k", self.times, self.times)
-
-    @classmethod
-    def of_mean(cls, gram: Gram) -> Ritz:
-        """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
-        if gram.n_good == 0:
-            return cls.nothing(gram.use.size, gram.n_samples)
-        u = gram.use / np.sqrt(gram.n_good)
-        _, v = gram.apply(u)
-        apart = gram.energy - float(v @ v) > EMPTY * gram.n_good * gram.energy  # else look at the remainder itself
-        rank = 1 + (apart or gram.left(u[None], v[None]) > NOTHING * gram.energy)
-        return cls(np.array([v @ v]), u[None], v[None], np.zeros(1), rank, 1, "detector mean")
+    @property
+    def energies(self) -> Floats:
+        """|v_i|^2 of the modes."""
+        return np.asarray(np.einsum("kt,kt->k", self.times, self.times))
 
     @classmethod
     def nothing(cls, n_det: int, n_samples: int, why: str = "no good detector") -> Ritz:
@@ -101,30 +91,31 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
         floor = EMPTY * n * gram.energy
         residuals = beta * np.abs(vectors[-1]) / np.maximum(values, floor)
         exhausted = m == min(n, len(projected)) or gram.energy - float(values.sum()) <= floor
-        enough = m > wanted
-        converged = bool((residuals[:wanted] <= residual).all())
-        closed = False
-        if enough and gap is not None and m >= wanted + 3:
-            size = np.sqrt(np.maximum(values, 0.0))
-            rough = bool((residuals[: wanted + 1] <= 0.1).all())
-            closed = rough and all(size[i + 1] > gap * size[i] for i in range(wanted))
-        if exhausted or closed or (enough and converged):
+        converged = m > wanted and bool((residuals[:wanted] <= residual).all())
+        if exhausted or converged or _gaps_are_closed(values, residuals, wanted, gap):
             k = min(wanted, m)
-            detectors = np.array(vectors[:, :k].T @ space)
-            series = _combined(vectors[:, :k].T, times)
             rank = int(np.count_nonzero(values > floor))
             if not exhausted:
                 rank += 1
             elif rank < n:  # G squares what is small: look at the remainder itself
                 seen = vectors[:, :rank].T
                 rank += gram.left(seen @ space, _combined(seen, times)) > NOTHING * gram.energy
-            return Ritz(values, detectors, series, residuals[:k], rank, m)
+            leading = vectors[:, :k].T
+            return Ritz(values, np.array(leading @ space), _combined(leading, times), residuals[:k], rank, m)
         if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
             rest = gram.use * directions(m, gram.use.size)
             for _ in range(2):
                 rest = rest - (space @ rest) @ space
             beta = float(np.linalg.norm(rest))
         basis.append(rest / beta)
+
+
+def _gaps_are_closed(values: Floats, residuals: Floats, wanted: int, gap: float | None) -> bool:
+    """Whether no wanted mode is determined, as far as residuals of a tenth show."""
+    if gap is None or len(values) < wanted + 3 or not (residuals[: wanted + 1] <= 0.1).all():
+        return False
+    size = np.sqrt(np.maximum(values, 0.0))
+    return all(size[i + 1] > gap * size[i] for i in range(wanted))
 
 
 def _combined(shares: Floats, times: list[Floats]) -> Floats:
