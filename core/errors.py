@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class ZondaError(Exception):
     """Base of every error that is the user's to mend (exit code 2 at the command line).
@@ -39,3 +42,13 @@ class PointingError(ZondaError):
 
 class PipelineError(ZondaError):
     """The operators of a pipeline do not fit together (missing input, wrong order, too little memory ...)."""
+
+
+@contextmanager
+def placed(place: str) -> Iterator[None]:
+    """Errors that are raised inside and name no place are given this one."""
+    try:
+        yield
+    except ZondaError as err:
+        err.place = err.place or place
+        raise

@@ -26,7 +26,6 @@ from .turbulence.nodes import (
     layer_time_error,
     spread_evenly,
     time_error,
-    time_error_within,
     times_with_margin,
 )
 from .weather.radiative_transfer import ELEVATION_MAX
@@ -162,7 +161,7 @@ class _Timing:
         still = [0.0] * len(self._layers)
         for step in candidates:
             dt = step / self._observation.sample_rate
-            if not time_error_within(self._layers, self._speeds, still, dt, allowed):
+            if time_error(self._layers, self._speeds, still, dt, allowed) > allowed:
                 continue  # even along an exact path
             error = time_error(self._layers, self._speeds, self.path_errors(step)[0], dt)
             if error <= allowed:

@@ -106,11 +106,6 @@ class Response:
             out[far] = self._direct[name](y[far], s[far])
         return out
 
-    @property
-    def exact(self) -> bool:
-        """Whether any range was too wide for polynomials."""
-        return any(c is None for c in self._coefficients.values())
-
     def _fit(self, function: Callable[[Floats, Floats], Floats]) -> Floats | None:
         """(n_y, n_s) power coefficients, or None."""
 

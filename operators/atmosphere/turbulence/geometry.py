@@ -205,18 +205,13 @@ class ScanPlane:
 
     def positions(self, crossings: Floats, seconds: Floats, height: float, wind: Floats) -> tuple[Floats, Floats]:
         """(across, along) the wind, m, of crossings X (2, m, n) at ``seconds`` (n,) after the start. Equation (2)."""
-        return self.place(self.unroll(crossings), seconds, height, wind)
-
-    def place(self, unrolled: Floats, seconds: Floats, height: float, wind: Floats) -> tuple[Floats, Floats]:
-        """As `positions`, of crossings that `unroll` has been applied to (they are the same for every layer)."""
-        matrix, start, velocity = self.affine(height, wind)
-        across, along = (
-            m[0] * unrolled[0] + m[1] * unrolled[1] + (b + v * seconds) for m, b, v in zip(matrix, start, velocity, strict=True)
-        )
+        x, y = self.unroll(crossings)
+        parts = zip(*self.affine(height, wind), strict=True)
+        across, along = (m[0] * x + m[1] * y + (b + v * seconds) for m, b, v in parts)
         return across, along
 
     def affine(self, height: float, wind: Floats) -> tuple[Floats, Floats, Floats]:
-        """What `place` does: (across, along) = matrix (2, 2) unrolled + start (2,) [m] + velocity (2,) [m/s] seconds."""
+        """Of equation (2): (across, along) = matrix (2, 2) unrolled + start (2,) [m] + velocity (2,) [m/s] seconds."""
         along = self.frame @ wind
         speed = float(np.hypot(*along))
         c, s = along / speed if speed > 0 else (1.0, 0.0)

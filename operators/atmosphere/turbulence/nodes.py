@@ -138,30 +138,23 @@ def _sides(xi: Floats, eta: Floats, n: int) -> list[Floats]:
     return [chebyshev(float(v.min()), float(v.max()), n if v.max() > v.min() else 1) for v in (xi, eta)]
 
 
-def detectors_as_nodes(xi: Floats, eta: Floats) -> Nodes:
-    """Every detector its own node: no error in the focal plane."""
-    return Nodes(np.asarray(xi, np.float64), np.asarray(eta, np.float64), np.zeros((0, 0)), None)
-
-
-def focal_plane_error(nodes: Nodes, xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float = 1.0) -> float:
-    """Expected rms error of the interpolation to detectors at (xi, eta), in units of the fluctuation before the beam.
+def grid_error(x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float = 1.0) -> float:
+    """Expected rms error of the interpolation from nodes x times y to detectors at (xi, eta), in units of the fluctuation
+    before the beam.
 
     Equation (1), mean over the detectors. ``stretch`` multiplies distances along eta (1 / sin(elevation) where the
     turbulence lies in the horizontal plane).
     """
-    if nodes.shape is None:
-        return 0.0
-    ny = nodes.shape[1]
-    return _grid_error(nodes.xi[::ny], nodes.eta[:ny], xi, eta, layers, stretch)
-
-
-def _grid_error(x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float) -> float:
-    components = [layer.components() for layer in layers]
-    weight = np.concatenate([layer.amplitude**2 * w for layer, (_, w) in zip(layers, components, strict=True)])
-    nearness = np.concatenate([layer.distance**2 / (4 * e) for layer, (e, _) in zip(layers, components, strict=True)])
+    weight, nearness = _weights_and_nearness(layers, [layer.components() for layer in layers])
     one, two = _separable(x, xi, nearness), _separable(y, eta, nearness * stretch**2)
     total = float((1 - 2 * (one[0] * two[0]).mean(0) + (one[1] * two[1]).mean(0)) @ weight)
     return float(np.sqrt(max(total, 0.0)))
+
+
+def _weights_and_nearness(layers: Sequence[Layer], components: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Of the components of all layers: a_l^2 w, and z^2 / 4e."""
+    weight = np.concatenate([layer.amplitude**2 * w for layer, (_, w) in zip(layers, components, strict=True)])
+    return weight, np.concatenate([layer.distance**2 / (4 * e) for layer, (e, _) in zip(layers, components, strict=True)])
 
 
 def _separable(nodes: Floats, points: Floats, nearness: Floats) -> tuple[Floats, Floats]:
@@ -179,9 +172,7 @@ def differential_rms(xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: 
     """Expected rms of the fluctuation minus its focal-plane mean, in units of the fluctuation before the beam."""
     i, j = np.triu_indices(len(xi), 1)
     square = (xi[i] - xi[j]) ** 2 + (stretch * (eta[i] - eta[j])) ** 2
-    components = [layer.gaussian() for layer in layers]
-    weight = np.concatenate([layer.amplitude**2 * w for layer, (_, w) in zip(layers, components, strict=True)])
-    nearness = np.concatenate([layer.distance**2 / (4 * e) for layer, (e, _) in zip(layers, components, strict=True)])
+    weight, nearness = _weights_and_nearness(layers, [layer.gaussian() for layer in layers])
     return float(np.sqrt(_gone(nearness, square) @ weight * 2 / len(xi) ** 2))
 
 
@@ -208,71 +199,35 @@ def spread_evenly(xi: Floats, eta: Floats, number: int = _TRIED) -> tuple[Floats
     return xi[index], eta[index]
 
 
-def choose_nodes(
-    xi: Floats, eta: Floats, layers: Sequence[Layer], tolerance: float, stretch: float = 1.0, at_least: int = 1
-) -> tuple[Nodes, float]:
-    """The coarsest grid whose `focal_plane_error` is <= ``tolerance``, and that error.
+def choose_nodes(xi: Floats, eta: Floats, layers: Sequence[Layer], tolerance: float, stretch: float = 1.0) -> tuple[Nodes, float]:
+    """The coarsest grid whose `grid_error` is <= ``tolerance``, and that error.
 
-    Where a grid would need as many nodes as there are detectors, the detectors are the nodes. ``at_least`` nodes per axis.
+    Where a grid would need as many nodes as there are detectors, the detectors are the nodes.
     """
-    some_xi, some_eta = spread_evenly(xi, eta)
+    few_xi, few_eta = spread_evenly(xi, eta)
 
     @cache
     def error(n: int) -> float:
         x, y = _sides(xi, eta, n)
-        return _grid_error(x, y, some_xi, some_eta, layers, stretch)
+        return grid_error(x, y, few_xi, few_eta, layers, stretch)
 
-    sizes = [n for n in GRIDS if n >= at_least and n * n < len(xi)]
+    sizes = [n for n in GRIDS if n * n < len(xi)]
     reach = 1
     while reach < len(sizes) and error(sizes[reach - 1]) > tolerance:  # small grids cost little, and serve most often
         reach *= 2
     place = bisect_left(sizes, True, reach // 2, min(reach, len(sizes)), key=lambda size: error(size) <= tolerance)
     if place == len(sizes):
-        return detectors_as_nodes(xi, eta), 0.0
+        return Nodes(np.asarray(xi, np.float64), np.asarray(eta, np.float64), np.zeros((0, 0)), None), 0.0
     n = sizes[place]
     return grid(xi, eta, n), error(n)
 
 
 @lru_cache(maxsize=1)
 def _spline_table() -> tuple[float, float, Floats, Floats]:
-    """First ln q and the steps per unit of it, ln G(q) and its steps, of `spline_table`, as kept in the package."""
+    """First ln q and the steps per unit of it, ln G(q) and its steps (made by benchmarks/atmosphere_data)."""
     with np.load(SPLINE_TABLE) as kept:
         log_q, log_g = kept["log_q"], kept["log_g"]
     return float(log_q[0]), (len(log_q) - 1) / float(log_q[-1] - log_q[0]), log_g, np.diff(log_g)
-
-
-def spline_table() -> tuple[Floats, Floats]:
-    """(ln q, ln G(q)) of equation (2) on 500 points of q, 0.01 to 1000."""
-    q = np.geomspace(1e-2, 1e3, 500)
-    u = np.linspace(-6, 6, 1201)  # w / q: the spectrum of exp(-q^2 n^2 / 4) is a Gaussian exp(-(w/q)^2)
-    density = np.exp(-u * u) / np.sqrt(np.pi) * (u[1] - u[0])
-    even = 2 * density[600:]
-    even[0] = density[600]
-    out = np.concatenate([_lost(np.multiply.outer(part, u[600:])) @ even for part in np.array_split(q, 50)])
-    return np.log(q), np.log(out)
-
-
-def _lost(w: Floats) -> Floats:
-    """(1 - A_0 b)^2 + sum (A_m b)^2 of equation (2)."""
-    b = 3 / (2 + np.cos(w))
-    # Images of frequencies far above Nyquist: fold w to (-pi, pi] and name its own image m.
-    own = np.round(w / (2 * np.pi))
-    half = (w - 2 * np.pi * own) / 2
-    top = np.sin(half) ** 4 * b
-    tiny = np.abs(half) < 1e-12
-    half[tiny], top[tiny] = 1.0, 0.0
-    base = np.where(tiny, 1.0, top / half**4)  # sinc^4 b of the image at the folded frequency itself
-    error = np.zeros_like(w)
-    for m in range(1, 9):
-        for shift in (m * np.pi, -m * np.pi):
-            fourth = (half + shift) ** 2
-            fourth *= fourth
-            fourth *= fourth
-            error += 1 / fourth
-    error = error * top**2 + np.where(own == 0, 0.0, base**2)
-    here = np.where(own == 0, base, np.where(tiny, 0.0, top / np.where(w == 0, 1.0, w / 2) ** 4))
-    error -= np.where((own != 0) & (np.abs(own) <= 8), here**2, 0.0)
-    return np.asarray(error + (1 - here) ** 2, np.float64)
 
 
 def spline_error(q: Floats) -> Floats:
@@ -289,26 +244,20 @@ def spline_error(q: Floats) -> Floats:
     return np.asarray(np.exp(log_error), np.float64)
 
 
-def time_error(layers: Sequence[Layer], speeds: Sequence[Floats], deltas: Sequence[float], dt: float) -> float:
+def time_error(
+    layers: Sequence[Layer], speeds: Sequence[Floats], deltas: Sequence[float], dt: float, enough: float = math.inf
+) -> float:
     """Expected rms error of the spline in time, equation (2), in units of the fluctuation before the beam.
 
     ``speeds``: per layer, speeds [m/s] that the rays have at times evenly spread over the scan (the mean of E_t is
-    taken); ``deltas``: per layer, rms error of the interpolated ray path, m.
+    taken); ``deltas``: per layer, rms error of the interpolated ray path, m. Beyond ``enough`` no further layer is added.
     """
-    parts = (layer_time_error(*one, dt) for one in zip(layers, speeds, deltas, strict=True))
-    return math.sqrt(sum(parts))
-
-
-def time_error_within(
-    layers: Sequence[Layer], speeds: Sequence[Floats], deltas: Sequence[float], dt: float, allowed: float
-) -> bool:
-    """Whether `time_error` is at most ``allowed``; only as many layers are looked at as it takes to exceed it."""
     total = 0.0
     for one in zip(layers, speeds, deltas, strict=True):
         total += layer_time_error(*one, dt)
-        if math.sqrt(total) > allowed:
-            return False
-    return True
+        if math.sqrt(total) > enough:
+            break
+    return math.sqrt(total)
 
 
 def layer_time_error(layer: Layer, speeds: Floats, delta: float, dt: float) -> float:

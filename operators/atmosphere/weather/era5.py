@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, placed
 from zonda.core.storage import hdf5_files
 from zonda.core.storage.files import reading
 from zonda.core.types import Floats
@@ -75,24 +75,23 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
         A file that is not NetCDF, lacks a variable or an axis, is too coarse, or does not cover the place or the time.
     """
     place = f"ERA5 file {path}"
-    with _opened(path, place) as file:
+    with placed(place), _opened(path, place) as file:
         lacking = [name for name in ("t", "u", "v", "z") if name not in file] + ([] if "q" in file or "r" in file else ["q"])
         if lacking:
             names = ", ".join(f"{name} ({VARIABLES[name]})" for name in lacking)
-            raise InputError(f"lacks {names}", place=place, cure=f"download these too: {GET}")
-        axes = {kind: _axis(file, names, place) for kind, names in AXES.items()}
-        pressure = _pressure(file, axes["level"], place)
+            raise InputError(f"lacks {names}", cure=f"download these too: {GET}")
+        axes = {kind: _axis(file, names) for kind, names in AXES.items()}
+        pressure = _pressure(file, axes["level"])
+        latitude, longitude = np.degrees(site.latitude), np.degrees(site.longitude)
         weights = {
-            "time": _time_weights(file, axes["time"], time, place),
-            "lat": _latitude_weights(file.values(axes["lat"]), np.degrees(site.latitude), place),
-            "lon": _longitude_weights(
-                file.values(axes["lon"]), np.degrees(site.longitude), abs(np.degrees(site.latitude)), place
-            ),
+            "time": _time_weights(file, axes["time"], time),
+            "lat": _latitude_weights(file.values(axes["lat"]), latitude),
+            "lon": _longitude_weights(file.values(axes["lon"]), longitude, abs(latitude)),
         }
         order = np.argsort(-pressure)
 
         def column(name: str, logarithm: bool = False) -> Floats:
-            return file.interpolated(name, axes, weights, logarithm, place)[order]
+            return file.interpolated(name, axes, weights, logarithm)[order]
 
         pressure, temperature = pressure[order], column("t")
         if "q" in file:
@@ -148,35 +147,32 @@ class _File:
             hdf5_files.check_size(self._variables[name], self._place)
         raw = np.asarray(self._variables[name][where])
         missing = [self.attribute(name, key) for key in ("_FillValue", "missing_value")]
-        out = raw.astype(np.float64) * float(self.attribute(name, "scale_factor", 1.0)) + float(
-            self.attribute(name, "add_offset", 0)
-        )
+        scale, offset = float(self.attribute(name, "scale_factor", 1.0)), float(self.attribute(name, "add_offset", 0))
+        out = raw.astype(np.float64) * scale + offset
         for value in missing:
             if value is not None:
                 out = np.where(raw == value, np.nan, out)
         return np.atleast_1d(out)
 
-    def interpolated(
-        self, name: str, axes: dict[str, str], weights: dict[str, dict[int, float]], log: bool, place: str
-    ) -> Floats:
+    def interpolated(self, name: str, axes: dict[str, str], weights: dict[str, dict[int, float]], log: bool) -> Floats:
         """(n_level,) of a variable."""
         total: Floats | float = 0.0
         for i, a in weights["time"].items():
             for j, b in weights["lat"].items():
                 for k, c in weights["lon"].items():
-                    column = self._column(name, axes, {"time": i, "lat": j, "lon": k}, place)
+                    column = self._column(name, axes, {"time": i, "lat": j, "lon": k})
                     if log:
                         self.below_none += int(np.count_nonzero(column < 0))
                         column = np.log(np.maximum(column, DRIEST))
                     total = total + a * b * c * column
         return np.asarray(np.exp(total) if log else total)
 
-    def _column(self, name: str, axes: dict[str, str], at: dict[str, int], place: str) -> Floats:
+    def _column(self, name: str, axes: dict[str, str], at: dict[str, int]) -> Floats:
         names = self._dimensions[name]
         index = {axes[kind]: value for kind, value in at.items()} | {axes["level"]: slice(None)}
         if any(axis not in names for axis in axes.values()):
             message = f"the variable {name} lies on {', '.join(names)}"
-            raise InputError(message, place=place, cure=f"it needs time, level, latitude and longitude: {GET}")
+            raise InputError(message, cure=f"it needs time, level, latitude and longitude: {GET}")
         values = self.values(name, tuple(index.get(n, slice(None)) for n in names))
         extra = [n for n in names if n not in index]  # expver: ERA5, and its preliminary months; number: of an ensemble
         if extra:
@@ -185,9 +181,7 @@ class _File:
             whole = np.flatnonzero(np.isfinite(values).all(axis=0))
             values = values[:, whole[0] if len(whole) else 0]
         if not np.isfinite(values).all():
-            raise InputError(
-                f"the variable {name} has no values at this place and time", place=place, cure="download the file again"
-            )
+            raise InputError(f"the variable {name} has no values at this place and time", cure="download the file again")
         return values
 
 
@@ -213,14 +207,14 @@ def _label(dimension: Any) -> str:
     return str(dimension[0].name).rpartition("/")[2] if len(dimension) else str(dimension.label)
 
 
-def _axis(file: _File, names: tuple[str, ...], place: str) -> str:
+def _axis(file: _File, names: tuple[str, ...]) -> str:
     found = next((name for name in names if name in file), None)
     if found is None:
-        raise InputError(f"has no axis {' or '.join(names)}", place=place, cure=f"it must be on pressure levels: {GET}")
+        raise InputError(f"has no axis {' or '.join(names)}", cure=f"it must be on pressure levels: {GET}")
     return found
 
 
-def _pressure(file: _File, name: str, place: str) -> Floats:
+def _pressure(file: _File, name: str) -> Floats:
     """(n_level,) Pa."""
     unit = str(file.attribute(name, "units", "hPa"))
     pressure = file.values(name) * (1.0 if unit == "Pa" else 100.0)
@@ -228,59 +222,55 @@ def _pressure(file: _File, name: str, place: str) -> Floats:
     low = falling[falling >= HIGHEST * (1 - 1e-9)]
     gap = float((low[:-1] / low[1:]).max()) if len(low) > 1 else np.inf
     if falling[-1] > HIGHEST or gap > RATIO_MAX:
-        raise InputError(
-            f"is too coarse: its {len(falling)} pressure levels ({', '.join(f'{p / 100:g}' for p in falling[:12])} hPa) "
-            + (f"end at {falling[-1] / 100:g} hPa" if falling[-1] > HIGHEST else f"lie up to a factor {gap:.2g} apart"),
-            place=place,
-            cure=f"download all levels up to {HIGHEST / 100:g} hPa or higher, none further apart than 700 and 500 hPa: {GET}",
-        )
+        levels = f"its {len(falling)} pressure levels ({', '.join(f'{p / 100:g}' for p in falling[:12])} hPa)"
+        fault = f"end at {falling[-1] / 100:g} hPa" if falling[-1] > HIGHEST else f"lie up to a factor {gap:.2g} apart"
+        cure = f"download all levels up to {HIGHEST / 100:g} hPa or higher, none further apart than 700 and 500 hPa: {GET}"
+        raise InputError(f"is too coarse: {levels} {fault}", cure=cure)
     return pressure
 
 
-def _time_weights(file: _File, name: str, time: Instant, place: str) -> dict[int, float]:
+def _time_weights(file: _File, name: str, time: Instant) -> dict[int, float]:
     match = re.match(r"(seconds|hours|days) since (\d+)-(\d+)-(\d+)", str(file.attribute(name, "units", "")))
     if not match:
-        raise InputError(
-            f"its {name} has the unit '{file.attribute(name, 'units')}'", place=place, cure="expected hours since a date"
-        )
+        raise InputError(f"its {name} has the unit '{file.attribute(name, 'units')}'", cure="expected hours since a date")
     start = datetime(int(match[2]), int(match[3]), int(match[4]), tzinfo=UTC).timestamp()
     seconds = start + file.values(name) * {"seconds": 1.0, "hours": 3600.0, "days": 86400.0}[match[1]]
     order, wanted = np.argsort(seconds), time.posix
     first, last = seconds[order[0]], seconds[order[-1]]
     if not first - 1800 <= wanted <= last + 1800:
         covered = " to ".join(f"{datetime.fromtimestamp(t, UTC):%Y-%m-%dT%H:%MZ}" for t in (first, last))
-        raise InputError(f"covers {covered}, not {time}", place=place, cure=f"change the time, or get the file for it: {GET}")
+        raise InputError(f"covers {covered}, not {time}", cure=f"change the time, or get the file for it: {GET}")
     weights = _linear(seconds[order], wanted)
     if len(weights) == 2:
         low, high = (seconds[order[k]] for k in weights)
         if high - low > STEP_MAX * 3600 * 1.001:
             message = f"is too coarse: its times around {time} are {(high - low) / 3600:g} h apart"
-            raise InputError(message, place=place, cure=f"get it every {STEP_MAX:g} h or more often: {GET}")
+            raise InputError(message, cure=f"get it every {STEP_MAX:g} h or more often: {GET}")
     return {int(order[k]): w for k, w in weights.items()}
 
 
-def _latitude_weights(latitude: Floats, wanted: float, place: str) -> dict[int, float]:
+def _latitude_weights(latitude: Floats, wanted: float) -> dict[int, float]:
     order = np.argsort(latitude)
-    return {int(order[k]): w for k, w in _within(latitude[order], wanted, "latitudes", place).items()}
+    return {int(order[k]): w for k, w in _within(latitude[order], wanted, "latitudes").items()}
 
 
-def _longitude_weights(longitude: Floats, wanted: float, latitude: float, place: str) -> dict[int, float]:
+def _longitude_weights(longitude: Floats, wanted: float, latitude: float) -> dict[int, float]:
     offset = (longitude - wanted + 180) % 360 - 180  # the place is at 0, wherever the file cuts the globe
     order = np.argsort(offset)
     if latitude > 89.9:
         return {int(np.argmin(np.abs(offset))): 1.0}
-    return {int(order[k]): w for k, w in _within(offset[order], 0.0, "longitudes", place, wanted).items()}
+    return {int(order[k]): w for k, w in _within(offset[order], 0.0, "longitudes", wanted).items()}
 
 
-def _within(points: Floats, wanted: float, noun: str, place: str, origin: float = 0.0) -> dict[int, float]:
+def _within(points: Floats, wanted: float, noun: str, origin: float = 0.0) -> dict[int, float]:
     if not points[0] - HALF_CELL <= wanted <= points[-1] + HALF_CELL:
         message = f"covers {noun} {points[0] + origin:.2f} to {points[-1] + origin:.2f} deg, not {wanted + origin:.2f} deg"
-        raise InputError(message, place=place, cure=f"get the file for this place: {GET}")
+        raise InputError(message, cure=f"get the file for this place: {GET}")
     weights = _linear(points, wanted)
     spacing = np.ptp(points[list(weights)])
     if spacing > SPACING_MAX * 1.001:
         message = f"is too coarse: its {noun} are {spacing:g} deg apart"
-        raise InputError(message, place=place, cure=f"get it on a grid of {SPACING_MAX:g} deg or finer (ERA5 has 0.25): {GET}")
+        raise InputError(message, cure=f"get it on a grid of {SPACING_MAX:g} deg or finer (ERA5 has 0.25): {GET}")
     return weights
 
 

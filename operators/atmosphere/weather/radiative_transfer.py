@@ -122,8 +122,8 @@ class Layers:
             share,
         )
 
-    def airmass(self, elevation: float, *, plane_parallel: bool = False) -> Floats:
-        """(n,) slant over vertical path of each layer, equation (1), or 1/sin(elevation) when ``plane_parallel``.
+    def airmass(self, elevation: float) -> Floats:
+        """(n,) slant over vertical path of each layer, equation (1).
 
         Raises
         ------
@@ -136,8 +136,6 @@ class Layers:
                 "4.5 to 90 deg",
                 cure="choose a target or a time with a higher elevation",
             )
-        if plane_parallel:
-            return np.full(len(self.h2o), 1 / math.sin(elevation))
         above_site = (self.height[1:] + self.height[:-1]) / 2 - self.height[0]
         ratio = math.cos(elevation) * (EARTH_RADIUS + self.height[0]) / (EARTH_RADIUS + self.height[0] + above_site)
         return np.asarray(1 / np.sqrt(1 - ratio**2))
@@ -197,9 +195,7 @@ def emission(slant_opacity: Floats, source: Floats) -> Floats:
     return np.asarray(np.einsum("i...,i...->...", below, mean))
 
 
-def spectrum(
-    layers: Layers, elevation: float, *, low: float | None = None, high: float | None = None, plane_parallel: bool = False
-) -> Spectrum:
+def spectrum(layers: Layers, elevation: float, *, low: float | None = None, high: float | None = None) -> Spectrum:
     """Opacity and brightness between two frequencies [Hz] (default: the whole table) at an elevation [rad].
 
     Raises
@@ -210,7 +206,7 @@ def spectrum(
     table = layers.table
     edges = table.edges
     cells = table.cells(edges[0] if low is None else low, edges[-1] if high is None else high)
-    frequency, airmass = table.frequency[cells], layers.airmass(elevation, plane_parallel=plane_parallel)[:, None]
+    frequency, airmass = table.frequency[cells], layers.airmass(elevation)[:, None]
     sections = layers.cross_sections(cells)
     vertical = layers.opacity(sections)
     parts, cell, share = layers.in_parts(sections)

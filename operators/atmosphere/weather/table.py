@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, placed
 from zonda.core.types import Floats
 from zonda.core.weather import Column
 
@@ -58,19 +58,14 @@ def read_table(path: Path, site: Site) -> Column:
         With the line: an unknown, missing or doubled column, text that is no number, NaN, heights that do not increase,
         pressures that do not fall, what no air is, a table that ends below 8 km.
     """
-    place = f"table {path}"
-    lines = _lines(path, place)
-    columns = _header(lines[0][1], place)
-    values = _numbers(lines, columns, place)
-    rows = [number for number, _ in lines[1:]]
-    height, pressure, temperature = (values[name] for name in ("height", "pressure", "temperature"))
-    _limits(values, rows, place)
-    if len(rows) < 5 or height[-1] < HIGHEST:
-        raise InputError(
-            f"has {len(rows)} heights up to {height[-1]:g} m above sea level",
-            place=place,
-            cure=f"give at least 5, up to {HIGHEST:g} m: the water and most of the oxygen lie below",
-        )
+    with placed(f"table {path}"):
+        lines = _lines(path)
+        values = _numbers(lines, _header(lines[0][1]))
+        height, pressure, temperature = (values[name] for name in ("height", "pressure", "temperature"))
+        _limits(values, [number for number, _ in lines[1:]])
+        if len(height) < 5 or height[-1] < HIGHEST:
+            cause = f"has {len(height)} heights up to {height[-1]:g} m above sea level"
+            raise InputError(cause, cure=f"give at least 5, up to {HIGHEST:g} m: the water and most of the oxygen lie below")
     humidity: dict[str, Callable[[Floats], Floats]] = {
         "relative humidity": lambda x: from_relative(x, pressure, temperature),
         "vapour density": lambda x: from_density(x, pressure, temperature),
@@ -92,20 +87,20 @@ def read_table(path: Path, site: Site) -> Column:
     )
 
 
-def _lines(path: Path, place: str) -> list[tuple[int, list[str]]]:
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
     """(line number, cells) of the header and every row."""
     try:
         text = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
-        raise InputError(f"cannot be read as text: {err}", place=place, cure=f"write a CSV file: {EXAMPLE}") from None
+        raise InputError(f"cannot be read as text: {err}", cure=f"write a CSV file: {EXAMPLE}") from None
     found = [(n, line.partition("#")[0].strip()) for n, line in enumerate(text, 1)]
     lines = [(n, [cell.strip() for cell in next(csv.reader([line]))]) for n, line in found if line]
     if len(lines) < 2:
-        raise InputError("holds no rows", place=place, cure=f"write a header and one row per height: {EXAMPLE}")
+        raise InputError("holds no rows", cure=f"write a header and one row per height: {EXAMPLE}")
     return lines
 
 
-def _header(cells: list[str], place: str) -> list[tuple[str, str]]:
+def _header(cells: list[str]) -> list[tuple[str, str]]:
     """(name, unit) of each column."""
     columns: list[tuple[str, str]] = []
     for cell in cells:
@@ -113,50 +108,44 @@ def _header(cells: list[str], place: str) -> list[tuple[str, str]]:
         name = " ".join(match[1].lower().replace("_", " ").split()) if match else ""
         if not match or name not in UNITS or match[2] not in UNITS[name]:
             units = f"'{name}' comes in {', '.join(UNITS[name])}" if name in UNITS else f"columns: {', '.join(UNITS)}"
-            raise InputError(f"the column '{cell}' is not known", place=place, cure=f"{units}; a header is e.g. {EXAMPLE}")
+            raise InputError(f"the column '{cell}' is not known", cure=f"{units}; a header is e.g. {EXAMPLE}")
         if name in (known for known, _ in columns):
-            raise InputError(f"the column '{name}' is there twice", place=place, cure="keep one")
+            raise InputError(f"the column '{name}' is there twice", cure="keep one")
         columns.append((name, match[2]))
     names = [name for name, _ in columns]
     missing = [name for name in ("height", "pressure", "temperature") if name not in names]
     if missing or not any(name in names for name in HUMIDITY):
         lacks = ", ".join([*missing, *([] if any(n in names for n in HUMIDITY) else [f"a humidity ({', '.join(HUMIDITY)})"])])
-        raise InputError(f"lacks {lacks}", place=place, cure=f"a header is e.g. {EXAMPLE}")
+        raise InputError(f"lacks {lacks}", cure=f"a header is e.g. {EXAMPLE}")
     if sum(name in names for name in HUMIDITY) > 1 or ("wind east" in names) != ("wind north" in names):
-        raise InputError(
-            "has two humidities, or one component of the wind only", place=place, cure="one humidity, both or no winds"
-        )
+        raise InputError("has two humidities, or one component of the wind only", cure="one humidity, both or no winds")
     return columns
 
 
-def _numbers(lines: list[tuple[int, list[str]]], columns: list[tuple[str, str]], place: str) -> dict[str, Floats]:
+def _numbers(lines: list[tuple[int, list[str]]], columns: list[tuple[str, str]]) -> dict[str, Floats]:
     """SI values of each column."""
     table = np.empty((len(lines) - 1, len(columns)))
     for row, (number, cells) in enumerate(lines[1:]):
         if len(cells) != len(columns):
-            raise InputError(
-                f"line {number} has {len(cells)} cells for {len(columns)} columns", place=place, cure="mend that line"
-            )
+            raise InputError(f"line {number} has {len(cells)} cells for {len(columns)} columns", cure="mend that line")
         for k, cell in enumerate(cells):
             try:
                 table[row, k] = float(cell)
             except ValueError:
-                raise InputError(
-                    f"line {number}: '{cell}' is not a number", place=place, cure=f"mend {columns[k][0]} there"
-                ) from None
+                raise InputError(f"line {number}: '{cell}' is not a number", cure=f"mend {columns[k][0]} there") from None
             if not np.isfinite(table[row, k]):
                 message = f"line {number}: {columns[k][0]} is {cell}"
-                raise InputError(message, place=place, cure="give every value, or leave the row out")
+                raise InputError(message, cure="give every value, or leave the row out")
     values = {name: table[:, k] * UNITS[name][unit] for k, (name, unit) in enumerate(columns)}
     if ("temperature", "degC") in columns:
         values["temperature"] = values["temperature"] + 273.15
     return values
 
 
-def _limits(values: dict[str, Floats], rows: list[int], place: str) -> None:
+def _limits(values: dict[str, Floats], rows: list[int]) -> None:
     def refuse(bad: NDArray[np.bool_], message: str, cure: str) -> None:
         if bad.any():
-            raise InputError(f"line {rows[int(np.argmax(bad))]}: {message}", place=place, cure=cure)
+            raise InputError(f"line {rows[int(np.argmax(bad))]}: {message}", cure=cure)
 
     height, pressure, temperature = (values[name] for name in ("height", "pressure", "temperature"))
     refuse(np.append(False, np.diff(height) <= 0), "the height does not increase", "sort the rows from the ground up")

@@ -154,7 +154,7 @@ def band() -> Any:
 def test_the_response_is_that_of_the_band(band: Any, rms: float, low: float) -> None:
     names = ("emission", "transmission", "opacity", "pwv", "path_delay")
     response = Response(band, 1e-3, (-8 * rms, 8 * rms), (low, low + 0.1), 1500.0, 6.5, names)
-    assert not response.exact
+    assert all(c is not None for c in response._coefficients.values())
     rng = np.random.default_rng(1)
     y, s = rms * rng.standard_normal((4, 50)), low + 0.1 * rng.random((4, 50))
     elevation = np.arcsin(s)
@@ -193,7 +193,7 @@ def test_wide_ranges_are_left_to_the_band(band: Any, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(module, "_DEGREES", ((2, 2), (3, 3)))
     response = Response(band, 1e-5, (-1.0, 250.0), (0.3, 0.6), 1500.0, 6.5, ("emission",))
-    assert response.exact
+    assert any(c is None for c in response._coefficients.values())
     y, s = np.array([[-0.9, 0.0, 100.0]]), np.array([[0.4, 0.5, 0.55]])
     np.testing.assert_array_equal(response("emission", y, s), band.emission_difference(1e-5, 1e-5 * y, np.arcsin(s)))
 
