@@ -63,54 +63,60 @@ class PointingBackAndForth(Pointing):
     def in_turnaround(self, seconds: Floats) -> NDArray[np.bool_]:
         """(n,) True in turnarounds."""
         leg = self.throw / self.speed
-        late: NDArray[np.bool_] = np.mod(seconds, leg + self.turnaround) > leg
-        return late
+        return np.asarray(np.mod(seconds, leg + self.turnaround) > leg)
 
     def directions(self, aim: Aim, seconds: Floats) -> Floats:
-        target, offset = aim.target, aim.offset
-        longitude, elevation = -target.longitude, target.latitude
-        if target.frame != "horizontal":
-            middle = np.array([(seconds[0] + seconds[-1]) / 2])
-            north, west, up = aim.transform.horizontal(unit_vectors(*target.icrs()), middle)[0]
-            longitude, elevation = math.atan2(west, north), math.atan2(up, math.hypot(north, west))
-        elevation += offset[1]
-        widest = self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2)
-        if elevation >= math.pi / 2 or widest > math.pi * math.cos(elevation):
-            raise PointingError(
-                f"the scan spans more than a whole turn of azimuth at elevation {math.degrees(elevation):.2f} deg",
-                place=self.label,
-                cure="lower throw, or choose a lower elevation",
-            )
+        longitude, elevation = _middle(aim, seconds)
+        elevation += aim.offset[1]
+        _check_turn(self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2), elevation, self.label)
         found = series(3, len(seconds))
         for some in chunks(len(seconds)):
             x, _ = self.path(seconds[some])
-            found[some] = unit_vectors(longitude - (x + offset[0]) / math.cos(elevation), np.full(len(x), elevation))
+            found[some] = unit_vectors(longitude - (x + aim.offset[0]) / math.cos(elevation), np.full(len(x), elevation))
         return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
-        if not self.flag_turnarounds:
-            return np.zeros(len(seconds), np.uint8)
-        return np.where(self.in_turnaround(seconds), TURNAROUND, 0).astype(np.uint8)
+        return np.where(self.flag_turnarounds & self.in_turnaround(seconds), TURNAROUND, 0).astype(np.uint8)
 
     def intervals(self, seconds: Floats) -> Intervals:
-        """As TOAST has them. Left to right is towards larger azimuth; a turnaround has the direction of the scan before it.
-        A throw goes from the middle of a turnaround to that of the next (the parameter `throw` is the length of a *scan*)."""
-        cycle = self.throw / self.speed + self.turnaround
-        turning, first, throw = np.empty((3, len(seconds)), bool)
-        for some in chunks(len(seconds)):
-            t = seconds[some]
-            turning[some] = self.in_turnaround(t)
-            first[some] = np.floor(t / cycle) % 2 == 0
-            throw[some] = np.floor((t + self.turnaround / 2) / cycle) % 2 == 0
-        found: Intervals = {}
-        for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
-            found[f"throw_{way}"] = runs(going, seconds)
-            found[f"scan_{way}"] = runs(~turning & after, seconds)
-            found[f"turn_{way}"] = runs(turning & after, seconds)
-        for name, part in (("throw", "throw"), ("scanning", "scan"), ("turnaround", "turn")):
-            found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
-        return found
+        return _intervals(seconds, self.throw / self.speed, self.turnaround, self.in_turnaround(seconds))
 
     def describe(self, observation: Observation) -> None:
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
         observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()), observation.n_samples)
+
+
+def _middle(aim: Aim, seconds: Floats) -> tuple[float, float]:
+    """Horizontal (longitude, latitude) of the target in the middle of the scan."""
+    if aim.target.frame == "horizontal":
+        return -aim.target.longitude, aim.target.latitude
+    middle = np.array([(seconds[0] + seconds[-1]) / 2])
+    north, west, up = aim.transform.horizontal(unit_vectors(*aim.target.icrs()), middle)[0]
+    return math.atan2(west, north), math.atan2(up, math.hypot(north, west))
+
+
+def _check_turn(widest: float, elevation: float, place: str) -> None:
+    """Refuse a scan that reaches ``widest`` [rad] from its middle, half a turn of azimuth or more at its elevation."""
+    if elevation >= math.pi / 2 or widest > math.pi * math.cos(elevation):
+        raise PointingError(
+            f"the scan spans more than a whole turn of azimuth at elevation {math.degrees(elevation):.2f} deg",
+            place=place,
+            cure="lower throw, or choose a lower elevation",
+        )
+
+
+def _intervals(seconds: Floats, leg: float, turnaround: float, turning: NDArray[np.bool_]) -> Intervals:
+    """TOAST's intervals. Left to right is towards larger azimuth; a turnaround has the direction of the scan before it.
+
+    A throw goes from the middle of a turnaround to that of the next (the parameter `throw` is the length of a *scan*).
+    """
+    cycle = leg + turnaround
+    first, throw = (np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + turnaround / 2))
+    found: Intervals = {}
+    for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
+        found[f"throw_{way}"] = runs(going, seconds)
+        found[f"scan_{way}"] = runs(~turning & after, seconds)
+        found[f"turn_{way}"] = runs(turning & after, seconds)
+    for name, part in (("throw", "throw"), ("scanning", "scan"), ("turnaround", "turn")):
+        found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
+    return found

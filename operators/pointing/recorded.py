@@ -28,6 +28,8 @@ from .samples_per_beam import SamplesPerBeam
 from .transform import CelestialTransform
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
     from zonda.core.instrument import Telescope
@@ -87,12 +89,8 @@ class PointingRecorded(Operator):
     def observe(self, data: Data) -> None:
         """Append an observation for each part of the record without long gaps."""
         recording, found = self._read()
-        first, start = len(data.observations), recording.start or data.scene.time
-        if abs(data.scene.time.seconds_since(start)) > ANOTHER_DAY:
-            text = f"the record begins {start}, the weather is that of {data.scene.time}"
-            warnings.warn(f"{self.label}: {text}: set the scene's time", stacklevel=2)
-        if number := found.counts[OUT_OF_ORDER]:
-            text = f"{number} rows of {self.file} were dropped: their times jump ahead or back; is its clock right?"
+        first = len(data.observations)
+        for text in _doubts(recording, found, data.scene.time, self.file):
             warnings.warn(f"{self.label}: {text}", stacklevel=2)
         sampled = SamplesPerBeam()
         for scan in found.scans:
@@ -104,16 +102,28 @@ class PointingRecorded(Operator):
         report(self.label, data.observations[first:], sampled)
 
     def _read(self) -> tuple[Recording, Comb]:
-        recording = read_recording(self.file, self.clock, self.flag_mask)
-        if self.celestial == "recorded" and recording.frame == "azel" and recording.radec is None:
-            raise InputError(
-                "has azimuth and elevation and no boresight_radec",
-                place=f"{self.label}, {self.file}",
-                cure="set celestial: recomputed, or leave it out",
-            )
-        if self.celestial == "recomputed":
-            recording = replace(recording, radec=None)
-        return recording, comb(recording, self.split, f"{self.label}, {self.file}")
+        place = f"{self.label}, {self.file}"
+        recording = _on_the_sky(read_recording(self.file, self.clock, self.flag_mask), self.celestial, place)
+        return recording, comb(recording, self.split, place)
+
+
+def _on_the_sky(recording: Recording, celestial: str | None, place: str) -> Recording:
+    """The recording with those directions on the sky that ``celestial`` (`PointingRecorded`) asks for."""
+    if celestial == "recorded" and recording.frame == "azel" and recording.radec is None:
+        raise InputError(
+            "has azimuth and elevation and no boresight_radec", place=place, cure="set celestial: recomputed, or leave it out"
+        )
+    return replace(recording, radec=None) if celestial == "recomputed" else recording
+
+
+def _doubts(recording: Recording, found: Comb, time: Instant, file: Path) -> list[str]:
+    """What a run warns of: a record of another day than the scene's, rows out of order."""
+    texts, start = [], recording.start or time
+    if abs(time.seconds_since(start)) > ANOTHER_DAY:
+        texts.append(f"the record begins {start}, the weather is that of {time}: set the scene's time")
+    if number := found.counts[OUT_OF_ORDER]:
+        texts.append(f"{number} rows of {file} were dropped: their times jump ahead or back; is its clock right?")
+    return texts
 
 
 def _thinned(scan: Scan) -> Scan:
