@@ -93,13 +93,14 @@ def _root(frame: FrameType) -> str:
 
 
 def _step(frame: FrameType) -> Operator | None:
-    """The step whose method this is."""
+    """The step whose method, or whose planning's, this is."""
     if "zonda.core.operator" not in sys.modules:  # nor is there any step
         return None
     from .operator import Operator
 
     owner = frame.f_locals.get("self")
-    return owner if isinstance(owner, Operator) else None
+    planned = getattr(owner, "__dict__", {}).get("operator")
+    return next((step for step in (owner, planned) if isinstance(step, Operator)), None)
 
 
 def _is_plugin(frame: FrameType) -> bool:

@@ -75,8 +75,7 @@ class Planning(Generic[O]):
 
 def planning_of(operator: Operator) -> Planning[Any]:
     """The planning of an operator; of one that has none, `Planning` itself."""
-    found = planning_class(type(operator))
-    return _Own(operator) if found is Planning and hasattr(operator, "traits") else found(operator)
+    return planning_class(type(operator))(operator)
 
 
 def planning_class(operator: type[Operator]) -> type[Planning[Any]]:
@@ -92,12 +91,3 @@ def planning_class(operator: type[Operator]) -> type[Planning[Any]]:
             if found.of is cls:
                 return found
     return Planning
-
-
-class _Own(Planning[Any]):
-    """Of an operator that still has these methods itself. (Goes as soon as none has.)"""
-
-    def __init__(self, operator: Any) -> None:
-        super().__init__(operator)
-        self.knobs = operator.knobs  # type: ignore[misc]
-        self.traits, self.estimate, self.memory = operator.traits, operator.estimate, operator.memory  # type: ignore[method-assign]

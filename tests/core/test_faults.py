@@ -25,7 +25,9 @@ from zonda.core.data import Block
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.operator import Operator
+from zonda.core.output import Output
 from zonda.core.plan.estimate import Estimate, Traits
+from zonda.core.plan.planning import Planning
 from zonda.core.site import Site
 from zonda.operators.noise.models import NoiseModel
 
@@ -64,36 +66,37 @@ class Breaks(Operator):
     def halo(self, observation):
         self.at("halo")
         return 0
-    def in_time_order(self, observation, state):
-        self.at("in_time_order")
-        return False
-    def memory(self, observation):
-        self.at("memory")
-        return 0
     def exec(self, block, state): self.at("exec")
     def collect(self, data, observation, state): self.at("collect")
     def finalize(self, data): self.at("finalize")
+
+class Plans(Planning):
+    """What the planner asks."""
+    of = Breaks
+    def in_time_order(self, observation):
+        self.operator.at("in_time_order")
+        return False
+    def memory(self, observation):
+        self.operator.at("memory")
+        return 0
+    def sweeps(self, observation): return 1
     def traits(self, observation):
-        self.at("traits")
+        self.operator.at("traits")
         return Traits()
     def estimate(self, context):
-        self.at("estimate")
+        self.operator.at("estimate")
         return Estimate()
-    def pack(self, data, first): self.at("pack")
-    def merge(self, data, part): pass
 
 class Measures(Breaks):
     """Reads it all."""
     couples = "all"
-    def sweeps(self, observation): return 1
-    def measure(self, stream, state):
+    def measure(self, stream, model=None):
         self.at("measure")
         for _ in stream.sweep(lambda detectors, samples, part: self.at("sweep")):
             pass
 
-class Ends(Operator):
+class Ends(Output):
     """Acts at the end."""
-    at_end = True
     where: str = ""
     """The place."""
     def watch(self, data, done):
@@ -116,6 +119,7 @@ def metric(data):
 '''
 GROUPS = {
     "zonda.operators": {"Breaks": "zf_breaks:Breaks", "Measures": "zf_breaks:Measures", "Ends": "zf_breaks:Ends"},
+    "zonda.planning": {"Breaks": "zf_breaks:Plans"},
     "zonda.noise_models": {"zf_noise": "zf_breaks:Noise"},
     "zonda.sites": {"zf_hill": "zf_breaks:hill"},
     "zonda.metrics": {"zf_metric": "zf_breaks:metric"},
@@ -159,19 +163,7 @@ WAYS = {
     "StopIteration": "raised StopIteration",
     "click": "raised Exit: 0",
 }
-PLACES = [
-    "observe",
-    "configure",
-    "prepare",
-    "halo",
-    "in_time_order",
-    "memory",
-    "exec",
-    "collect",
-    "finalize",
-    "traits",
-    "estimate",
-]
+PLACES = ["observe", "configure", "prepare", "halo", "exec", "collect", "finalize"]
 
 
 def told(status: int, err: str, words: str, place: str) -> None:
@@ -189,6 +181,12 @@ def test_whatever_method_ends_the_program(breaks: Any, capsys: Any, where: str) 
     told(status, capsys.readouterr().err, WAYS["sys.exit(0)"], f"Breaks: zf_breaks.Breaks.{where} of zf-breaks 1.5 ")
 
 
+@pytest.mark.parametrize("where", ["in_time_order", "memory", "traits", "estimate"])
+def test_planning_too(breaks: Any, capsys: Any, where: str) -> None:
+    status, _ = breaks("sys.exit(0)", f"Breaks: {{where: {where}}}")
+    told(status, capsys.readouterr().err, WAYS["sys.exit(0)"], f"Breaks: zf_breaks.Plans.{where} of zf-breaks 1.5 ")
+
+
 @pytest.mark.parametrize("how", list(WAYS))
 def test_whatever_is_raised_on_any_thread(breaks: Any, capsys: Any, how: str) -> None:
     status, _ = breaks(how, "Breaks: {where: exec}")
@@ -201,7 +199,7 @@ def test_measuring(breaks: Any, capsys: Any, where: str) -> None:
     told(status, capsys.readouterr().err, WAYS["sys.exit(0)"], "Measures: zf_breaks.Measures.measure")
 
 
-@pytest.mark.parametrize("where", ["pointing", "scan", "run", "runs", "end"])
+@pytest.mark.parametrize("where", ["pointing", "scan", "maps", "end"])
 def test_what_acts_at_the_end(breaks: Any, capsys: Any, where: str) -> None:
     status, _ = breaks("sys.exit(0)", "", more=f"  - Ends: {{where: {where}}}\n")
     told(status, capsys.readouterr().err, WAYS["sys.exit(0)"], "Ends: zf_breaks.Ends.")
