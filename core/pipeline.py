@@ -190,9 +190,21 @@ class Pipeline:
 
     @faults_named(exceptions=False)
     def finish(self, data: Data) -> Data:
-        """Finish partial products that were combined, and let the outputs act."""
+        """Finish partial products that were combined, with the layouts that they have in common, and let the outputs act."""
+        for operator in self.operators:
+            if operator.label in data.layouts:
+                operator.observe(data)
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
         self._finish(data, Timer())
+        return data
+
+    @faults_named(exceptions=False)
+    def point(self, scene: Scene, layouts: Mapping[str, Any], output: Path, *, laid_out: bool = False) -> Data:
+        """The observations of a scene, and ``layouts`` extended to them, or taken as they are where all is ``laid_out``."""
+        data = Data(scene, output=output, layouts=dict(layouts), laid_out=laid_out)
+        for operator in self.operators:
+            if not isinstance(operator, Output):
+                operator.observe(data)
         return data
 
     def least_memory(self, observations: Sequence[Observation]) -> int:
@@ -210,7 +222,7 @@ class Pipeline:
     ) -> tuple[Data, Settings]:
         threads, memory, ceiling = arguments.check_run(scene, output, numbers, keep, self.name)
         data = Data(scene=scene, output=None if output is None else Path(output))
-        data.provenance = {**self._provenance(scene), **(provenance or {})}
+        data.provenance = {**self.provenance(scene), **(provenance or {})}
         hooks = manager().hook
         settings = Settings(
             threads=threads or available_threads(),
@@ -302,7 +314,8 @@ class Pipeline:
         if stage == "finalize":
             hooks.zonda_after_operator(operator=operator, observation=None, stage=stage, seconds=used)
 
-    def _provenance(self, scene: Scene) -> dict[str, Any]:
+    def provenance(self, scene: Scene) -> dict[str, Any]:
+        """What made the products: name, seed, versions, signals, operators with their parameters."""
         return {
             "name": self.name,
             "description": self.description,

@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..errors import InputError, OutputError, ZondaError
@@ -68,36 +69,34 @@ def publish(job: Job, folder: Path) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def verify(job: Job, folder: Path, log: Log, combined: set[int], say: Say, same_machine: bool = False) -> list[Task]:
+def verify(tasks: Sequence[Task], folder: Path, log: Log, say: Say, same_machine: bool = False) -> list[Task]:
     """Tasks whose products are not there, or not what they should be; the log then says so.
 
     ``same_machine``: products of another kind of machine than the first task's are removed.
     """
     rows = {row.number: row for row in log.rows()}
     others = {row.number: row for path in shares(folder) for row in readable(path)}
-    missing, lost, strange = [], [], []
+    missing, lost, strange = [], set(), 0
     first = next(filter(None, (machines.kind((others.get(n) or rows[n]).machine) for n in sorted(rows))), None)
-    for task in job.tasks:
-        if task.combination in combined:
-            continue
-        row, other = rows[task.number], others.get(task.number)
-        digest = parts.digest_of(task.path(folder), task.key)
-        if digest is None or (row.state == "done" and digest != row.digest):
-            missing.append(task)
-            if row.state == "done":
-                lost.append(task)
-        elif same_machine and machines.kind((other or row).machine) not in (first, frozenset()):
-            discard(task.path(folder))
-            missing.append(task)
-            strange.append(task.number)
-        elif row.state != "done":
-            known = other or row
-            log.done(task.number, known.host, known.seconds, digest, known.machine)
-    gone = {task.number for task in lost}
+    with log.together():
+        for task in tasks:
+            row, other = rows[task.number], others.get(task.number)
+            digest = parts.digest_of(task.path(folder), task.key)
+            if digest is None or (row.state == "done" and digest != row.digest):
+                missing.append(task)
+                if row.state == "done":
+                    lost.add(task.number)
+            elif same_machine and machines.kind((other or row).machine) not in (first, frozenset()):
+                discard(task.path(folder))
+                missing.append(task)
+                strange += 1
+            elif row.state != "done":
+                known = other or row
+                log.done(task.number, known.host, known.seconds, digest, known.machine)
+        log.put_off(task.number for task in missing if task.number not in lost)
+        log.put_off(lost, "its partial product was missing or damaged when the campaign was resumed")
     if strange:
-        say(f"{plural(len(strange), 'task')} ran on another kind of machine than the first: run again")
-    log.put_off(task.number for task in missing if task.number not in gone)
-    log.put_off(gone, "its partial product was missing or damaged when the campaign was resumed")
+        say(f"{plural(strange, 'task')} ran on another kind of machine than the first: run again")
     if lost:
         say(f"{len(lost)} partial products were missing or damaged: their tasks are run again")
     return missing
@@ -116,30 +115,29 @@ def readable(path: Path) -> list[joblog.Row]:
         return []
 
 
-def open_log(path: Path, job: Job) -> Log:
-    """A job log that knows all tasks."""
+def open_log(path: Path, tasks: Sequence[Task]) -> Log:
+    """A job log that knows these tasks."""
     log = Log(path)
-    log.begin(task.number for task in job.tasks)
+    log.begin(task.number for task in tasks)
     return log
 
 
-def opened(folder: Path, job: Job, say: Say) -> Log:
-    """The job log; a damaged one is put aside and made anew."""
-    path = folder / LOG
+def opened(path: Path, tasks: Sequence[Task], layouts: Mapping[int, str], say: Say) -> Log:
+    """As `open_log`; a log that is damaged or of another campaign is put aside and made anew. ``layouts``: see `Log.combined`."""
     try:
-        log = open_log(path, job)
-        if {row.number for row in log.rows()} != {task.number for task in job.tasks}:
+        log = open_log(path, tasks)
+        if {row.number for row in log.rows()} != {task.number for task in tasks}:
             raise InputError("it is of another campaign", place=str(path))
         log.check()
-        log.combined(job.layouts)
+        log.combined(layouts)
         return log
     except InputError:
-        aside = next(p for k in range(1, 1000) if not (p := folder / f"jobs.damaged-{k}.sqlite").exists())
+        aside = next(p for k in range(1, 1000) if not (p := path.with_name(f"jobs.damaged-{k}.sqlite")).exists())
         os.replace(path, aside)
-        for journal in folder.glob(f"{LOG}-*"):
+        for journal in path.parent.glob(f"{path.name}-*"):
             discard(journal)
         say(f"the job log was damaged: it is kept as {aside.name} and made anew from the partial products")
-        return open_log(path, job)
+        return open_log(path, tasks)
 
 
 def clean(folder: Path) -> None:

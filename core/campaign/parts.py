@@ -42,6 +42,18 @@ def write(path: Path, identity: str, tree: Mapping[str, Any]) -> str:
 
 def read(path: Path, identity: str, digest: str | None = None) -> dict[str, Any]:
     """The tree in a file that `write` made. Raises `InputError` where it is damaged, another's, or not the one meant."""
+    return _opened(path, identity, digest)[0]
+
+
+def digest_of(path: Path, identity: str) -> str | None:
+    """The digest of a file that is whole and the product of ``identity``; None of any other."""
+    try:
+        return _opened(path, identity, None)[1]
+    except InputError:
+        return None
+
+
+def _opened(path: Path, identity: str, digest: str | None) -> tuple[dict[str, Any], str]:
     try:
         with zipfile.ZipFile(path) as archive:
             head, _, text = archive.read(VALUES).decode().partition("\n")
@@ -57,18 +69,7 @@ def read(path: Path, identity: str, digest: str | None = None) -> dict[str, Any]
         cure = "zonda resume looks for such files and makes them anew"
         raise InputError(f"cannot be used: {str(err) or type(err).__name__}", place=str(path), cure=cure) from None
     assert isinstance(tree, dict)
-    return tree
-
-
-def digest_of(path: Path, identity: str) -> str | None:
-    """The digest of a file that is whole and the product of ``identity``; None of any other."""
-    try:
-        read(path, identity)
-        with zipfile.ZipFile(path) as archive:
-            found: str = json.loads(archive.read(VALUES).partition(b"\n")[0])["digest"]
-    except (InputError, OSError, ValueError, KeyError, zipfile.BadZipFile):
-        return None
-    return found
+    return tree, found
 
 
 def _put(archive: zipfile.ZipFile, name: str, data: str | bytes) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, ZondaError
-from ..output import Output
 from ..storage.files import product_path
 from . import parts
 from .entries import Entry, entries
@@ -21,7 +20,7 @@ from .settings import MOST_TASKS, Campaign
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
     from ..configuration.time import Instant
-    from ..data import Data
+    from ..scene import Scene
 
 
 MEASURED = 8
@@ -51,6 +50,10 @@ class Look:
     seed: int
     time: Instant
     place: str
+
+    def scene(self, files: Sequence[PipelineFile]) -> Scene:
+        """Of one of these files, at its time."""
+        return scene_of(files[self.pipeline], self.seed, self.time)
 
 
 @dataclass(frozen=True)
@@ -152,9 +155,12 @@ class _Draft:
 
     def _combine(self, source: Source, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]) -> None:
         """One set of products: the layout of all that is co-added, and its tasks."""
-        pointed: dict[int, Data] = {}
-        layouts, scans = agree(looks, self._files, pointed)
-        self.need = max([self.need, *(_need(self._files[k], data, layouts, self._folder) for k, data in pointed.items())])
+        layouts, scans = common_layouts(looks, self._files, self._folder)
+        firsts = {look.pipeline: look for look in reversed(looks)}
+        for look in list(firsts.values())[:MEASURED]:
+            pipeline = self._files[look.pipeline].pipeline()
+            data = pipeline.point(look.scene(self._files), layouts, self._folder, laid_out=True)
+            self.need = max(self.need, pipeline.least_memory(data.observations))
         name, subfolder = _names(source, members[0][1], self.combinations)
         digest = parts.write(layout_path(self._folder, len(self.combinations)), "layout", {"layouts": layouts})
         self.combinations.append(Combination(name, subfolder, digest))
@@ -198,7 +204,7 @@ def about(entry: Entry) -> str:
     return ", ".join(f"{k}={v}" for k, v in entry.values.items())
 
 
-def scene_of(file: PipelineFile, seed: int, time: Instant) -> Any:
+def scene_of(file: PipelineFile, seed: int, time: Instant) -> Scene:
     """The file's scene with another seed and start."""
     return file.scene().model_copy(update={"seed": seed, "time": time})
 
@@ -208,32 +214,29 @@ def changed(job: Job) -> list[str]:
     return [path for path, stamp in job.files.items() if _stamp(Path(path), stamp.partition(":")[0]) != stamp]
 
 
-def agree(
-    looks: Sequence[Look], files: Sequence[PipelineFile], pointed: dict[int, Data] | None = None
+def common_layouts(
+    looks: Sequence[Look], files: Sequence[PipelineFile], folder: Path
 ) -> tuple[dict[str, Mapping[str, Any]], list[tuple[int, ...]]]:
-    """What the operators agree on for all scans of a combination; and the samples (detectors x samples) of each entry's scans.
+    """The layouts of all scans of a combination; and the samples (detectors x samples) of each entry's scans.
 
     The telescope is pointed for one entry after the other, once for those that begin at the same time, and only as long as that
-    can change something. Raises `PointingError` where it cannot be. ``pointed``: takes the first entry of some of the pipelines.
+    can change something. Raises `PointingError` where it cannot be.
     """
     layouts: dict[str, Mapping[str, Any]] = {}
     by_start: dict[tuple[int, int], tuple[int, ...]] = {}
     by_pipeline: dict[int, tuple[int, ...]] = {}
-    found = []
     for look in looks:
         at = look.pipeline, look.time.nanoseconds
-        if at not in by_start:
-            settled = bool(layouts) and all(layout.get("fixed") for layout in layouts.values())
-            if settled and look.pipeline in by_pipeline:
-                by_start[at] = by_pipeline[look.pipeline]
-            else:
-                with _placed(look.place):
-                    data, by_start[at] = _point(files[look.pipeline], look, layouts)
-                if pointed is not None and len(pointed) < MEASURED:
-                    pointed.setdefault(look.pipeline, data)
-                by_pipeline[look.pipeline] = by_start[at]
-        found.append(by_start[at])
-    return layouts, found
+        if at in by_start:
+            continue
+        settled = bool(layouts) and all(layout.get("fixed") for layout in layouts.values())
+        if not settled or look.pipeline not in by_pipeline:
+            with _placed(look.place):
+                data = files[look.pipeline].pipeline().point(look.scene(files), layouts, folder)
+            layouts = data.layouts
+            by_pipeline[look.pipeline] = tuple(o.n_detectors * o.n_samples for o in data.observations)
+        by_start[at] = by_pipeline[look.pipeline]
+    return layouts, [by_start[look.pipeline, look.time.nanoseconds] for look in looks]
 
 
 def restore_layout(job: Job, folder: Path, number: int) -> None:
@@ -245,36 +248,12 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
     looks = [Look(t.pipeline, t.seed, Instant(t.time), t.about) for t in sorted(first.values(), key=lambda t: t.number)]
     files = [parse(text, name="campaign") for text in job.pipelines]
     path = layout_path(folder, number)
-    if parts.write(path, "layout", {"layouts": agree(looks, files)[0]}) != job.combinations[number].layout:
+    if parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]}) != job.combinations[number].layout:
         raise InputError(
             "is not what it was",
             place=str(path),
             cure="the pointing has changed since (another version?): run the campaign again",
         )
-
-
-def _point(file: PipelineFile, look: Look, layouts: dict[str, Mapping[str, Any]]) -> tuple[Data, tuple[int, ...]]:
-    """Point the telescope, let the operators agree; the observations, and the samples of each."""
-    from ..data import Data
-
-    pipeline = file.pipeline()
-    data = Data(scene=scene_of(file, look.seed, look.time))
-    data.layouts = dict(layouts)
-    for operator in pipeline.operators:
-        if not isinstance(operator, Output):
-            operator.observe(data)
-    layouts.update(data.layouts)
-    return data, tuple(o.n_detectors * o.n_samples for o in data.observations)
-
-
-def _need(file: PipelineFile, data: Data, layouts: Mapping[str, Mapping[str, Any]], folder: Path) -> int:
-    """Least bytes with which a process runs a pipeline over these observations. ``folder``: the campaign's, to write to."""
-    pipeline, data.output = file.pipeline(), folder
-    data.layouts, data.laid_out = dict(layouts), True
-    for operator in pipeline.operators:
-        if not isinstance(operator, Output) and "boresight" not in operator.provides:
-            operator.observe(data)
-    return pipeline.least_memory(data.observations)
 
 
 def _names(source: Source, entry: Entry, others: Sequence[Combination]) -> tuple[str, str]:

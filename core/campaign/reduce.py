@@ -7,50 +7,22 @@ to the tree.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from ..data import Data, Observation
+from ..configuration.time import Instant
+from ..data import Data
 from ..errors import ZondaError
 from ..faults import faults_named
-from ..output import Output
-from ..pipeline import Pipeline
-from ..product import Product
-from ..registry import products
 from ..storage.files import check_output_folder
-from . import parts
 from .job import Job, Task, layout_path, plural
+from .partial import Partial
 from .prepare import scene_of
 from .task import layouts_in, pipeline_of
 
 FAN = 32
 """Parts that are added up at once."""
-
-
-@dataclass
-class Thinned(Observation):
-    """A scan of which a few boresight directions are kept: `seconds`, `boresight_azel` and `boresight_radec` hold those alone.
-
-    ``flags`` and ``detector_flags`` hold as many ones as there are flagged samples and detectors.
-    """
-
-    samples: int = 0
-    detectors: int = 0
-
-    def __post_init__(self) -> None:
-        """No flags are made for the samples that are not here."""
-
-    @property
-    def n_samples(self) -> int:
-        return self.samples
-
-    @property
-    def n_detectors(self) -> int:
-        return self.detectors
 
 
 @dataclass(frozen=True)
@@ -77,106 +49,34 @@ def combine(folder: Path, number: int, digests: Mapping[int, str]) -> Combined:
 @faults_named()
 def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) -> Data:
     """As `combine`; the finished data. Raises `InputError` where a partial product is missing or damaged."""
-    combination = job.combinations[number]
-    tasks = job.tasks_of(number)
-    pipeline, data = _begin(job, folder, number, tasks)
-    leaves = [(t.path(folder), t.key, digests[t.number]) for t in tasks]
-    _add(data, _tree(data, leaves, lambda leaf: parts.read(*leaf)))
-    data.output = check_output_folder(folder / combination.folder)
-    for observation in data.observations[1:]:
-        observation.focalplane = data.observations[0].focalplane
+    combination, tasks = job.combinations[number], job.tasks_of(number)
+    first = tasks[0]
+    file = pipeline_of(job.pipelines[first.pipeline])
+    pipeline, scene = file.pipeline(), scene_of(file, first.seed, Instant(first.time))
+    data = Data(scene, output=check_output_folder(folder / combination.folder))
+    data.provenance = {
+        **pipeline.provenance(scene),
+        "resolved_yaml": job.source[0] if len(job.source) == 1 else job.pipelines[first.pipeline],
+        "command": job.command,
+        "plan": job.plans[first.pipeline],
+        "campaign": f"{combination.name or job.name}: {plural(len(tasks), 'task')}",
+    }
+    data.layouts, data.laid_out = dict(layouts_in(layout_path(folder, number), combination.layout)), True
+    depth = 1
+    while FAN**depth < len(tasks):
+        depth += 1
+    whole = _sum(tasks, folder, digests, 0, depth)
+    data.partial, data.tally, data.observations = whole.products, whole.tally, whole.observations(scene)
     return pipeline.finish(data)
 
 
-def _begin(job: Job, folder: Path, number: int, tasks: Sequence[Task]) -> tuple[Pipeline, Data]:
-    """The pipeline of the first task, laid out, and data without products."""
-    from ..configuration.time import Instant
-
-    first = tasks[0]
-    file = pipeline_of(job.pipelines[first.pipeline])
-    pipeline = file.pipeline()
-    combination = job.combinations[number]
-    layouts = layouts_in(layout_path(folder, number), combination.layout)
-    scene = scene_of(file, first.seed, Instant(first.time))
-    data = Data(scene=scene, layouts=dict(layouts), laid_out=True)
-    for operator in pipeline.operators:
-        if not isinstance(operator, Output) and "boresight" not in operator.provides:
-            operator.observe(data)
-    source = job.source[0] if len(job.source) == 1 else job.pipelines[first.pipeline]
-    extra = {"resolved_yaml": source, "command": job.command, "plan": job.plans[first.pipeline]}
-    extra["campaign"] = f"{combination.name or job.name}: {plural(len(tasks), 'task')}"
-    data.provenance = {**pipeline._provenance(scene), **extra}
-    return pipeline, data
-
-
-def _tree(data: Data, nodes: Sequence[Any], read: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
-    """The sum of parts, of which there are `FAN` at once in the branches of each level; one sum is held per level."""
-    depth = 1
-    while FAN**depth < len(nodes):
-        depth += 1
-
-    def total(low: int, level: int) -> dict[str, Any]:
-        if level == 0:
-            return read(nodes[low])
-        branch = _empty(data)
-        width = FAN ** (level - 1)
-        for start in range(low, min(low + FAN**level, len(nodes)), width):
-            _add(branch, total(start, level - 1))
-        return _packed(branch)
-
-    return total(0, depth)
-
-
-def _empty(data: Data) -> Data:
-    """The same scene without observations and products."""
-    return Data(scene=data.scene, provenance=data.provenance)
-
-
-def _packed(data: Data) -> dict[str, Any]:
-    tally = data.tally
-    rows = {name: [list(row) for row in getattr(tally, name)()] for name in ("counts", "totals", "figures")}
-    partial = {who: [type(product).__name__, product] for who, product in data.partial.items()}
-    return {"partial": partial, "scans": data.observations, **rows}
-
-
-def _add(data: Data, tree: dict[str, Any]) -> None:
-    for who, (kind, product) in tree["partial"].items():
-        data.add(who, product if isinstance(product, Product) else products.get(kind).of(product))
-    totals = {(who, what): total for who, what, total in tree["totals"]}
-    for who, what, count in tree["counts"]:
-        data.tally.count(who, what, count, totals.get((who, what), 0))
-    for who, what, text in tree["figures"]:
-        data.tally.state(who, what, text)
-    for scan in tree["scans"]:
-        index = len(data.observations)
-        data.observations.append(replace(scan, index=index) if isinstance(scan, Thinned) else _thinned(data, scan, index))
-
-
-def _thinned(data: Data, scan: dict[str, Any], index: int) -> Thinned:
-    from ..configuration.time import Instant
-
-    scene = data.scene
-    if data.observations:
-        plane = data.observations[0].focalplane
-    else:  # the first scan tells what the steps made of it
-        plane = scene.instrument.focalplane()
-        for name, values in scan["focal_plane"].items():
-            setattr(plane, name, values)
-    return Thinned(
-        name=scan["name"],
-        index=index,
-        site=scene.site,
-        instrument=scene.instrument,
-        focalplane=plane,
-        start=Instant(scan["start"]),
-        seconds=scan["seconds"],
-        sample_rate=scan["sample_rate"],
-        boresight_azel=scan["azel"],
-        boresight_radec=scan["radec"],
-        centre=(scan["centre"][0], scan["centre"][1]),
-        seed=scene.seed,
-        flags=np.ones(scan["flagged"][0], np.uint8),
-        detector_flags=np.ones(scan["flagged"][1], np.uint8),
-        samples=scan["n_samples"],
-        detectors=scan["n_detectors"],
-    )
+def _sum(tasks: Sequence[Task], folder: Path, digests: Mapping[int, str], first: int, level: int) -> Partial:
+    """Of ``FAN**level`` parts from the ``first`` on; one sum is held for each level."""
+    if level == 0:
+        task = tasks[first]
+        return Partial.read(task.path(folder), task.key, digests[task.number])
+    whole = _sum(tasks, folder, digests, first, level - 1)
+    width = FAN ** (level - 1)
+    for branch in range(first + width, min(first + FAN * width, len(tasks)), width):
+        whole += _sum(tasks, folder, digests, branch, level - 1)
+    return whole

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from .. import hooks
 from ..errors import InputError, OutputError, PipelineError, ZondaError
-from ..storage.files import check_output_folder, discard
+from ..storage.files import check_output_folder
 from . import parts
 from .engines import Pool
 from .folder import (
@@ -65,7 +65,7 @@ def begin(
         raise
     _describe(made, folder, say)
     write_sources(made, folder)
-    with contextlib.closing(open_log(folder / LOG, made)) as log:
+    with contextlib.closing(open_log(folder / LOG, made.tasks)) as log:
         made.write(folder)
         return _work(made, folder, log, pool, _watch(made.same_machine, folder, [log.rows()], say), made.tasks)
 
@@ -85,8 +85,7 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_mac
     check_unchanged(job, folder, anyway)
     share_out(pool, job.need, job.name)
     clean(folder)
-    log = opened(folder, job, say)
-    with contextlib.closing(log):
+    with contextlib.closing(opened(folder / LOG, job.tasks, job.layouts, say)) as log:
         combined = log.combined(job.layouts)
         for number, combination in enumerate(job.combinations):
             if number not in combined:
@@ -94,7 +93,7 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_mac
                     parts.read(layout_path(folder, number), "layout", combination.layout)
                 except InputError:
                     restore_layout(job, folder, number)
-        missing = verify(job, folder, log, combined, say, strict)
+        missing = verify([t for t in job.tasks if t.combination not in combined], folder, log, say, strict)
         return _work(job, folder, log, pool, _watch(strict, folder, [log.rows()], say), missing)
 
 
@@ -118,22 +117,8 @@ def share(
     share_out(pool, job.need, job.name)
     mine = [task for task in job.tasks if task.number % which[1] == which[0] - 1]
     path = folder / f"jobs.{which[0]}-of-{which[1]}.sqlite"
-    try:
-        log = Log(path)
-        rows = {row.number: row for row in log.rows()}
-    except InputError:
-        discard(path)
-        log, rows = Log(path), {}
-    with contextlib.closing(log):
-        log.begin(task.number for task in mine)
-        missing = []
-        for task in mine:
-            digest = parts.digest_of(task.path(folder), task.key)
-            if digest is None:
-                missing.append(task)
-            elif task.number not in rows or rows[task.number].state != "done":
-                log.done(task.number, "", 0.0, digest)
-        log.put_off(task.number for task in missing)
+    with contextlib.closing(opened(path, mine, {}, say)) as log:
+        missing = verify(mine, folder, log, say)
         theirs = [readable(path) for path in shares(folder)]
         result = Tasks(job, folder, log, pool, _watch(job.same_machine, folder, theirs, say)).run(missing)
     _tell(result, say)

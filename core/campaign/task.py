@@ -17,13 +17,10 @@ from ..errors import InputError, OutputError, PipelineError, PointingError, Zond
 from ..faults import faults_named
 from . import machines, parts
 from .job import Task, layout_path
+from .partial import NotCombined, Partial
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
-
-POINTS = 512
-"""Boresight directions that are kept of a scan for pictures and tables; of those beyond `SCANS`, 16."""
-SCANS = 32
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ def perform(order: Order) -> Outcome:
         digest = _run(order)
     except ZondaError as err:
         final = isinstance(err, PipelineError | PointingError)
-        stop = isinstance(err, OutputError | _NotCombined)
+        stop = isinstance(err, OutputError | NotCombined)
         return Outcome(number, host, time.monotonic() - begin, error=str(err), final=final, stop=stop, peak=_peak())
     except Exception as err:
         import traceback
@@ -110,22 +107,15 @@ def perform(order: Order) -> Outcome:
     return Outcome(number, host, time.monotonic() - begin, digest, peak=_peak(), machine=machines.here())
 
 
-class _NotCombined(PipelineError):
-    """A product that cannot be added to those of other observations."""
-
-
 @faults_named()
 def _run(order: Order) -> str:
     from ..configuration.time import Instant
     from ..pipeline import Part
     from .prepare import scene_of
 
-    task, folder = order.task, order.folder
-    file = pipeline_of(order.pipeline)
-    layouts = layouts_in(layout_path(folder, task.combination), order.layout)
-    part = Part(task.scans, layouts, prefix=f"{task.entry:06d}-")
-    pipeline = file.pipeline()
-    data = pipeline.run_part(
+    task, folder, file = order.task, order.folder, pipeline_of(order.pipeline)
+    part = Part(task.scans, layouts_in(layout_path(folder, task.combination), order.layout), f"{task.entry:06d}-")
+    data = file.pipeline().run_part(
         scene_of(file, task.seed, Instant(task.time)),
         part,
         output=folder / "entries" / f"{task.entry:06d}",  # the time streams of one entry together
@@ -133,23 +123,7 @@ def _run(order: Order) -> str:
         ceiling=order.memory,
         provenance={"resolved_yaml": order.pipeline},
     )
-    if data.products:
-        raise _NotCombined(
-            f"the product {sorted(data.products)[0]!r} cannot be combined with those of other observations",
-            place=file.header.name,
-            cure="its operator needs to hand a Product to Data.add; or run the observations one by one",
-        )
-    scans = [_thinned(o, k + task.before) for k, o in enumerate(data.observations)]
-    tally = data.tally
-    tree = {
-        "partial": {who: [type(product).__name__, dict(product.arrays())] for who, product in data.partial.items()},
-        "scans": scans,
-        "counts": [list(row) for row in tally.counts()],
-        "totals": [list(row) for row in tally.totals()],
-        # figures of scans of one number share a row, whatever the entry: there may be a million entries
-        "figures": [[who, what.removeprefix(part.prefix), text] for who, what, text in tally.figures()],
-    }
-    return parts.write(task.path(folder), task.key, tree)
+    return Partial.of(data, task.before, part.prefix).write(task.path(folder), task.key)
 
 
 @lru_cache(4)
@@ -168,34 +142,6 @@ def layouts_in(path: Path, digest: str) -> Mapping[str, Any]:
     except InputError as err:
         raise InputError(err.message, place=err.place, cure="can this worker see the campaign's folder?") from None
     return layouts
-
-
-def _thinned(observation: Any, number: int) -> dict[str, Any]:
-    """What a report tells of a scan, with a few of its boresight directions."""
-    import numpy as np
-
-    n = observation.n_samples
-    some = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)
-    elevation = observation.elevation
-    some = np.unique([*some, elevation.argmin(), elevation.argmax()])
-    return {
-        "name": observation.name,
-        "start": observation.start.nanoseconds,
-        "n_samples": n,
-        "n_detectors": observation.n_detectors,
-        "sample_rate": observation.sample_rate,
-        "seconds": observation.seconds[some],
-        "azel": observation.boresight_azel[some],
-        "radec": observation.boresight_radec[some],
-        "centre": list(observation.centre),
-        "focal_plane": _levels(observation.focalplane) if number == 0 else {},
-        "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],
-    }
-
-
-def _levels(plane: Any) -> dict[str, Any]:
-    """What the steps made of the focal plane, for the report: efficiencies and noise as they were resolved."""
-    return {name: getattr(plane, name) for name in ("main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope")}
 
 
 def _peak() -> int:

@@ -356,7 +356,7 @@ def test_shares_of_an_array(undisturbed, bench, capsys):
 def test_an_operator_that_cannot_be_combined_is_named(bench, monkeypatch, capsys):
     from zonda.operators.diagnostics.power_spectrum import PowerSpectrum
 
-    monkeypatch.setattr(PowerSpectrum, "collect", lambda self, data, observation, state: data.products.update(spectrum=1))
+    monkeypatch.setattr(PowerSpectrum, "collect", lambda self, data, observation, state: data.products.update(spectrum=state))
     out = bench.run(bench.CAMPAIGN, *SERIAL, "--no-prune", status=2)
     assert "'spectrum' cannot be combined" in capsys.readouterr().err
     assert states(out).count("failed") == 1  # the others would fail alike: they are not tried

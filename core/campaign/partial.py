@@ -1,0 +1,166 @@
+"""What a task leaves: its partial products, its counts, and a few directions of each of its scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import registry
+from ..configuration.time import Instant
+from ..data import Data
+from ..errors import PipelineError
+from ..focalplane import Focalplane
+from ..observation import Observation
+from ..product import Product
+from ..scene import Scene
+from ..tally import Tally
+from . import parts
+
+POINTS = 512
+"""Boresight directions that are kept of a scan for pictures and tables; of those beyond `SCANS`, 16."""
+SCANS = 32
+LEVELS = ("main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope")
+"""What the steps made of the focal plane, for the report."""
+
+
+class NotCombined(PipelineError):
+    """A product that cannot be added to those of other observations."""
+
+
+@dataclass
+class Partial:
+    """Shares of some tasks, in the order of their scans.
+
+    Attributes
+    ----------
+    products
+        By the label of the step.
+    scans
+        What `Thinned` is made of.
+    """
+
+    products: dict[str, Product]
+    tally: Tally
+    scans: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, data: Data, before: int, prefix: str) -> Partial:
+        """That of the scans of a task. ``before``: number of scans before them; ``prefix``: of their names.
+
+        Raises `NotCombined` for a product that no campaign can add up.
+        """
+        kinds = {label: type(product) for label, product in data.partial.items()}
+        unknown = [label for label, kind in kinds.items() if not _registered(kind)]
+        for name in (*data.products, *unknown):
+            raise NotCombined(
+                f"the product {name!r} cannot be combined with those of other observations",
+                place=str(data.provenance["name"]),
+                cure="its operator must hand a registered Product to data.add(), see docs/plugins.md; or run them one by one",
+            )
+        # figures of scans of one number share a row, whatever the entry: there may be a million entries
+        tally = _tally({**_rows(data.tally), "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.tally.figures()]})
+        return cls(data.partial, tally, [_thinned(o, k + before) for k, o in enumerate(data.observations)])
+
+    def __iadd__(self, other: Partial) -> Partial:
+        """Add what follows."""
+        for label, product in other.products.items():
+            if label in self.products:
+                self.products[label] += product
+            else:
+                self.products[label] = product
+        self.tally.update(other.tally)
+        self.scans += other.scans
+        return self
+
+    def write(self, path: Path, identity: str) -> str:
+        """Into a file; its digest."""
+        products = {label: {"kind": type(p).__name__, "arrays": p.arrays()} for label, p in self.products.items()}
+        return parts.write(path, identity, {"products": products, "scans": self.scans, "tally": _rows(self.tally)})
+
+    @classmethod
+    def read(cls, path: Path, identity: str, digest: str) -> Partial:
+        """From a file. Raises `InputError` where it is missing or damaged."""
+        tree = parts.read(path, identity, digest)
+        products = {label: registry.products.get(p["kind"]).of(p["arrays"]) for label, p in tree["products"].items()}
+        return cls(products, _tally(tree["tally"]), tree["scans"])
+
+    def observations(self, scene: Scene) -> list[Observation]:
+        """All scans, thinned; the very first one tells what the steps made of the focal plane."""
+        plane = scene.instrument.focalplane()
+        for name, values in self.scans[0]["focal_plane"].items():
+            setattr(plane, name, values)
+        return [Thinned.made(scan, index, scene, plane) for index, scan in enumerate(self.scans)]
+
+
+@dataclass
+class Thinned(Observation):
+    """A scan of which a few boresight directions are kept: `seconds`, `boresight_azel` and `boresight_radec` hold those alone.
+
+    ``flags`` and ``detector_flags`` hold as many ones as there are flagged samples and detectors.
+    """
+
+    samples: int = 0
+    detectors: int = 0
+
+    def __post_init__(self) -> None:
+        """No flags are made for the samples that are not here."""
+
+    @property
+    def n_samples(self) -> int:
+        return self.samples
+
+    @property
+    def n_detectors(self) -> int:
+        return self.detectors
+
+    @classmethod
+    def made(cls, scan: dict[str, Any], index: int, scene: Scene, plane: Focalplane) -> Thinned:
+        """From what `_thinned` kept."""
+        samples, detectors = (np.ones(number, np.uint8) for number in scan["flagged"])
+        own = {k: v for k, v in scan.items() if k not in ("start", "centre", "focal_plane", "flagged")}
+        return cls(
+            index=index, site=scene.site, instrument=scene.instrument, focalplane=plane, start=Instant(scan["start"]),
+            centre=(scan["centre"][0], scan["centre"][1]), seed=scene.seed, flags=samples, detector_flags=detectors, **own,
+        )  # fmt: skip
+
+
+def _registered(kind: type[Product]) -> bool:
+    return kind.__name__ in registry.products and registry.products.get(kind.__name__) is kind
+
+
+def _rows(tally: Tally) -> dict[str, list[Any]]:
+    return {"counts": tally.counts(), "totals": tally.totals(), "figures": tally.figures()}
+
+
+def _tally(rows: Mapping[str, Any]) -> Tally:
+    tally = Tally()
+    totals = {(who, what): total for who, what, total in rows["totals"]}
+    for who, what, count in rows["counts"]:
+        tally.count(who, what, count, totals.get((who, what), 0))
+    for who, what, text in rows["figures"]:
+        tally.state(who, what, text)
+    return tally
+
+
+def _thinned(observation: Observation, number: int) -> dict[str, Any]:
+    """What a report shows of a scan, with a few of its boresight directions. ``number``: its place among all."""
+    n, elevation = observation.n_samples, observation.elevation
+    few = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)
+    few = np.unique([*few, elevation.argmin(), elevation.argmax()])
+    return {
+        "name": observation.name,
+        "start": observation.start.nanoseconds,
+        "samples": n,
+        "detectors": observation.n_detectors,
+        "sample_rate": observation.sample_rate,
+        "seconds": observation.seconds[few],
+        "boresight_azel": observation.boresight_azel[few],
+        "boresight_radec": observation.boresight_radec[few],
+        "centre": list(observation.centre),
+        "focal_plane": {name: getattr(observation.focalplane, name) for name in LEVELS} if number == 0 else {},
+        "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],
+    }
