@@ -24,7 +24,7 @@ from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
 from .limits import LargestMotion, check_elevation, excess
-from .motion import POINTS, Peak, Quantity, motion
+from .motion import POINTS, LargestDerivative, Quantity, motion
 from .observed import Samples, centre_of, observed, report, state_times
 from .samples_per_beam import SamplesPerBeam
 from .slower import what_fits
@@ -262,7 +262,7 @@ class Pointing(Operator):
         def track(scan: Pointing, step: float) -> Floats:
             return scan.directions(aim, np.arange(max(round(length / step), 1), dtype=np.float64) * step)
 
-        def of(scan: Pointing) -> dict[Quantity, Peak]:
+        def of(scan: Pointing) -> dict[Quantity, LargestDerivative]:
             coarse = min(rate, POINTS / length)
             return motion(track(scan, 1 / coarse), coarse, limits, lambda step: track(scan, step))
 

@@ -12,7 +12,7 @@ from zonda.core.errors import PointingError
 from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.types import Floats
 
-from .motion import Peak, Quantity, rate_text
+from .motion import LargestDerivative, Quantity, rate_text
 from .transform import CelestialTransform
 
 if TYPE_CHECKING:
@@ -97,14 +97,14 @@ ROUNDING = 1e-6
 """Share by which a figure may exceed its limit: a scan that was laid out to reach it exactly is none too fast."""
 
 
-def excess(found: dict[Quantity, Peak], limits: dict[Quantity, float]) -> dict[Quantity, float]:
+def excess(found: dict[Quantity, LargestDerivative], limits: dict[Quantity, float]) -> dict[Quantity, float]:
     """By how much each limit is exceeded, a factor > 1, the worst first."""
     ratio = {q: found[q].figure / limit for q, limit in limits.items() if q in found}
     over = {q: r for q, r in ratio.items() if r > 1 + ROUNDING}
     return dict(sorted(over.items(), key=lambda item: -(item[1] ** (1 / item[0][1]))))
 
 
-def lower_elevation(found: Mapping[Quantity, Peak], over: Mapping[Quantity, float]) -> float | None:
+def lower_elevation(found: Mapping[Quantity, LargestDerivative], over: Mapping[Quantity, float]) -> float | None:
     """Elevation [rad] at which the scan would fit, where only the azimuth axis is too fast: it turns by 1 / cos(elevation)."""
     if any(axis != "azimuth" for axis, _ in over):
         return None
@@ -122,16 +122,16 @@ class LargestMotion:
         self.telescope = telescope
         self.limits = {q: limit for q, name in LIMITS.items() if (limit := getattr(telescope, name)) is not None}
         """Those that the telescope states, rad/s^order."""
-        self._found: dict[Quantity, Peak] = {}
+        self._found: dict[Quantity, LargestDerivative] = {}
         self._where: dict[Quantity, str] = {}
 
-    def add(self, name: str, found: dict[Quantity, Peak]) -> None:
+    def add(self, name: str, found: dict[Quantity, LargestDerivative]) -> None:
         """Take a scan into account."""
         for q, peak in found.items():
             if q not in self._found or peak.figure > self._found[q].figure:
                 self._found[q], self._where[q] = peak, name
 
-    def too_fast(self, quantity: Quantity, found: dict[Quantity, Peak], name: str = "the scan") -> str:
+    def too_fast(self, quantity: Quantity, found: dict[Quantity, LargestDerivative], name: str = "the scan") -> str:
         """The message about a limit that the scan exceeds."""
         (axis, order), peak = quantity, found[quantity]
         word = WORDS[order]

@@ -40,7 +40,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 """What is measured. On the sky the azimuth counts times the cosine of the elevation."""
 
 
-class Peak(NamedTuple):
+class LargestDerivative(NamedTuple):
     """A largest derivative of the track."""
 
     figure: float
@@ -55,7 +55,7 @@ class Peak(NamedTuple):
 
 def motion(
     horizontal: Floats, rate: float, limits: Mapping[Quantity, float], finer: Callable[[float], Floats]
-) -> dict[Quantity, Peak]:
+) -> dict[Quantity, LargestDerivative]:
     """The largest derivatives of a track.
 
     Parameters
@@ -80,7 +80,7 @@ def motion(
         stride, step = stride // 2, step / 2
 
 
-def _peaks(track: Floats, step: float) -> dict[Quantity, Peak]:
+def _peaks(track: Floats, step: float) -> dict[Quantity, LargestDerivative]:
     azimuth = np.unwrap(np.arctan2(-track[:, 1], track[:, 0]))
     elevation = np.arctan2(track[:, 2], np.hypot(track[:, 0], track[:, 1]))
     fine, coarse = _derivatives(azimuth, elevation, 1, step), _derivatives(azimuth, elevation, 2, step)
@@ -92,7 +92,7 @@ def _peaks(track: Floats, step: float) -> dict[Quantity, Peak]:
         bend = 2 * largest - float(around[0] + around[-1]) if len(around) == 3 else 0.0
         error = max(abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3, bend * (3 + order) / 24)
         there = float(elevation[min(k + order // 2, len(elevation) - 1)])
-        found[axis, order] = Peak(largest, (k + order / 2) * step, there, error)
+        found[axis, order] = LargestDerivative(largest, (k + order / 2) * step, there, error)
     return found
 
 

@@ -40,7 +40,7 @@ Columns = Mapping[str, tuple[Any, str | None]]
 
 
 @dataclass
-class Table:
+class RecordedTable:
     """What a file holds.
 
     Attributes
@@ -90,7 +90,7 @@ def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recordi
         raise InputError(f"cannot be read: {err}", place=place, cure=CURE) from None
 
 
-def _csv(path: Path, place: str) -> Table:
+def _csv(path: Path, place: str) -> RecordedTable:
     try:
         with path.open(encoding="utf-8-sig") as file:  # spreadsheets begin with a byte order mark
             header = file.readline().lstrip("# ").strip()
@@ -108,10 +108,10 @@ def _csv(path: Path, place: str) -> Table:
     for k, name in enumerate(names):
         word, _, unit = name.partition("[")
         columns[word.strip().lower()] = (table[:, k], unit.rstrip("] ") or None)
-    return Table(columns)
+    return RecordedTable(columns)
 
 
-def _fits(path: Path, place: str) -> Table:
+def _fits(path: Path, place: str) -> RecordedTable:
     from astropy.io import fits
 
     with fits_files.opened(path, place, CURE) as file:
@@ -126,7 +126,7 @@ def _fits(path: Path, place: str) -> Table:
                     and np.asarray(table.data[c.name]).ndim == 1 and np.asarray(table.data[c.name]).dtype.kind in "fiub"
                 }  # fmt: skip
                 start = file[0].header.get("DATE-OBS") if "seconds" in columns else None
-                found = Table(columns, Instant.parse(start) if start else None, in_seconds=True)
+                found = RecordedTable(columns, Instant.parse(start) if start else None, in_seconds=True)
                 if names >= {"boresight_azel", "boresight_radec"}:  # SaveTOD's
                     found.bits = "toast" if "FLAGBITS" in table.header else "before"
                     found.radec = np.asarray(table.data["BORESIGHT_RADEC"], np.float64)
@@ -135,7 +135,7 @@ def _fits(path: Path, place: str) -> Table:
     raise InputError("has no table with az and el, or ra and dec", place=place, cure="name the columns TIME, AZ and EL")
 
 
-def _hdf5(path: Path, place: str) -> Table:
+def _hdf5(path: Path, place: str) -> RecordedTable:
     import h5py
 
     with hdf5_files.opened(path, place, "HDF5", CURE) as file:
@@ -150,7 +150,7 @@ def _hdf5(path: Path, place: str) -> Table:
             known = next((ours for ours, names in ALIASES.items() if name.lower() in names), None)
             si = {"time": "s", "seconds": "s", "az": "rad", "el": "rad"}.get(known or "") if toast else None
             columns[name.lower()] = (values[:], str(unit) if unit is not None else si)
-        found = Table(columns)
+        found = RecordedTable(columns)
         if toast:
             other = file["metadata/other"].attrs if "metadata/other" in file else {}
             start = other.get("zonda_start_utc")
@@ -191,7 +191,7 @@ def _check_rotation(quaternions: Any, place: str) -> None:
         )
 
 
-def _recording(table: Table, clock: Clock, mask: int | None, place: str) -> Recording:
+def _recording(table: RecordedTable, clock: Clock, mask: int | None, place: str) -> Recording:
     columns, start = table.columns, table.start
     found = {ours: columns[name] for ours, names in ALIASES.items() for name in names if name in columns}
     frame: Literal["azel", "icrs"] = "azel" if {"az", "el"} <= set(found) else "icrs"

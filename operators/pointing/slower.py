@@ -11,7 +11,7 @@ from zonda.core.configuration.parameters import Parameters
 from zonda.core.errors import PointingError
 
 from .limits import lower_elevation
-from .motion import Peak, Quantity, rate_text
+from .motion import LargestDerivative, Quantity, rate_text
 
 Scan = TypeVar("Scan", bound=Parameters)
 
@@ -19,7 +19,7 @@ Scan = TypeVar("Scan", bound=Parameters)
 def what_fits(
     scan: Scan,
     slows: Mapping[str, tuple[int, int]],
-    found: Mapping[Quantity, Peak],
+    found: Mapping[Quantity, LargestDerivative],
     over: Mapping[Quantity, float],
     fits: Callable[[Scan], bool],
 ) -> str:

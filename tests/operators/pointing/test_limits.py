@@ -11,7 +11,7 @@ from zonda.core.errors import PointingError
 from zonda.core.instrument import Telescope
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.limits import LargestMotion
-from zonda.operators.pointing.motion import Peak
+from zonda.operators.pointing.motion import LargestDerivative
 from zonda.operators.pointing.stare import PointingStare
 
 
@@ -95,7 +95,7 @@ def test_tracking_counts_as_motion(observe: Callable[..., Data]) -> None:
 def test_an_axis_that_stands_still_is_not_said_to_move():
     """What rounding leaves of an elevation that is constant is no speed."""
     moved = LargestMotion(Telescope(name="dish", diameter="6 m", elevation_speed_max="1 deg/s"))
-    moved.add("scan", {("azimuth", 1): Peak(0.02, 0, 1, 0), ("elevation", 1): Peak(3e-14, 0, 1, 0)})
+    moved.add("scan", {("azimuth", 1): LargestDerivative(0.02, 0, 1, 0), ("elevation", 1): LargestDerivative(3e-14, 0, 1, 0)})
     assert moved.statements() == [
         ("largest speed of the axes", "azimuth 1.146 deg/s, elevation 0 arcsec/s (0 % of 1 deg/s)"),
     ]
