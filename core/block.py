@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .numerics.smooth import SmoothField
 from .observation import Observation
-from .signal import MAIN, Component, Entrance, is_signal
+from .signal import MAIN, Component, Entrance
 from .tally import Tally
 from .types import AnyFloats
 
@@ -64,8 +64,8 @@ class Block:
 
     @property
     def signals(self) -> list[str]:
-        """Names of the streams of all signals that are here, the complete one first."""
-        return sorted(filter(is_signal, self.detdata))
+        """Names of the streams of all signals that are here, in the order of `Observation.signals`."""
+        return [name for name in self.observation.signals if name in self.detdata]
 
     def entering(self, where: Entrance) -> list[str]:
         """Names of the components of ``signal`` that are here and enter there, in a fixed order."""
