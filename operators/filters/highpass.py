@@ -48,52 +48,18 @@ class HighpassFilter(Operator):
 
     def check(self, data: Data) -> list[str]:
         """Scans that are shorter than one cycle of the cut."""
-        short = sum(o.duration * self.frequency < 1 for o in data.observations)
-        if not short:
-            return []
-        return [
-            f"{short} of {len(data.observations)} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {self._left()}"
-        ]
+        short, every = sum(o.duration * self.frequency < 1 for o in data.observations), len(data.observations)
+        text = f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {_only(self.degree)}"
+        return [text] if short else []
 
     def prepare(self, observation: Observation) -> tuple[HighpassPlan, NDArray[np.intp]]:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
-        n, rate, tally = observation.n_samples, observation.sample_rate, observation.tally
-        if self.frequency >= rate / 2:
-            raise PipelineError(
-                f"a cut at {self.frequency:g} Hz removes everything: samples come at {rate:g} Hz",
-                place=self.label,
-                cure=f"choose a frequency well below {rate / 2:g} Hz",
-            )
         bad = ~good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
-        trimmed = min(round(self.trim * rate), n)
-        if 2 * trimmed >= n and trimmed:
-            raise PipelineError(
-                f"trimming {self.trim:g} s at either end leaves nothing of a scan of {observation.duration:g} s",
-                place=f"{self.label}, {observation.name}",
-                cure="shorten trim or lengthen the scan",
-            )
-        if trimmed:
-            observation.flags[:trimmed] |= PROCESSING
-            observation.flags[n - trimmed :] |= PROCESSING
-        tally.count(self.label, "samples trimmed", 2 * trimmed, n)
-        tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()), n)
+        _trim(self, observation)
+        observation.tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()), bad.size)
         if observation.smooth.get("atmosphere") is not None:
-            tally.state(self.label, "smooth mean emission", "removed analytically")
-        plan = plan_highpass(n, self.frequency / rate, self.degree, self.oversampling)
-        if plan.cut == 0:
-            text = self._left() if n > 1 + min(self.degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
-            tally.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
-        elif plan.cut >= n:
-            raise PipelineError(
-                f"a cut at {self.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz hold no faster wave",
-                place=f"{self.label}, {observation.name}",
-                cure=f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan",
-            )
-        return plan, np.flatnonzero(bad)
-
-    def _left(self) -> str:
-        """What is removed from a short scan."""
-        return ONLY_A_LINE if self.degree else ONLY_THE_MEAN
+            observation.tally.state(self.label, "smooth mean emission", "removed analytically")
+        return _planned(self, observation), np.flatnonzero(bad)
 
     def exec(self, block: Block, state: tuple[HighpassPlan, NDArray[np.intp]]) -> None:
         """Filter the block's rows in place."""
@@ -101,3 +67,39 @@ class HighpassFilter(Operator):
         plan, bad = state
         spoilt = plan.apply(block.detdata["signal"], bad)
         block.observation.tally.count(self.label, SPOILT, spoilt)
+
+
+def _trim(step: HighpassFilter, observation: Observation) -> None:
+    """Flag the ends of a scan."""
+    n = observation.n_samples
+    trimmed = min(round(step.trim * observation.sample_rate), n)
+    if 2 * trimmed >= n and trimmed:
+        raise PipelineError(
+            f"trimming {step.trim:g} s at either end leaves nothing of a scan of {observation.duration:g} s",
+            place=f"{step.label}, {observation.name}",
+            cure="shorten trim or lengthen the scan",
+        )
+    observation.flags[:trimmed] |= PROCESSING
+    observation.flags[n - trimmed :] |= PROCESSING
+    observation.tally.count(step.label, "samples trimmed", 2 * trimmed, n)
+
+
+def _planned(step: HighpassFilter, observation: Observation) -> HighpassPlan:
+    """The plan for a scan's length; says, or refuses, where nothing or little is left."""
+    n, rate = observation.n_samples, observation.sample_rate
+    plan = plan_highpass(n, step.frequency / rate, step.degree, step.oversampling)
+    if plan.cut == 0:
+        text = _only(step.degree) if n > 1 + min(step.degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+        observation.tally.state(step.label, f"{observation.name} is shorter than 1/frequency", text)
+    elif plan.cut >= n:
+        raise PipelineError(
+            f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz hold no faster wave",
+            place=f"{step.label}, {observation.name}",
+            cure=f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan",
+        )
+    return plan
+
+
+def _only(degree: int) -> str:
+    """What is removed from a short scan."""
+    return ONLY_A_LINE if degree else ONLY_THE_MEAN
