@@ -20,15 +20,16 @@ import numpy as np
 from pydantic import Field
 
 from zonda.core import flags
+from zonda.core.block import Block
 from zonda.core.compilation.jit import nb
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
-from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
+from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import AnyFloats, Floats
 
@@ -61,81 +62,103 @@ class Efficiency(Operator):
     def configure(self, observation: Observation) -> None:
         """Write ``main_beam_efficiency`` and ``illumination_efficiency`` of the focal plane."""
         plane = observation.focalplane
-        n = len(plane)
         if self.illumination is not None:
-            plane.illumination_efficiency = np.full(n, self.illumination)
+            plane.illumination_efficiency = np.full(len(plane), self.illumination)
         if self.main_beam is not None:
-            plane.main_beam_efficiency = np.full(n, self.main_beam)
+            plane.main_beam_efficiency = np.full(len(plane), self.main_beam)
         if self.scatter > 0:
-            nominal = plane.main_beam_efficiency
-            if self.main_beam is None:  # from the instrument, so that configuring twice scatters once
-                own = observation.instrument.focalplane()
-                known = dict(zip(own.names, own.main_beam_efficiency, strict=True))
-                nominal = np.array([known.get(d, z) for d, z in zip(plane.names, nominal, strict=True)])
-            drawn = nominal * (1 + self.scatter * _normals(observation, self.label, "zeta"))
-            plane.main_beam_efficiency = np.clip(drawn, 0.01 * nominal, 1.0)
-            clipped = int(np.count_nonzero(plane.main_beam_efficiency != drawn))
-            observation.tally.count(self.label, "detectors whose scattered zeta was clipped", clipped)
+            _scatter(self, observation)
 
     def prepare(self, observation: Observation) -> Calibration:
         """Coefficients of equation (2); flags what is opaque."""
-        plane, tally = observation.focalplane, observation.tally
-        gain = np.ones(len(plane))
-        if self.calibration_error > 0:
-            gain += self.calibration_error * _normals(observation, self.label, "gain")
-        transmission = observation.smooth.get("transmission")
-        if transmission is not None:
-            _flag_opaque(self.label, observation, transmission)
-        emission, mean = observation.smooth.get("atmosphere"), None
-        if emission is not None:
-            share = gain * plane.illumination_efficiency / plane.main_beam_efficiency
-            ratio, error = emission, 0.0
-            if transmission is not None:
-                ratio, error = quotient(emission, transmission, np.flatnonzero(observation.good_detectors))
-            mean = ratio.scaled(share)
-            tally.state(self.label, "largest error of the smooth mean emission", f"{error * np.abs(share).max():.1e} K_RJ")
-        zeta, epsilon = plane.main_beam_efficiency, plane.illumination_efficiency
-        tally.state(self.label, "zeta and epsilon (mean)", f"{zeta.mean():.4g}, {epsilon.mean():.4g}")
-        tally.state(self.label, "calibrated by", f"zeta e^-tau, {self.calibration}")
-        return Calibration(zeta, epsilon, gain, transmission, mean)
+        found = _coefficients(self, observation)
+        what = f"{found.zeta.mean():.4g}, {found.epsilon.mean():.4g}"
+        observation.tally.state(self.label, "zeta and epsilon (mean)", what)
+        observation.tally.state(self.label, "calibrated by", f"zeta e^-tau, {self.calibration}")
+        return found
 
     def exec(self, block: Block, state: Calibration) -> None:
         """Equation (2) on one block."""
-        rows, shape = block.detectors, block.shape
-        have = block.detdata
         if beside := sorted(self.optional & block.means.keys()):
             raise PipelineError(
                 f"a mean stands beside {beside[0]} in block.means, which is not calibrated",
                 place=self.label,
                 cure="let the step that makes it add the mean to the stream, or set observation.smooth['atmosphere']",
             )
-        signal = block.buffer("signal", shape)
-        absent = np.empty((0, 0), block.dtype)
-        divisor = mean = Series(absent, 0, np.ones(1, block.dtype))
-        own = None if block.components and "atmosphere" not in block.components else state.mean
-        sky = _sum(block, "sky", [n for n in block.entering("above the atmosphere") if n not in ("sky", "transmission")])
-        pink = _sum(block, "pink", [n for n in block.entering("at the detector") if n not in KNOWN])
-        noisy = pink.size > 0 or any(name in have for name in ("atmosphere", "white"))
-        if state.transmission is not None and noisy:
-            divisor = state.transmission.series(rows, block.samples, signal.dtype)
-        instantaneous = self.calibration == "instantaneous" and "transmission" in have
-        if instantaneous and own is not None:
-            mean = own.series(rows, block.samples, signal.dtype)
-        streams = [sky, *(have.get(name, absent) for name in ("transmission", "atmosphere", "white")), pink]
-        first = np.array([block.samples.start, divisor.first, mean.first], np.int64)
-        smooth = divisor.lines, divisor.inside, mean.lines, mean.inside
-        factors = np.array([a[rows] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
-        clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
+        instantaneous = self.calibration == "instantaneous" and "transmission" in block.detdata
+        clipped = _make_signal(block, state, instantaneous)
         if instantaneous:
-            block.observation.tally.count(
-                self.label, f"samples whose fluctuating e^-tau was raised to {LEAST_TRANSMISSION:g}", clipped
-            )
-        for name in block.entering("calibrated"):
-            signal += have[name]
-        have["signal"] = signal
-        block.means.pop("signal", None)
-        if own is not None:
-            block.means["signal"] = own
+            what = f"samples whose fluctuating e^-tau was raised to {LEAST_TRANSMISSION:g}"
+            block.observation.tally.count(self.label, what, clipped)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What `Efficiency` knows of one observation: per-detector factors (n_det,), t and M of equation (2)."""
+
+    zeta: Floats
+    epsilon: Floats
+    gain: Floats
+    transmission: SmoothField | None
+    mean: SmoothField | None
+
+
+def _scatter(step: Efficiency, observation: Observation) -> None:
+    """Scatter zeta."""
+    plane = observation.focalplane
+    nominal = plane.main_beam_efficiency
+    if step.main_beam is None:  # from the instrument, so that configuring twice scatters once
+        own = observation.instrument.focalplane()
+        known = dict(zip(own.names, own.main_beam_efficiency, strict=True))
+        nominal = np.array([known.get(d, z) for d, z in zip(plane.names, nominal, strict=True)])
+    drawn = nominal * (1 + step.scatter * _normals(observation, step.label, "zeta"))
+    plane.main_beam_efficiency = np.clip(drawn, 0.01 * nominal, 1.0)
+    clipped = int(np.count_nonzero(plane.main_beam_efficiency != drawn))
+    observation.tally.count(step.label, "detectors whose scattered zeta was clipped", clipped)
+
+
+def _coefficients(step: Efficiency, observation: Observation) -> Calibration:
+    zeta, epsilon = observation.focalplane.main_beam_efficiency, observation.focalplane.illumination_efficiency
+    gain, transmission, mean = np.ones(len(zeta)), observation.smooth.get("transmission"), None
+    if step.calibration_error > 0:
+        gain += step.calibration_error * _normals(observation, step.label, "gain")
+    if transmission is not None:
+        _flag_opaque(step.label, observation, transmission)
+    if (ratio := observation.smooth.get("atmosphere")) is not None:
+        share, error = gain * epsilon / zeta, 0.0
+        if transmission is not None:
+            ratio, error = quotient(ratio, transmission, np.flatnonzero(observation.good_detectors))
+        mean = ratio.scaled(share)
+        text = f"{error * np.abs(share).max():.1e} K_RJ"
+        observation.tally.state(step.label, "largest error of the smooth mean emission", text)
+    return Calibration(zeta, epsilon, gain, transmission, mean)
+
+
+def _make_signal(block: Block, state: Calibration, instantaneous: bool) -> int:
+    """Put the signal and its mean into a block. Returns how many samples of 1 + x were raised to `LEAST_TRANSMISSION`."""
+    have, signal = block.detdata, block.buffer("signal", block.shape)
+    absent = np.empty((0, 0), block.dtype)
+    divisor = level = Series(absent, 0, np.ones(1, block.dtype))
+    mean = None if block.components and "atmosphere" not in block.components else state.mean
+    sky = _sum(block, "sky", [n for n in block.entering("above the atmosphere") if n not in ("sky", "transmission")])
+    pink = _sum(block, "pink", [n for n in block.entering("at the detector") if n not in KNOWN])
+    noisy = pink.size > 0 or any(name in have for name in ("atmosphere", "white"))
+    if state.transmission is not None and noisy:
+        divisor = state.transmission.series(block.detectors, block.samples, signal.dtype)
+    if instantaneous and mean is not None:
+        level = mean.series(block.detectors, block.samples, signal.dtype)
+    streams = [sky, *(have.get(name, absent) for name in ("transmission", "atmosphere", "white")), pink]
+    first = np.array([block.samples.start, divisor.first, level.first], np.int64)
+    smooth = divisor.lines, divisor.inside, level.lines, level.inside
+    factors = np.array([a[block.detectors] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
+    clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
+    for name in block.entering("calibrated"):
+        signal += have[name]
+    have["signal"] = signal
+    block.means.pop("signal", None)
+    if mean is not None:
+        block.means["signal"] = mean
+    return int(clipped)
 
 
 def _sum(block: Block, name: str, others: Sequence[str]) -> AnyFloats:
@@ -150,22 +173,13 @@ def _sum(block: Block, name: str, others: Sequence[str]) -> AnyFloats:
     return total
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """What `Efficiency` knows of one observation: per-detector factors (n_det,), t and M of equation (2)."""
-
-    zeta: Floats
-    epsilon: Floats
-    gain: Floats
-    transmission: SmoothField | None
-    mean: SmoothField | None
-
-
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _calibrate(sky, wet, air, white, pink, first, divisor, inside, mean, mean_inside, factors, at_once, out):  # type: ignore[no-untyped-def]
-    """Equation (2); absent streams have no rows. ``wet`` is x; ``divisor``, t, and ``mean``, M, are lines of `Series`;
+def _calibrate(  # type: ignore[no-untyped-def]
+    sky, fluctuation, emission, white, pink, first, divisor, inside, mean, mean_inside, factors, instantaneous, out
+):
+    """Equation (2); absent streams have no rows. ``fluctuation`` is x; ``divisor``, t, and ``mean``, M, are lines of `Series`;
     ``first`` (3,): the first sample, and the first cells of t and M; ``factors`` (3, n_det): gain, epsilon, zeta.
-    ``at_once``: by the instantaneous transmission.
+    ``instantaneous``: calibrated by 1 + x too.
 
     Returns how many samples of 1 + x were raised to `LEAST_TRANSMISSION`.
     """
@@ -174,7 +188,7 @@ def _calibrate(sky, wet, air, white, pink, first, divisor, inside, mean, mean_in
     n_det, n = out.shape
     clipped = 0
     one, opaque = out.dtype.type(1), out.dtype.type(LEAST_TRANSMISSION)
-    noisy = air.shape[0] or white.shape[0] or pink.shape[0]
+    noisy = emission.shape[0] or white.shape[0] or pink.shape[0]
     piece = 2048
     nothing, scale, level = np.zeros(piece, out.dtype), np.empty(piece, out.dtype), np.zeros(piece, out.dtype)
     for d in range(n_det):
@@ -182,19 +196,19 @@ def _calibrate(sky, wet, air, white, pink, first, divisor, inside, mean, mean_in
         for begin in range(0, n, piece):
             m = min(piece, n - begin)
             s = sky[d, begin : begin + m] if sky.shape[0] else nothing[:m]
-            x = wet[d, begin : begin + m] if wet.shape[0] else nothing[:m]
-            a = air[d, begin : begin + m] if air.shape[0] else nothing[:m]
+            x = fluctuation[d, begin : begin + m] if fluctuation.shape[0] else nothing[:m]
+            a = emission[d, begin : begin + m] if emission.shape[0] else nothing[:m]
             w = white[d, begin : begin + m] if white.shape[0] else nothing[:m]
             p = pink[d, begin : begin + m] if pink.shape[0] else nothing[:m]
             row = out[d, begin : begin + m]
-            if not noisy and not at_once:
+            if not noisy and not instantaneous:
                 for t in range(m):
                     row[t] = gain[d] * s[t] * (one + x[t])
                 continue
             scale[:] = one
             if divisor.shape[0]:
                 series_into(divisor[d], cell, inside, start + begin, scale[:m])
-            if not at_once:
+            if not instantaneous:
                 for t in range(m):
                     noise = epsilon[d] * a[t] + w[t] + p[t]
                     row[t] = gain[d] * s[t] * (one + x[t]) + noise * (factor / max(scale[t], opaque))
