@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 from ..knobs import Knob
 from ..operator import Operator
 from ..registry import RegistryError, planning
-from .estimate import Estimate, Traits
+from .estimate import Cost, Estimate, Traits
 
 if TYPE_CHECKING:
     from ..data import Observation
@@ -25,6 +25,8 @@ class Planning(Generic[O]):
     ----------
     of
         The class of the operator; those derived from it inherit its planning.
+    cost
+        What it costs, where that is the same for every scene.
     knobs
         The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
     reads_streams
@@ -34,6 +36,7 @@ class Planning(Generic[O]):
     """
 
     of: ClassVar[type[Operator]]
+    cost: ClassVar[Cost | None] = None
     knobs: ClassVar[tuple[Knob, ...]] = ()
     reads_streams: ClassVar[bool] = False
     smaller: ClassVar[str] = ""
@@ -50,7 +53,7 @@ class Planning(Generic[O]):
 
     def estimate(self, context: Context) -> Estimate:
         """Upper bounds on what its effects contribute, coarser forms of them, and what it costs."""
-        return Estimate()
+        return Estimate((), self.cost)
 
     def coarser(self, parameter: str) -> list[Any]:
         """The rungs of a knob that are coarser than the operator's own value, the finest of them first."""

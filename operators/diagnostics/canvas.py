@@ -15,8 +15,10 @@ COLOURS = {
     "sky": "#D55E00",
     "transmission": "#009E73",
 }
+OTHER = "#56B4E9"
 SEQUENCE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-
+PALE = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
+"""The box behind text that lies on lines."""
 
 DPI = 110
 TOP, BOTTOM = 0.34, 0.58

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .canvas import BOTTOM, CHARACTER, LINE, TOP, new_figure
+from .canvas import BOTTOM, CHARACTER, LINE, PALE, TOP, new_figure
 from .graticule import AstropyAxes, Graticule, graticule
 from .sky_axes import SkyAxes, Ticks, names_of
 
@@ -158,9 +158,8 @@ def _mark(ax: Any, marks: _Marks, shape: tuple[int, ...]) -> None:
         for place, label in zip(*marks.ticks.get(edge, none), strict=True):
             at = (place, ny - 0.5) if edge == "top" else (nx - 0.5, place)
             ax.annotate(label, at, xytext=(dx, dy), textcoords="offset points", fontsize=9, annotation_clip=False, **where)
-    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
     for x, y, text in marks.grid.inside:
-        ax.text(x, y, text, fontsize=8, ha="center", va="center", zorder=4, bbox=box)
+        ax.text(x, y, text, fontsize=8, ha="center", va="center", zorder=4, bbox=PALE)
 
 
 def _tick_style(marker: int) -> dict[str, Any]:

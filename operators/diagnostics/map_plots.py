@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.types import AnyFloats
 
-from .canvas import log_labels, unit_of, write_title
+from .canvas import PALE, log_labels, unit_of, write_title
 from .graticule import AstropyAxes
 from .map_layout import located, map_axes
 from .sky_axes import SkyAxes
@@ -223,5 +223,5 @@ def _draw_beam(ax: Any, scales: tuple[float, float], fwhm: float) -> None:
         va="center",
         fontsize=8,
         zorder=5,
-        bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5},
+        bbox=PALE,
     )

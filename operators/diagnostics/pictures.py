@@ -14,7 +14,7 @@ from zonda.core.numerics.angles import angle_text
 from .flat_map import FlatMap
 from .map_layout import map_axes
 from .map_plots import SHOWN, plot_coverage, plot_map
-from .plots import Track, plot_scan, plot_spectra, plot_tod, plot_transfer
+from .plots import ScanTrack, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .png import png_of
 from .series import Spectrum, TimeStream
 from .sky_axes import SkyAxes
@@ -91,7 +91,7 @@ def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int) -> lis
     return [Picture(file, "Coverage", text, png_of(ax))]
 
 
-def draw_scan(tracks: Sequence[Track]) -> list[Picture]:
+def draw_scan(tracks: Sequence[ScanTrack]) -> list[Picture]:
     """Where the boresight went."""
     ax = plot_scan(tracks)
     return [Picture("scan", "Boresight track", "The boresight about the target, one line per scan.", png_of(ax))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from zonda.core.data import Observation
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
@@ -18,42 +17,29 @@ class PlotsPlanning(Planning[Plots]):
     """A cost for the whole run."""
 
     of = Plots
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(once=1.2, kernel="python"))
-
-    def memory(self, observation: Observation) -> int:
-        """matplotlib and the pictures."""
-        return 150_000_000
+    cost = Cost(once=1.2, bytes=150e6, kernel="python")
 
 
 class ReportPlanning(Planning[Report]):
     """A cost for the whole run, without that of the pictures."""
 
     of = Report
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(once=0.1, kernel="python"))
-
-    def memory(self, observation: Observation) -> int:
-        """The page."""
-        return 10_000_000
+    cost = Cost(once=0.1, bytes=10e6, kernel="python")
 
 
 class TransferFunctionPlanning(Planning[TransferFunction]):
     """A cost for the whole run, without that of the two signals that it compares."""
 
     of = TransferFunction
+    cost = Cost(once=0.15, bytes=20e6, kernel="python")
 
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(once=0.15, kernel="python"))
 
-    def memory(self, observation: Observation) -> int:
-        """Fourier transforms of the maps."""
-        return 20_000_000
+class TimeStreamsPlanning(Planning[TimeStreams]):
+    """It reads the streams; its cost is small."""
+
+    of = TimeStreams
+    reads_streams = True
+    cost = Cost(0.005)
 
 
 class PowerSpectrumPlanning(Planning[PowerSpectrum]):
@@ -65,14 +51,3 @@ class PowerSpectrumPlanning(Planning[PowerSpectrum]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.operator.detectors / context.first.n_detectors) * 14))
-
-
-class TimeStreamsPlanning(Planning[TimeStreams]):
-    """It reads the streams; its cost is small."""
-
-    of = TimeStreams
-    reads_streams = True
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(0.005))

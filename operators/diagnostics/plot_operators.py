@@ -39,7 +39,7 @@ from .pictures import (
     draw_streams,
     draw_transfer,
 )
-from .plots import Track
+from .plots import ScanTrack
 from .series import Spectrum, TimeStream
 from .sky_axes import SkyAxes
 from .transfer_function import Transfer
@@ -176,7 +176,7 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
         if sources := noise_sources(maps, name):
             yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style))
     if data.observations:
-        yield Drawing("scan", draw_scan, lambda: ([Track.of(o) for o in data.observations],), True)
+        yield Drawing("scan", draw_scan, lambda: ([ScanTrack.of(o) for o in data.observations],), True)
     early = {p.product: p for p in data.partial.values() if isinstance(p, TimeStream)}
     for name, product in (data.products | early).items():
         file = product_path("", name).name

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.numerics.angles import ARCMIN
+from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.types import AnyFloats
 
-from .canvas import CHARACTER, COLOURS, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
+from .canvas import CHARACTER, COLOURS, OTHER, PALE, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
 from .map_layout import map_axes
 from .map_plots import plot_coverage, plot_map
 
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from .series import Spectrum, TimeStream
     from .transfer_function import Transfer
 
-__all__ = ["Track", "map_axes", "plot_coverage", "plot_map", "plot_scan", "plot_spectra", "plot_tod", "plot_transfer"]
+__all__ = ["ScanTrack", "map_axes", "plot_coverage", "plot_map", "plot_scan", "plot_spectra", "plot_tod", "plot_transfer"]
 
 MANY = 2000
 """Points of a track that are drawn, however near to one another."""
 
 
 @dataclass(frozen=True)
-class Track:
+class ScanTrack:
     """A scan for `plot_scan`: unit vectors (n, 3) of the boresight, ICRS; the scan's centre (RA, Dec) [rad]."""
 
     name: str
@@ -44,7 +44,7 @@ class Track:
     directions: NDArray[np.float64]
 
     @classmethod
-    def of(cls, observation: Observation, most: int = 20000) -> Track:
+    def of(cls, observation: Observation, most: int = 20000) -> ScanTrack:
         """Of at most ``most`` samples, evenly spaced."""
         step = -(-observation.n_samples // most)
         x, y, z, w = np.asarray(observation.boresight_radec[::step], np.float64).T
@@ -74,60 +74,50 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
             continue
         frequency, power = spectrum.frequency[good], psd[good]
         x, y = _binned(frequency, power)
-        colour = COLOURS.get(name, "#56B4E9")
-        ax.loglog(frequency, power, color=colour, linewidth=0.5, alpha=0.25)
-        ax.loglog(
-            x,
-            y,
-            color=colour,
-            linewidth=2.2 if name == "signal" else 1.6,
-            label=names.get(name, name),
-            zorder=3 if name == "signal" else 2.5,
-        )
+        ax.loglog(frequency, power, color=COLOURS.get(name, OTHER), linewidth=0.5, alpha=0.25)
+        width, order = (2.2, 3) if name == "signal" else (1.6, 2.5)
+        ax.loglog(x, y, color=COLOURS.get(name, OTHER), linewidth=width, label=names.get(name, name), zorder=order)
         if name != "sky" or len(spectrum.psd) == 1:
             top, bottom = max(top, float(y.max())), min(bottom, float(np.percentile(y, 5)))
-    level = spectrum.white_level
-    if level > 0 and ({"white", "signal"} & set(spectrum.psd)):
-        ax.axhline(level, color="black", linestyle="--", linewidth=1.0, zorder=2)
-        net = np.sqrt(level / 2) * 1e3
-        ax.annotate(
-            f"2 NET² (NET = {net:.3g} mK√s)",
-            (1, level),
-            xycoords=("axes fraction", "data"),
-            xytext=(-4, -5),
-            textcoords="offset points",
-            fontsize=8,
-            ha="right",
-            va="top",
-        )
-        top, bottom = max(top, level), min(bottom, level)
-    knee = spectrum.knee()
-    if knee is not None:
-        ax.axvline(knee, color="black", linestyle=":", linewidth=1.0, zorder=2)
-        ax.annotate(
-            f"knee {knee:.2g} Hz",
-            (knee, 0.02),
-            xycoords=("data", "axes fraction"),
-            xytext=(4, 0),
-            textcoords="offset points",
-            fontsize=8,
-            rotation=90,
-            va="bottom",
-            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
-            zorder=4,
-        )
+    floor = spectrum.white_level if {"white", "signal"} & set(spectrum.psd) else 0.0
+    if floor > 0:
+        top, bottom = max(top, floor), min(bottom, floor)
     if 0 < bottom < top:
-        floor = level if level > 0 and {"white", "signal"} & set(spectrum.psd) else bottom
-        ax.set_ylim(max(bottom * 1e-2, min(floor, top) * 1e-4), top * 5)
+        ax.set_ylim(max(bottom * 1e-2, min(floor or bottom, top) * 1e-4), top * 5)
     ax.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
+    _mark_levels(ax, floor, spectrum.knee())
     log_labels(ax.xaxis, *ax.get_xlim())
     log_labels(ax.yaxis, *ax.get_ylim())
-    ax.set_xlabel("frequency [Hz]")
-    ax.set_ylabel("power spectral density, Rayleigh–Jeans [K²/Hz]")
-    ax.grid(which="major", color="0.9", linewidth=0.7)
+    _name(ax, "frequency [Hz]", "power spectral density, Rayleigh–Jeans [K²/Hz]")
     ax.legend(frameon=False, fontsize=9, loc="upper right")
     write_title(ax, title)
     return ax  # type: ignore[no-any-return]
+
+
+def _mark_levels(ax: Any, level: float, knee: float | None) -> None:
+    """The level of white noise (0: none) and the knee [Hz] of a picture of spectra."""
+    if level > 0:
+        ax.axhline(level, color="black", linestyle="--", linewidth=1.0, zorder=2)
+        text = f"2 NET² (NET = {np.sqrt(level / 2) * 1e3:.3g} mK√s)"
+        place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "xytext": (-4, -5), "ha": "right", "va": "top"}
+        ax.annotate(text, (1, level), textcoords="offset points", fontsize=8, **place)
+    if knee is not None:
+        ax.axvline(knee, color="black", linestyle=":", linewidth=1.0, zorder=2)
+        place = {"xycoords": ("data", "axes fraction"), "xytext": (4, 0), "rotation": 90, "va": "bottom", "bbox": PALE}
+        ax.annotate(f"knee {knee:.2g} Hz", (knee, 0.02), textcoords="offset points", fontsize=8, zorder=4, **place)
+
+
+def _name(ax: Any, across: str, up: str, grey: str = "0.9") -> None:
+    """Names of the axes, and a grid."""
+    ax.set_xlabel(across)
+    ax.set_ylabel(up)
+    ax.grid(which="major", color=grey, linewidth=0.7)
+
+
+def _legend(ax: Any, **style: Any) -> None:
+    """A legend whose lines are wide enough for their colours to be told apart."""
+    for line in ax.legend(fontsize=8, **style).get_lines():
+        line.set_linewidth(2)
 
 
 def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer function") -> Axes:
@@ -137,8 +127,8 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     Horizontal bars are the rings. The dotted line is the beam's FWHM; the upper axis counts wavelengths.
     """
     ax = new_axes(ax, (7.2, 4.8), top=0.86)
-    r, arcsec = transfer.rings, ARCMIN / 60
-    scale, edges = transfer.scale / arcsec, 1 / transfer.edges / arcsec
+    r = transfer.rings
+    scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
     width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
     error = np.where(np.isfinite(r.error), r.error, 0.0)
     ax.errorbar(scale, r.transfer, yerr=error, xerr=width, fmt="o", color=SEQUENCE[0], markersize=4, label="T: share in phase")
@@ -149,14 +139,12 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     top = float(np.nanmax(np.append(np.minimum(r.amplitude, 2.0), r.transfer), initial=1.0))
     ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.05 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
-    if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / arcsec <= edges[0]:
-        ax.axvline(transfer.fwhm / arcsec, color="black", linestyle=":", linewidth=1.0)
+    if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
+        ax.axvline(transfer.fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
     upper = ax.secondary_xaxis("top", functions=(_to_kilolambda, _to_kilolambda))
     upper.set_xlabel("baseline [1000 wavelengths]")
     log_labels(upper.xaxis, _to_kilolambda(edges[0]), _to_kilolambda(edges[-1]))
-    ax.set_xlabel("angular scale [arcsec]")
-    ax.set_ylabel("transfer function")
-    ax.grid(which="major", color="0.9", linewidth=0.7)
+    _name(ax, "angular scale [arcsec]", "transfer function")
     ax.legend(frameon=False, fontsize=9, loc="best")
     write_title(ax, title, pad=42)
     return ax  # type: ignore[no-any-return]
@@ -165,7 +153,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
 def _to_kilolambda(arcsec: Any) -> Any:
     """1000 wavelengths of a scale in arcsec, and back: the function is its own inverse."""
     with np.errstate(divide="ignore"):
-        return 1e-3 / (np.asarray(arcsec, np.float64) * ARCMIN / 60)
+        return 1e-3 / (np.asarray(arcsec, np.float64) * ARCSEC)
 
 
 def _envelope(x: AnyFloats, y: AnyFloats, columns: int = 1600) -> tuple[AnyFloats, AnyFloats]:
@@ -197,33 +185,29 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
         colour = SEQUENCE[k % len(SEQUENCE)]
         ax.plot(*_envelope(stream.seconds, values[k] * factor), linewidth=0.4, alpha=0.2, color=colour)
         ax.plot(centres, values[k, :whole].reshape(-1, width).mean(axis=1) * factor, linewidth=0.9, color=colour, label=detector)
-    ax.set_xlabel("time since the start of the scan [s]")
-    ax.set_ylabel(label)
+    _name(ax, "time since the start of the scan [s]", label, "0.92")
     ax.margins(x=0)
     if len(stream.seconds) > 1:
         ax.set_xlim(stream.seconds[0], stream.seconds[-1])
-    ax.grid(color="0.92", linewidth=0.7)
     if values.shape[0]:
         rows = -(-len(stream.names) // 6)
         if rows <= 3:  # above the lines
             low, high = ax.get_ylim()
             ax.set_ylim(low, high + (high - low) * 0.08 * rows)
         frame = {"frameon": rows > 3, "framealpha": 0.85, "edgecolor": "none"}
-        legend = ax.legend(**frame, fontsize=8, ncols=min(6, len(stream.names)), loc="upper right")
-        for line in legend.get_lines():
-            line.set_linewidth(2)
+        _legend(ax, **frame, ncols=min(6, len(stream.names)), loc="upper right")
     if own:
         fit_left(ax)
     write_title(ax, title or f"Time streams of {stream.observation}, after step {stream.label}")
     return ax  # type: ignore[no-any-return]
 
 
-def plot_scan(observations: Sequence[Observation | Track], *, ax: Any = None, title: str = "Boresight track") -> Axes:
-    """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin or deg, a line per scan.
+def plot_scan(observations: Sequence[Observation | ScanTrack], *, ax: Any = None, title: str = "Boresight track") -> Axes:
+    """ScanTrack of the boresight about the centre of the first scan, tangent-plane offsets in arcmin or deg, a line per scan.
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
-    tracks = [o if isinstance(o, Track) else Track.of(o) for o in observations]
+    tracks = [o if isinstance(o, ScanTrack) else ScanTrack.of(o) for o in observations]
     named, own = len(tracks) <= 8, ax is None
     right = 0.55 + CHARACTER * max(len(track.name) for track in tracks) if named and own else 0.0
     ax = new_axes(ax, (5.7 + right, 5.2), left=0.75, right=0.12 + right)
@@ -239,20 +223,16 @@ def plot_scan(observations: Sequence[Observation | Track], *, ax: Any = None, ti
     ax.set_aspect("equal", adjustable="datalim")
     if not ax.xaxis_inverted():
         ax.invert_xaxis()
-    ax.set_xlabel(f"RA offset [{unit}]")
-    ax.set_ylabel(f"Dec offset [{unit}]")
-    ax.grid(color="0.92", linewidth=0.7)
+    _name(ax, f"RA offset [{unit}]", f"Dec offset [{unit}]", "0.92")
     if named:
         beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}
         within = {"loc": "upper right", "framealpha": 0.85, "edgecolor": "none"}
-        legend = ax.legend(fontsize=8, **(beside if own else within))
-        for line in legend.get_lines():
-            line.set_linewidth(2)
+        _legend(ax, **(beside if own else within))
     write_title(ax, title)
     return ax  # type: ignore[no-any-return]
 
 
-def _offsets(track: Track, centre: tuple[float, float]) -> NDArray[np.float64]:
+def _offsets(track: ScanTrack, centre: tuple[float, float]) -> NDArray[np.float64]:
     """(n, 2) arcmin east and north of ``centre`` on its tangent plane; NaN far from it."""
     ra, dec = centre
     ahead = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

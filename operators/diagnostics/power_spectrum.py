@@ -19,7 +19,7 @@ from zonda.core.operator import Operator
 from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
 
-from .series import Spectrum, product_name
+from .series import Spectrum, key_of
 
 StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
 
@@ -198,7 +198,7 @@ class PowerSpectrum(Operator):
         if mean is not None:
             what = "scans of another length left out of the mean spectrum"
             data.tally.count(self.label, what, mean.of_another_length)
-            data.products[product_name(self, "spectrum")] = mean
+            data.products[key_of(self, "spectrum")] = mean
 
 
 def in_order(streams: Iterable[str]) -> list[str]:

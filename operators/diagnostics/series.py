@@ -113,6 +113,6 @@ class TimeStream(Record):
         return self
 
 
-def product_name(step: Operator, usual: str) -> str:
+def key_of(step: Operator, usual: str) -> str:
     """Name of a step's product: ``usual``, or the step's own where it has one."""
     return step.name or (usual if step.label == type(step).__name__ else step.label)

@@ -13,7 +13,7 @@ from zonda.core.operator import Operator
 from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
 
-from .series import TimeStream, product_name
+from .series import TimeStream, key_of
 
 
 class TimeStreams(Operator):
@@ -50,7 +50,7 @@ class TimeStreams(Operator):
         chosen = np.linspace(0, n - 1, shape[0]).round().astype(int)
         names = [observation.focalplane.names[d] for d in chosen]
         streams: dict[str, Floats] = {name: np.full(shape, np.nan) for name in self.streams}
-        key = product_name(self, "time_streams")
+        key = key_of(self, "time_streams")
         return TimeStream(observation.seconds, streams, names, observation.name, self.label, key)
 
     def exec(self, block: Block, state: TimeStream | None) -> None:
