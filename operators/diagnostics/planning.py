@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from zonda.core.data import Observation
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
@@ -17,21 +18,33 @@ class PlotsPlanning(Planning[Plots]):
     """A cost for the whole run."""
 
     of = Plots
-    cost = Cost(once=1.2, bytes=150e6, kernel="python")
+    cost = Cost(once=1.2, kernel="python")
+
+    def memory(self, observation: Observation) -> int:
+        """matplotlib and the pictures."""
+        return 150_000_000
 
 
 class ReportPlanning(Planning[Report]):
     """A cost for the whole run, without that of the pictures."""
 
     of = Report
-    cost = Cost(once=0.1, bytes=10e6, kernel="python")
+    cost = Cost(once=0.1, kernel="python")
+
+    def memory(self, observation: Observation) -> int:
+        """The page."""
+        return 10_000_000
 
 
 class TransferFunctionPlanning(Planning[TransferFunction]):
     """A cost for the whole run, without that of the two signals that it compares."""
 
     of = TransferFunction
-    cost = Cost(once=0.15, bytes=20e6, kernel="python")
+    cost = Cost(once=0.15, kernel="python")
+
+    def memory(self, observation: Observation) -> int:
+        """Fourier transforms of the maps."""
+        return 20_000_000
 
 
 class TimeStreamsPlanning(Planning[TimeStreams]):
