@@ -40,6 +40,8 @@ from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
+from .series import key_of
+
 NO_POWER = 1e-12
 """Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
 
@@ -71,7 +73,7 @@ class TransferFunction(Output):
     least_coverage: float = Field(0.1, ge=0, lt=1)
     """Where the (beam-smoothed) samples per pixel are below this share of their 99th percentile, the window is zero."""
     map: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
-    """Which map: `BinMap.product`."""
+    """Which map, by its name among the products."""
 
     @model_validator(mode="after")
     def _ordered(self) -> TransferFunction:
@@ -86,43 +88,44 @@ class TransferFunction(Output):
 
     def finalize(self, data: Data) -> None:
         """Compare the two maps. Raises PipelineError where there is none, or none that can be compared."""
-        after, before = (self._map(data, name) for name in self.shown)
+        after, before = (_map(data, name, self.map, self.label) for name in self.shown)
         window = window_of(before, self.radius, self.taper, self.least_coverage)
-        if not window.any():
-            raise PipelineError("no pixel is left in the window", place=self.label, cure="choose a larger radius")
-        smallest = self.smallest or max(before.fwhm, 2 * before.pixel)
-        largest = self.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
-        if largest <= smallest:
-            raise PipelineError(
-                f"scales from {largest / ARCSEC:.3g} to {smallest / ARCSEC:.3g} arcsec are none",
-                place=self.label,
-                cure="set largest and smallest, or map a larger field",
-            )
-        edges = np.geomspace(1 / largest, 1 / smallest, self.bins + 1)
+        edges = _edges(self, before, window)
         rings = compare(before.signal, after.signal, window, before.pixel, edges)
-        found = Transfer(rings, edges, self.modes, before.fwhm, self.label, self.map)
-        empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
-        data.tally.count(self.label, "rings without modes or power: NaN", empty)
+        data.tally.count(self.label, "rings without modes or power: NaN", int(np.count_nonzero(~np.isfinite(rings.transfer))))
         data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
         if self.modes == "full":
-            what = "of the complete data, which are the sky alone" if not self.shown[0] else "of the complete data"
+            what = "of the complete data" if self.shown[0] else "of the complete data, which are the sky alone"
             data.tally.state(self.label, "singular modes", what)
-        key = self.name or ("transfer_function" if self.label == type(self).__name__ else self.label)
-        data.products[key] = found
+        key = key_of(self, "transfer_function")
+        found = data.products[key] = Transfer(rings, edges, self.modes, before.fwhm, self.label, self.map)
         if data.output is not None:
             found.write(product_path(data.output, key, ".ecsv"), data.provenance)
 
-    def _map(self, data: Data, name: str) -> MapProduct:
-        product = data.products.get(product_name(stream_of(name), self.map))
-        if not isinstance(product, MapProduct):
-            raise PipelineError(
-                f"there is no map {self.map!r}", place=self.label, cure="set map to BinMap's product, or BinMap.product to map"
-            )
-        if product.header is None or product.contents == "hits":
-            raise PipelineError(
-                "a transfer function needs a TAN map of the signal", place=self.label, cure="leave BinMap.nside and contents out"
-            )
-        return product
+
+def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
+    """The map ``name`` of a signal, which can be compared; else a PipelineError about ``place``."""
+    product = data.products.get(product_name(stream_of(signal), name))
+    any_map = product or data.products.get(name)
+    if isinstance(any_map, MapProduct) and (any_map.header is None or any_map.contents == "hits"):
+        cure = "leave nside and contents of the map out"
+        raise PipelineError("a transfer function needs a TAN map of the signal", place=place, cure=cure)
+    if not isinstance(product, MapProduct):
+        cure = "set map to the product of the step that makes it, or that step's product to map"
+        raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
+    return product
+
+
+def _edges(step: TransferFunction, before: MapProduct, window: Floats) -> Floats:
+    """(bins + 1,) wavenumbers between the rings, rad^-1."""
+    if not window.any():
+        raise PipelineError("no pixel is left in the window", place=step.label, cure="choose a larger radius")
+    smallest = step.smallest or max(before.fwhm, 2 * before.pixel)
+    largest = step.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
+    if largest <= smallest:
+        scales = f"scales from {largest / ARCSEC:.3g} to {smallest / ARCSEC:.3g} arcsec are none"
+        raise PipelineError(scales, place=step.label, cure="set largest and smallest, or map a larger field")
+    return np.geomspace(1 / largest, 1 / smallest, step.bins + 1)
 
 
 @dataclass(frozen=True)

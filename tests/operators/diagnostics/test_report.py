@@ -222,11 +222,11 @@ def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeyp
     report()
     operator = Report()
     monkeypatch.setattr("zonda.operators.diagnostics.report_results.noise_figures", broken)
-    operator.watch(data, "runs")
+    operator.watch(data, "maps")
     with pytest.raises(MemoryError):
         operator.finalize(data)
     monkeypatch.undo()
-    operator.watch(data, "runs")
+    operator.watch(data, "maps")
     operator.finalize(data)
 
 
