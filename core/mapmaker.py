@@ -52,6 +52,12 @@ def place_of_signal(operators: Sequence[Operator]) -> int | None:
     return None
 
 
+def with_sky_signal(operators: Sequence[Operator]) -> list[Operator]:
+    """The steps, and a `SkySignal` where it has its place."""
+    place = place_of_signal(operators)
+    return list(operators) if place is None else [*operators[:place], SkySignal(), *operators[place:]]
+
+
 def forms(operator: Operator) -> bool:
     """Whether it makes signals of their components."""
     return MAIN in operator.provides and MAIN not in operator.requires

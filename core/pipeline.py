@@ -210,7 +210,7 @@ class Pipeline:
     def least_memory(self, observations: Sequence[Observation]) -> int:
         """Bytes with which a process runs the pipeline over these observations on one thread, libraries included."""
         observation = longest_of(observations)
-        observation.signals = tuple(s.stream for s in self.signals.formed)
+        observation.signals = tuple(sorted(s.stream for s in self.signals.formed))
         return least_memory(self.chain, observation, Settings(dtype=self._dtype))
 
     @property
@@ -244,7 +244,7 @@ class Pipeline:
         for observation in data.observations:
             observation.output, observation.focalplane = data.output, observation.focalplane.copy()
             observation.components = frozenset(map(str, self.signals.components))
-            observation.signals = tuple(s.stream for s in self.signals.formed)
+            observation.signals = tuple(sorted(s.stream for s in self.signals.formed))
         self._watch(data, "pointing")
         listeners = hooks.zonda_before_operator.get_hookimpls() or hooks.zonda_after_operator.get_hookimpls()
         ahead = Ahead(settings.threads > 1 and not listeners)  # who listens hears of one observation after the other

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..mapmaker import with_sky_signal
 from ..output import Output
 from ..run.budget import BASE
 from ..run.schedule import Chain, schedule
@@ -110,7 +111,7 @@ def predict(
     during = [o for o in context.operators if not isinstance(o, Output)]
     held = POINTED * context.times + sum(planning_of(o).memory(longest) for o in during)
     after = sum(planning_of(o).memory(longest) for o in context.operators if isinstance(o, Output))
-    steps = [o for o in during if "boresight" not in o.provides]
+    steps = with_sky_signal([o for o in during if "boresight" not in o.provides])
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
     acting = {label: max(number, 1.0) for label, number in context.runs.items()}
     sizes = [o.n_samples * o.n_detectors for o in context.observations]

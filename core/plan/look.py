@@ -33,7 +33,7 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
     formed = tuple(pipeline.signals.all[name] for name in ["", *structure.runs] if name not in structure.derived)
     for observation in data.observations:
         observation.components = frozenset(map(str, pipeline.signals.components))
-        observation.signals = tuple(signal.stream for signal in formed)
+        observation.signals = tuple(sorted(signal.stream for signal in formed))
     shown = _some(data.observations)
     for observation in shown:
         for operator in operators:
