@@ -12,6 +12,7 @@ elevation of the ray (`response`). All of it is smooth, so it is computed at nod
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -58,8 +59,8 @@ class AtmosphereLayers(LayerParameters):
         return self._models.of(self, observation)
 
     def observe(self, data: Data) -> None:
-        """Note when the run begins and how its scans follow each other: all of them look through the same drifting atmosphere.
-        Say what the load will be about: map makers lay out their sums for the noise that follows from it."""
+        """Note the start of the run and its scans, which share one drifting atmosphere; announce the load to map makers."""
+        self._models = replace(self._models, _planes={}, _made=[])  # copies of this step may be at work in other threads
         self._models.take(data)
         for observation in data.observations:
             observation.expected_load = partial(expected_load, self._models, self, observation)
