@@ -67,7 +67,7 @@ class Observation:
     intervals
         By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`). Default: all is *scanning*.
     weather
-        At the telescope; None: the air of this scan is not known.
+        At the telescope; None: not known.
     smooth
         Slowly varying float64 fields: ``atmosphere`` (mean emission at the detector before efficiency, K_RJ) and
         ``transmission`` (band-mean e^-tau at the mean PWV), each a `SmoothField`. Set by operators in ``configure``, so that the
@@ -81,8 +81,6 @@ class Observation:
         Levels of the white noise by step, in their order. Pink noise refers to the last.
     quoted_net
         (n_det,) ``focalplane.net`` before a step with white noise set it to what it comes to on the sky; None: there is none.
-    resolved
-        What operators resolved for one another. It outlives the main run: companion runs use the same.
     components
         Names of the streams that the steps make before there is a signal: ``sky``, ``white`` ...
     signals
@@ -113,7 +111,6 @@ class Observation:
     detdata: dict[str, AnyFloats] = field(default_factory=dict)
     noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
     quoted_net: NDArray[np.float64] | None = None
-    resolved: dict[str, Any] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None

@@ -63,12 +63,12 @@ class Maker(Operator):
             raise PipelineError(f"{what} of {observation.name} failed")
 
     def configure(self, observation):
-        observation.resolved["factor"] = observation.index + 1
+        observation.factor = observation.index + 1
 
     def prepare(self, observation):
         self.at("prepare", observation)
         observation.tally.count(self.label, "prepared", 1)
-        drawn = np.random.default_rng(observation.index).normal(size=observation.n_samples) * observation.resolved["factor"]
+        drawn = np.random.default_rng(observation.index).normal(size=observation.n_samples) * observation.factor
         if self.log:
             self.log.prepared[observation.index].set()
         return drawn
@@ -242,7 +242,7 @@ class Configures(Operator):
     """Configures, and does not say that it may do so ahead."""
 
     def configure(self, observation):
-        observation.resolved["more"] = 1
+        observation.more = 1
 
 
 def test_how_far_ahead():
