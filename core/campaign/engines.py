@@ -80,7 +80,6 @@ def engine_failed(err: BaseException) -> bool:
     return isinstance(err, BrokenExecutor | CancelledError) or type(err).__module__.partition(".")[0] in ("distributed", "dask")
 
 
-@contextlib.contextmanager
 def engine(
     name: Engine,
     *,
@@ -89,8 +88,8 @@ def engine(
     memory: int | None = None,
     scheduler: str | None = None,
     tls: Tls | None = None,
-) -> Iterator[Pool]:
-    """Open an engine.
+) -> contextlib.AbstractContextManager[Pool]:
+    """An engine, open while the context lasts.
 
     Parameters
     ----------
@@ -105,17 +104,13 @@ def engine(
     PipelineError
         Where a package is missing, or the scheduler of Dask is not named or cannot be reached.
     """
-    if name == "serial":
-        yield Pool(SerialExecutor(), 1, 0, threads, memory, asked=memory)
-    elif name == "processes":
-        with _processes(workers, threads, memory) as pool:
-            yield pool
-    elif name == "mpi":
-        with _mpi(threads, memory) as pool:
-            yield pool
-    else:
-        with _dask(scheduler, tls, threads, memory) as pool:
-            yield pool
+    if name == "processes":
+        return _processes(workers, threads, memory)
+    if name == "mpi":
+        return _mpi(threads, memory)
+    if name == "dask":
+        return _dask(scheduler, tls, threads, memory)
+    return contextlib.nullcontext(Pool(SerialExecutor(), 1, 0, threads, memory, asked=memory))
 
 
 @contextlib.contextmanager
@@ -133,20 +128,20 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
 
     count = workers or available_threads()
     share = (memory or available_memory() // 2) // count
-    made: list[ProcessPoolExecutor] = []
 
     def make() -> Executor:
-        for old in made:
-            _end(old)
+        stop()
         safe = os.environ.get(children.SAFE)
         with children.safe_path():  # its queues start a process that counts them
-            pool = Workers(count, mp_context=get_context("spawn"), initializer=begin_worker, initargs=(safe,))
-        made[:] = [pool]
-        return pool
+            return Workers(opened.workers, mp_context=get_context("spawn"), initializer=begin_worker, initargs=(safe,))
 
     def stop() -> None:
-        for pool in made:
-            _end(pool)
+        """End the processes, at work or not."""
+        if opened.executor is None:
+            return
+        for process in list((getattr(opened.executor, "_processes", None) or {}).values()):
+            process.terminate()
+        opened.executor.shutdown(wait=True, cancel_futures=True)
 
     def resize(number: int) -> None:
         opened.workers = number
@@ -160,8 +155,8 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
     except BaseException:
         stop()
         raise
-    for pool in made:
-        pool.shutdown()
+    if opened.executor is not None:
+        opened.executor.shutdown()
 
 
 @contextlib.contextmanager
@@ -204,14 +199,6 @@ def begin_worker(safe: str | None = None) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _end(pool: Any) -> None:
-    """End the processes of a pool, at work or not."""
-    processes = list((getattr(pool, "_processes", None) or {}).values())
-    for process in processes:
-        process.terminate()
-    pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextlib.contextmanager

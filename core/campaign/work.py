@@ -56,10 +56,11 @@ class Tasks(Work[Task, Outcome]):
         self.result = Result(folder)
         self._attempts: dict[int, int] = {}
         self._claimed: set[int] = set()
+        self._failures = 0
 
     def run(self, tasks: Sequence[Task]) -> Result:
         """All of these; what was at work when it is interrupted waits again."""
-        self._progress, begin = _Progress(tasks), time.monotonic()
+        self._all, self._begin = {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)}, time.monotonic()
         try:
             carry_out(self, tasks, self.pool, self.folder)
         except BaseException:
@@ -69,8 +70,8 @@ class Tasks(Work[Task, Outcome]):
                 clean(self.folder)
             raise
         finally:
-            self._progress.end()
-        self.result.seconds = time.monotonic() - begin
+            hooks.manager().hook.zonda_campaign_end()
+        self.result.seconds = time.monotonic() - self._begin
         return self.result
 
     def together(self) -> contextlib.AbstractContextManager[None]:
@@ -100,17 +101,21 @@ class Tasks(Work[Task, Outcome]):
         if not outcome.error and (error := self.watch.meet(outcome.machine, f"task {number} on {outcome.host}")):
             discard(item.path(self.folder))
             outcome = replace(outcome, error=error, final=True, stop=True)
-        self._progress.step(item.samples, bool(outcome.error))
+        again = bool(outcome.error) and not outcome.final and self._attempts[number] <= self.job.retries
         if not outcome.error:
             self.log.done(number, outcome.host, outcome.seconds, outcome.digest, outcome.machine)
             self.result.tasks += 1
             self.result.samples += item.samples
-            return False
-        again = not outcome.final and self._attempts[number] <= self.job.retries
-        self.log.failed(number, outcome.host, outcome.seconds, outcome.error, again)
-        if not again:
-            self.result.failed[number] = outcome.error
-            self.stop = self.stop or outcome.stop
+        else:
+            self._failures += 1
+            self.log.failed(number, outcome.host, outcome.seconds, outcome.error, again)
+            if not again:
+                self.result.failed[number] = outcome.error
+                self.stop = self.stop or outcome.stop
+        hooks.manager().hook.zonda_campaign_progress(
+            done=self.result.tasks, failed=self._failures, samples=self.result.samples,
+            seconds=time.monotonic() - self._begin, **self._all,
+        )  # fmt: skip
         return again
 
 
@@ -160,24 +165,3 @@ class Combinations(Work[int, Combined]):
             for task in self.job.tasks_of(item):
                 discard(task.path(self.folder))
         return False
-
-
-class _Progress:
-    """Tells the hooks how far it is."""
-
-    def __init__(self, tasks: Sequence[Task]) -> None:
-        self._hook, self._begin = hooks.manager().hook, time.monotonic()
-        self._all = {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)}
-        self._done = self._made = self._failed = 0
-
-    def step(self, samples: int, failed: bool) -> None:
-        """One attempt more."""
-        self._failed += failed
-        self._done += not failed
-        self._made += 0 if failed else samples
-        seconds = time.monotonic() - self._begin
-        self._hook.zonda_campaign_progress(done=self._done, failed=self._failed, samples=self._made, seconds=seconds, **self._all)
-
-    def end(self) -> None:
-        """No more is coming."""
-        self._hook.zonda_campaign_end()
