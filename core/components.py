@@ -45,8 +45,8 @@ class Registry:
     ----------
     kind
         Noun for messages: ``operator``.
-    group
-        Entry-point group: ``zonda.operators``.
+    groups
+        Entry-point groups: ``zonda.operators``; more than one separated by spaces.
     base
         ``module:class`` that what is provided must be: a subclass where ``classes``, else an instance. Empty: anything.
     classes
@@ -61,22 +61,18 @@ class Registry:
         (label, cure) for a name that is not there, empty where there is nothing to say beyond the nearest name.
     """
 
-    def __init__(self, kind: str, group: str, base: str = "", *, classes: bool = False, exact: bool = False) -> None:
-        self.kind, self.group, self.base, self.classes, self.exact = kind, group, base, classes, exact
+    def __init__(self, kind: str, groups: str, base: str = "", *, classes: bool = False, exact: bool = False) -> None:
+        self.kind, self.groups, self.base, self.classes, self.exact = kind, groups.split(), base, classes, exact
         self._found: dict[str, list[Found]] | None = None
         self._loaded: dict[Found, Any] = {}
         self._registered: dict[str, Any] = {}
         self.hint: Callable[[str], tuple[str, str]] = lambda name: ("", "")
 
     @property
-    def _local(self) -> dict[str, Any]:
-        return self._registered
-
-    @property
     def _index(self) -> dict[str, list[Found]]:
         if self._found is None:
             self._found = {}
-            for found in discover(self.group):
+            for found in dict.fromkeys(found for group in self.groups for found in discover(group)):
                 self._found.setdefault(found.name, []).append(found)
         return self._found
 
@@ -106,17 +102,17 @@ class Registry:
         return component
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and (name in self._local or bool(self._named(name)))
+        return isinstance(name, str) and (name in self._registered or bool(self._named(name)))
 
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted({*self._index, *self._local}))
+        return iter(sorted({*self._index, *self._registered}))
 
     def __len__(self) -> int:
-        return len({*self._index, *self._local})
+        return len({*self._index, *self._registered})
 
     def candidates(self) -> list[Found]:
         """Everything on offer, by name; what was registered by hand comes from "this session". Imports nothing."""
-        local = [Found(name, _reference(value), SESSION, "") for name, value in self._local.items()]
+        local = [Found(name, _reference(value), SESSION, "") for name, value in self._registered.items()]
         return sorted([f for found in self._index.values() for f in found] + local)
 
     def suggest(self, name: str) -> str | None:
@@ -130,7 +126,7 @@ class Registry:
 
         Raises `RegistryError` where several do.
         """
-        if self.exact or not isinstance(name, str) or name in self._local or self._named(name):
+        if self.exact or not isinstance(name, str) or name in self._registered or self._named(name):
             return name
         distribution, colon, short = name.rpartition(":")
         alike = [known for known in self if fold(known) == fold(short)]
@@ -145,8 +141,8 @@ class Registry:
         Raises `RegistryError` for a name that is unknown, doubly provided, broken or written for another plugin API.
         """
         name = self.registered(name)
-        if name in self._local:
-            return self._check(self._local[name], Found(name, _reference(self._local[name]), SESSION, ""))
+        if name in self._registered:
+            return self._check(self._registered[name], Found(name, _reference(self._registered[name]), SESSION, ""))
         found = self._named(name)
         if not found:
             raise self._unknown(name)
@@ -167,7 +163,7 @@ class Registry:
         component = self.get(name)
         if not callable(component):
             return component
-        found = Found(name, _reference(component), SESSION, "") if name in self._local else self._named(name)[0]
+        found = Found(name, _reference(component), SESSION, "") if name in self._registered else self._named(name)[0]
         try:
             made = component()
         except RAISED as err:
@@ -179,7 +175,7 @@ class Registry:
     def load(self, found: Found) -> Any:
         """Import one candidate. Raises `RegistryError` where that fails or it is written for another plugin API."""
         if found.distribution == SESSION:
-            return self._check(self._local[found.name], found)
+            return self._check(self._registered[found.name], found)
         if found not in self._loaded:
             try:
                 component = found.load()
@@ -227,29 +223,6 @@ class Registry:
                 noun = f"a subclass of {attribute}" if self.classes else f"a{'n' * (attribute[0] in 'AEIOU')} {attribute}"
                 raise RegistryError(f"{who} is not {noun}", label=f"it is {component!r:.60}", cure=f"mend {found.reference}")
         return component
-
-
-class Together(Registry):
-    """Several registries of classes seen as one."""
-
-    def __init__(self, kind: str, *parts: Registry) -> None:
-        super().__init__(kind, "", parts[0].base, classes=True, exact=parts[0].exact)
-        self.parts = parts
-
-    @property
-    def _index(self) -> dict[str, list[Found]]:
-        index: dict[str, list[Found]] = {}
-        for part in self.parts:
-            for name, found in part._index.items():
-                index[name] = index.get(name, []) + [f for f in found if f not in index.get(name, [])]
-        return index
-
-    @property
-    def _local(self) -> dict[str, Any]:
-        return {name: value for part in self.parts for name, value in part._local.items()}
-
-    def register(self, component: Any = None, *, name: str | None = None) -> Any:
-        return self.parts[0].register(component, name=name)
 
 
 def fold(name: str) -> str:

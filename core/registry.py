@@ -13,12 +13,11 @@ from functools import partial
 from typing import Any
 
 from . import discovery, hints
-from .components import Registry, Together
+from .components import Registry
 from .components import RegistryError as RegistryError
 from .components import fold as fold
 
-operators = Registry("operator", "zonda.operators", "zonda.core.operator:Operator", classes=True, exact=True)
-mapmakers = Registry("mapmaker", "zonda.mapmakers", "zonda.core.operator:Operator", classes=True, exact=True)
+operators = Registry("operator", "zonda.operators zonda.mapmakers", "zonda.core.operator:Operator", classes=True, exact=True)
 instruments = Registry("instrument", "zonda.instruments", "zonda.core.instrument:Instrument")
 sites = Registry("site", "zonda.sites", "zonda.core.site:Site")
 bands = Registry("band", "zonda.bands", "zonda.core.instrument:Band")
@@ -42,24 +41,21 @@ products = Registry("product", "zonda.products", "zonda.core.product:Product", c
 sites.hint = partial(hints.for_site, sites, instruments)
 instruments.hint = partial(hints.for_instrument, sites, instruments)
 
-steps = Together("operator", operators, mapmakers)
-"""What a pipeline's list of operators may name."""
-
 register = operators.register
 """Decorator: register an operator for this process, in scripts and notebooks. Packages use entry points."""
 
 registries = (
-    operators, mapmakers, instruments, sites, bands, noise_models, weather_sources, ground_weather, spectra, checks, metrics,
+    operators, instruments, sites, bands, noise_models, weather_sources, ground_weather, spectra, checks, metrics,
     planning, products, sections,
 )  # fmt: skip
 
 
-def steps_that(test: Callable[[Any], bool]) -> list[str]:
+def operators_that(test: Callable[[Any], bool]) -> list[str]:
     """Installed operators whose class passes ``test``. Imports them all: for messages only."""
     found = []
-    for name in steps:
+    for name in operators:
         with suppress(RegistryError):  # a broken plugin is another message's
-            if test(steps.get(name)):
+            if test(operators.get(name)):
                 found.append(name)
     return found
 
@@ -71,7 +67,7 @@ def makers(what: str) -> list[str]:
         provides, requires = (n if isinstance(n, frozenset) else frozenset() for n in (step.provides, step.requires))
         return what in provides - requires  # a property says nothing before there is an operator
 
-    return steps_that(makes)
+    return operators_that(makes)
 
 
 def refresh() -> None:

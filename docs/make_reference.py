@@ -11,7 +11,7 @@ from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Unit
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.plan.planning import planning_class
-from zonda.core.registry import mapmakers, noise_models, operators
+from zonda.core.registry import noise_models, operators
 from zonda.core.site import Site
 
 PAGE = Path(__file__).with_name("operators.md")
@@ -31,7 +31,7 @@ SCENE = {Site: "site", Instrument: "instrument", Telescope: "instrument.telescop
 
 def page() -> str:
     """The whole page."""
-    classes = [r.get(c.name) for r in (operators, mapmakers) for c in r.candidates() if c.distribution == "zonda"]
+    classes = [operators.get(c.name) for c in operators.candidates() if c.distribution == "zonda"]
     lines = [
         "# Reference of the operators",
         "",

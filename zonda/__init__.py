@@ -96,9 +96,10 @@ def __getattr__(name: str) -> Any:
     if name in _WHERE:
         return getattr(import_module(_WHERE[name]), name)
     if not name.startswith("_"):
-        for registry in _steps():  # zonda.BinMap, zonda.WhiteNoise and every plugin's operator
-            if name in registry:
-                return registry.get(name)
+        from zonda.core.registry import operators
+
+        if name in operators:  # zonda.BinMap, zonda.WhiteNoise and every plugin's operator
+            return operators.get(name)
         from difflib import get_close_matches
 
         near = get_close_matches(name, __dir__(), n=1)
@@ -107,11 +108,6 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*__all__, *(name for registry in _steps() for name in registry)})
+    from zonda.core.registry import operators
 
-
-def _steps() -> tuple[Any, Any]:
-    """The registries of operators; reading them imports nothing heavy."""
-    from zonda.core.registry import mapmakers, operators
-
-    return operators, mapmakers
+    return sorted({*__all__, *operators})

@@ -15,7 +15,7 @@ from ..errors import ZondaError
 def plugins(check: bool) -> None:
     """List operators, instruments, sites and other components.
 
-    These are operators, mapmakers, instruments, sites, bands, noise models, weather sources, spectra, checks, metrics and hooks,
+    These are operators, instruments, sites, bands, noise models, weather sources, spectra, checks, metrics and hooks,
     each with the distribution and the module that it comes from.
     """
     from .. import hooks

@@ -104,7 +104,7 @@ def _check_kind(path: Path, content: bytes) -> None:
 
 def _reader(what: str) -> str:
     """How a step that reads ``what`` from a file is written in a pipeline."""
-    from ..registry import makers, steps
+    from ..registry import makers, operators
 
-    names = [name for name in makers(what) if "file" in steps.get(name).model_fields]
+    names = [name for name in makers(what) if "file" in operators.get(name).model_fields]
     return " or ".join(f"- {name}: {{file: <name>}}" for name in names) or f"a step that provides {what}"

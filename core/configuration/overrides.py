@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .. import registry
+from ..registry import operators
 from . import yaml_places
 from .diagnostics import Diagnostic, nearest
 from .yaml_places import Document, Mark, Path, Source, Span
@@ -69,9 +69,7 @@ def _step_path(document: Document, key: str, keys: list[str]) -> Path:
     name = max((n for n in names if key.startswith(f"{n}.") or key == n), key=len, default=None)
     if name is None:
         first = key.split(".")[0]
-        owners = [
-            f"'{name}.{key}'" for name in names if name in registry.steps and first in registry.steps.get(name).model_fields
-        ]
+        owners = [f"'{name}.{key}'" for name in names if name in operators and first in operators.get(name).model_fields]
         near = f"did you mean {' or '.join(owners)}?" if owners and "." not in key else nearest(first, [*names, *keys])
         cure = f"it has the steps {', '.join(names)} and the keys {', '.join(keys)}"
         raise _Refused(f"nothing is called '{first}' in this pipeline", near, cure)

@@ -129,7 +129,7 @@ class _Check(Mistakes):
         at = self.document.mark(("target",)).value
         with_map = next((o for o in operators if isinstance(o, WithMap)), None)
         if with_map is None:
-            have = " or ".join(registry.steps_that(lambda step: issubclass(step, WithMap)))
+            have = " or ".join(registry.operators_that(lambda step: issubclass(step, WithMap)))
             cure = f"add {have}, or give a position" if have else "give a position"
             self.wrong("target: map takes the centre of an input map, and no step has one", at, "", cure)
             return scene

@@ -23,10 +23,10 @@ _MODE: JsonSchemaMode = "validation"
 def json_schema() -> dict[str, Any]:
     """Schema (draft 2020-12) of pipeline files: one property per installed operator; broken plugins are left out."""
     classes: dict[str, type[Operator]] = {}
-    for found in registry.steps.candidates():
-        twice = sum(other.name == found.name for other in registry.steps.candidates()) > 1
+    for found in registry.operators.candidates():
+        twice = sum(other.name == found.name for other in registry.operators.candidates()) > 1
         try:
-            operator = registry.steps.load(found)
+            operator = registry.operators.load(found)
             operator.model_json_schema()
         except (ZondaError, PydanticInvalidForJsonSchema):
             continue

@@ -67,10 +67,10 @@ def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operato
         return None, None
     name = str(name)
     try:
-        operator = registry.steps.get(name)
+        operator = registry.operators.get(name)
     except ZondaError as err:
         first = re.split(r"[\s{:]", name)[0]
-        if first != name and first in registry.steps:
+        if first != name and first in registry.operators:
             missing = "a space is missing behind the colon" if name[len(first)] == ":" else "a colon is missing"
             mistakes.wrong(f"cannot read the step '{name}'", span, missing, f"write '- {first}: {{...}}'")
         else:

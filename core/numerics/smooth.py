@@ -66,15 +66,6 @@ def spline_basis(u: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6])
 
 
-def coarse_times(n_samples: int, step: int) -> NDArray[np.int64]:
-    """Sample indices (may be negative or past the end) of the coefficients that cover ``n_samples`` samples.
-
-    Shape (ceil(n_samples / step) + 3,): index k stands at sample (k - PAD) * step.
-    """
-    cells = -(-n_samples // step)
-    return (np.arange(cells + 3, dtype=np.int64) - PAD) * step
-
-
 @lru_cache(maxsize=32)
 def _inside(step: int, dtype: str) -> AnyFloats:
     """(step,) r / step."""

@@ -133,12 +133,9 @@ def _extreme(values: Any) -> float:
 
 def class_of(kind: str) -> type[Operator] | None:
     """The operator class of that name; None where its plugin cannot be had any more."""
-    from zonda.core.registry import mapmakers, operators
+    from zonda.core.registry import operators
 
-    for registry in (operators, mapmakers):
-        with suppress(ZondaError, KeyError):
-            if kind in registry:
-                found = registry.get(kind)
-                if isinstance(found, type) and issubclass(found, Operator):
-                    return found
+    with suppress(ZondaError):
+        found: type[Operator] = operators.get(kind)
+        return found
     return None

@@ -136,7 +136,7 @@ def toys(fresh_registries: None) -> Any:
     registry.instruments.register(toy_camera)
     for operator in (ToyPointing, ToySky, ToyNoise, ToySum):
         registry.operators.register(operator)
-    registry.mapmakers.register(ToyMap)
+    registry.operators.register(ToyMap)
     return SimpleNamespace(
         head="site: toy_site\ninstrument: toy_camera\ntime: 2024-11-25T07:00\ntarget: 05h00m00s +20d00m00s\nseed: 3\n",
         steps="operators:\n  - ToyPointing: {duration: 45 min}\n  - ToySky\n  - ToyNoise\n  - ToySum:\n  - ToyMap\n",

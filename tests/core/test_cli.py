@@ -295,7 +295,7 @@ def test_a_fault_of_the_program_shows_its_traceback(here: Path, monkeypatch: pyt
     def broken(*_: Any) -> None:
         raise RuntimeError("a fault of the program")
 
-    monkeypatch.setattr(Pipeline, "_provenance", broken)
+    monkeypatch.setattr(Pipeline, "_begin", broken)
     with pytest.raises(RuntimeError, match="a fault of the program"):
         cli.main(["run", "p.yaml"])
 

@@ -63,7 +63,7 @@ def test_a_pipeline_takes_them(tmp_path: Path) -> None:
 def test_operators_are_classes_and_keep_their_spelling() -> None:
     for written in ("binmap", "bin_map", "Bin-Map"):
         with pytest.raises(RegistryError, match=f"unknown operator '{written}'; did you mean 'BinMap'"):
-            registry.steps.get(written)
+            registry.operators.get(written)
 
 
 def test_two_names_that_differ_by_capitals_alone_are_told_apart(fresh_registries: None) -> None:

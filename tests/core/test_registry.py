@@ -105,22 +105,21 @@ def test_duplicates_name_both_and_can_be_told_apart(plugin: Plugin) -> None:
         )
     words = "operator 'Twin' is provided by zonda-twin1 2.0 and zonda-twin2 2.0|by zonda-twin2 2.0 and zonda-twin1 2.0"
     with pytest.raises(RegistryError, match=words) as caught:
-        registry.steps.get("Twin")
+        registry.operators.get("Twin")
     assert "'zonda-twin1:Twin'" in caught.value.label
-    assert registry.steps.get("zonda-twin2:Twin").__doc__.startswith("Twin 2.")
+    assert registry.operators.get("zonda-twin2:Twin").__doc__.startswith("Twin 2.")
 
 
-def test_steps_are_operators_and_mapmakers(plugin: Plugin) -> None:
+def test_operators_come_from_both_groups(plugin: Plugin) -> None:
     source = OPERATOR.format(name="One", doc="", api=API_VERSION) + OPERATOR.format(name="Two", doc="", api=API_VERSION)
     groups = {
         "zonda.operators": {"One": "zt_both:One", "Same": "zt_both:One"},
         "zonda.mapmakers": {"Two": "zt_both:Two", "Same": "zt_both:One"},
     }
     plugin("zonda-both", "1", groups, zt_both=source)
-    assert {"One", "Two"} <= set(registry.steps)
-    assert "Two" not in registry.operators
-    assert registry.steps.get("Same") is registry.steps.get("One")  # the same object offered as both is no conflict
-    assert registry.steps.get("Two").__name__ == "Two"
+    assert {"One", "Two"} <= set(registry.operators)
+    assert registry.operators.get("Same") is registry.operators.get("One")  # the same object offered as both is no conflict
+    assert registry.operators.get("Two").__name__ == "Two"
 
 
 def test_a_plugin_that_doubles_a_mapmaker_as_operator_is_a_conflict(plugin: Plugin) -> None:
@@ -128,7 +127,7 @@ def test_a_plugin_that_doubles_a_mapmaker_as_operator_is_a_conflict(plugin: Plug
         source = OPERATOR.format(name="Twin", doc="", api=API_VERSION)
         plugin(f"zonda-k{number}", "1", {f"zonda.{kind}": {"Twin": f"zt_k{number}:Twin"}}, **{f"zt_k{number}": source})
     with pytest.raises(RegistryError, match="provided by"):
-        registry.steps.get("Twin")
+        registry.operators.get("Twin")
 
 
 def test_allow_list(plugin: Plugin, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,7 +161,7 @@ def test_register(fresh_registries: None) -> None:
         """Theirs."""
 
     assert registry.operators.get("Mine") is Mine
-    assert registry.steps.get("Other") is Theirs
+    assert registry.operators.get("Other") is Theirs
     registry.sites.register(Site(name="yard", latitude="1 deg", longitude="1 deg"))
     assert registry.sites.create("yard").name == "yard"
     assert [f.distribution for f in registry.sites.candidates() if f.name == "yard"] == ["this session"]
@@ -193,7 +192,9 @@ def test_faults_of_plugins_have_a_place_in_the_file(plugin: Plugin, toys: Any) -
 
 def test_reading_the_registry_imports_nothing_heavy() -> None:
     heavy = ("numpy", "astropy", "numba", "healpy", "scipy", "matplotlib", "h5py", "pydantic", "click")
-    code = f"import sys, zonda.core.registry as r; list(r.steps); 'x' in r.sites; print([m for m in {heavy} if m in sys.modules])"
+    code = (
+        f"import sys, zonda.core.registry as r; list(r.operators), len(r.sites); print([m for m in {heavy} if m in sys.modules])"
+    )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 

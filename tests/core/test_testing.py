@@ -8,7 +8,7 @@ import pytest
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Kelvin
 from zonda.core.operator import Operator
-from zonda.core.registry import mapmakers, operators
+from zonda.core.registry import operators
 from zonda.testing import check_operator
 
 SIGNAL = frozenset({"signal"})
@@ -35,8 +35,7 @@ BUILT_IN = {
 
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_built_in_operators_keep_the_contract(name):
-    registry = mapmakers if name in mapmakers else operators
-    check_operator(registry.get(name)(**BUILT_IN[name]))
+    check_operator(operators.get(name)(**BUILT_IN[name]))
 
 
 def test_sky_map_keeps_the_contract():
@@ -56,7 +55,7 @@ def test_recorded_pointing_keeps_the_contract(tmp_path):
 
 
 def test_none_is_forgotten():
-    own = {c.name for r in (operators, mapmakers) for c in r.candidates() if c.distribution == "zonda"}
+    own = {c.name for c in operators.candidates() if c.distribution == "zonda"}
     assert own == {*BUILT_IN, "SkyMap", "PointingRecorded"}
 
 

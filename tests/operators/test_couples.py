@@ -15,7 +15,7 @@ from pydantic import PrivateAttr
 from zonda.core.data import Block, Data, Observation
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.core.registry import mapmakers, operators
+from zonda.core.registry import operators
 from zonda.core.scene import Scene
 from zonda.core.testing import STREAMS
 
@@ -93,18 +93,17 @@ def test_one_sample(bench: Any, name: str) -> None:
 
 def test_every_operator_that_couples_is_looked_at() -> None:
     """Whatever reads streams and makes streams is in the list above."""
-    for registry in (operators, mapmakers):
-        for candidate in registry.candidates():
-            if candidate.distribution == "zonda":
-                cls = registry.get(candidate.name)
-                optional = cls.optional if isinstance(cls.optional, frozenset) else frozenset()
-                acting = (cls.requires | optional) & set(STREAMS) and cls.provides & set(STREAMS)
-                assert bool(acting) == (candidate.name in ACTING), candidate.name
+    for candidate in operators.candidates():
+        if candidate.distribution == "zonda":
+            cls = operators.get(candidate.name)
+            optional = cls.optional if isinstance(cls.optional, frozenset) else frozenset()
+            acting = (cls.requires | optional) & set(STREAMS) and cls.provides & set(STREAMS)
+            assert bool(acting) == (candidate.name in ACTING), candidate.name
 
 
 @pytest.mark.parametrize("name", ["PowerSpectrum", "BinMap", "TimeStreams", "SaveTOD"])
 def test_observers_leave_the_streams_as_they_are(bench: Any, name: str, tmp_path: Any) -> None:
-    operator = (mapmakers if name in mapmakers else operators).get(name)()
+    operator = operators.get(name)()
     scan, streams = Scan(), Streams()
     scan._observation = bench.observation(N_DETECTORS, N_SAMPLES)
     scene = Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00")

@@ -21,7 +21,7 @@ from astropy.io import fits
 import zonda
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
-from zonda.core.registry import mapmakers, noise_models, operators
+from zonda.core.registry import noise_models, operators
 from zonda.core.site import Site
 from zonda.operators.io.save_tod import load_tod
 
@@ -100,7 +100,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make(which: str, /, **parameters: Any) -> Any:
-    return (mapmakers if which in mapmakers else operators).get(which)(**parameters)
+    return operators.get(which)(**parameters)
 
 
 def outcome(steps: list[Any], where: Any, folder: Path, runs: Any = None) -> dict[str, Any]:
@@ -408,7 +408,7 @@ def known() -> dict[str, Any]:
 
 
 def test_no_operator_and_no_parameter_is_left_out() -> None:
-    own = {c.name: r for r in (operators, mapmakers) for c in r.candidates() if c.distribution == "zonda"}
+    own = {c.name: operators for c in operators.candidates() if c.distribution == "zonda"}
     assert set(own) == set(CASES)
     for name, registry in own.items():
         assert set(registry.get(name).model_fields) - {"name"} == set(CASES[name]), name

@@ -19,7 +19,7 @@ from numba.core.dispatcher import Dispatcher
 import zonda
 from zonda.core.compilation import kernel_cache
 from zonda.core.compilation.kernel_cache import SUFFIX, KernelCache, KernelFiles, meaning
-from zonda.core.registry import mapmakers, operators
+from zonda.core.registry import operators
 
 INNER = """
 import numba as nb
@@ -405,9 +405,8 @@ def test_kernels_of_others_stay_with_numba():
 
 
 def test_every_kernel_is_kept_this_way():
-    for registry in (operators, mapmakers):
-        for name in registry:
-            registry.get(name)
+    for name in operators:
+        operators.get(name)
     for name in ("zonda.operators.atmosphere.weather.era5", "zonda.operators.pointing.transform"):
         import_module(name)
     found = {

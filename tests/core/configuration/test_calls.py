@@ -132,7 +132,7 @@ STEPS = [zonda.PointingDaisy(scan_duration="2 s"), zonda.WhiteNoise(), zonda.Eff
         (lambda: zonda.Pipeline(STEPS[::-1]), ["step 1: BinMap needs boresight", "move it below PointingDaisy"]),
         (lambda: zonda.Pipeline(STEPS, runs={"a": {"onyl": ["sky"]}}), ["unknown parameter 'onyl'", "did you mean 'only'?"]),
         (lambda: zonda.Pipeline(STEPS, runs={"a": "sky"}), ["run a is a dict, not the text 'sky'"]),
-        (lambda: zonda.Pipeline(STEPS, runs=["a"]), ["runs is a dict of companion runs"]),
+        (lambda: zonda.Pipeline(STEPS, runs=["a"]), ["runs is a dict of signals"]),
         (
             lambda: zonda.Pipeline(STEPS, precision="float23"),
             ["'float32' or 'float64', not 'float23'", "did you mean 'float32'?"],

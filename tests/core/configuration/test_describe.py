@@ -11,7 +11,7 @@ import pytest
 import zonda
 from zonda.core.configuration.describe import choices, kind, written_choices
 from zonda.core.configuration.docstrings import own_doc
-from zonda.core.registry import steps
+from zonda.core.registry import operators
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_what_a_parameter_takes(cls: str, parameter: str, words: str, markdown: 
     assert written_choices(field) == markdown
 
 
-@pytest.mark.parametrize("name", [*steps, "Scene", "Site", "Instrument", "Telescope", "Band"])
+@pytest.mark.parametrize("name", [*operators, "Scene", "Site", "Instrument", "Telescope", "Band"])
 def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
     cls: Any = getattr(zonda, name)
     text = pydoc.plain(pydoc.render_doc(cls))

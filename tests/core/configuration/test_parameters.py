@@ -100,7 +100,7 @@ def test_a_file_that_was_changed_after_it_was_read_has_none(lines: list[str]) ->
     assert _of_class(lines, "A") == {}
 
 
-@pytest.mark.parametrize("kind", [registry.operators, registry.mapmakers, registry.weather_sources])
+@pytest.mark.parametrize("kind", [registry.operators, registry.weather_sources])
 def test_they_are_what_pydantic_finds(kind: registry.Registry) -> None:
     for name in kind:
         model = kind.get(name)
