@@ -88,15 +88,16 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     import zonda
     import zonda.testing
 
-    first, second, third = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S)[:3]
+    first, *others = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S)[:4]
     assert set(re.findall(r"^(?:import|from) .*", first, re.M)) == {"import numpy as np", "import zonda"}
-    (tmp_path / "page_for_authors.py").write_text(first + second + third)  # a file: docstrings of fields are read from it
+    (tmp_path / "page_for_authors.py").write_text(first + "".join(others))  # a file: docstrings of fields are read from it
     monkeypatch.syspath_prepend(str(tmp_path))
     page = importlib.import_module("page_for_authors")
     drift, demean = page.GainDrift(period="20 s"), page.Demean()
     zonda.testing.check_operator(drift)
     zonda.testing.check_operator(demean)
     zonda.testing.check_operator(page.Rms())
+    zonda.testing.check_operator(page.GroundPickup())
 
     def signal(*steps):
         scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5)

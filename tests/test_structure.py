@@ -13,17 +13,17 @@ SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "structure.py"
 
 # figure: largest value allowed. A limit is only ever lowered; what the design aims at is behind it.
 LIMITS = {
-    "methods and properties of Operator": 31,  # 10
-    "class attributes of Operator": 14,  # 6
+    "methods and properties of Operator": 10,
+    "class attributes of Operator": 6,
     "modules in the largest circle of imports": 3,
-    "modules over 400 lines": 4,  # 0
-    "functions over 60 lines": 5,  # 0
-    "functions of more than 7 parameters": 5,  # 0
+    "modules over 400 lines": 0,
+    "functions over 60 lines": 1,  # 0
+    "functions of more than 7 parameters": 2,  # 0
     "imports between siblings of operators": 0,
     "upward imports": 0,
     "operators that core names": 0,
-    "operators whose class is over 60 lines": 14,  # 9
-    "lines of framework hooks in BinMap": 87,  # 25
+    "operators whose class is over 60 lines": 9,
+    "lines of framework hooks in BinMap": 25,
 }
 
 pytestmark = pytest.mark.skipif(not SCRIPT.exists(), reason="benchmarks are not in this copy")

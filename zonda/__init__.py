@@ -32,6 +32,9 @@ _WHERE = {
     "Block": "zonda.core.block",
     "Stream": "zonda.core.stream",
     "Product": "zonda.core.product",
+    "Component": "zonda.core.signal",
+    "Signal": "zonda.core.signal",
+    "MapMaker": "zonda.core.mapmaker",
     "Output": "zonda.core.output",
     "Planning": "zonda.core.plan.planning",
     "Knob": "zonda.core.knobs",
@@ -75,6 +78,7 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Instrument as Instrument
     from zonda.core.instrument import Telescope as Telescope
     from zonda.core.knobs import Knob as Knob
+    from zonda.core.mapmaker import MapMaker as MapMaker
     from zonda.core.numerics.random import normals as normals
     from zonda.core.numerics.random import uniforms as uniforms
     from zonda.core.operator import Operator as Operator
@@ -85,6 +89,8 @@ if TYPE_CHECKING:
     from zonda.core.product import Product as Product
     from zonda.core.registry import register as register
     from zonda.core.scene import Scene as Scene
+    from zonda.core.signal import Component as Component
+    from zonda.core.signal import Signal as Signal
     from zonda.core.site import Site as Site
     from zonda.core.stream import Stream as Stream
     from zonda.core.weather import Column as Column
