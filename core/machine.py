@@ -1,4 +1,4 @@
-"""What this machine has: memory, threads; what this process holds."""
+"""Memory and threads of this machine, and the memory of this process."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def available_memory() -> int:
-    """Free memory of this machine in bytes (2 GB where it cannot be told)."""
+    """Free memory of this machine in bytes (2 GB where that is unknown)."""
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -24,7 +24,7 @@ def available_threads() -> int:
 
 
 def resident_memory() -> int:
-    """Bytes of memory that this process holds now, libraries included (0 where it cannot be told)."""
+    """Bytes of memory that this process holds now, libraries included (0 where that is unknown)."""
     with suppress(OSError, ValueError):
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0

@@ -1,4 +1,4 @@
-"""What a number may depend on besides the pipeline: versions, and the instructions that this machine computes with."""
+"""Versions of libraries and instruction sets of the CPU: what results depend on besides the pipeline."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Lost:
-    """What became of a call that did not run to its end, because its worker was killed or the engine could not send it."""
+    """The result of a call that did not end: its worker was killed, or the engine could not send it."""
 
     error: Exception
 
@@ -31,7 +31,7 @@ class Lost:
 
 
 class Work(ABC, Generic[T, R]):
-    """A list of calls, one for each item, and what is noted of them."""
+    """A list of calls, one for each item: how they are made and how their results are recorded."""
 
     stop = False
     """Set to begin no more of them."""
@@ -49,7 +49,7 @@ class Work(ABC, Generic[T, R]):
         """Whether to try it again."""
 
     def together(self) -> contextlib.AbstractContextManager[None]:
-        """Around the notes that are made at one time."""
+        """A context for all records that are made at one time."""
         return contextlib.nullcontext()
 
 

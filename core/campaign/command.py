@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from ..cli.request import Request
     from .job import Job, Task
     from .log import Row
-    from .prepare import Source
+    from .prepare import CampaignFile
     from .settings import Campaign
-    from .work import Result
+    from .work import CampaignResult
 
     Table = Sequence[tuple[Task, Row]]
 
@@ -46,7 +46,7 @@ def run(request: Request) -> None:
                 campaign.share(sources, folder, request.command, pool, _say, pruning, (k, n))
             _say(f"share {k} of {n} is done; when all are: zonda resume {folder}")
         else:
-            with lock(folder), _told_how_to_go_on(folder):
+            with lock(folder), _resumable(folder):
                 _show(campaign.begin(sources, folder, request.command, pool, _say, pruning), request.verbose)
     click.echo(f"{folder}/")
 
@@ -101,7 +101,7 @@ def resume(
         if pool.executor is None:
             return
         check_output_folder(folder)
-        with lock(folder), _told_how_to_go_on(folder):
+        with lock(folder), _resumable(folder):
             _show(campaign.resume(folder, pool, _say, anyway=anyway, same_machine=same_machine), verbose)
     click.echo(f"{folder}/")
 
@@ -128,10 +128,10 @@ def status(folder: Path, listed: bool, as_json: bool) -> None:
         click.echo("\n".join(_lines(job, table, listed)))
 
 
-def source(pipeline: str, settings: tuple[str, ...], several: bool) -> Source:
+def source(pipeline: str, settings: tuple[str, ...], several: bool) -> CampaignFile:
     """A pipeline file as part of a campaign, with the knobs that its ``accuracy`` asks for."""
     from ..configuration.pipeline_file import load
-    from .prepare import Source
+    from .prepare import CampaignFile
 
     file = load(pipeline, settings)
     if (target := file.header.accuracy) is not None:
@@ -141,7 +141,7 @@ def source(pipeline: str, settings: tuple[str, ...], several: bool) -> Source:
         _say(f"accuracy: {choice.reason}")
         settings = (*settings, *choice.overrides)
         file = load(pipeline, settings)
-    return Source(file, lambda more: load(pipeline, (*settings, *more)), file.header.name if several else "")
+    return CampaignFile(file, lambda more: load(pipeline, (*settings, *more)), file.header.name if several else "")
 
 
 def _engine(campaign: Campaign, engine: str | None, workers: int | None, scheduler: str | None) -> dict[str, Any]:
@@ -165,8 +165,8 @@ def _campaign_of(job: Job) -> Campaign:
 
 
 @contextlib.contextmanager
-def _told_how_to_go_on(folder: Path) -> Iterator[None]:
-    """Name the command that goes on, where a campaign that has begun is interrupted."""
+def _resumable(folder: Path) -> Iterator[None]:
+    """On an interrupt of a campaign that has begun, show the command that resumes it."""
     from .job import FILE
 
     try:
@@ -182,7 +182,7 @@ def _say(text: str) -> None:
     click.echo(text, err=True)
 
 
-def _show(result: Result, verbose: bool) -> None:
+def _show(result: CampaignResult, verbose: bool) -> None:
     """What was lost, or with ``verbose`` all of the tally."""
     for combination, who, what, value, counted in result.tally:
         if verbose or (counted and value != "0" and "/" not in who and what != "samples binned"):

@@ -1,4 +1,4 @@
-"""What works on tasks: anything with the interface of `concurrent.futures.Executor`."""
+"""Engines that run tasks: anything with the interface of `concurrent.futures.Executor`."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: i
     except ImportError as err:
         raise _missing("dask.distributed", "dask", err) from None
     for logger in ("distributed", "distributed.client", "distributed.core", "tornado", "tornado.application"):
-        logging.getLogger(logger).setLevel(logging.CRITICAL)  # a scheduler that is gone is told without Dask's traceback
+        logging.getLogger(logger).setLevel(logging.CRITICAL)  # errors are reported without Dask's traceback
     if scheduler is None:
         raise PipelineError(
             "no Dask scheduler is named",

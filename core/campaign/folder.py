@@ -1,4 +1,4 @@
-"""A campaign's output folder: what is kept there besides products, and what others may do with it."""
+"""A campaign's output folder: the files in it besides products, and whether it may be used again."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def publish(job: Job, folder: Path) -> None:
 
 
 def verify(tasks: Sequence[Task], folder: Path, log: Log, say: Say, same_machine: bool = False) -> list[Task]:
-    """Tasks whose products are not there, or not what they should be; the log then says so.
+    """Tasks whose products are missing or damaged, which is recorded in the log.
 
     ``same_machine``: products of another kind of machine than the first task's are removed.
     """
@@ -141,7 +141,7 @@ def opened(path: Path, tasks: Sequence[Task], layouts: Mapping[int, str], say: S
 
 
 def clean(folder: Path) -> None:
-    """Remove what killed workers left half written, wherever in the folder. None may be at work there."""
+    """Remove temporary files that killed workers left anywhere in the folder. No worker may be active there."""
     for path in [p for p in folder.rglob(".*.part*") if PART.search(p.name)]:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What a campaign consists of: worked out once, before the first task starts, and the same for every engine and every resumption.
+"""The plan of a campaign: made once, before the first task starts; every engine and every resumption follows it.
 
 ``campaign.json`` in the output folder holds it. A task is named by a hash of all that its product depends on.
 """
@@ -39,7 +39,7 @@ class OtherFormat(InputError):
 
 @dataclass(frozen=True)
 class Task:
-    """Some scans of one entry.
+    """One scan of an entry, or all of them.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Combination:
-    """What is co-added into one set of products: in ``folder`` ('': the output folder), from tasks that share a layout."""
+    """One set of co-added products, in ``folder`` ('': the output folder); its tasks share a layout."""
 
     name: str
     folder: str
@@ -181,7 +181,7 @@ class Job:
         except FileNotFoundError:
             raise InputError("holds no campaign", place=str(folder), cure="zonda run FILE --output DIR begins one") from None
         except (OSError, ValueError, KeyError, TypeError) as err:
-            cure = f"remove {folder} and run the campaign again: its tasks cannot be told without this file"
+            cure = f"remove {folder} and run the campaign again: its tasks are known from this file only"
             raise InputError(f"cannot be used: {err}", place=str(path), cure=cure) from None
 
 

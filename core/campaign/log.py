@@ -115,7 +115,7 @@ class Log:
         )
 
     def put_off(self, numbers: Iterable[int], error: str = "") -> None:
-        """Tasks wait again, with all their attempts before them. ``error``: why, where that is worth telling."""
+        """Tasks wait again, with all their attempts before them. ``error``: why; empty: the one before is kept."""
         self._write(
             "UPDATE tasks SET state = 'waiting', attempts = 0, digest = '', machine = 0, "
             "error = CASE WHEN ?1 = '' THEN error ELSE ?1 END WHERE number = ?2",

@@ -1,4 +1,4 @@
-"""CPU and libraries of each task of a campaign: bits are the same only on one kind of machine with the same libraries."""
+"""The CPU and libraries that each task ran with: results have the same bits only on one kind of machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .job import Say
 WITHOUT_INFLUENCE = frozenset({"processor", "python"})
 """What is recorded, and changes no bit: the model's name (its instructions count), and Python, which computes nothing."""
 
-EFFECT = "maps of the two may differ in the last bits, by some 1e-7 K"
+EFFECT = "maps of the two may differ in the last bits, by about 1e-7 K"
 
 
 @cache
@@ -37,7 +37,7 @@ def kind(text: str) -> frozenset[tuple[str, str]]:
 
 
 def differences(one: str, other: str) -> str:
-    """What is otherwise: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions, those that one of the two lacks."""
+    """How two machines differ: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions, those that one of the two lacks."""
     a, b = read(one), read(other)
     found = []
     for key in sorted((a.keys() | b.keys()) - WITHOUT_INFLUENCE):
@@ -47,9 +47,9 @@ def differences(one: str, other: str) -> str:
         if key.endswith("instructions"):
             more, less = sorted(set(mine.split()) - set(theirs.split())), sorted(set(theirs.split()) - set(mine.split()))
             words = [
-                f"{sign} {' '.join(some[:3])}{' ...' * (len(some) > 3)}"
-                for sign, some in (("with", more), ("without", less))
-                if some
+                f"{sign} {' '.join(names[:3])}{' ...' * (len(names) > 3)}"
+                for sign, names in (("with", more), ("without", less))
+                if names
             ]
             found.append(f"{key} {', '.join(words)}")
         else:
@@ -66,7 +66,7 @@ def short(text: str) -> str:
 
 
 class Watch:
-    """Compares where tasks run with where the first one did, and tells of each other kind once.
+    """Compares the machine of each task with that of the first one, and reports every other kind once.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""``--memory`` of a campaign: all that it may hold on this machine, shared out among its workers, checked before it starts.
+"""``--memory`` of a campaign: the budget of all its processes on this machine, divided among workers before it starts.
 
 With MPI and Dask, whose processes are started by others, and for a job of an array (``--task``) it is that of one process or job.
 """

@@ -1,4 +1,4 @@
-"""What a task leaves: its partial products, its counts, and a few directions of each of its scans."""
+"""The results of tasks that are not yet combined: partial products, counts, and scans with a subset of their directions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class NotCombined(PipelineError):
 
 @dataclass
 class Partial:
-    """Shares of some tasks, in the order of their scans.
+    """Results of one task or of several, in the order of their scans.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Partial:
         return cls(products, _tally(tree["tally"]), tree["scans"])
 
     def observations(self, scene: Scene) -> list[Observation]:
-        """All scans, thinned; the very first one tells what the steps made of the focal plane."""
+        """All scans, thinned; the focal plane is as the steps left it in the very first one."""
         plane = scene.instrument.focalplane()
         for name, values in self.scans[0]["focal_plane"].items():
             setattr(plane, name, values)
@@ -98,7 +98,7 @@ class Partial:
 
 @dataclass
 class Thinned(Observation):
-    """A scan of which a few boresight directions are kept: `seconds`, `boresight_azel` and `boresight_radec` hold those alone.
+    """A scan with a subset of its boresight directions: `seconds`, `boresight_azel` and `boresight_radec` hold those alone.
 
     ``flags`` and ``detector_flags`` hold as many ones as there are flagged samples and detectors.
     """
@@ -147,19 +147,19 @@ def _tally(rows: Mapping[str, Any]) -> Tally:
 
 
 def _thinned(observation: Observation, number: int) -> dict[str, Any]:
-    """What a report shows of a scan, with a few of its boresight directions. ``number``: its place among all."""
+    """What a report shows of a scan, with a subset of its boresight directions. ``number``: its place among all."""
     n, elevation = observation.n_samples, observation.elevation
-    few = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)
-    few = np.unique([*few, elevation.argmin(), elevation.argmax()])
+    kept = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)
+    kept = np.unique([*kept, elevation.argmin(), elevation.argmax()])
     return {
         "name": observation.name,
         "start": observation.start.nanoseconds,
         "samples": n,
         "detectors": observation.n_detectors,
         "sample_rate": observation.sample_rate,
-        "seconds": observation.seconds[few],
-        "boresight_azel": observation.boresight_azel[few],
-        "boresight_radec": observation.boresight_radec[few],
+        "seconds": observation.seconds[kept],
+        "boresight_azel": observation.boresight_azel[kept],
+        "boresight_radec": observation.boresight_radec[kept],
         "centre": list(observation.centre),
         "focal_plane": {name: getattr(observation.focalplane, name) for name in LEVELS} if number == 0 else {},
         "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],

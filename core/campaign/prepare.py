@@ -28,7 +28,7 @@ MEASURED = 8
 
 
 @dataclass(frozen=True)
-class Source:
+class CampaignFile:
     """A pipeline file and the settings from the command line. ``load(settings)`` reads it with further ones."""
 
     file: PipelineFile
@@ -66,13 +66,13 @@ class Pruning:
 
 
 def job(
-    sources: Sequence[Source],
+    sources: Sequence[CampaignFile],
     folder: Path,
     command: str,
     pruning: Pruning,
     say: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> Job:
-    """Work out a campaign and write the layouts of its maps to ``folder``.
+    """Plan a campaign and write the layouts of its maps to ``folder``.
 
     Entries that differ in more than seed and night are planned one by one. Where n scans are co-added, the budget for the errors
     of the plan is that of one observation divided by sqrt(n): such errors may add up while noise averages down.
@@ -105,7 +105,7 @@ def job(
 
 
 class _Draft:
-    """A campaign that is being worked out, one pipeline file after the other."""
+    """A campaign that is being planned, one pipeline file after the other."""
 
     def __init__(self, folder: Path, pruning: Pruning, say: Callable[[int, int, str], None]) -> None:
         self._folder, self._pruning, self._say = folder, pruning, say
@@ -118,7 +118,7 @@ class _Draft:
         self._files: list[PipelineFile] = []
         self._entries = 0
 
-    def add(self, source: Source) -> None:
+    def add(self, source: CampaignFile) -> None:
         """All entries of a pipeline file."""
         found = _entries(source)
         self.inputs |= _inputs(source.file)
@@ -138,7 +138,7 @@ class _Draft:
                 looks.append(Look(planned[entry.settings, share], entry.seed, entry.time, about(entry)))
             self._combine(source, members, looks)
 
-    def _plan(self, source: Source, entry: Entry, share: float) -> int:
+    def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
         """Plan an entry's pipeline; its number."""
         from ..plan.planner import plan
         from ..run.first_look import first_look
@@ -153,7 +153,7 @@ class _Draft:
         self.inputs |= _inputs(self._files[-1])
         return len(self.pipelines) - 1
 
-    def _combine(self, source: Source, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]) -> None:
+    def _combine(self, source: CampaignFile, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]) -> None:
         """One set of products: the layout of all that is co-added, and its tasks."""
         layouts, scans = common_layouts(looks, self._files, self._folder)
         firsts = {look.pipeline: look for look in reversed(looks)}
@@ -185,12 +185,12 @@ class _Draft:
         )
 
 
-def _entries(source: Source) -> list[Entry]:
+def _entries(source: CampaignFile) -> list[Entry]:
     return entries(source.campaign, source.file.scene().seed, lambda settings: source.load(settings).scene().time)
 
 
-def outline(source: Source) -> tuple[str, PipelineFile]:
-    """What a campaign consists of in one line; and its first entry as a pipeline file, with its share of the budget."""
+def outline(source: CampaignFile) -> tuple[str, PipelineFile]:
+    """A campaign in one line; and its first entry as a pipeline file, with its share of the budget."""
     found = _entries(source)
     first = found[0]
     together = sum(e.combination == first.combination for e in found)
@@ -210,7 +210,7 @@ def scene_of(file: PipelineFile, seed: int, time: Instant) -> Scene:
 
 
 def changed(job: Job) -> list[str]:
-    """Files that are not as they were when the campaign was worked out."""
+    """Files that have changed since the campaign was planned."""
     return [path for path, stamp in job.files.items() if _stamp(Path(path), stamp.partition(":")[0]) != stamp]
 
 
@@ -240,7 +240,7 @@ def common_layouts(
 
 
 def restore_layout(job: Job, folder: Path, number: int) -> None:
-    """Write the layout of a combination again, from its tasks. Raises InputError where it comes out otherwise than before."""
+    """Write the layout of a combination again, from its tasks. Raises InputError where it is not the same as before."""
     from ..configuration.pipeline_file import parse
     from ..configuration.time import Instant
 
@@ -256,7 +256,7 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
         )
 
 
-def _names(source: Source, entry: Entry, others: Sequence[Combination]) -> tuple[str, str]:
+def _names(source: CampaignFile, entry: Entry, others: Sequence[Combination]) -> tuple[str, str]:
     """Name of a combination and the folder of its products."""
     name = ", ".join(f"{k}={v}" for k, v in entry.combination)
     texts = [f"{k}={_short(v)}" for k, v in entry.combination if k != "observation" or len(entry.combination) == 1]

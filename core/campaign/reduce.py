@@ -1,4 +1,4 @@
-"""Partial products together, in a fixed tree: the same bits for any engine, any number of workers, any order of completion.
+"""Combine partial products in a fixed tree: the same bits for any engine, any number of workers, any order of completion.
 
 The parts of a combination are numbered in the order of their scans. Runs of `FAN` parts are added up from left to right,
 the sums likewise, until one is left. Sums of maps are integers and exact anyway; means of spectra are floats and owe their bits
@@ -34,7 +34,7 @@ class Combined:
 
 
 def combine(folder: Path, number: int, digests: Mapping[int, str]) -> Combined:
-    """Add up one combination's parts, finish its products and write them. Works in any process; errors are told, not raised.
+    """Add up one combination's parts, finish its products and write them. Errors are returned, not raised.
 
     ``digests``: of the tasks' products, by the task's number.
     """

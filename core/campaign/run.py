@@ -30,19 +30,19 @@ from .job import FILE, LOG, TASKS, Job, Say, Task, digest_of_text, layout_path, 
 from .log import Log, Row
 from .machines import Watch
 from .memory import share_out
-from .prepare import Pruning, Source, changed, restore_layout
+from .prepare import CampaignFile, Pruning, changed, restore_layout
 from .prepare import job as prepare
-from .work import Combinations, Result, Tasks
+from .work import CampaignResult, Combinations, Tasks
 
 
 def begin(
-    sources: Sequence[Source],
+    sources: Sequence[CampaignFile],
     folder: Path,
     command: str,
     pool: Pool,
     say: Say,
     pruning: Pruning = Pruning(),
-) -> Result:
+) -> CampaignResult:
     """Run a new campaign. The caller holds the folder's lock.
 
     Raises
@@ -70,7 +70,7 @@ def begin(
         return _work(made, folder, log, pool, _watch(made.same_machine, folder, [log.rows()], say), made.tasks)
 
 
-def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_machine: bool | None = None) -> Result:
+def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_machine: bool | None = None) -> CampaignResult:
     """Go on with a campaign: what is done is verified, what is missing is run. The caller holds the folder's lock.
 
     ``same_machine``: refuse what another kind of machine made, or do not; default: as the campaign has it.
@@ -98,8 +98,8 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_mac
 
 
 def share(
-    sources: Sequence[Source], folder: Path, command: str, pool: Pool, say: Say, pruning: Pruning, which: tuple[int, int]
-) -> Result:
+    sources: Sequence[CampaignFile], folder: Path, command: str, pool: Pool, say: Say, pruning: Pruning, which: tuple[int, int]
+) -> CampaignResult:
     """Run every n-th task from the k-th on (counted from 1), where ``which`` is (k, n): a job of an array. Combines nothing.
 
     The first job there works the campaign out; all write their own job log. The caller holds the lock of its share.
@@ -150,7 +150,7 @@ def _watch(strict: bool, folder: Path, logs: Iterable[Iterable[Row]], say: Say) 
     return Watch(known, strict, folder, say)
 
 
-def _work(job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: Sequence[Task]) -> Result:
+def _work(job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: Sequence[Task]) -> CampaignResult:
     """Run tasks, combine what is complete, remove partial products."""
     result = Tasks(job, folder, log, pool, watch).run(missing)
     if result.tasks:
@@ -178,12 +178,12 @@ def _describe(job: Job, folder: Path, say: Say) -> None:
     say(f"campaign: {', '.join(counts)}, {job.samples:.3g} samples; zonda status {folder}")
 
 
-def _tell(result: Result, say: Say) -> None:
+def _tell(result: CampaignResult, say: Say) -> None:
     rate = result.samples / result.seconds if result.seconds else 0.0
     say(f"{plural(result.tasks, 'task')} in {result.seconds:.1f} s, {rate:.3g} samples/s")
 
 
-def _fail(result: Result, total: int) -> None:
+def _fail(result: CampaignResult, total: int) -> None:
     if result.failed:
         number, error = min(result.failed.items())
         last = error.strip().splitlines()[-1] if error.startswith("Traceback") else error

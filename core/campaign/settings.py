@@ -84,7 +84,7 @@ class Campaign(Parameters):
 
     same_machine: bool = False
     """Refuse tasks of another kind of machine (other instructions of the CPU) than the first one's, or of other libraries: their
-    bits may differ. Otherwise they are told."""
+    bits may differ. Otherwise they are reported."""
 
     @model_validator(mode="after")
     def _axes(self) -> Campaign:

@@ -1,4 +1,4 @@
-"""One task: some scans of one entry, to a file of partial products. The same bits wherever and whenever it runs."""
+"""Run one task: scans of one entry, to a file of partial products. The bits do not depend on where and when it runs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Order:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task.
+    """The outcome of a task.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Outcome:
 
 
 def perform(order: Order) -> Outcome:
-    """Do a task. Never raises an `Exception`: what fails is told in the outcome."""
+    """Run a task. Never raises an `Exception`: the outcome states what failed."""
     begin, number, host = time.monotonic(), order.task.number, f"{socket.gethostname()}:{os.getpid()}"
     try:
         from zonda import __version__

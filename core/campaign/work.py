@@ -25,8 +25,8 @@ LOST = "(lost)"
 
 
 @dataclass
-class Result:
-    """How a campaign went.
+class CampaignResult:
+    """The result of a campaign.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Tasks(Work[Task, Outcome]):
 
     def __init__(self, job: Job, folder: Path, log: Log, pool: Pool, watch: Watch) -> None:
         self.job, self.folder, self.log, self.pool, self.watch = job, folder, log, pool, watch
-        self.result = Result(folder)
+        self.result = CampaignResult(folder)
         self._attempts: dict[int, int] = {}
         self._claimed: set[int] = set()
         self._failures = 0
 
-    def run(self, tasks: Sequence[Task]) -> Result:
-        """All of these; what was at work when it is interrupted waits again."""
+    def run(self, tasks: Sequence[Task]) -> CampaignResult:
+        """Run these tasks; on an interrupt, those at work wait again."""
         self._all, self._begin = {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)}, time.monotonic()
         try:
             carry_out(self, tasks, self.pool, self.folder)
@@ -94,7 +94,7 @@ class Tasks(Work[Task, Outcome]):
         self.log.claim(task.number for task in items)
 
     def ended(self, item: Task, result: Outcome | Lost) -> bool:
-        """Note what became of a task."""
+        """Record the outcome of a task."""
         number = item.number
         outcome = Outcome(number, LOST, 0.0, error=str(result)) if isinstance(result, Lost) else result
         self._claimed.discard(number)
@@ -120,9 +120,9 @@ class Tasks(Work[Task, Outcome]):
 
 
 class Combinations(Work[int, Combined]):
-    """The sets of products, by number: pictures and reports take time, and memory that the main process need not hold."""
+    """The sets of products, by number. They are combined on workers: pictures and reports take time and memory."""
 
-    def __init__(self, job: Job, folder: Path, log: Log, result: Result) -> None:
+    def __init__(self, job: Job, folder: Path, log: Log, result: CampaignResult) -> None:
         self.job, self.folder, self.log, self.result = job, folder, log, result
         self._digests = {row.number: row.digest for row in log.rows()}
         self._attempts: dict[int, int] = {}
@@ -144,7 +144,7 @@ class Combinations(Work[int, Combined]):
             self._attempts[number] = self._attempts.get(number, 0) + 1
 
     def ended(self, item: int, result: Combined | Lost) -> bool:
-        """Note that products are written; their parts are not needed any more."""
+        """Record that products are written, and remove their parts."""
         if isinstance(result, Lost):
             if not engine_failed(result.error):
                 raise result.error

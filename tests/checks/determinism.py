@@ -113,7 +113,7 @@ class Backwards(Executor):
 def _campaign(folder: Path, executor: Executor, workers: int, *, again: bool = False) -> dict[str, bytes]:
     """Run or resume the campaign; its map."""
     from zonda.core.campaign.engines import Pool
-    from zonda.core.campaign.prepare import Source
+    from zonda.core.campaign.prepare import CampaignFile
     from zonda.core.campaign.run import begin, resume
     from zonda.core.configuration.pipeline_file import load
 
@@ -123,7 +123,7 @@ def _campaign(folder: Path, executor: Executor, workers: int, *, again: bool = F
     if again:
         resume(folder, pool, lambda text: None)
     else:
-        source = Source(load(path), lambda settings: load(path, settings), "")
+        source = CampaignFile(load(path), lambda settings: load(path, settings), "")
         begin([source], folder, "zonda run campaign.yaml", pool, lambda text: None)
     return {p.name: p.read_bytes() for p in sorted(folder.glob("*.fits"))}
 
