@@ -14,7 +14,7 @@ Noise = Literal["half_difference", "source_free"]
 
 
 def maps_of(products: Mapping[str, Any]) -> dict[str, MapProduct]:
-    """Every map among ``data.products``, by name, the main run's first; not those of runs that a step made for itself (_NAME)."""
+    """Every map among ``data.products``, by name, of ``signal`` first; not of signals that a step has for itself (_NAME)."""
     found = (n for n, p in products.items() if isinstance(p, MapProduct) and not n.startswith("_"))
     names = sorted(found, key=lambda n: ("/" in n, n))
     return {name: products[name] for name in names}

@@ -45,23 +45,23 @@ def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, A
     return [Picture(file, "Input", "The input map, before beam, opacity and filters.", png_of(ax))]
 
 
-def draw_map(file: str, run: str, key: str, product: FlatMap, style: Style) -> list[Picture]:
-    """Plane ``signal`` of a map of run ``run``, called ``key``."""
+def draw_map(file: str, signal: str, key: str, product: FlatMap, style: Style) -> list[Picture]:
+    """Plane ``signal`` of a map of a signal, called ``key``."""
     shown, how = _shown(product.cropped(), style)
-    title = {"": "Map", "noiseless": "Map of the noiseless run"}.get(run, f"Map of run {run}")
+    title = {"": "Map", "noiseless": "Noiseless map"}.get(signal, f"Map of signal {signal}")
     title += "" if key == "map" else f" ({key})"
     meaning = {
         "": "Everything: sky, atmosphere and noise, filtered and binned.",
         "noiseless": "The sky alone through the same pointing, filters and binning: what the processing leaves of it.",
-    }.get(run, "A companion run.")
-    limit = shown.limit("signal", shown.hits, SHOWN if run == "noiseless" else 99.7)
+    }.get(signal, "A part of the components, filtered and binned.")
+    limit = shown.limit("signal", shown.hits, SHOWN if signal == "noiseless" else 99.7)
     png = _panels([(shown, _titled(title, how))], style, limit)
     return [Picture(file, title, f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}", png)]
 
 
 def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Picture]:
     """Maps of noise alone: ``half_difference`` (of the map, which comes first) and ``source_free`` (plane ``signal``)."""
-    words = {"half_difference": "even minus odd scans", "source_free": "run without the sky"}
+    words = {"half_difference": "even minus odd scans", "source_free": "all but the sky"}
     panels, figures, limits, how = [], [], [], ""
     window = next(iter(sources.values())).window()
     for of, source in sources.items():

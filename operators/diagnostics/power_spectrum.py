@@ -121,7 +121,7 @@ class Periodograms:
         assert self.welch is not None
         found: dict[str, Floats] = {}
         gain = _gain(block, detector)
-        for name in self.streams or [s for s in in_order(block.detdata) if s != "transmission"]:
+        for name in self.streams or in_order({*block.detdata} - {*block.signals, "transmission"} | {"signal"}):
             if name not in block.detdata:
                 have = ", ".join(sorted(block.detdata))
                 raise PipelineError(f"there is no stream {name!r} at this step", place=self.place, cure=f"choose from: {have}")

@@ -36,7 +36,7 @@ _WIDE = 1000
 class Report(Output):
     """HTML report, ``report.html``: pictures, what was simulated, seed and versions, counts and approximations.
 
-    The page needs no other file and no network. Acts after all runs: put it last, so that it knows of the files before it.
+    The page needs no other file and no network. Put it last, so that it knows of the files before it.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
@@ -227,22 +227,17 @@ def _steps(data: Data) -> str:
 
 
 def _tally(data: Data) -> str:
-    """The main run's rows in the order of the steps; those of companion runs (``noiseless/BinMap``) folded below."""
-    by_run: dict[str, list[tuple[str, str, str]]] = {"": []}
+    """The log of counts and figures, in the order of the steps."""
+    rows: list[tuple[str, str, str]] = []
     previous = ""
     order = {label: k for k, (label, *_) in enumerate(data.provenance.get("operators", []))}
-    for who, what, value in sorted(data.tally.told(), key=lambda row: order.get(row[0].rpartition("/")[2], len(order))):
-        run, _, step = who.rpartition("/")
+    for who, what, value in sorted(data.tally.told(), key=lambda row: order.get(row[0], len(order))):
         counted = re.fullmatch(r"(\d+)( \(.* %\))?", value)
         number = f"{int(counted[1]):,}{counted[2] or ''}".replace(",", "\u202f") if counted else value
-        again = who == previous and len(by_run.get(run, ())) != LONG  # a folded table begins with a name
-        by_run.setdefault(run, []).append(("" if again else step, what, number))
+        rows.append(("" if who == previous and len(rows) != LONG else who, what, number))  # a folded table begins with a name
         previous = who
-    head = ("step", "what", "value")
-    parts = [folded(by_run.pop(""), head, "counts and figures")]
-    for run, rows in by_run.items():
-        parts.append(details(f"Run {run}", table(rows, head)))
-    return f'<div class="steps">{"".join(parts)}</div>' if any(parts) else ""
+    table = folded(rows, ("step", "what", "value"), "counts and figures")
+    return f'<div class="steps">{table}</div>' if table else ""
 
 
 def _plan(data: Data) -> str:
@@ -267,7 +262,7 @@ def _timings(data: Data) -> str:
             detail = ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005)
             bar = f'<span class="bar" style="width:{100 * total[label] / longest:.1f}%"></span>'
             rows.append((label, f"{total[label]:.3f} s", Html(bar), small(detail)))
-    what = "CPU seconds of all runs before the products were written, added up over threads"
+    what = "CPU seconds before the products were written, added up over threads"
     note = f'<p class="note">{what}: {sum(total.values()):.2f} s (first use compiles).</p>'
     return f'{note}<div class="timings">{table(rows, ("step", "CPU", "", "stages"), numbers=(1,))}</div>'
 
@@ -282,7 +277,7 @@ def _provenance(data: Data) -> str:
         rows.append(("precision", provenance["precision"]))
     for name, run in provenance.get("runs", {}).items():
         parts = [f"{how} {' and '.join(what) if isinstance(what, list) else what}" for how, what in run.items()]
-        rows.append((f"run {name}", ", ".join(parts)))
+        rows.append((f"signal {name}", ", ".join(parts)))
     files = [str(p.name) for key in ("map_file", "tod_file") for p in data.products.get(key, [])]
     if len(files) > LONG // 2 + 2:
         every = "".join(f"<li>{escape(name)}</li>" for name in files)

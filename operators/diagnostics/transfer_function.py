@@ -59,7 +59,7 @@ class TransferFunction(Output):
     provides: ClassVar[frozenset[str]] = frozenset({"transfer_function"})
 
     modes: Literal["sky", "full"] = "sky"
-    """Singular modes of the sky alone (`sky`: the paper's noiseless run), or of the complete data, applied to it (`full`)."""
+    """Singular modes of the sky alone (`sky`: the paper's noiseless map), or of the complete data, applied to it (`full`)."""
     bins: int = Field(12, ge=1, le=500)
     """Number of rings, of equal width in the logarithm of the scale."""
     largest: Angle | None = Field(None, gt=0)

@@ -26,7 +26,7 @@ _MEANING = {
     "weights": "sum of weights",
     "noise": "standard error per pixel",
     "half_difference": "noise from the difference of even and odd scans",
-    "source_free": "map of the run without the sky",
+    "source_free": "map of all but the sky",
 }
 _COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
@@ -53,6 +54,28 @@ class _State:
     largest: float = 0.0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
+    @classmethod
+    def begun(cls, path: Path, module: Any, tod: TimeOrderedData, streams: list[str], dtype: str) -> _State:
+        """A file that gets its name when it is finished."""
+        if path.is_dir():
+            cure = "remove it or choose another output folder"
+            raise OutputError("cannot be written: there is a folder of that name", place=str(path), cure=cure)
+        temporary = temporary_sibling(path)
+        try:
+            return cls(path, temporary, tod, module.Writer(temporary, tod, streams, dtype))
+        except BaseException:
+            discard(temporary)
+            raise
+
+    def finish(self, observation: Observation, provenance: Mapping[str, str | int | float]) -> None:
+        """Write what is known now that the scan is complete, and give the file its name."""
+        self.tod.flags = in_file(observation.flags, SAMPLE_FLAGS)
+        self.tod.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
+        log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.tally)
+        self.tod.metadata.update(provenance, tally=log)
+        self.writer.finish()
+        publish(self.temporary, self.path)
+
 
 class SaveTOD(Operator):
     """Files of the streams at this step, one per scan: ``tod_<observation>.h5`` or ``.fits``.
@@ -81,23 +104,9 @@ class SaveTOD(Operator):
 
     def prepare(self, observation: Observation) -> _State:
         module = _FORMATS[self.format]
-        folder = output_folder(observation, self.label)
         stem = f"tod_{observation.name}" if self.label == "SaveTOD" else f"tod_{self.label}_{observation.name}"
-        path = product_path(folder, stem, module.SUFFIX)
-        if path.is_dir():
-            raise OutputError(
-                "cannot be written: there is a folder of that name",
-                place=str(path),
-                cure="remove it or choose another output folder",
-            )
-        temporary = temporary_sibling(path)
-        tod = TimeOrderedData.of(observation)
-        try:
-            writer = module.Writer(temporary, tod, list(dict.fromkeys(self.streams)), self.dtype)
-        except BaseException:
-            discard(temporary)
-            raise
-        return _State(path, temporary, tod, writer)
+        path = product_path(output_folder(observation, self.label), stem, module.SUFFIX)
+        return _State.begun(path, module, TimeOrderedData.of(observation), list(dict.fromkeys(self.streams)), self.dtype)
 
     def exec(self, block: Block, state: _State) -> None:
         for name in dict.fromkeys(self.streams):
@@ -111,16 +120,12 @@ class SaveTOD(Operator):
                 state.writer.write(name, block.detectors, block.samples, values)
 
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
-        state.tod.flags = in_file(observation.flags, SAMPLE_FLAGS)
-        state.tod.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
-        state.tod.weather = observation.weather or self._weather(data, observation)
+        state.tod.weather = observation.weather or _weather(data, observation, self.label)
         if self.dtype == "float32":
             observation.tally.state(self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}")
         if "white" not in observation.components:
             observation.tally.state(self.label, "NET of the detectors", "the instrument's; this run has no white noise")
-        state.tod.metadata.update(_provenance(data), tally="\n".join(f"{who}: {what}: {v}" for who, what, v in observation.tally))
-        state.writer.finish()
-        publish(state.temporary, state.path)
+        state.finish(observation, _provenance(data))
         data.add(self.label, Files([str(state.path)]))
 
     def finalize(self, data: Data) -> None:
@@ -128,18 +133,19 @@ class SaveTOD(Operator):
         if files is not None:
             data.products.setdefault("tod_file", []).extend(map(Path, files.paths))
 
-    def _weather(self, data: Data, observation: Observation) -> GroundWeather | None:
-        """That of the scene, where no step made an atmosphere of it."""
-        try:
-            found: GroundWeather = ground_weather.get("scene")(data.scene)
-            return found
-        except InputError as err:
-            observation.tally.state(self.label, "weather is not written", str(err).splitlines()[0])
-            return None
-
     def discard(self, observation: Observation, state: _State) -> None:
         state.writer.close()
         discard(state.temporary)
+
+
+def _weather(data: Data, observation: Observation, place: str) -> GroundWeather | None:
+    """That of the scene, where no step made an atmosphere of it."""
+    try:
+        found: GroundWeather = ground_weather.get("scene")(data.scene)
+        return found
+    except InputError as err:
+        observation.tally.state(place, "weather is not written", str(err).splitlines()[0])
+        return None
 
 
 def _provenance(data: Data) -> dict[str, str | int | float]:

@@ -258,7 +258,7 @@ def test_every_picture_is_written(data, products, make_observation):
         assert picture.caption
     noise = next(p for p in data.products["pictures"] if p.name == "noise_map")
     assert "even minus odd scans" in noise.caption
-    assert "run without the sky" in noise.caption
+    assert "all but the sky" in noise.caption
     assert "smoothed by 9″" in noise.caption
 
 

@@ -183,3 +183,9 @@ def test_the_knee_is_where_pink_equals_white():
     assert spectrum.knee() == pytest.approx(0.5, rel=0.05)  # logarithmic bins of 1/3 decade, interpolated
     assert Spectrum(f, {"white": np.full(5000, 2.0)}, 1.0, 2.0, "x", 1).knee() is None
     assert Spectrum(f, {"white": np.full(5000, 2.0), "pink": np.full(5000, 1.0)}, 1.0, 2.0, "x", 1).knee() is None
+
+
+def test_other_signals_have_no_spectrum(make_observation, data, noise):
+    found = run(PowerSpectrum(), make_observation(20000), data, noise | {"signal/noiseless": noise["signal"]})
+    assert "signal/noiseless" not in found.psd
+    assert "signal" in found.psd
