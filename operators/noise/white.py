@@ -61,8 +61,8 @@ class WhiteNoise(Operator):
     def observe(self, data: Data) -> None:
         """Announce the level to `PinkNoise`, and to map makers, which lay out their sums for it."""
         for observation in data.observations:
-            level = NoiseLevel(self.model or FixedNet.of(self.net, self.reference), self.scatter, self.label)
-            observation.noise_levels.setdefault(self.label, level)
+            model = self.model or FixedNet.of(self.net, self.reference)
+            observation.noise_levels[self.label] = NoiseLevel(model, self.scatter, self.label)
 
     def prepare(self, observation: Observation) -> _State:
         """Resolve the level."""

@@ -131,15 +131,6 @@ def test_third_party_model(make_observation, simulate):
     np.testing.assert_allclose(observation.focalplane.net, 1e-3 * np.arange(1, 5))
 
 
-def test_companion_runs_keep_the_level(make_observation, simulate):
-    """Without its load a background-limited detector is as noisy as in the main run."""
-    operator, observation = WhiteNoise(model=BackgroundLimited()), make_observation(n_det=2)
-    observation.smooth["atmosphere"] = SmoothField.constant(np.full(2, 30.0), observation.n_samples)
-    main = simulate(observation, operator)["white"]
-    observation.smooth = {}
-    assert np.array_equal(simulate(observation, operator)["white"], main)
-
-
 def test_the_level_is_stated(make_observation, simulate):
     observation = make_observation()
     simulate(observation, WhiteNoise())
