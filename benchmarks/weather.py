@@ -35,10 +35,10 @@ def main() -> None:
         print(f"{name:40s} {1e3 * min(float(v) for v in values):8.2f} ms")
 
     from zonda.core.registry import instruments, sites
-    from zonda.operators.atmosphere.weather.summary import water_by_month
+    from zonda.operators.atmosphere.weather.summary import pwv_by_month
 
     start = perf_counter()
-    water_by_month(sites.create("chajnantor"))
+    pwv_by_month(sites.create("chajnantor"))
     print(f"{'water by month and hour (96 profiles)':40s} {1e3 * (perf_counter() - start):8.2f} ms")
     start = perf_counter()
     plane = instruments.create("atlast_full").focalplane()

@@ -82,11 +82,11 @@ def show(
         raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")
     bands = list(dict.fromkeys(registry.instruments.create(name).band for name in instruments))
     air = profile_of(source, place, when, seed)
-    water = summary.water_by_month(place, when.datetime.year) if place.climatology is not None else None
+    water = summary.pwv_by_month(place, when.datetime.year) if place.climatology is not None else None
 
     parts = [summary.place_lines(place, when, air), summary.profile_lines(air)]
     if water is not None:
-        parts.append(summary.water_lines(water))
+        parts.append(summary.pwv_lines(water))
     if bands:
         parts.append(summary.band_lines(air, bands, angle))
     click.echo("\n\n".join("\n".join(lines) for lines in parts))

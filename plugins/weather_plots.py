@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather.summary import HOURS, MONTHS, QUANTILES, WaterByMonth, pwv_steps
+from zonda.operators.atmosphere.weather.summary import HOURS, MONTHS, QUANTILES, PwvByMonth, pwv_steps
 from zonda.operators.diagnostics.canvas import DPI, SEQUENCE
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def plot_profile(air: Profile, ax: Any = None) -> Any:
     return ax
 
 
-def plot_water(water: WaterByMonth, ax: Any = None) -> Any:
+def plot_pwv(water: PwvByMonth, ax: Any = None) -> Any:
     """PWV over the year: the medians of eight hours of the day, and the quantiles of the months."""
     ax = _axes(ax)
     month = np.arange(12)
@@ -147,7 +147,7 @@ def spread(places: Sequence[float], least: float, low: float, high: float) -> li
 
 
 def weather_figure(
-    title: str, air: Profile, water: WaterByMonth | None, elevation: float = math.pi / 2, bands: Sequence[Band] = ()
+    title: str, air: Profile, water: PwvByMonth | None, elevation: float = math.pi / 2, bands: Sequence[Band] = ()
 ) -> Figure:
     """Profile, water by month and hour (where it is known), emission and transmission: one figure, not pyplot's."""
     from matplotlib.figure import Figure
@@ -157,7 +157,7 @@ def weather_figure(
     axes = figure.subplots(2, 2)
     plot_profile(air, axes[0, 0])
     if water is not None:
-        plot_water(water, axes[0, 1])
+        plot_pwv(water, axes[0, 1])
     else:
         axes[0, 1].set_axis_off()
         axes[0, 1].text(0.5, 0.5, "no climatology here: no water by month", ha="center")

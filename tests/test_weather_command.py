@@ -29,7 +29,7 @@ def test_site_by_name(tmp_path, capsys):
     for words in (
         "llano_de_chajnantor",
         "5064 m; 2022-08-01T23:00:00Z",
-        "water: PWV 1.2 mm, as given",
+        "PWV: 1.2 mm, as given",
         "PWV [mm]: median by hour (UTC)",
         "\nJul ",
         "atlast_92ghz (66 to 118 GHz)",

@@ -1,1 +1,1 @@
-"""The air between the telescope and the sky."""
+"""The atmosphere between the telescope and the sky."""

@@ -76,7 +76,7 @@ def streams(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def in_time_order(model: AtmosphereModel) -> bool:
-    """Whether blocks should come in order of time: detectors are evaluated one by one, and share the air of the moment."""
+    """Whether blocks should come in order of time: detectors are evaluated one by one, and share the turbulence of the moment."""
     o, chosen = model.observation, model.resolution()
     if chosen.nodes.shape:
         return False

@@ -1,7 +1,7 @@
 """The fluctuations that a block is given: from nodes over the focal plane, or of each detector where no nodes pay.
 
 At nodes everything is drawn once, before the blocks: few nodes stand for all detectors. Where each detector is its own node
-its series are made when they are asked for, a unit of detectors and samples at a time, so that a scan of any length needs
+its series are made on demand, a unit of detectors and samples at a time, so that a scan of any length needs
 little memory; a unit has the same bits whenever it is made.
 """
 
@@ -28,13 +28,13 @@ ToPwv = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
 """(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""
 
 UNIT_DETECTORS, UNIT_SAMPLES = 128, 16384
-"""What is made at a time."""
+"""Size of a unit."""
 
 POINTS_AT_ONCE = 1 << 19
 """Nodes x times that are worked on at a time, where nodes serve."""
 
 AHEAD = 8
-"""Units that a thread may be ahead of what it was asked for."""
+"""Units that a thread may work ahead."""
 
 BYTES_KEPT = 128 << 20
 """Memory of the units that are kept: until the other detectors and operators have taken their part."""
@@ -84,7 +84,7 @@ class AtNodes:
 
 
 class OfDetectors:
-    """Each detector's own series, in float32, made as they are asked for. Threads may ask at the same time."""
+    """Each detector's own series, in float32, made on demand. Safe for threads."""
 
     def __init__(
         self, nodes: Nodes, layers: DriftingLayers, to_pwv: ToPwv, response: Response, step: int, n_samples: int
@@ -97,7 +97,7 @@ class OfDetectors:
         self._size = _unit_size(len(nodes.xi), step, len(response.names))
 
     def drawn(self) -> tuple[int, float, float]:
-        """As `AtNodes.drawn`, of what has been asked for."""
+        """As `AtNodes.drawn`, of the units made so far."""
         parts = [self._sums[key] for key in sorted(self._sums)]
         return sum(p[0] for p in parts), math.fsum(p[1] for p in parts), math.fsum(p[2] for p in parts)
 
@@ -137,7 +137,7 @@ class OfDetectors:
                     mine: Future[dict[str, AnyFloats]] = Future()
                     self._units[key] = mine
                     while len(self._units) > most:
-                        self._units.popitem(last=False)  # whoever waits for it still holds it
+                        self._units.popitem(last=False)  # a thread that waits for it still holds it
             if key is None:
                 assert wanted is not None
                 return wanted.result()
@@ -152,7 +152,7 @@ class OfDetectors:
                 return mine.result()
 
     def _next(self, unit: int, number: int, reach: int) -> Iterator[tuple[int, int]]:
-        """Units that will be asked for soon: later ones of the same detectors, the same time of the next detectors."""
+        """Units that will be needed soon: later ones of the same detectors, the same time of the next detectors."""
         for k in range(number + 1, min(number + reach, -(-self._n_samples // UNIT_SAMPLES))):
             yield unit, k
         for k in range(unit + 1, min(unit + reach, -(-len(self._xi) // UNIT_DETECTORS))):

@@ -12,7 +12,6 @@ elevation of the ray (`response`). All of it is smooth, so it is computed at nod
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -60,11 +59,9 @@ class AtmosphereLayers(LayerParameters):
 
     def observe(self, data: Data) -> None:
         """Note the start of the run and its scans, which share one drifting atmosphere; announce the load to map makers."""
-        self._models = replace(self._models, _planes={}, _made=[])  # copies of this step may be at work in other threads
-        self._models.take(data)
+        self._models = self._models.of_run(data)  # one of its own: copies of this step may be at work in other threads
         for observation in data.observations:
             observation.expected_load = partial(expected_load, self._models, self, observation)
-        self._models.follow(data.observations)
 
     def configure(self, observation: Observation) -> None:
         """Set the smooth means: noise levels that follow from the load need them before any step is prepared."""
@@ -84,9 +81,8 @@ class AtmosphereLayers(LayerParameters):
 
     def exec(self, block: Block, state: AtNodes | OfDetectors) -> None:
         """Add the fluctuations to the block's ``atmosphere`` and ``transmission``, and to the `outputs`."""
-        names: dict[str, str] = {"emission": "atmosphere", "transmission": "transmission"} | {
-            str(name): name for name in self.outputs
-        }
+        names: dict[str, str] = {"emission": "atmosphere", "transmission": "transmission"}
+        names.update((name, name) for name in self.outputs)
         made = {}
         for name, stream in names.items():
             there = stream in block.detdata

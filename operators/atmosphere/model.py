@@ -90,7 +90,7 @@ class AtmosphereModel:
 
     @cached_property
     def turbulence(self) -> list[Turbulence]:
-        """The layers' fields. Keyed by seed, operator and layer, not by observation: all scans see the same air."""
+        """The layers' fields. Keyed by seed, operator and layer, not by observation: all scans see the same atmosphere."""
         p = self.parameters
         return [
             Turbulence(
@@ -143,7 +143,7 @@ class AtmosphereModel:
 
 @dataclass
 class Models:
-    """The scene of an operator's observations, and the models of those that were last asked for."""
+    """The scene of an operator's observations, and the the last models that were built."""
 
     _time: Instant | None = field(default=None, compare=False)
     _weather: WeatherSource | None = field(default=None, compare=False)
@@ -151,13 +151,10 @@ class Models:
     _bands: dict[Any, tuple[Profile, BandAtmosphere]] = field(default_factory=dict, compare=False)
     _made: list[tuple[str, AtmosphereModel]] = field(default_factory=list, compare=False)
 
-    def take(self, data: Data) -> None:
-        """Note when the run begins, and its weather: that of all its scans."""
-        self._time, self._weather = data.scene.time, data.scene.weather
-
-    def follow(self, observations: Sequence[Observation]) -> None:
-        """Note how the scans follow each other: all of them look through the same drifting air."""
-        self._planes = dict(zip((o.name for o in observations), scan_planes(observations), strict=True))
+    def of_run(self, data: Data) -> Models:
+        """Those of a run, which begins at one time in one weather, and whose scans follow each other through the same layers."""
+        planes = dict(zip((o.name for o in data.observations), scan_planes(data.observations), strict=True))
+        return Models(data.scene.time, data.scene.weather, planes, self._bands)
 
     def of(self, parameters: LayerParameters, observation: Observation) -> AtmosphereModel:
         """The model of one observation."""
@@ -175,8 +172,8 @@ class Models:
     def weather(self, parameters: LayerParameters, observation: Observation) -> tuple[Profile, BandAtmosphere]:
         """One weather for the run: the scene's at its start; and the band's response to it."""
         time, band = self._time or observation.start, observation.instrument.band
-        water = parameters.pwv, parameters.pwv_rms, parameters.spectra
-        key = (repr(observation.site), time, repr(band), repr(self._weather), observation.seed, *water)
+        vapour = parameters.pwv, parameters.pwv_rms, parameters.spectra
+        key = (repr(observation.site), time, repr(band), repr(self._weather), observation.seed, *vapour)
         if key not in self._bands:
             profile = profile_of(self._weather, observation.site, time, observation.seed, parameters.pwv)
             largest = largest_pwv(parameters.pwv or profile.pwv, parameters.pwv_rms)
@@ -219,13 +216,15 @@ def _shares(parameters: LayerParameters, profile: Profile, heights: Floats) -> F
         thickness = np.gradient(heights) if len(heights) > 1 else share
         share = np.asarray(profile.at(heights).vapour_density) * thickness
     if not share.sum() > 0:
-        raise InputError("the air is dry at every layer", place=parameters.label, cure="set weights: equal, or lower the layers")
+        raise InputError(
+            "the atmosphere is dry at every layer", place=parameters.label, cure="set weights: equal, or lower the layers"
+        )
     return np.asarray(share / np.sqrt((share**2).sum()), np.float64)
 
 
 def _winds(parameters: LayerParameters, profile: Profile, heights: Floats) -> Sequence[Floats]:
     wind = parameters.wind
     if isinstance(wind, str):
-        air = profile.at(heights)
-        return list(np.stack([air.wind_east, air.wind_north], axis=-1))
+        found = profile.at(heights)
+        return list(np.stack([found.wind_east, found.wind_north], axis=-1))
     return [wind.vector] * len(heights) if isinstance(wind, Wind) else [one.vector for one in wind]

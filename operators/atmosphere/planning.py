@@ -36,7 +36,7 @@ from .weather.bands import BandAtmosphere, BandTransfer
 from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 
 INSTANTS = 200
-"""Of a scan at which the speed through the air is looked at."""
+"""Samples of a scan at which the speed relative to a layer is determined."""
 
 SAFETY = 1.25
 """Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
@@ -52,7 +52,7 @@ PAYS = 0.3
 
 
 class AtmospherePlanning(Planning[AtmosphereLayers]):
-    """Layers, their resolution, the spectrum of the air, slopes with elevation."""
+    """Layers, their resolution, spectral approximations, slopes with elevation."""
 
     of = AtmosphereLayers
     knobs = (
@@ -67,7 +67,7 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         return 100_000_000 + 700 * observation.n_detectors + 40 * observation.n_samples
 
     def in_time_order(self, observation: Observation) -> bool:
-        """Where detectors are evaluated one by one and the scan is long, all of them share the air of the moment."""
+        """Where detectors are evaluated one by one and the scan is long, all of them share the turbulence of the moment."""
         return in_time_order(self.operator.model(observation))
 
     def traits(self, observation: Observation) -> Traits:
@@ -104,7 +104,7 @@ class Calibrated:
     """The fluctuation of an observation's atmosphere in calibrated samples.
 
     ``kelvin``: K of equation (1), of the detector that sees most. ``uneven``: rms of K over the detectors, of the largest.
-    ``variances`` s_l^2. ``velocities`` of the boresight's ray through the air of each layer. ``averages`` by coverage, see
+    ``variances`` s_l^2. ``velocities`` of the boresight's ray relative to the air of each layer. ``averages`` by coverage, see
     `averaging.shares`.
     """
 
@@ -172,7 +172,7 @@ def _gains(observation: Observation, band: BandAtmosphere, pwv: float, elevation
 
 
 def _velocities(o: Observation, plane: ScanPlane, layers: list[Layer]) -> list[Floats]:
-    """Velocities (2, n) [m/s] of the boresight's ray through the air of each layer, at some instants of the scan."""
+    """Velocities (2, n) [m/s] of the boresight's ray relative to the air of each layer, at some instants of the scan."""
     if o.n_samples < 2:
         return [np.zeros((2, 1))] * len(layers)
     at = np.unique(np.linspace(0, o.n_samples - 2, INSTANTS).astype(int))
@@ -191,8 +191,10 @@ def _without(label: str, context: Context, effects: list[Effect]) -> dict[str, f
 
 
 def left_of_layer(context: Context, a: Calibrated, k: int) -> float:
-    """rms of layer k in one calibrated sample after the common mode is gone, K: what the detectors see apart, and what they see
-    alike with other gains."""
+    """rms of layer k in one calibrated sample after the common mode is gone, K.
+
+    That is what the detectors see differently, and what they see with unequal gains.
+    """
     whole = a.of_layer(k)
     if not context.removes_common:
         return whole

@@ -1,6 +1,6 @@
-"""What the band makes of a fluctuation of the water, as polynomials good for one scan: fast, and smooth.
+"""The band's response to a fluctuation of the PWV, as polynomials valid for one scan: fast, and smooth.
 
-With y the relative fluctuation of the water and s the sine of the elevation,
+With y the relative fluctuation of the PWV and s the sine of the elevation,
 
     f(y, s) = y sum_ij c_ij Y^i S^j,       Y, S in [-1, 1] over the ranges of y and s                               (1)
 
@@ -48,7 +48,7 @@ class Response:
     delay_per_vapour
         Path delay per line-of-sight PWV.
     names
-        What will be asked for, of ``emission, transmission, opacity, pwv, path_delay``.
+        The responses wanted, of ``emission, transmission, opacity, pwv, path_delay``.
 
     Raises
     ------

@@ -13,7 +13,7 @@ from zonda.core import registry, weather
 from zonda.core.configuration.time import Instant
 from zonda.operators.atmosphere.weather.absorption import absorption_table
 from zonda.operators.atmosphere.weather.sources import profile_of
-from zonda.operators.atmosphere.weather.summary import water_by_month
+from zonda.operators.atmosphere.weather.summary import pwv_by_month
 from zonda.plugins.weather_plots import LINES, plot_spectrum, spread, weather_figure
 
 
@@ -60,7 +60,7 @@ def test_spectra_reach_1_thz_with_any_bands(air, bands, which):
 
 
 def test_names_lie_over_nothing(air, site, bands):
-    figure = weather_figure("Title", air, water_by_month(site, 2024), math.pi / 2, bands)
+    figure = weather_figure("Title", air, pwv_by_month(site, 2024), math.pi / 2, bands)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     for ax in figure.axes:

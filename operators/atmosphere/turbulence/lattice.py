@@ -8,7 +8,7 @@ interpolation of L taps:
     f_j = noise_j * h_j + up2(f_(j+1)),            |FFT h_j|^2 = aliased spectrum of the level                     (1)
 
 Every sum runs over a fixed list of taps in a fixed order, so a lattice point has the same bits in whatever region it is
-asked for. The beam costs nothing and is exact; no matrix is inverted and nothing is periodic.
+evaluated. The beam costs nothing and is exact; no matrix is inverted and nothing is periodic.
 
 Behind an aperture with a rim (`beams`) the finest level takes what two Gaussians leave of the footprint's spectrum. What the
 kernels are, and how well the covariance holds: `levels`.

@@ -27,7 +27,7 @@ from zonda.core.types import Floats
 from .geometry import Cone, ScanPlane, axes_at, rim
 
 _ERROR = 1e-9
-"""Of a polynomial in equation (1): micrometres at a layer some kilometres away."""
+"""Error of a polynomial in equation (1): micrometres at a layer kilometres away."""
 
 _WORST = 1e-4
 """What such a polynomial may err by in wide fields near the horizon, where none reaches `_ERROR`; beyond, a scan is refused."""
@@ -48,7 +48,7 @@ class LinesOfSight:
     step
         Samples between the times.
     first, count
-        The times that will be asked for.
+        The times that will be evaluated.
 
     Attributes
     ----------

@@ -1,10 +1,9 @@
 """Evaluation of the layers along lines of sight, at a step in time of each layer's own, from tiles of their lattices.
 
 A layer's spline coefficients are made in tiles that overlap by the three cells a cubic spline needs, so that every point is
-interpolated from one tile. Tiles are kept while there is room; any tile has the same bits whenever it is made, and a point
-the same bits in whatever company it is asked for. Where a scan sweeps over few cells they are made as one piece; where it sweeps
-over a strip along the wind, in slabs as wide as that, since what squares would hold beside it is made for nothing; along a narrow
-path that turns, in strips.
+interpolated from one tile. Tiles are kept up to `BYTES_KEPT`; any tile has the same bits whenever it is made, and a point
+the same bits whichever points it is evaluated with. Where a scan sweeps over few cells they are made as one piece; over a strip
+along the wind, in slabs as wide as that, since squares would hold more than is used; along a narrow path that turns, in strips.
 """
 
 from __future__ import annotations
@@ -79,13 +78,13 @@ class Drifting:
 
 
 class Tiles:
-    """The coefficients of several layers, as many as `BYTES_KEPT` allow. Threads may ask at the same time."""
+    """The coefficients of several layers, as many as `BYTES_KEPT` allow. Safe for threads."""
 
     def __init__(self) -> None:
         self._kept: dict[_Key, tuple[Field, int]] = {}
         self._making: dict[_Key, Future[tuple[Field, int]]] = {}
         self._lock = threading.Lock()
-        self._room = BYTES_KEPT
+        self._free = BYTES_KEPT
 
     def get(self, field: Turbulence, layer: int, box: tuple[int, int, int, int]) -> tuple[Field, int]:
         """Coefficients of a layer and their address: of the cells low <= i < high, low <= j < high of a box, with the apron."""
@@ -111,9 +110,9 @@ class Tiles:
                 del self._making[key]
             raise
         with self._lock:
-            self._room -= tile.nbytes
-            while self._room < 0 and self._kept:  # the oldest goes first; whoever works with it still holds it
-                self._room += self._kept.pop(next(iter(self._kept)))[0].nbytes
+            self._free -= tile.nbytes
+            while self._free < 0 and self._kept:  # the oldest goes first; a thread that works with it still holds it
+                self._free += self._kept.pop(next(iter(self._kept)))[0].nbytes
             self._kept[key] = made
             del self._making[key]
         making.set_result(made)
@@ -131,13 +130,13 @@ class DriftingLayers:
     observation, plane
         The scan and its plane.
     points
-        The focal-plane points (xi, eta) that will be asked for.
+        The focal-plane points (xi, eta) that will be evaluated.
     drifting
         The layers; their steps are ``step`` times powers of two.
     step
         Samples between times.
     span
-        First time that may be asked for, and the one after the last.
+        First time that may be evaluated, and the one after the last.
     dtype
         What the splines over the lattices are summed in: float32 is right to 1e-7 of each layer.
 
@@ -257,7 +256,7 @@ class DriftingLayers:
                         cells[n] += (b - a + 2.0 * AROUND) * (d - c + 2.0 * AROUND)
                         k, m, p, q = whole[n]
                         whole[n] = min(k, a), max(m, b), min(p, c), max(q, d)
-        return [(box, min(some, _cells_of(box))) for box, some in zip(whole, cells, strict=True)]
+        return [(box, min(number, _cells_of(box))) for box, number in zip(whole, cells, strict=True)]
 
 
 def _cells_of(box: tuple[int, int, int, int]) -> float:

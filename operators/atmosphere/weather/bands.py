@@ -50,9 +50,9 @@ class BandAtmosphere:
     band
         The passband.
     profile
-        The air; its water is scaled to whatever PWV is asked for.
+        The profile; its vapour is scaled to the PWV wanted.
     pwv_max
-        Largest PWV that will be asked for, m; three times the profile's own, up to 60 mm, where absent.
+        Largest PWV of the table, m; three times the profile's own, up to 60 mm, where absent.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class BandAtmosphere:
         self.pwv_max = min(3 * profile.pwv, PWV_MAX) if pwv_max is None else pwv_max
         check_pwv(self.pwv_max)
         if self.pwv_max == 0:
-            raise InputError("the air is dry, so there is no water to vary", cure="give a PWV above 0 mm")
+            raise InputError("the profile is dry, so there is no vapour to vary", cure="give a PWV above 0 mm")
         self._transfer = BandTransfer(band, replace(profile.layers, spectra=spectra))
         self._v_max = -math.log(math.sin(ELEVATION_MIN))
         for n_u, n_v, ratio in GRIDS:
@@ -185,9 +185,9 @@ class BandAtmosphere:
     def _contract(self, which: int, basis: Floats, elevation: Floats) -> Floats:
         """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the number of threads."""
         y, found, along = self._y(elevation).ravel(), np.empty(elevation.size), self._coefficients[which]
-        for some in chunks(len(y)):
-            one, other = basis[:, some] if basis.shape[1] > 1 else basis, _chebyshev(y[some], along.shape[1])
-            found[some] = np.sum(np.einsum("ij,in->jn", along, one) * other, axis=0)
+        for chunk in chunks(len(y)):
+            one, other = basis[:, chunk] if basis.shape[1] > 1 else basis, _chebyshev(y[chunk], along.shape[1])
+            found[chunk] = np.sum(np.einsum("ij,in->jn", along, one) * other, axis=0)
         return found.reshape(elevation.shape)
 
 

@@ -37,7 +37,7 @@ YEARS = (1940, 2100)
 
 
 def profile(site: Site, time: Instant, pwv: float | None = None) -> Profile:
-    """The median air above a site at a time, its water scaled to ``pwv`` [m] where that is given.
+    """The median profile above a site at a time, scaled to ``pwv`` [m] where that is given.
 
     A site without climatology has the US Standard Atmosphere where ``pwv`` is given.
 
@@ -74,9 +74,9 @@ def climatology_column(site: Site, time: Instant) -> Column:
     known = climatologies()
     if name is None:
         raise InputError(
-            "has no climatology, so the air above it is unknown",
+            "has no climatology, so the atmosphere above it is unknown",
             place=place,
-            cure="give its water, e.g. weather: {pwv: 3 mm}, or an ERA5 file, weather: {file: era5.nc}, which "
+            cure="give its PWV, e.g. weather: {pwv: 3 mm}, or an ERA5 file, weather: {file: era5.nc}, which "
             "`zonda weather fetch` gets; or choose a site that has a climatology (see `zonda plugins`), or set the site's "
             f"climatology to one of: {', '.join(known)}",
         )

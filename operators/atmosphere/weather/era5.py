@@ -1,4 +1,4 @@
-"""The air above a place from a file of ERA5 on pressure levels, as the Copernicus Climate Data Store delivers it.
+"""The atmosphere above a place from a file of ERA5 on pressure levels, as the Copernicus Climate Data Store delivers it.
 
 Both layouts are read: NetCDF-4 with ``valid_time`` and ``pressure_level`` (from 2024), and NetCDF-3 with packed values,
 ``time`` and ``level`` (before). Only what surrounds the place and the time is read from the disk. Interpolation is bilinear in
@@ -56,7 +56,7 @@ STEP_MAX = 6.0
 RATIO_MAX = 1.55
 """Between neighbouring pressure levels up to `HIGHEST` (700 and 500 hPa pass, 1000 and 500 hPa do not)."""
 HIGHEST = 20000.0
-"""Pa that the levels must reach: the water lies below."""
+"""Pa that the levels must reach: the vapour lies below."""
 HALF_CELL = 0.13
 """deg that the place may lie outside the grid: half a cell of ERA5's own."""
 
@@ -67,7 +67,7 @@ GET = "`zonda weather fetch SITE --time TIME --output era5.nc` gets such a file,
 
 
 def read_era5(path: Path, site: Site, time: Instant) -> Column:
-    """The air above ``site`` at ``time``.
+    """The column above ``site`` at ``time``.
 
     Raises
     ------

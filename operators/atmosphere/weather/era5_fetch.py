@@ -26,7 +26,7 @@ KEY = "https://cds.climate.copernicus.eu/how-to-api says how to get a free key a
 def request(site: Site, time: Instant, hours: int) -> dict[str, Any]:
     """What to ask for: the cells around the site, and every hour from that before ``time`` to ``hours`` later.
 
-    The store takes whole days times hours of the day, so a stretch over midnight gets more than that.
+    The store takes whole days times hours of the day, so a period over midnight gets more than that.
     """
     first = time.datetime.replace(minute=0, second=0, microsecond=0)
     stamps = [first + timedelta(hours=k) for k in range(hours + 2)]

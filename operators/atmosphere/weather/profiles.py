@@ -45,7 +45,7 @@ STRATOPAUSE_TEMPERATURE = 270.65
 
 @dataclass(frozen=True)
 class Conditions:
-    """The air at some heights, arrays of the shape asked for: m above the site, Pa, K, kg/m3, m/s, m/s."""
+    """Conditions at given heights, arrays of the shape asked for: m above the site, Pa, K, kg/m3, m/s, m/s."""
 
     height: Floats
     pressure: Floats
@@ -88,7 +88,7 @@ class PwvDistribution:
 
 @dataclass(frozen=True)
 class Profile:
-    """The air above a site, arrays (61,) from the ground up.
+    """The atmosphere above a site, arrays (61,) from the ground up.
 
     Attributes
     ----------
@@ -105,9 +105,9 @@ class Profile:
     wind_east_spread, wind_north_spread
         Standard deviations of the winds [m/s] over the weather of the season and hour; None: not known.
     distribution
-        How the PWV of that season and hour is distributed, whatever the water is scaled to; None: not known.
+        How the PWV of that season and hour is distributed, whatever the PWV is scaled to; None: not known.
     stated
-        (what, text): where this air comes from, for the reports.
+        (what, text): where this profile comes from, for the reports.
     """
 
     height: Floats
@@ -145,16 +145,16 @@ class Profile:
         return self.layers.pwv
 
     def scaled(self, pwv: float) -> Profile:
-        """The same air with all its water multiplied so that it amounts to ``pwv`` [m].
+        """The same profile with all its vapour multiplied so that the PWV is ``pwv`` [m].
 
         Raises
         ------
         InputError
-            A PWV that is negative or above 60 mm, or water asked of air that has none.
+            A PWV that is negative or above 60 mm, or any of a profile without vapour.
         """
         check_pwv(pwv)
         if pwv > 0 and not self.pwv > 0:
-            raise InputError("the air has no water at all, so it has no shape to scale", cure="give a profile with some vapour")
+            raise InputError("the profile has no vapour at all, so there is nothing to scale", cure="give a profile with vapour")
         profile = self
         for _ in range(8):  # as in Layers.scaled
             profile = replace(profile, h2o=profile.h2o * (pwv / profile.pwv)) if pwv > 0 else replace(self, h2o=0 * self.h2o)
@@ -162,7 +162,7 @@ class Profile:
 
     @property
     def typical_wind(self) -> Profile:
-        """The same air with the median speed along the median direction.
+        """The same profile with the median speed along the median direction.
 
         Of a wind whose components are normal with means (u, v) and spreads su, sv, the median speed is within 3 % of
 
@@ -182,7 +182,7 @@ class Profile:
         return replace(self, wind_east=speed * east, wind_north=speed * north)
 
     def at(self, height: ArrayLike) -> Conditions:
-        """The air at heights above the site [m], any shape: winds as vectors, pressure and vapour as logarithms, linearly.
+        """Conditions at heights above the site [m], any shape: winds as vectors, pressure and vapour as logarithms, linearly.
 
         Raises
         ------
@@ -210,7 +210,7 @@ class Profile:
 
 
 def check_pwv(pwv: float) -> None:
-    """Refuse a precipitable water vapour [m] that no air holds (`InputError`)."""
+    """Refuse a precipitable water vapour [m] that does not occur on Earth (`InputError`)."""
     if not 0 <= pwv <= PWV_MAX:
         raise InputError(
             f"a precipitable water vapour of {pwv * 1e3:g} mm is outside the limits, 0 to {PWV_MAX * 1e3:g} mm",

@@ -82,7 +82,7 @@ class Layers:
         return float(np.sum(self.molecules * self.h2o)) * MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY
 
     def scaled(self, pwv: float) -> Layers:
-        """The same layers with all water multiplied so that it amounts to ``pwv`` [m]. The pressure stays as it is."""
+        """The same layers with all vapour multiplied so that the PWV is ``pwv`` [m]. The pressure stays as it is."""
         if pwv == 0:
             return replace(self, h2o=np.zeros_like(self.h2o))
         air, h2o = -np.diff(self.pressure) / GRAVITY, self.h2o

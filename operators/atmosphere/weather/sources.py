@@ -1,4 +1,4 @@
-"""The built-in weather sources, and the air that a scene has: a source, a site, a time, a PWV and a seed."""
+"""The built-in weather sources, and the profile of a scene, from its source, site, time, PWV and seed."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 
 class Climatology(WeatherSource):
-    """The median air of the site's embedded climatology at that season and hour.
+    """The median atmosphere of the site's embedded climatology at that season and hour.
 
-    A site without climatology has the US Standard Atmosphere, where its water is given.
+    A site without climatology has the US Standard Atmosphere, where its PWV is given.
     """
 
     source: Literal["climatology"] = "climatology"
@@ -52,7 +52,7 @@ class Standard(WeatherSource):
     def column(self, site: Site, time: Instant) -> Column:
         """See `WeatherSource.column`."""
         if self.pwv is None or self.pwv.metres is None:
-            raise InputError("the standard atmosphere does not know the water", place="weather", cure="give pwv, e.g. 3 mm")
+            raise InputError("the standard atmosphere has no PWV of its own", place="weather", cure="give pwv, e.g. 3 mm")
         return standard_column(site)
 
 
@@ -83,20 +83,20 @@ class Table(WeatherSource):
 
 
 DRY = 1e-12
-"""m: what air of 0 mm is given, so that its profile keeps the shape of the water; it absorbs 1e-9 of what a millimetre does."""
+"""m: PWV that a profile of 0 mm is given, so that the vapour keeps its shape; it absorbs 1e-9 of what a millimetre does."""
 
 
 def profile_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None) -> Profile:
-    """The air of a scene; its ``stated`` says what was taken, and why.
+    """The profile of a scene; its ``stated`` says what was used, and why.
 
     Parameters
     ----------
     weather
         The scene's; None: the climatology.
     seed
-        The scene's: of random water and wind.
+        The scene's: of random PWV and wind.
     pwv
-        Of the operator, m: it scales the water where the scene gives none.
+        Of the operator, m: it scales the vapour where the scene gives no PWV.
 
     Raises
     ------
@@ -114,13 +114,13 @@ def profile_of(weather: WeatherSource | None, site: Site, time: Instant, seed: i
             )
     without_climatology = isinstance(weather, Climatology) and site.climatology is None and pwv is not None
     profile = on_heights(standard_column(site) if without_climatology else weather.column(site, time), site)
-    profile, how = _water(profile, weather, seed, pwv)
-    profile, wind = _wind(profile, weather, seed)
-    return replace(profile, stated=(*profile.stated, ("water", how), *_supersaturated(profile), ("wind", wind)))
+    profile, how = _scaled(profile, weather, seed, pwv)
+    profile, wind = _blown(profile, weather, seed)
+    return replace(profile, stated=(*profile.stated, ("PWV", how), *_supersaturated(profile), ("wind", wind)))
 
 
 def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None) -> GroundWeather:
-    """What instruments at the telescope read in this air; ``wind`` (east, north) [m/s] where it is not the profile's."""
+    """What instruments at the telescope read; ``wind`` (east, north) [m/s] where it is not the profile's."""
     ground, air = profile.at(0.0), profile.at(10.0)
     vapour, temperature = float(air.vapour_density), float(air.temperature)
     dry = (float(air.pressure) - vapour * VAPOUR_GAS_CONSTANT * temperature) / (DRY_AIR_GAS_CONSTANT * temperature)
@@ -138,12 +138,12 @@ def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None
 
 
 def of_scene(scene: Scene) -> GroundWeather:
-    """What instruments at the telescope read in the air of a scene at its start."""
+    """What instruments at the telescope read at the start of a scene."""
     return on_the_ground(profile_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
 
 
 def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:
-    """What is said of air that holds more water than saturates it: it is taken as it is."""
+    """The statement on a profile that is supersaturated: it is used as it is."""
     saturated = saturation_pressure(profile.temperature) / profile.pressure
     over = profile.h2o > saturated * (1 + 1e-9)
     if not over.any():
@@ -154,30 +154,30 @@ def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:
     return (("relative humidity above 100 %", f"{text}; taken as it is"),)
 
 
-def _water(profile: Profile, weather: WeatherSource, seed: int, pwv: float | None) -> tuple[Profile, str]:
+def _scaled(profile: Profile, weather: WeatherSource, seed: int, pwv: float | None) -> tuple[Profile, str]:
     given = weather.pwv
     if pwv is not None or (given is not None and given.metres is not None):
         wanted = pwv if pwv is not None else given.metres if given is not None else None
         assert wanted is not None
-        return profile.scaled(max(wanted, DRY)), f"PWV {wanted * 1e3:.4g} mm, as given"
+        return profile.scaled(max(wanted, DRY)), f"{wanted * 1e3:.4g} mm, as given"
     if given is None:
-        return profile, f"PWV {profile.pwv * 1e3:.4g} mm, as the source has it"
+        return profile, f"{profile.pwv * 1e3:.4g} mm, as the source has it"
     law = profile.distribution
     if law is None:
         raise InputError(
-            f"a PWV of '{given}' needs a distribution, and source '{weather.source}' has one state of the air only",
+            f"a PWV of '{given}' needs a distribution, and source '{weather.source}' has one state of the atmosphere only",
             place="weather",
             cure="give the PWV in mm, or leave it away to take the source's own",
         )
     quantile = given.quantile if given.quantile is not None else float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
     wanted = law.at(quantile)
     low, high = law.at(0.25) * 1e3, law.at(0.75) * 1e3
-    text = f"PWV {wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile{'' if given.quantile is not None else ' (drawn)'}"
+    text = f"{wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile{'' if given.quantile is not None else ' (drawn)'}"
     season = f"of that season and hour: median {law.median * 1e3:.4g} mm, half the days between {low:.3g} and {high:.3g} mm"
     return profile.scaled(wanted), f"{text} {season}"
 
 
-def _wind(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profile, str]:
+def _blown(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profile, str]:
     if profile.wind_east_spread is None or profile.wind_north_spread is None:
         return profile, "as the source has it"
     if weather.wind == "median":

@@ -1,4 +1,4 @@
-"""The US Standard Atmosphere 1976: the air where nothing better is known, and above what a source reaches."""
+"""The US Standard Atmosphere 1976: used where nothing better is known, and above what a source reaches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `zonda weather` prints: the profile, the water by month and hour, and what instruments see of it."""
+"""What `zonda weather` prints: the profile, the PWV by month and hour, and what instruments see."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from zonda.core.configuration.time import Instant
 from zonda.core.types import Floats
 
+from . import climatology
 from .bands import BandAtmosphere
-from .climatology import profile
 from .profiles import PWV_MAX, Profile
 
 if TYPE_CHECKING:
@@ -31,48 +31,52 @@ MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", 
 
 
 @dataclass(frozen=True)
-class WaterByMonth:
+class PwvByMonth:
     """PWV [m] on the 15th of each month: ``median`` (12, n_hour), and the mean over the hours of ``quantiles`` (12, 5)."""
 
     median: Floats
     quantiles: Floats
 
 
-def water_by_month(site: Site, year: int = 2023) -> WaterByMonth:
+def pwv_by_month(site: Site, year: int = 2023) -> PwvByMonth:
     """From the site's climatology. Raises `InputError` where there is none."""
     median, quantiles = np.empty((12, len(HOURS))), np.zeros((12, len(QUANTILES)))
     for month in range(12):
         for k, hour in enumerate(HOURS):
-            law = profile(site, Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z")).distribution
+            law = climatology.profile(site, Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z")).distribution
             assert law is not None  # the climatology has spreads
             median[month, k] = law.median
             quantiles[month] += np.array([law.at(q) for q in QUANTILES]) / len(HOURS)
-    return WaterByMonth(median, quantiles)
+    return PwvByMonth(median, quantiles)
 
 
-def pwv_steps(air: Profile) -> list[float]:
-    """The PWVs [m] for which spectra are shown: the air's own among round values from very dry to very wet for that air."""
-    law = air.distribution
-    low, high = (law.at(0.05), law.at(0.95)) if law is not None else (air.pwv / 3, min(3 * air.pwv, PWV_MAX))
+def pwv_steps(profile: Profile) -> list[float]:
+    """The PWVs [m] for which spectra are shown: the profile's own among round values from very dry to very wet there."""
+    law = profile.distribution
+    low, high = (law.at(0.05), law.at(0.95)) if law is not None else (profile.pwv / 3, min(3 * profile.pwv, PWV_MAX))
     rounded = {float(f"{low * (high / low) ** (k / 3):.1g}") for k in range(4)}
-    return sorted(p for p in {*rounded, air.pwv} if p == air.pwv or abs(p / air.pwv - 1) > 0.2) if air.pwv > 0 else [0.0, 1e-3]
+    return (
+        sorted(p for p in {*rounded, profile.pwv} if p == profile.pwv or abs(p / profile.pwv - 1) > 0.2)
+        if profile.pwv > 0
+        else [0.0, 1e-3]
+    )
 
 
-def place_lines(site: Site, time: Instant, air: Profile) -> list[str]:
-    """Where and when, and where the air comes from."""
+def place_lines(site: Site, time: Instant, profile: Profile) -> list[str]:
+    """Where and when, and where the profile comes from."""
     where = f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg, {site.altitude:g} m"
     head = f"{site.name}: {site.description}" if site.description else site.name
-    return [head, f"{where}; {time}", *(f"{what}: {text}" for what, text in air.stated)]
+    return [head, f"{where}; {time}", *(f"{what}: {text}" for what, text in profile.stated)]
 
 
-def profile_lines(air: Profile) -> list[str]:
+def profile_lines(profile: Profile) -> list[str]:
     """A table of the profile; the wind is that which blows, coming from a direction."""
     lines = [
         "  above site   pressure  temperature   vapour     wind      from",
         "           m        hPa            K     g/m3      m/s       deg",
     ]
     for h in HEIGHTS:
-        a = air.at(h)
+        a = profile.at(h)
         east, north = float(a.wind_east), float(a.wind_north)
         direction = math.degrees(math.atan2(-east, -north)) % 360
         lines.append(
@@ -82,7 +86,7 @@ def profile_lines(air: Profile) -> list[str]:
     return lines
 
 
-def water_lines(water: WaterByMonth) -> list[str]:
+def pwv_lines(water: PwvByMonth) -> list[str]:
     """A table of the PWV by month and hour."""
     head = "".join(f"{f'{hour:02d}h':>7}" for hour in HOURS) + "  |" + "".join(f"{f'{100 * q:g} %':>7}" for q in QUANTILES)
     lines = ["PWV [mm]: median by hour (UTC), and quantiles of the month", "     " + head]
@@ -92,15 +96,15 @@ def water_lines(water: WaterByMonth) -> list[str]:
     return lines
 
 
-def band_lines(air: Profile, bands: Iterable[Band], elevation: float) -> list[str]:
+def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> list[str]:
     """Emission and transmission of bands at several PWVs and an elevation [rad]."""
-    steps = pwv_steps(air)
+    steps = pwv_steps(profile)
     lines = [f"at an elevation of {math.degrees(elevation):g} deg: emission of the air (background 0 K), transmission, opacity"]
     for band in bands:
-        seen = BandAtmosphere(band, air, min(max(*steps, 1e-4) * 1.01, PWV_MAX))
+        seen = BandAtmosphere(band, profile, min(max(*steps, 1e-4) * 1.01, PWV_MAX))
         lines.append(f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)")
         for pwv in steps:
-            mark = "  <" if pwv == air.pwv else ""
+            mark = "  <" if pwv == profile.pwv else ""
             kelvin, passed = float(seen.emission(pwv, elevation)), float(seen.transmission(pwv, elevation))
             opacity = float(seen.opacity(pwv, elevation))
             lines.append(f"    PWV {_short(pwv)} mm: {kelvin:7.2f} K_RJ, {_fraction(passed)}, {opacity:.4g}{mark}")

@@ -1,4 +1,4 @@
-"""A profile of the air from a text table that the user wrote."""
+"""A profile from a text table that the user wrote."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ EXAMPLE = "height [m], pressure [hPa], temperature [K], relative humidity [%], w
 
 
 def read_table(path: Path, site: Site) -> Column:
-    """The air of a CSV table: a header of ``name [unit]``, then rows of increasing height; ``#`` begins a comment.
+    """The column of a CSV table: a header of ``name [unit]``, then rows of increasing height; ``#`` begins a comment.
 
     Heights are above sea level. Without winds there is a west wind of `standard_atmosphere.wind_speed`.
 

@@ -178,5 +178,5 @@ def test_limits_are_named(air, mustang2):
         BandAtmosphere(band(990, 1010), air)
     with pytest.raises(InputError, match="outside the limits, 0 to 60 mm"):
         BandAtmosphere(band(78, 108), air, pwv_max=0.1)
-    with pytest.raises(InputError, match="the air is dry"):
+    with pytest.raises(InputError, match="the profile is dry"):
         BandAtmosphere(band(78, 108), air.scaled(0.0))

@@ -224,7 +224,7 @@ def test_the_scenes_weather_reaches_the_pipeline():
     s = scene({"pwv": "3 mm", "wind": "median"}, target="az 180 deg el 60 deg")
     steps = [zonda.PointingStare(scan_duration="10 s"), zonda.AtmosphereLayers(layers=2), zonda.Efficiency()]
     said = {what: text for _, what, text in zonda.Pipeline(steps).run(s).tally}
-    assert said["water"] == "PWV 3 mm, as given"
+    assert said["PWV"] == "3 mm, as given"
     assert said["wind"] == "medians of the components"
     with pytest.raises(InputError, match="given twice"):
         zonda.Pipeline([steps[0], zonda.AtmosphereLayers(pwv="4 mm"), steps[2]]).run(s)
@@ -238,7 +238,7 @@ def test_a_place_without_climatology_needs_water_or_a_file():
         profile_of(None, here(), NIGHT, 0)
     with pytest.raises(InputError, match="has no climatology"):
         profile_of(Climatology(pwv="50 %"), here(), NIGHT, 0)
-    with pytest.raises(InputError, match="standard atmosphere does not know the water"):
+    with pytest.raises(InputError, match="standard atmosphere has no PWV of its own"):
         profile_of(Standard(), here(), NIGHT, 0)
     for made in (
         profile_of(Climatology(pwv="3 mm"), here(), NIGHT, 0),
@@ -310,7 +310,7 @@ def test_era5_gives_air_for_a_scene(tmp_path):
     assert (np.diff(made.pressure) < 0).all()
     assert (made.temperature > 190).all()
     assert air({"file": str(path), "pwv": "2 mm"}, site=here(), time="2024-03-01T02:00").pwv == pytest.approx(2e-3)
-    with pytest.raises(InputError, match="'25 %' needs a distribution, and source 'era5' has one state of the air only"):
+    with pytest.raises(InputError, match="'25 %' needs a distribution, and source 'era5' has one state of the atmosphere only"):
         air({"file": str(path), "pwv": "25 %"}, site=here(), time="2024-03-01T02:00")
 
 
@@ -502,7 +502,7 @@ def test_dry_air_keeps_the_shape_of_its_water() -> None:
     usual = profile_of(None, site, time, 1)
     # the pressure stays, so that the few per mille of molecules that were water are air: shapes agree to that
     np.testing.assert_allclose(dry.scaled(usual.pwv).h2o, usual.h2o, rtol=1e-6)
-    with pytest.raises(InputError, match="no water at all"):
+    with pytest.raises(InputError, match="no vapour at all"):
         dataclasses.replace(usual, h2o=0 * usual.h2o).scaled(1e-3)
 
 
