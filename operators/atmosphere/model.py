@@ -143,7 +143,7 @@ class AtmosphereModel:
 
 @dataclass
 class Models:
-    """The scene of an operator's observations, and the the last models that were built."""
+    """The scene of an operator's observations, and the last models that were built."""
 
     _time: Instant | None = field(default=None, compare=False)
     _weather: WeatherSource | None = field(default=None, compare=False)
