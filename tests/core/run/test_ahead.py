@@ -1,7 +1,6 @@
 """The next observation is prepared while one is executed: the same bits, order, errors and memory as one after the other."""
 
 import threading
-from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -13,8 +12,6 @@ from zonda.core.errors import PipelineError
 from zonda.core.hooks import hookimpl, manager
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.core.run import ahead
-from zonda.core.run.settings import Settings
 
 WAIT = 60.0
 """Seconds after which a thread that never came is given up."""
@@ -51,7 +48,6 @@ class Maker(Operator):
     """Makes a signal from what it drew in `prepare`; where it ``waits``, `exec` goes on once the next observation is prepared."""
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    prepares_ahead: ClassVar[bool] = True
     log: ClassVar[Log | None] = None
     waits: ClassVar[bool] = False
     fails: ClassVar[tuple[str, int] | None] = None
@@ -62,13 +58,10 @@ class Maker(Operator):
         if self.fails == (what, observation.index):
             raise PipelineError(f"{what} of {observation.name} failed")
 
-    def configure(self, observation):
-        observation.factor = observation.index + 1
-
     def prepare(self, observation):
         self.at("prepare", observation)
         observation.tally.count(self.label, "prepared", 1)
-        drawn = np.random.default_rng(observation.index).normal(size=observation.n_samples) * observation.factor
+        drawn = np.random.default_rng(observation.index).normal(size=observation.n_samples) * (observation.index + 1)
         if self.log:
             self.log.prepared[observation.index].set()
         return drawn
@@ -87,22 +80,19 @@ class Maker(Operator):
 
 
 class Total(Operator):
-    """Keeps the signal; does not say that it can be prepared ahead."""
+    """Keeps the signal."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"total"})
 
     def prepare(self, observation):
-        observation.tally.state(
-            self.label, "thread", "main" if threading.current_thread() is threading.main_thread() else "other"
-        )
         return np.zeros((observation.n_detectors, observation.n_samples), np.float32)
 
     def exec(self, block, state):
         state[block.detectors, block.samples] = block.detdata["signal"]
 
     def collect(self, data, observation, state):
-        data.products.setdefault(data.product("total"), []).append(state)
+        data.products.setdefault("total", []).append(state)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +117,6 @@ def test_same_bits_and_tally_and_really_ahead(scene, log, monkeypatch):
     for a, b in zip(alone.products["total"], beside.products["total"], strict=True):
         assert np.array_equal(a, b)
     assert list(alone.tally) == list(beside.tally)
-    assert ("Total", "thread", "main") in list(beside.tally)  # what does not say that it may is prepared in its turn
     assert [row for row in log.rows if row[0] == "collect"] == [("collect", k) for k in range(3)]
     assert not [t for t in threading.enumerate() if t.name.startswith("ahead")]
 
@@ -182,88 +171,3 @@ def test_who_listens_hears_one_observation_after_the_other(scene, log):
     expected = [(stage, k) for k in range(3) for stage in ("prepare", "exec")]
     assert heard[:6] == expected
     assert {log.threads["prepare", k] for k in range(3)} == {"MainThread"}
-
-
-class Draws(Operator):
-    """Where told to, the last scan of the first run waits until the first scan of the second is prepared."""
-
-    provides: ClassVar[frozenset[str]] = frozenset({"white"})
-    prepares_ahead: ClassVar[bool] = True
-    prepared: ClassVar[list[tuple[int, str]]] = []
-    fourth: ClassVar[threading.Event | None] = None
-
-    def prepare(self, observation):
-        self.prepared.append((observation.index, threading.current_thread().name))
-        if len(self.prepared) == 4 and self.fourth:
-            self.fourth.set()
-        observation.tally.count(self.label, "prepared", 1)
-        return observation.index + 1
-
-    def exec(self, block, state):
-        if self.fourth and len(self.prepared) >= 3 and block.observation.index == 2:
-            assert self.fourth.wait(WAIT)
-        block.new("white")[...] = state
-
-
-class Signal(Operator):
-    """Passes it on."""
-
-    requires: ClassVar[frozenset[str]] = frozenset({"white"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-
-    def exec(self, block, state):
-        block.new("signal")[...] = block.detdata["white"]
-
-
-def test_the_first_scan_of_the_next_run_is_prepared_beside_the_last_of_this_one(scene, monkeypatch):
-    pipeline = Pipeline([Point(), Draws(), Signal(), Total()], runs={"again": {"only": ["white"]}})
-    tallies = []
-    for threads in (1, 2):
-        monkeypatch.setattr(Draws, "prepared", [])
-        monkeypatch.setattr(Draws, "fourth", threading.Event() if threads > 1 else None)
-        data = pipeline.run(scene, threads=threads)
-        assert [k for k, _ in Draws.prepared] == [0, 1, 2] * 2
-        assert all(name.startswith("ahead") == (threads > 1) for _, name in Draws.prepared[1:])
-        for run in ("", "again/"):
-            assert [float(t.mean()) for t in data.products[f"{run}total"]] == [1, 2, 3]
-            assert data.tally.get(f"{run}Draws", "prepared") == 3
-        tallies.append([row for row in data.tally if row[1] != "thread"])
-    assert tallies[0] == tallies[1]
-
-
-class Overrides(Maker):
-    """Has another `prepare` than the class that said it was safe."""
-
-    def prepare(self, observation):
-        return super().prepare(observation)
-
-
-class Configures(Operator):
-    """Configures, and does not say that it may do so ahead."""
-
-    def configure(self, observation):
-        observation.more = 1
-
-
-def test_how_far_ahead():
-    class Nothing(Operator):
-        """Has nothing to prepare."""
-
-    assert ahead.reach([Nothing(), Maker(), Nothing()]) == 3
-    assert ahead.reach([Maker(), Total(), Maker()]) == 1
-    assert ahead.reach([Overrides(), Maker()]) == 0
-    assert ahead.reach([Maker(), Configures()]) == 0
-
-
-def test_memory_of_the_next_observation_is_counted():
-    class Holds(Maker):
-        """Holds 1 GB."""
-
-        def memory(self, observation):
-            return 1_000_000_000
-
-    detectors, samples = 64, 1_000_000  # one stream: 256 MB
-    observation = SimpleNamespace(n_detectors=detectors, n_samples=samples, name="scan")
-    steps = [Holds(), Total()]
-    assert ahead.affordable(steps, [observation], Settings(2, memory=4_000_000_000)) == 1_000_000_000
-    assert ahead.affordable(steps, [observation], Settings(2, memory=1_000_000_000)) is None

@@ -1,23 +1,27 @@
-"""Memory is forecast by the rules of the execution, and what does not fit is refused before anything is prepared."""
+"""Memory is forecast by the schedule that is followed, and what does not fit is refused before anything is prepared."""
 
 import re
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
-from zonda.core.run.forecast import BASE, forecast, need, room
 
 from tests.core.run.test_execution import CHAIN, Demean, Level, Scale, Sink, Source, execute, observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+from zonda.core.plan.planning import Planning
+from zonda.core.registry import planning
+from zonda.core.run.budget import BASE, divided, least_memory, with_scan_ahead
+from zonda.core.run.schedule import Chain, schedule
 from zonda.core.run.settings import Settings
 
 
-def labelled(chain):
-    chain = [o.model_copy() for o in chain]
-    for i, o in enumerate(chain):
+def labelled(steps):
+    steps = [o.model_copy() for o in steps]
+    for i, o in enumerate(steps):
         o._label = f"{type(o).__name__}.{i}"
-    return chain
+    return Chain(steps)
 
 
 @pytest.mark.parametrize("chain", [[Source(), Demean(), Level(), Sink()], [Source(), Demean(), Scale(), Sink()], CHAIN])
@@ -27,76 +31,116 @@ def test_what_is_held_is_what_was_forecast(chain, threads, share):
     """The ledger's peak stays below the forecast, and that below the budget; the least that is forecast is enough."""
     obs = observation()
     settings = {"memory": int(share * threads * 4 * obs.n_detectors * obs.n_samples), "threads": threads}
-    found = forecast(labelled(chain), obs, Settings(**settings))
+    found = schedule(labelled(chain), obs, Settings(**settings))
     # the bench keeps the last stream besides
     kept = 4 * obs.n_detectors * obs.n_samples
     execution, want, _ = execute(chain, obs, **settings)
     assert execution.ledger.peak <= found.bytes + kept
     assert found.least <= found.bytes <= settings["memory"]
-    least = forecast(labelled(chain), obs, Settings(memory=1, threads=threads)).least
+    least = schedule(labelled(chain), obs, Settings(memory=1, threads=threads)).least
     _, got, _ = execute(chain, observation(), threads=threads, memory=least + 2 * kept)
     assert np.array_equal(got, want)
 
 
+def test_the_schedule_is_followed():
+    """What a run does with its streams is what its schedule says, with the same blocks."""
+    obs = observation()
+    execution, _, _ = execute([Source(), Demean(), Level(), Sink()], obs, memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples))
+    planned = execution.schedule.planned
+    assert [p.how for p in planned] == ["spilled", "kept"]
+    assert execution.schedule.elsewhere == ("signal spilled to disk",)
+    assert any("stream signal spilled" in what for _, what, _ in obs.tally)
+
+
 class Heavy(Operator):
-    """Holds much."""
+    """Makes a product."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    product_only: ClassVar[bool] = True
-    lighter: ClassVar[str] = "choose a larger pixel"
+    provides: ClassVar[frozenset[str]] = frozenset({"heap"})
     size: int = 0
 
+
+class HeavyPlanning(Planning):
+    """Much memory."""
+
+    of = Heavy
+    smaller = "choose a larger pixel"
+
     def memory(self, observation):
-        return self.size
+        return self.operator.size
+
+
+planning.register(HeavyPlanning, name="Heavy")
+
+
+def libraries(monkeypatch, free=10**10):
+    monkeypatch.setattr("zonda.core.run.budget.resident_memory", lambda: BASE)
+    monkeypatch.setattr("zonda.core.run.budget.available_memory", lambda: free)
 
 
 def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
     chain = labelled([Source(), Heavy(size=3_000_000_000)])
-    obs, settings = observation(), Settings(threads=2)
-    monkeypatch.setattr("zonda.core.run.forecast.resident_memory", lambda: BASE)
-    monkeypatch.setattr("zonda.core.run.forecast.available_memory", lambda: 10**10)
+    obs, settings = observation(), Settings(threads=2, asked=2 * 10**9)
+    libraries(monkeypatch)
     with pytest.raises(
         PipelineError, match=r"(?s)3\.23 GB: Heavy\.1 3 GB.*budget is 2 GB.*use --memory 33..MB.*Heavy.1: choose a l"
     ):
-        room(chain, [obs], settings, 2 * 10**9, "test")
-    monkeypatch.setattr("zonda.core.run.forecast.available_memory", lambda: 10**9)
+        divided(chain, obs, settings, "test")
+    libraries(monkeypatch, 10**9)
     with pytest.raises(PipelineError, match=r"more than this machine has \(1\.23 GB\)") as refused:
-        room(chain, [obs], settings, 2 * 10**9, "test")
+        divided(chain, obs, settings, "test")
     assert "--memory" not in refused.value.cure
-    left, products = room(chain, [obs], settings, 4 * 10**9, "test")
-    assert products == 3 * 10**9
-    assert left == 10**9 - BASE
+    found = divided(chain, obs, replace(settings, asked=4 * 10**9), "test")
+    assert found.ceiling == 10**9  # the product is still to come
+    assert found.memory == 10**9 - BASE
 
 
 def test_blocks_that_are_too_large_are_worked_on_by_fewer_threads(monkeypatch):
     """Blocks of 4 threads take 774 MB, of one 193.5 MB: 630 MB less the libraries' 230 MB have room for two of them."""
-    obs, settings = observation(16, 1_000_000), Settings(threads=4)
-    monkeypatch.setattr("zonda.core.run.forecast.resident_memory", lambda: BASE)
-    room(labelled([Source(), Demean(), Sink()]), [obs], settings, 630 * 10**6, "test")
-    assert settings.threads == 2
+    libraries(monkeypatch)
+    chain = labelled([Source(), Demean(), Sink()])
+    assert divided(chain, observation(16, 1_000_000), Settings(threads=4, asked=630 * 10**6), "test").threads == 2
 
 
 def test_the_figure_that_a_refusal_names_works(monkeypatch):
     obs, chain = observation(16, 1_000_000), labelled([Source(), Demean(), Sink()])
-    monkeypatch.setattr("zonda.core.run.forecast.resident_memory", lambda: BASE)
-    for kept in (0, 300_000_000):
-        with pytest.raises(PipelineError, match=r"blocks on 1 thread 19\d MB") as refused:
-            room(chain, [obs], Settings(threads=4), 3 * 10**8, "test", kept)
-        found = re.search(r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure)
-        assert found is not None
-        settings = Settings(threads=4)
-        settings.memory, _ = room(chain, [obs], settings, int(found[1]) * 10**6, "test", kept)
-        assert settings.threads == 1
-        assert settings.memory >= settings.least
-        assert int(found[1]) * 10**6 >= need(chain, [obs], Settings(threads=4), kept)
+    libraries(monkeypatch)
+    with pytest.raises(PipelineError, match=r"blocks on 1 thread 19\d MB") as refused:
+        divided(chain, obs, Settings(threads=4, asked=3 * 10**8), "test")
+    found = re.search(r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure)
+    assert found is not None
+    settings = divided(chain, obs, Settings(threads=4, asked=int(found[1]) * 10**6), "test")
+    assert settings.threads == 1
+    assert settings.memory >= settings.least
+    assert int(found[1]) * 10**6 >= least_memory(chain, obs, Settings(threads=4))
 
 
 def test_no_cure_is_named_that_cannot_work(monkeypatch):
     """Less than the libraries take: no shorter scan makes that fit."""
     obs = observation(16, 1_000_000)
-    monkeypatch.setattr("zonda.core.run.forecast.resident_memory", lambda: BASE)
     for free, cure in ((10**10, r"use --memory \d+MB"), (10**8, "use a machine with more memory")):
-        monkeypatch.setattr("zonda.core.run.forecast.available_memory", lambda free=free: free)
+        libraries(monkeypatch, free)
         with pytest.raises(PipelineError) as refused:
-            room(labelled([Source(), Demean(), Sink()]), [obs], Settings(threads=4), BASE // 2, "test")
+            divided(labelled([Source(), Demean(), Sink()]), obs, Settings(threads=4, asked=BASE // 2), "test")
         assert re.fullmatch(cure, refused.value.cure)
+
+
+def test_memory_of_a_scan_that_is_prepared_ahead_is_counted():
+    class Holds(Source):
+        """Holds 1 GB."""
+
+    class HoldsPlanning(Planning):
+        """1 GB."""
+
+        of = Holds
+
+        def memory(self, observation):
+            return 1_000_000_000
+
+    planning.register(HoldsPlanning, name="Holds")
+    obs = observation(64, 1_000_000)  # one stream: 256 MB
+    chain = labelled([Holds(), Sink()])
+    ahead = with_scan_ahead(chain, obs, Settings(2, memory=4_000_000_000))
+    assert ahead is not None
+    assert ahead.memory == 3_000_000_000
+    assert with_scan_ahead(chain, obs, Settings(2, memory=1_000_000_000)) is None

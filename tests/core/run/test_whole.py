@@ -12,6 +12,8 @@ from zonda.core.faults import PluginError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
+from zonda.core.plan.planning import Planning
+from zonda.core.registry import planning
 
 SIGNAL = frozenset({"signal"})
 
@@ -122,27 +124,32 @@ class Measures(Gain):
     readings: int = 0
     _dtypes: set = PrivateAttr(default_factory=set)
 
-    def sweeps(self, observation):
-        return self.readings
-
-    def prepare(self, observation):
-        return {}
-
-    def measure(self, stream, state):
+    def measure(self, stream, model=None):
         assert "signal" not in stream.means
         assert stream.dtype == np.float64
         if not self.readings:
             rows = stream.array
             assert rows.dtype == np.float64
-            state["rms"] = np.sqrt(sum(float((row**2).sum()) for row in rows) / rows.size)
-            return
+            return np.sqrt(sum(float((row**2).sum()) for row in rows) / rows.size)
         power = 0.0
         for tiles in stream.sweep(lambda d, t, part: [(x**2).sum() for x in np.split(part, range(16, len(part), 16))]):
             power += float(sum(tiles[2]))
-        state["rms"] = np.sqrt(power / np.prod(stream.shape))
+        return np.sqrt(power / np.prod(stream.shape))
 
     def exec(self, block, state):
-        block.detdata["signal"] *= 30 / state["rms"]
+        block.detdata["signal"] *= 30 / state
+
+
+class ReadingsPlanning(Planning):
+    """As often as the operator says."""
+
+    of = Gain
+
+    def sweeps(self, observation):
+        return self.operator.readings
+
+
+planning.register(ReadingsPlanning, name="Gain")
 
 
 class Adds(Operator):
