@@ -139,39 +139,51 @@ def test_expected_failures():
 
 
 class Normalizes(Operator):
-    """Divides by the rms of everything; frozen, it forgets to use the complete data's."""
+    """Divides by the rms of everything; it forgets to use the complete data's."""
 
     requires: ClassVar[frozenset[str]] = SIGNAL
     provides: ClassVar[frozenset[str]] = SIGNAL
     couples: ClassVar = "all"
+    linear: ClassVar[bool] = True
 
-    def prepare(self, observation):
-        return []
-
-    def measure(self, stream, state):
-        state[:] = [float(np.std(stream.array[:16, :1000].astype(float)))]
-
-    def freeze(self, state):
-        return state[0]
-
-    def measure_frozen(self, stream, state, frozen):
-        self.measure(stream, state)
+    def measure(self, stream, model=None):
+        return float(np.std(stream.array[:16, :1000].astype(float))) or 1.0
 
     def exec(self, block, state):
-        block.detdata["signal"] /= block.dtype(state[0])
+        block.detdata["signal"] /= block.dtype(state)
 
 
-class NormalizesFrozen(Normalizes):
+class NormalizesAlike(Normalizes):
     """The same, right."""
 
-    def measure_frozen(self, stream, state, frozen):
-        state[:] = [frozen]
+    def measure(self, stream, model=None):
+        return super().measure(stream) if model is None else model
 
 
-def test_an_operator_that_is_not_linear_when_frozen():
-    check_operator(NormalizesFrozen())
-    with pytest.raises(AssertionError, match="check_frozen: frozen, it is not linear"):
-        check_operator(Normalizes())
+class Rectifies(Good):
+    """Says that it is linear, and takes absolute values."""
+
+    linear: ClassVar[bool] = True
+
+    def exec(self, block, state):
+        np.abs(block.detdata["signal"], out=block.detdata["signal"])
+
+
+class Offsets(Good):
+    """Says that it is linear, and adds a constant."""
+
+    linear: ClassVar[bool] = True
+
+
+def test_an_operator_that_is_not_linear():
+    check_operator(NormalizesAlike())
+    for broken, words in (
+        (Normalizes(), "does not add up"),
+        (Rectifies(), "does not add up"),
+        (Offsets(), "something of nothing"),
+    ):
+        with pytest.raises(AssertionError, match=f"check_linear: says that it is linear, but .*{words}"):
+            check_operator(broken)
 
 
 class Gain(Good):
@@ -247,22 +259,22 @@ class CountsThatKnows(Counts):
         super().exec(block, state)
 
 
-class MeasuresThatKnows(NormalizesFrozen):
+class MeasuresThatKnows(NormalizesAlike):
     """Measures without the mean, adds it in `exec`."""
 
     knows_means: ClassVar[bool] = True
 
-    def measure(self, stream, state):
-        super().measure(stream, state)
+    def measure(self, stream, model=None):
+        return super().measure(stream, model)
 
     def exec(self, block, state):
-        whole = block.total("signal") / state[0]
+        whole = block.total("signal") / state
         block.means.pop("signal", None)
         block.detdata["signal"][...] = whole
 
 
 def test_the_mean_is_no_trap():
-    for right in (Gain(), GainThatDoes(), GainOfAtmosphere(), Counts(), NormalizesFrozen()):
+    for right in (Gain(), GainThatDoes(), GainOfAtmosphere(), Counts(), NormalizesAlike()):
         check_operator(right)
 
 
