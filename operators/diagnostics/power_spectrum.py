@@ -16,6 +16,7 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+from zonda.core.signal import MAIN, TRANSMISSION, is_signal
 from zonda.core.stream_names import StreamsAsked
 from zonda.core.types import Floats
 
@@ -121,7 +122,7 @@ class Periodograms:
         assert self.welch is not None
         found: dict[str, Floats] = {}
         gain = _gain(block, detector)
-        for name in self.streams or in_order({*block.detdata} - {*block.signals, "transmission"} | {"signal"}):
+        for name in self.streams or [s for s in in_order(block.detdata) if s == MAIN or not (is_signal(s) or s == TRANSMISSION)]:
             if name not in block.detdata:
                 have = ", ".join(sorted(block.detdata))
                 raise PipelineError(f"there is no stream {name!r} at this step", place=self.place, cure=f"choose from: {have}")
