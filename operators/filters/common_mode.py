@@ -52,7 +52,7 @@ KEPT = "modes kept because the data do not determine them (rank)"
 
 
 class CommonModeFilter(Operator):
-    """Remove the first singular modes of each scan: equation (1). Flagged samples and detectors take no part.
+    """Filter that removes the leading singular modes of each scan, equation (1). Flagged samples and detectors are excluded.
 
     Detectors whose complete signal is not finite are flagged, and those whose complete signal is constant: they are dead. In a
     scene of the sky alone a constant signal is a valid zero, which takes part.

@@ -24,11 +24,11 @@ ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a li
 
 
 class HighpassFilter(Operator):
-    """Brick-wall high-pass filter of each detector's scan, zero phase: equations (1) and (2) of `brick_wall`.
+    """Zero-phase brick-wall high-pass filter of each detector's scan: equations (1) and (2) of `brick_wall`.
 
     The modelled mean emission that accompanies the signal is dropped analytically, before anything else. A scan that is shorter
-    than 1 / `frequency` loses its mean and a line alone, which is said. A cut so near the Nyquist frequency that nothing of a
-    scan is left is refused.
+    than 1 / `frequency` loses its mean and a line alone; the log says so. A frequency so near the Nyquist frequency that
+    nothing of a scan is left is refused.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -38,7 +38,7 @@ class HighpassFilter(Operator):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     frequency: Hertz = quantity("0.08 Hz", gt=0)
-    """Cut: everything slower is removed."""
+    """Cutoff: everything slower is removed."""
     degree: int = Field(3, ge=0, le=3)
     """Degree of the polynomial fitted to each detector's scan and removed before the even extension (1: a line)."""
     trim: Seconds = quantity("0 s", ge=0)

@@ -45,7 +45,7 @@ class _Linear:
 
 
 class BinMap(MapParameters):
-    """Average the samples in each pixel, equation (1), into a FITS image (TAN) or a HEALPix map."""
+    """Weighted mean of the samples in each pixel, equation (1), as a FITS image (TAN) or a HEALPix map."""
 
     requires: ClassVar[Any] = _Requires()
     provides: ClassVar[frozenset[str]] = frozenset({"map"})

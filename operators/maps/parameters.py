@@ -35,10 +35,10 @@ class MapParameters(MapMaker):
     ordering: Literal["ring", "nested"] = "ring"
     """HEALPix pixel order."""
     weights: Literal["uniform", "inverse_variance"] = "inverse_variance"
-    """Weigh samples alike, or by the inverse variance that follows from each detector's NET."""
+    """Equal weights, or weights by the inverse variance that follows from each detector's NET."""
     noise: Literal["net", "scatter"] = "net"
     """Noise of each pixel: from the detectors' NET, or from the scatter of its samples. From the NET also where the scene has no
-    white noise; the tally then says so."""
+    white noise; the log then says so."""
     contents: Literal["all", "hits"] = "all"
     """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
     half_difference: bool = True

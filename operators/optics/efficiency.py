@@ -40,7 +40,7 @@ KNOWN = frozenset({"atmosphere", "transmission", "white", "pink"})
 
 
 class Efficiency(Operator):
-    """Telescope efficiencies, opacity and calibration: equation (1). Writes ``signal``; the components stay as they are."""
+    """Telescope efficiencies, opacity and calibration, equation (1): forms ``signal`` from the components."""
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     knows_means: ClassVar[bool] = True
