@@ -63,9 +63,31 @@ class Depth:
     weighed: float
 
 
+@dataclass(frozen=True)
+class Work:
+    """What is done with each observation.
+
+    Attributes
+    ----------
+    steps
+        The operators that act on it, in order.
+    signals
+        The signals that are formed, the complete one first.
+    components
+        Names of all streams that become part of a signal.
+    times
+        How often each operator does its work, by label: once for components, and for each signal that it forms, filters or maps.
+    """
+
+    steps: tuple[Operator, ...] = ()
+    signals: tuple[Formed, ...] = (Formed(MAIN, frozenset()),)
+    components: frozenset[Component] = frozenset()
+    times: Mapping[str, float] = field(default_factory=dict)
+
+
 @dataclass
 class Context:
-    """Everything an `Operator.estimate` may look at.
+    """Everything that `Planning.estimate` may look at.
 
     Attributes
     ----------
@@ -73,8 +95,8 @@ class Context:
         Observations have their pointing, and efficiencies and noise levels where those are given.
     operators
         Those that take part, in order, labelled.
-    runs
-        Number of runs (main and companions) in which each takes part, by label.
+    work
+        What they do with each observation.
     traits
         By label.
     coverage
@@ -86,7 +108,7 @@ class Context:
     scene: Scene
     observations: list[Observation]
     operators: list[Operator]
-    runs: dict[str, float]
+    work: Work = Work()
     traits: dict[str, Traits] = field(default_factory=dict)
     coverage: Coverage | None = None
     metrics: frozenset[str] = frozenset()
@@ -96,10 +118,6 @@ class Context:
     """The white noise that the run will have."""
     readers: frozenset[str] = frozenset()
     """Labels of the operators that make a product of the time streams themselves (`Planning.reads_streams`)."""
-    signals: tuple[Formed, ...] = (Formed(MAIN, frozenset()),)
-    """Those that are formed, the complete one first."""
-    components: frozenset[Component] = frozenset()
-    """Of all signals."""
     kept_streams: frozenset[str] = frozenset()
     """Streams that some operator saves, measures or draws besides ``signal``."""
 

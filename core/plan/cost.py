@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from ..mapmaker import with_sky_signal
 from ..output import Output
 from ..run.budget import BASE
 from ..run.schedule import Chain, schedule
@@ -111,18 +110,15 @@ def predict(
     during = [o for o in context.operators if not isinstance(o, Output)]
     held = POINTED * context.times + sum(planning_of(o).memory(longest) for o in during)
     after = sum(planning_of(o).memory(longest) for o in context.operators if isinstance(o, Output))
-    steps = with_sky_signal([o for o in during if "boresight" not in o.provides])
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
-    acting = {label: max(number, 1.0) for label, number in context.runs.items()}
-    sizes = [o.n_samples * o.n_detectors for o in context.observations]
-    found = schedule(Chain(steps, context.signals, context.components), longest, settings)
+    work = context.work
+    found = schedule(Chain(work.steps, work.signals, work.components), longest, settings)
     seconds = {}
     for label, cost in costs.items():
         if cost is not None:
             each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
-            again = found.again.get(label, 0) * (each - cost.fixed * len(sizes))  # prepared once, made again
-            seconds[label] = factors[cost.kernel] * (acting.get(label, 1) * (each + again) + cost.once)
+            again = found.again.get(label, 0) * (each - cost.fixed * len(context.observations))  # prepared once, made again
+            seconds[label] = factors[cost.kernel] * (work.times.get(label, 1.0) * (each + again) + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     startup = factors[STARTUP.kernel] * STARTUP.once
-    held += found.bytes
-    return Prediction(seconds, BASE + max(held, after), unknown, startup, acting, factors)
+    return Prediction(seconds, BASE + max(held + found.bytes, after), unknown, startup, work.times, factors)

@@ -55,9 +55,9 @@ class Decided:
         return math.inf if math.isnan(value) else value
 
     def saving(self, k: int, predicted: Prediction) -> float:
-        """CPU seconds that choice ``k`` saves on the machine of the prediction, all runs."""
-        runs = predicted.runs.get(self.operator, 1)
-        return self.effect.choices[k].seconds * runs * max(predicted.factors.values(), default=1.0)
+        """CPU seconds that choice ``k`` saves on the machine of the prediction, all signals."""
+        times = predicted.times.get(self.operator, 1)
+        return self.effect.choices[k].seconds * times * max(predicted.factors.values(), default=1.0)
 
 
 def decide(

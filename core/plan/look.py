@@ -16,7 +16,7 @@ from ..scene import Scene
 from .context import Context, Depth
 from .coverage import cover
 from .planning import planning_of
-from .structure import STREAMS, Structure, selected
+from .structure import STREAMS, Structure, work
 
 LOOKED_AT = 4
 """Observations whose levels of noise are looked at, apart from those at the extremes of elevation."""
@@ -30,18 +30,16 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
     for operator in operators:
         if operator.label not in readers and not isinstance(operator, Output):
             operator.observe(data)
-    formed = tuple(pipeline.signals.all[name] for name in ["", *structure.runs] if name not in structure.derived)
+    acting = work(pipeline, structure)
     for observation in data.observations:
-        observation.components = frozenset(map(str, pipeline.signals.components))
-        observation.signals = tuple(sorted(signal.stream for signal in formed))
+        observation.components = frozenset(map(str, acting.components))
+        observation.signals = tuple(sorted(signal.stream for signal in acting.signals))
     shown = _some(data.observations)
     for observation in shown:
         for operator in operators:
             operator.configure(observation)
-    runs = selected(pipeline, structure)
     streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.label in readers))
-    context = Context(scene, data.observations, operators, runs, readers=readers, kept_streams=streams)
-    context.signals, context.components = formed, pipeline.signals.components
+    context = Context(scene, data.observations, operators, acting, readers=readers, kept_streams=streams)
     context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(operators, shown, context)
     pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]

@@ -23,7 +23,7 @@ from .look import look
 from .planning import planning_of
 from .result import Plan
 from .slices import measured
-from .structure import Structure, prune, remainders, selected
+from .structure import Structure, prune, work
 from .summary import Prediction
 from .whole import everything_of, without
 
@@ -67,7 +67,7 @@ def plan(
     begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
     labels = [o.label for o in pipeline.operators]
-    everything = Structure(tuple(labels), tuple(pipeline.runs), (), derived=remainders(pipeline, tuple(pipeline.runs)))
+    everything = Structure.of_all(pipeline)
     structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
     context = look(pipeline, scene, structure)
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
@@ -140,7 +140,7 @@ def _everything_on(
     pipeline: Pipeline, everything: Structure, context: Context, estimates: Mapping[str, Estimate]
 ) -> tuple[Context, dict[str, Cost | None]]:
     """The context and the costs of the pipeline where nothing is left out."""
-    whole = dataclasses.replace(context, operators=list(pipeline.operators), runs=selected(pipeline, everything))
+    whole = dataclasses.replace(context, operators=list(pipeline.operators), work=work(pipeline, everything))
     costs: dict[str, Cost | None] = {}
     for operator in pipeline.operators:
         known = estimates.get(operator.label)

@@ -28,7 +28,7 @@ class Plan:
     Attributes
     ----------
     structure
-        What runs at all.
+        What takes part at all.
     decided
         One for each effect.
     limits, spent
@@ -82,8 +82,8 @@ class Plan:
         return tuple(d for d in self.decided if d.chosen > 0)
 
     def saved_seconds(self, d: Decided) -> float:
-        """CPU time that a decision saves, all runs [reference s]."""
-        return d.choice.seconds * self.prediction.runs.get(d.operator, 1) if d.chosen else 0.0
+        """CPU time that a decision saves, all signals [reference s]."""
+        return d.choice.seconds * self.prediction.times.get(d.operator, 1) if d.chosen else 0.0
 
     def __str__(self) -> str:
         return text(self)

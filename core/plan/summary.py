@@ -20,8 +20,8 @@ class Prediction:
     bytes: float
     unknown: tuple[str, ...] = ()
     startup: float = 0.0
-    runs: Mapping[str, float] = field(default_factory=dict)
-    """Runs in which each operator is carried out; of one whose streams later runs copy (`core.run.repeated`), only the first."""
+    times: Mapping[str, float] = field(default_factory=dict)
+    """How often each operator does its work, by label (`context.Work`)."""
     factors: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -37,7 +37,7 @@ class PlanSummary:
     Attributes
     ----------
     operators, runs
-        Labels of the operators, and names of the companion runs, that act.
+        Labels of the operators, and names of the signals beside the complete one, that act.
     settings
         Changed parameters by operator.
     short
@@ -66,7 +66,7 @@ class PlanSummary:
 def apply(
     file: PipelineFile, operators: Collection[str], names: Collection[str], settings: Mapping[str, Mapping[str, Any]]
 ) -> PipelineFile:
-    """``file`` with these operators (labels) and companion runs only, parameters changed by ``settings``."""
+    """``file`` with these operators (labels) and signals only, parameters changed by ``settings``."""
     labels = [o.label for o in file.pipeline().operators]
     steps, kept = [], []
     for label, step in zip(labels, file.steps, strict=True):

@@ -18,7 +18,7 @@ class SaveMapPlanning(Planning[SaveMap]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(once=0.02 * (1 + max(context.runs.values(), default=1)), kernel="python"))
+        return Estimate((), Cost(once=0.02 * (1 + len(context.work.signals)), kernel="python"))
 
     def memory(self, observation: Observation) -> int:
         """A map and its copy in the file's units."""

@@ -113,12 +113,12 @@ class SkyPlanning(Planning[SkyMap]):
         step = math.radians(math.sqrt(abs(float(np.linalg.det(grid.wcs.pixel_scale_matrix)))))
         points = fwhm / step
         n = points * (math.ceil(operator.pixels_per_fwhm / points - 1e-9) if 2 <= points < operator.pixels_per_fwhm else 1)
-        runs, saved = max(context.runs.get(operator.label, 1), 1), FASTER * context.samples
+        saved = FASTER * context.samples
         text = "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 / n^2 of its peak"
         choices = [full("cubic B-spline")]
         wanted = 2 * points * math.ceil(n / points - 1e-9)
         if points >= 2 and wanted <= 16:  # the finest grid that the operator makes
-            extra = CONVOLUTION * float(np.prod(grid.shape)) * 3 / runs
+            extra = CONVOLUTION * float(np.prod(grid.shape)) * 3
             settings = {"interpolation": "linear", "pixels_per_fwhm": min(wanted, 16.0)}
             bound, what = context.sky_error(LINEAR / wanted**2), "linear, on twice as fine a grid"
             choices.append(Choice("coarse", what, settings, bound=bound, formula=text, seconds=saved - extra))

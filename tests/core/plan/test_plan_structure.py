@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import pytest
-from zonda.core.run.companion import Companion
 
 from zonda.core.configuration.pipeline_file import parse
+from zonda.core.mapmaker import MapMaker
 from zonda.core.operator import Operator
 from zonda.core.output import Output
 from zonda.core.pipeline import Pipeline
+from zonda.core.plan import structure as shares
 from zonda.core.plan.planner import plan
-from zonda.core.plan.structure import prune, selected
+from zonda.core.plan.structure import Structure, prune, work
+from zonda.core.signal import Signal
 
 
 def kind(name, requires=(), provides=(), optional=(), base=Operator, **attributes):
@@ -22,16 +24,16 @@ POINT = kind("Point", provides={"boresight"})
 SKY = kind("Sky", {"boresight"}, {"sky"})
 AIR = kind("Air", {"boresight"}, {"atmosphere", "transmission"})
 NOISE = kind("Noise", {"boresight"}, {"white"})
-SUM = kind("Sum", (), {"signal"}, {"sky", "atmosphere", "transmission", "white", "pink"})
-FILTER = kind("Filter", {"signal"}, {"signal"}, couples="all")
-MAP = kind("Map", {"signal", "boresight"}, {"map"}, product_only=True)
-HITS = kind("Hits", {"boresight"}, {"map"}, product_only=True)
-SPECTRUM = kind("Spectrum", {"signal"}, {"spectrum"}, product_only=True, main_run_only=True)
-TOD = kind("Tod", {"signal"}, {"tod_file"}, main_run_only=True)
+SUM = kind("Sum", (), {"signal"}, {"sky", "atmosphere", "transmission", "white", "pink"}, linear=True)
+FILTER = kind("Filter", {"signal"}, {"signal"}, couples="all", linear=True)
+MAP = kind("Map", {"signal", "boresight"}, {"map"}, base=MapMaker, linear=True)
+HITS = kind("Hits", {"boresight"}, {"map"}, base=MapMaker, linear=True)
+SPECTRUM = kind("Spectrum", {"signal"}, {"spectrum"})
+TOD = kind("Tod", {"signal"})
 SAVE = kind("Save", {"map"}, {"map_file"}, base=Output)
-FREEZES = kind("Freezes", {"signal"}, {"signal"}, couples="all", freeze=lambda *a: None, measure_frozen=lambda *a: None)
-TRANSFER = kind("Transfer", {"map"}, {"table"}, base=Output, needs=lambda self: (Companion(only=["sky"]),))
-FULL = kind("Full", {"map"}, {"table"}, base=Output, needs=lambda self: (Companion(only=["sky"], modes="full"),))
+FREEZES = kind("Freezes", {"signal"}, {"signal"}, couples="all", linear=True)
+TRANSFER = kind("Transfer", {"map"}, {"table"}, base=Output, signals=lambda self: (Signal(only=["sky"]),))
+FULL = kind("Full", {"map"}, {"table"}, base=Output, signals=lambda self: (Signal(only=["sky"], modes="full"),))
 RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
 
 
@@ -44,7 +46,7 @@ def test_everything_is_needed_where_a_map_is_written():
     found, runs, structure = acting(POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE, runs=RUNS)
     assert found == {"Point", "Sky", "Air", "Noise", "Sum", "Filter", "Map", "Save"}
     assert runs == set(RUNS)
-    assert {(r.run, r.operator) for r in structure.rows} == {("noiseless", "Air"), ("noiseless", "Noise"), ("source_free", "Sky")}
+    assert not structure.rows
 
 
 def test_a_hit_map_draws_nothing():
@@ -60,19 +62,20 @@ def test_a_run_without_a_map_bins_nothing():
     assert not runs, "files of time streams are written in the main run only"
 
 
-def test_a_transfer_function_of_the_sky_alone_draws_no_turbulence():
+def test_each_further_signal_is_formed_filtered_and_mapped():
     pipeline = Pipeline([POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE], runs={"noiseless": {"only": ["sky"]}})
-    structure = prune(pipeline)
-    assert selected(pipeline, structure) == {
-        "Point": 0,
-        "Sky": 2,
-        "Air": 1,
-        "Noise": 1,
-        "Sum": 2,
-        "Filter": 2,
-        "Map": 2,
-        "Save": 0,
-    }
+    found = work(pipeline, prune(pipeline))
+    assert [signal.name for signal in found.signals] == ["", "noiseless"]
+    once = dict.fromkeys(("Point", "Sky", "Air", "Noise", "Save"), 1.0)
+    assert found.times == {**once, "Sum": 1 + shares.FORM, "Filter": 1 + shares.FILTER, "Map": 1 + shares.MAP}
+
+
+def test_a_remainder_is_not_formed():
+    runs = {name: {**signal, "modes": "full"} for name, signal in RUNS.items()}
+    pipeline = Pipeline([POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE], runs=runs)
+    for structure in (prune(pipeline), Structure.of_all(pipeline)):
+        assert list(structure.derived) == ["source_free"]
+        assert [signal.name for signal in work(pipeline, structure).signals] == ["", "noiseless"]
 
 
 def test_what_determines_singular_modes_stays():
@@ -101,7 +104,7 @@ def test_a_component_that_the_sum_does_not_read():
 
 
 def test_what_nobody_knows_stays():
-    unknown = kind("Unknown", {"boresight"}, {"table"})
+    unknown = kind("Unknown", {"boresight"})
     silent = kind("Silent", {"signal"})
     found, _, _ = acting(POINT, SKY, SUM, unknown, silent, MAP, SAVE)
     assert {"Unknown", "Silent", "Sum", "Sky"} <= found
@@ -155,13 +158,11 @@ def test_what_is_kept_by_name_keeps_the_main_run():
 
 def test_a_file_with_the_map_that_takes_the_main_runs_place():
     """A run that a step needs beside it, with fewer filters, goes on as a companion."""
-    both = Companion(only=["sky"]), Companion(only=["sky"], filters="none")
-    two = kind("Two", {"map"}, {"table"}, base=Output, needs=lambda self: both)
-    found, runs, structure = acting(POINT, SKY, AIR, SUM, FILTER, MAP, two)
+    both = Signal(only=["sky"]), Signal(only=["sky"], filters="none")
+    two = kind("Two", {"map"}, {"table"}, base=Output, signals=lambda self: both)
+    found, runs, _ = acting(POINT, SKY, AIR, SUM, FILTER, MAP, two)
     assert "Air" not in found
     assert runs == {"_sky_unfiltered"}
-    words = {(r.run, r.operator): r.reason for r in structure.rows}
-    assert words["_sky_unfiltered", "Filter"] == "the run has no filters"
 
 
 FILE = """
