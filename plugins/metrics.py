@@ -9,8 +9,8 @@ noise n of the reference; the rms of m0 itself where the noise is not known):
 
 It bounds the change of the map's rms, because | |m| - |m0| | <= |m - m0| for every norm.
 
-``peak``, the extreme value p of the beam-smoothed map, of the sky alone where a companion run keeps only that, among pixels with
-at least `COVERED` of the usual coverage:
+``peak``, the extreme value p of the beam-smoothed map, of the sky alone where a signal keeps only that, among pixels with at
+least `COVERED` of the usual coverage:
 
     E = |p - p0| / |p0|                                                                                   (2)
 
@@ -135,9 +135,10 @@ class Transfer(Metric):
         _needs_map("transfer", operators)
         if not any("sky" in o.provides for o in operators):
             raise PipelineError("the metric transfer needs a sky, and no step makes one", place="--metric", cure="add a SkyMap")
-        if not any(run.only == ["sky"] for run in runs.values()):
-            cure = "add `runs: {noiseless: {only: [sky]}}` to the file, or --set runs.noiseless='{only: [sky]}'"
-            raise PipelineError("the metric transfer needs a companion run with the sky alone", place="--metric", cure=cure)
+
+    def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
+        """The sky alone, where no signal of the pipeline is."""
+        return {} if any(run.only == ["sky"] for run in runs.values()) else {"sky_alone": Signal(only=["sky"])}
 
     def measure(self, data: Data) -> Floats:
         """(2, n): T_i, and its standard deviation from the instrument's noise in the main map."""
@@ -273,7 +274,7 @@ def _needs_map(metric: str, operators: Sequence[Operator]) -> None:
 
 
 def _map(data: Data, run: str = "") -> MapProduct:
-    """The first map of a run."""
+    """The first map of a signal; ``run`` empty: the complete one."""
     for name, product in data.products.items():
         if isinstance(product, MapProduct) and name.rpartition("/")[0] == run:
             return product
@@ -281,7 +282,7 @@ def _map(data: Data, run: str = "") -> MapProduct:
 
 
 def _sky_alone(runs: Mapping[str, Any]) -> str:
-    """Name of the companion run that keeps the sky alone; empty (the main run) where there is none."""
+    """Name of the signal that keeps the sky alone; empty (the complete one) where there is none."""
     return next((name for name, run in runs.items() if run.get("only") == ["sky"]), "")
 
 

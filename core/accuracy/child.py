@@ -88,18 +88,18 @@ def run(request: Request, metric: Metric, seed: int | None, timed: bool) -> tupl
 
 
 def execute(file: Any, metric: Metric, threads: int | None, timed: bool) -> tuple[Data, bool]:
-    """Run a pipeline file without what acts at its end; ``timed``: without the steps that the metric adds, too."""
+    """Run a pipeline file without what acts at its end; ``timed``: without the steps and signals that the metric adds, too."""
     from ..output import Output
     from ..pipeline import Pipeline
 
     own = [o for o in file.operators if metric.needs_end or not isinstance(o, Output)]
-    more = metric.steps(list(own))
-    pipeline = Pipeline(
-        own if timed else more, runs=file.runs, only=file.header.only, name=file.header.name, precision=file.header.precision
-    )
+    more, signals = metric.steps(list(own)), metric.signals(file.runs)
+    steps, runs = (own, file.runs) if timed else (more, {**file.runs, **signals})
+    header = file.header
+    pipeline = Pipeline(steps, runs=runs, only=header.only, name=header.name, precision=header.precision)
     with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:
         data = pipeline.run(file.scene(), output=folder, threads=threads)
-    return data, not timed or len(more) == len(own)
+    return data, not timed or (len(more) == len(own) and not signals)
 
 
 def main(ask: str, answer: str) -> int:

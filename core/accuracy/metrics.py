@@ -35,7 +35,11 @@ class Metric:
     needs_end: ClassVar[bool] = False
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        """Raise `PipelineError` where a pipeline of these steps and companion runs cannot have this metric."""
+        """Raise `PipelineError` where a pipeline of these steps and signals cannot have this metric."""
+
+    def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
+        """Signals that `measure` reads beside those of the pipeline, ``runs``. They are not timed."""
+        return {}
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
         """The steps to measure with: more than the pipeline's own where the metric needs more. They are not timed."""

@@ -47,7 +47,7 @@ def achieved(
 ) -> float:
     """Error of this pipeline's own setting against its knobs at their tightest, same scans and seed.
 
-    ``data``: of a run of it, which saves one of the two runs where the metric needs no step of its own.
+    ``data``: of a run of it, which saves one of the two runs where the metric needs no step and no signal of its own.
     """
     measures = get(metric)
     measures.check(file.operators, file.runs)
@@ -56,7 +56,7 @@ def achieved(
     def found(given: Sequence[str]) -> Any:
         return measure(Request(pipeline, tuple(given), metric, repeats=0, threads=threads or 1)).found[0]
 
-    enough = data is not None and len(measures.steps(list(file.operators))) == len(file.operators)
+    enough = len(measures.steps(list(file.operators))) == len(file.operators) and not measures.signals(file.runs)
     own = measures.measure(data) if data is not None and enough else found(settings)
     return measures.error(own, found((*settings, *reference)))
 

@@ -45,7 +45,7 @@ HEADLINE, ROUGH = 0.15, 0.4
 map's; and where hits were counted on coarse cells, of some of the samples."""
 
 GIVEN = "sky_given"
-"""Name of a companion run."""
+"""Name of the signal of the sky that no filter changes."""
 
 ROUNDING = 1e-6
 """Of the stream's rms: differences below are float32 arithmetic in another order, not the effect."""

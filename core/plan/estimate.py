@@ -82,7 +82,7 @@ class Cost:
     fixed, per_time, per_sample
         seconds = fixed + per_time N_t + per_sample N_det N_t.
     once
-        Seconds for the whole run, whatever the observations and companion runs (pictures, files).
+        Seconds for the whole run, whatever the observations and signals (pictures, files).
     kernel
         Which calibration kernel scales it: ``random``, ``stream`` or ``python``.
     """

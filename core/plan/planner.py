@@ -73,13 +73,8 @@ def plan(
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
     context.limits = allowed = {m: v for m, v in budget.items() if m in context.metrics}
     estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
-    effects = [Decided(label, e) for label, estimate in estimates.items() for e in estimate.effects]
-    effects += [Decided("pipeline", e) for e in _of_pipeline(pipeline, context)]
-    check_droppable(drop, effects, labels)
+    effects, left = _effects(file, structure, context, estimates, drop)
     whole = [label for label in structure.operators if label in drop]
-    left = without(file, structure, whole) if whole else context
-    effects = [d for d in effects if d.operator not in whole]
-    effects += [Decided(label, everything_of(label, estimates, context, left)) for label in whole]
     costs = {label: estimate.cost for label, estimate in estimates.items()}
     item = 8 if pipeline.precision == "float64" else 4
     decided = decide(
@@ -124,6 +119,22 @@ def _check_arguments(file: Any, keep: Any, drop: Any) -> None:
         if isinstance(names, str):
             cure = f"write {what}=[{names!r}]"
             raise ZondaError(f"{what} is a list of names, not the text {names!r}", place="zonda plan", cure=cure)
+
+
+def _effects(
+    file: PipelineFile, structure: Structure, context: Context, estimates: Mapping[str, Estimate], drop: Sequence[str]
+) -> tuple[list[Decided], Context]:
+    """All effects, those of an operator that is dropped altogether as one; and the context without such operators."""
+    pipeline = file.pipeline()
+    effects = [Decided(label, e) for label, estimate in estimates.items() for e in estimate.effects]
+    effects += [Decided("pipeline", e) for e in _of_pipeline(pipeline, context)]
+    check_droppable(drop, effects, [o.label for o in pipeline.operators])
+    whole = [label for label in structure.operators if label in drop]
+    if not whole:
+        return effects, context
+    left = without(file, structure, whole)
+    effects = [d for d in effects if d.operator not in whole]
+    return effects + [Decided(label, everything_of(label, estimates, context, left)) for label in whole], left
 
 
 def _with_savings(now: Prediction, decided: Iterable[Decided]) -> Prediction:
