@@ -13,7 +13,7 @@ import numpy as np
 
 from ..block import STREAMS
 from ..errors import PipelineError
-from ..mapmaker import MapMaker, forms
+from ..mapmaker import MapMaker, forms, makes_products
 from ..numerics.tiles import TILE_DETECTORS
 from ..observation import Observation
 from ..operator import Operator
@@ -204,9 +204,7 @@ class Schedule:
             self.planned.append(planned)
             if how == "again":
                 times = self._readings(later)
-                again.update(
-                    {o.label: max(times, again.get(o.label, 0)) for o in segment.operators if not isinstance(o, MapMaker)}
-                )
+                again.update({o.label: max(times, again.get(o.label, 0)) for o in segment.operators if not makes_products(o)})
                 source = Source({}, stage, stage.wanted)
                 continue
             size = 0 if how == "spilled" else size
