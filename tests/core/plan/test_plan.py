@@ -281,8 +281,8 @@ SET = [a for s in SHORT for a in ("--set", s)]
 
 
 def test_streams_that_are_made_again_are_paid_for_again():
-    """`method: mean` reads each of two signals for its mean, and both to subtract it: without room all above it acts thrice. Steps
-    that only look (spectra, excerpts) see a sample once; what is prepared is prepared once."""
+    """`method: mean` reads each of two signals for its mean, and both to subtract it: without room all above it acts thrice.
+    Steps that only look (spectra, excerpts) see a sample once; what is prepared is prepared once."""
     file = zonda.load("mustang2_cluster", overrides=[*SHORT, "CommonModeFilter.method=mean"])
     roomy, tight = (zonda.plan(file, prune_all=False, threads=2, memory=m) for m in (10**10, 1))
     more = {k: tight.prediction.seconds[k] / v for k, v in roomy.prediction.seconds.items() if v > 0}
