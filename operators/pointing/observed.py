@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
     from zonda.core.scene import Scene
 
+    from .limits import LargestMotion
+    from .samples_per_beam import SamplesPerBeam
     from .transform import CelestialTransform
 
 
@@ -104,17 +106,7 @@ def state_times(label: str, observation: Observation) -> None:
     )
 
 
-class Findings(Protocol):
-    """What was found about several scans: `LargestMotion`, `SamplesPerBeam`."""
-
-    def statements(self) -> list[tuple[str, str]]:
-        """(what, text) for the tally."""
-
-    def warnings(self) -> list[str]:
-        """What a run warns of."""
-
-
-def report(label: str, observations: Sequence[Observation], *findings: Findings) -> None:
+def report(label: str, observations: Sequence[Observation], *findings: LargestMotion | SamplesPerBeam) -> None:
     """Enter findings in the tally of each observation, and warn."""
     for found in findings:
         for what, text in found.statements():

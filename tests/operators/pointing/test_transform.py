@@ -16,7 +16,7 @@ from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics import chunks
 from zonda.core.numerics.projection import rotation_matrices
-from zonda.core.numerics.quaternions import Upright, from_angles
+from zonda.core.numerics.quaternions import from_angles
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.site import Site
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
@@ -98,31 +98,6 @@ def test_a_track_is_there_and_back_at_once(frame: str) -> None:
     assert angle(rotation_matrices(track.radec)[:, :, 2], sky).max() < rounding
 
 
-@pytest.mark.parametrize("sweep", [0.1, 2.0, 2.7, 3.2, 40.0])
-@pytest.mark.parametrize("start", [0.0, 1.0, math.pi - 1e-9, -math.pi, 3.0])
-def test_upright_is_from_angles(sweep: float, start: float) -> None:
-    """Within 150 deg of the first direction by half angles, else by angles; through south, round the sky, up to the zenith."""
-    way = np.linspace(0, 1, 4001)
-    longitude, latitude = start + sweep * way, 1.57 * np.sin(7 * way)
-    found = Upright()(unit_vectors(longitude, latitude))
-    expected = from_angles(longitude, latitude)
-    expected *= np.sign((found[0] * expected[0]).sum())  # the first longitude is counted from -pi to pi
-    assert np.abs(found - expected).max() < 3e-13  # near the zenith a direction's rounding turns it: 1e-16 / cos(1.57)
-    assert np.linalg.norm(np.diff(found, axis=0), axis=1).max() < 0.1
-    assert np.abs(np.linalg.norm(found, axis=1) - 1).max() < 1e-15
-
-
-@pytest.mark.parametrize("sweep", [0.1, 2.7, 3.2, 40.0, -40.0])
-def test_upright_goes_on_from_stretch_to_stretch(sweep: float) -> None:
-    """There and back again: signs are those of the whole, whichever way a stretch is worked out."""
-    longitude = 1.0 + sweep * np.sin(np.linspace(0, 3, 5001)) ** 2
-    directions = unit_vectors(longitude, 0.9 * np.cos(7 * longitude))
-    upright = Upright()
-    found = np.concatenate([upright(part) for part in np.array_split(directions, 23)])
-    assert np.abs(found - from_angles(longitude, 0.9 * np.cos(7 * longitude))).max() < 2e-14  # of angles of 40 rad
-    assert sweep > 0.1 or sweep < 0 or np.array_equal(found, Upright()(directions))
-
-
 @pytest.mark.parametrize("scan", [PointingDaisy(), PointingBackAndForth()])
 @pytest.mark.parametrize("target", ["05h +20d", "az 180d el 45d"])
 def test_bits_do_not_depend_on_the_chunk(scan: Any, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,13 +110,6 @@ def test_bits_do_not_depend_on_the_chunk(scan: Any, target: str, monkeypatch: py
     assert np.array_equal(whole.azel, parts.azel)
     # bent light is inverted by steps that begin at the mean of a chunk
     assert np.abs(whole.radec - parts.radec).max() <= (0.0 if isinstance(scan, PointingDaisy) and "az" not in target else 1e-15)
-
-
-def test_upright_where_there_is_no_longitude() -> None:
-    found = Upright()(np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]))
-    assert np.isfinite(found).all()
-    assert np.abs(rotation_matrices(found)[:, :, 2] - [[0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]]).max() < 1e-15
-    assert Upright()(np.empty((0, 3))).shape == (0, 4)
 
 
 def test_near_the_sun(reference: Any) -> None:

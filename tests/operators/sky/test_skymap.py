@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from zonda.core.data import Data
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.radiation import to_kelvin_rj
-from zonda.operators.sky.skymap import SkyMap
+from zonda.operators.sky.skymap import InputImage, SkyMap
 
 ARCSEC = np.pi / 648000
 FWHM = 9.0
@@ -450,3 +450,14 @@ def test_spectral_index_of_a_kelvin_map_is_refused(made, save):
     path = save(np.zeros((9, 9)), made.tan_header((9, 9)))
     with pytest.raises(InputError, match="spectral index"):
         SkyMap(file=path, spectral_index=1.0).prepare(made.observation([0.0], 0.0))
+
+
+def test_of_several_input_images_the_first_stays(made, save):
+    first, second = (SkyMap(file=save(np.full((20, 20), v), made.tan_header((20, 20)), f"{v}.fits")) for v in (1.0, 2.0))
+    scan = made.observation(np.full(30, np.radians(75)), np.radians(20))
+    one, other = (InputImage(o.prepare(scan).sky.image("SkyMap")) for o in (first, second))
+    one += other
+    back = InputImage.of(one.arrays()).image
+    np.testing.assert_array_equal(back.values, np.ones((20, 20)))
+    assert dict(back.header.items()) == dict(one.image.header.items())
+    assert back.unit == "K_RJ"
