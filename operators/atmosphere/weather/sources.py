@@ -37,7 +37,6 @@ class Climatology(WeatherSource):
     """Registered name."""
 
     def column(self, site: Site, time: Instant) -> Column:
-        """See `WeatherSource.column`."""
         if site.climatology is None and self.pwv is not None and self.pwv.metres is not None:
             return standard_column(site)
         return climatology_column(site, time)
@@ -50,7 +49,6 @@ class Standard(WeatherSource):
     """Registered name."""
 
     def column(self, site: Site, time: Instant) -> Column:
-        """See `WeatherSource.column`."""
         if self.pwv is None or self.pwv.metres is None:
             raise InputError("the standard atmosphere has no PWV of its own", place="weather", cure="give pwv, e.g. 3 mm")
         return standard_column(site)
@@ -65,7 +63,6 @@ class Era5(WeatherSource):
     """NetCDF file of `reanalysis-era5-pressure-levels`: t, q (or r), u, v, z, and o3 where it has it."""
 
     def column(self, site: Site, time: Instant) -> Column:
-        """See `WeatherSource.column`."""
         return read_era5(self.file, site, time)
 
 
@@ -78,7 +75,6 @@ class Table(WeatherSource):
     """CSV with a header, e.g. `height [m], pressure [hPa], temperature [K], relative humidity [%]`; see docs/weather.md."""
 
     def column(self, site: Site, time: Instant) -> Column:
-        """See `WeatherSource.column`."""
         return read_table(self.table, site)
 
 

@@ -553,3 +553,12 @@ def test_negative_water_and_ozone_of_era5_are_said(tmp_path):
     assert "2 negative levels of ozone taken as none" in stated
     files.new_layout(tmp_path / "b.nc")
     assert "negative" not in Era5(file=tmp_path / "b.nc").column(here(), NIGHT).stated
+
+
+def test_an_error_is_given_its_place_once():
+    with pytest.raises(InputError) as caught, placed("outside"):
+        raise InputError("is wrong", cure="mend it")
+    assert str(caught.value).startswith("outside: is wrong")
+    with pytest.raises(InputError) as caught, placed("outside"):
+        raise InputError("is wrong", place="inside")
+    assert caught.value.place == "inside"
