@@ -13,7 +13,7 @@ from zonda import Scene
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.configuration.time import Instant
-from zonda.core.errors import InputError, ZondaError
+from zonda.core.errors import InputError, ZondaError, placed
 from zonda.core.registry import sites, weather_sources
 from zonda.core.site import Site
 from zonda.core.weather import PWV_MAX, Column, Pwv, WeatherSource
