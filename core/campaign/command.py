@@ -12,17 +12,17 @@ import click
 from ..command_types import Bytes
 
 if TYPE_CHECKING:
-    from ..cli.request import Request
+    from ..cli.request import RunRequest
     from .job import Job, Task
-    from .log import Row
+    from .log import TaskRow
     from .prepare import CampaignFile
     from .settings import Campaign
     from .work import CampaignResult
 
-    Table = Sequence[tuple[Task, Row]]
+    Table = Sequence[tuple[Task, TaskRow]]
 
 
-def run(request: Request) -> None:
+def run(request: RunRequest) -> None:
     """``zonda run`` of pipeline files as a campaign."""
     from ..storage.files import check_output_folder
     from ..storage.lock import lock

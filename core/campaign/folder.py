@@ -107,7 +107,7 @@ def shares(folder: Path) -> list[Path]:
     return sorted(folder.glob("jobs.*-of-*.sqlite"))
 
 
-def readable(path: Path) -> list[joblog.Row]:
+def readable(path: Path) -> list[joblog.TaskRow]:
     """Rows of a log that may be damaged: none, then."""
     try:
         return joblog.read(path)

@@ -32,7 +32,7 @@ TABLES = (
 
 
 @dataclass(frozen=True)
-class Row:
+class TaskRow:
     """What is known of a task.
 
     Attributes
@@ -55,7 +55,7 @@ class Row:
     machine: str
 
 
-WAITING = Row(-1, "waiting", 0, "", "", 0.0, "", "")
+WAITING = TaskRow(-1, "waiting", 0, "", "", 0.0, "", "")
 """Of a task that no log knows."""
 
 
@@ -122,7 +122,7 @@ class Log:
             ((error, n) for n in numbers),
         )
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[TaskRow]:
         """All tasks, in order."""
         with self._errors():
             return _rows(self._db)
@@ -160,7 +160,7 @@ class Log:
             raise _error(err, self.path) from None
 
 
-def read(path: Path) -> list[Row]:
+def read(path: Path) -> list[TaskRow]:
     """The rows of a log that another process may be writing. Raises `InputError` where it is damaged."""
     for mode in ("ro", "rw"):  # a log whose writer was killed must be mended first, which takes leave to write
         try:
@@ -184,10 +184,10 @@ def damaged(path: Path, err: Exception) -> InputError:
     return InputError(f"is damaged: {err}", place=str(path), cure=f"zonda resume {path.parent} makes it anew from what is there")
 
 
-def _rows(database: sqlite3.Connection) -> list[Row]:
+def _rows(database: sqlite3.Connection) -> list[TaskRow]:
     columns = "number, state, attempts, error, host, seconds, digest, COALESCE(text, '')"
     query = f"SELECT {columns} FROM tasks LEFT JOIN machines ON id = machine ORDER BY number"
-    found = [Row(*values) for values in database.execute(query)]
+    found = [TaskRow(*values) for values in database.execute(query)]
     kinds = (int, str, int, str, str, float | int, str, str)
     if any(row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found):
         raise sqlite3.DatabaseError("it holds what is no state of a task")

@@ -27,7 +27,7 @@ from .folder import (
     write_sources,
 )
 from .job import FILE, LOG, TASKS, Job, Say, Task, digest_of_text, layout_path, plural
-from .log import Log, Row
+from .log import Log, TaskRow
 from .machines import Watch
 from .memory import share_out
 from .prepare import CampaignFile, Pruning, changed, restore_layout
@@ -145,7 +145,7 @@ def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
         )
 
 
-def _watch(strict: bool, folder: Path, logs: Iterable[Iterable[Row]], say: Say) -> Watch:
+def _watch(strict: bool, folder: Path, logs: Iterable[Iterable[TaskRow]], say: Say) -> Watch:
     known = {row.number: row.machine for rows in logs for row in rows if row.machine}
     return Watch(known, strict, folder, say)
 

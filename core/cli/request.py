@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class Request:
+class RunRequest:
     """The arguments and options of ``zonda run``."""
 
     pipelines: tuple[str, ...]

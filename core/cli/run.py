@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..command_types import Bytes, Share
-from .request import Request
+from .request import RunRequest
 
 if TYPE_CHECKING:
     from ..compilation.compile_ahead import Helper
@@ -58,7 +58,7 @@ def run(**given: Any) -> None:
     from ..compilation.compiled import ensure_cache, one_blas_thread
     from ..machine import available_threads
 
-    request = Request(**given)
+    request = RunRequest(**given)
     one_blas_thread()
     ensure_cache()
     context = click.get_current_context()
@@ -92,7 +92,7 @@ def load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) -
     return alone(file, only)
 
 
-def _run_campaign(request: Request) -> None:
+def _run_campaign(request: RunRequest) -> None:
     if request.verify or request.only:
         raise click.UsageError(f"{'--verify' if request.verify else '--only'} is for one run, not for a campaign")
     gc.enable()
@@ -101,7 +101,7 @@ def _run_campaign(request: Request) -> None:
     campaign.run(request)
 
 
-def _run_one(request: Request, file: PipelineFile, helper: Helper) -> None:
+def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
     from ..plan import remembered
     from ..run.first_look import first_look
     from ..storage.files import check_output_folder, write_text
@@ -165,7 +165,7 @@ def _show(data: Data, verbose: bool) -> None:
             click.echo(f"{who}: {what}: {value}", err=True)
 
 
-def _verify(file: PipelineFile, request: Request, settings: tuple[str, ...], data: Data | None) -> None:
+def _verify(file: PipelineFile, request: RunRequest, settings: tuple[str, ...], data: Data | None) -> None:
     """Measure the error of a run; ``data``: what it made, if that is the whole pipeline."""
     from ..accuracy.verify import achieved
 
