@@ -203,9 +203,9 @@ def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-
         series = v[low - start : high - start]
         _project(array, low, high, q, rows, series)
         if moments:
-            _image_and_moments(array, low, high, rows, series, out[k:])
+            _image(array, low, high, rows, series, True, out[k:])
         else:
-            _image(array, low, high, rows, series, out[k:])
+            _image(array, low, high, rows, series, None, out[k:])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
@@ -232,38 +232,9 @@ def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _image(array, begin, end, rows, series, out):  # type: ignore[no-untyped-def]
-    """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time."""
-    half, last = np.uintp(LANES), rows.size - 1
-    lanes = np.empty((4, LANES))
-    for k in range(0, rows.size, 4):
-        for start in range(begin, end, TILE_SAMPLES):
-            stop = min(start + TILE_SAMPLES, end)
-            v, to = series[start - begin : stop - begin], out[(start - begin) // TILE_SAMPLES]
-            a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
-            c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
-            n = np.uintp(stop - start)
-            whole = n // (half + half) * (half + half)
-            lanes[:] = 0.0
-            for t in range(np.uintp(0), whole, half + half):
-                for i in range(half):
-                    x, y = v[t + i], v[t + half + i]
-                    lanes[0, i] += np.float64(a[t + i]) * x + np.float64(a[t + half + i]) * y
-                    lanes[1, i] += np.float64(b[t + i]) * x + np.float64(b[t + half + i]) * y
-                    lanes[2, i] += np.float64(c[t + i]) * x + np.float64(c[t + half + i]) * y
-                    lanes[3, i] += np.float64(d[t + i]) * x + np.float64(d[t + half + i]) * y
-            for j in range(min(4, rows.size - k)):
-                row, total = array[rows[k + j], start:stop], 0.0
-                for i in range(LANES):
-                    total += lanes[j, i]
-                for t in range(whole, n):
-                    total += np.float64(row[t]) * v[t]
-                to[2, rows[k + j]] = total
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _image_and_moments(array, begin, end, rows, series, out):  # type: ignore[no-untyped-def]
-    """out = A 1, squares, A v (n_tile, 3, n_det): `_image` with the moments in the same reading."""
+def _image(array, begin, end, rows, series, moments, out):  # type: ignore[no-untyped-def]
+    """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time; unless ``moments`` is None,
+    out[:, 0] = A 1 and out[:, 1] = squares in the same reading."""
     half, last = np.uintp(LANES), rows.size - 1
     lanes = np.empty((4, 3, LANES))
     for k in range(0, rows.size, 4):
@@ -278,22 +249,23 @@ def _image_and_moments(array, begin, end, rows, series, out):  # type: ignore[no
             for t in range(np.uintp(0), whole, half + half):
                 for i in range(half):
                     x, y = v[t + i], v[t + half + i]
-                    p, r = np.float64(a[t + i]), np.float64(a[t + half + i])
-                    lanes[0, 0, i] += p + r
-                    lanes[0, 1, i] += p * p + r * r
-                    lanes[0, 2, i] += p * x + r * y
-                    p, r = np.float64(b[t + i]), np.float64(b[t + half + i])
-                    lanes[1, 0, i] += p + r
-                    lanes[1, 1, i] += p * p + r * r
-                    lanes[1, 2, i] += p * x + r * y
-                    p, r = np.float64(c[t + i]), np.float64(c[t + half + i])
-                    lanes[2, 0, i] += p + r
-                    lanes[2, 1, i] += p * p + r * r
-                    lanes[2, 2, i] += p * x + r * y
-                    p, r = np.float64(d[t + i]), np.float64(d[t + half + i])
-                    lanes[3, 0, i] += p + r
-                    lanes[3, 1, i] += p * p + r * r
-                    lanes[3, 2, i] += p * x + r * y
+                    a0, a1 = np.float64(a[t + i]), np.float64(a[t + half + i])
+                    b0, b1 = np.float64(b[t + i]), np.float64(b[t + half + i])
+                    c0, c1 = np.float64(c[t + i]), np.float64(c[t + half + i])
+                    d0, d1 = np.float64(d[t + i]), np.float64(d[t + half + i])
+                    lanes[0, 2, i] += a0 * x + a1 * y
+                    lanes[1, 2, i] += b0 * x + b1 * y
+                    lanes[2, 2, i] += c0 * x + c1 * y
+                    lanes[3, 2, i] += d0 * x + d1 * y
+                    if moments is not None:  # decided when it is compiled
+                        lanes[0, 0, i] += a0 + a1
+                        lanes[1, 0, i] += b0 + b1
+                        lanes[2, 0, i] += c0 + c1
+                        lanes[3, 0, i] += d0 + d1
+                        lanes[0, 1, i] += a0 * a0 + a1 * a1
+                        lanes[1, 1, i] += b0 * b0 + b1 * b1
+                        lanes[2, 1, i] += c0 * c0 + c1 * c1
+                        lanes[3, 1, i] += d0 * d0 + d1 * d1
             for j in range(min(4, rows.size - k)):
                 row, first, second, third = array[rows[k + j], start:stop], 0.0, 0.0, 0.0
                 for i in range(LANES):
@@ -305,6 +277,7 @@ def _image_and_moments(array, begin, end, rows, series, out):  # type: ignore[no
                     first += p
                     second += p * p
                     third += p * v[t]
-                to[0, rows[k + j]] = first
-                to[1, rows[k + j]] = second
+                if moments is not None:
+                    to[0, rows[k + j]] = first
+                    to[1, rows[k + j]] = second
                 to[2, rows[k + j]] = third
