@@ -14,6 +14,8 @@ from ..errors import InputError
 from ..notebook import html_table
 from ..numerics import tangent
 from ..numerics.angles import ARCMIN, FWHM_PER_SIGMA
+from ..numerics.gaussian import convolved, gaussian_taps
+from ..numerics.sphere import separation
 from ..types import Floats
 
 if TYPE_CHECKING:
@@ -99,7 +101,7 @@ class MapProduct:
         import healpy
 
         colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
-        return _angle(phi, np.pi / 2 - colatitude, self.centre)
+        return separation(phi, np.pi / 2 - colatitude, self.centre)
 
     def seconds_per_beam(self) -> Floats | float | None:
         """What one sample in a pixel adds to the integration time of all detectors per beam [s]: times ``hits``, that time.
@@ -178,15 +180,8 @@ class MapProduct:
         """f(values, power): values convolved with the power-th power of the Gaussian kernel, whose sum is 1."""
         sigma = fwhm / FWHM_PER_SIGMA / self.pixel
         if self.header is not None:
-            reach = np.arange(-math.ceil(5 * sigma), math.ceil(5 * sigma) + 1)
-            kernel = np.exp(-(reach**2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
-            kernel /= kernel.sum()
-
-            def flat(values: Floats, power: float) -> Floats:
-                taps = kernel[kernel.size // 2 :] ** power
-                return _symmetric(np.ascontiguousarray(_symmetric(values, taps).T), taps).T
-
-            return flat
+            taps = gaussian_taps(sigma)
+            return lambda values, power: convolved(values, taps**power)
 
         def sphere(values: Floats, power: float) -> Floats:
             import healpy
@@ -249,15 +244,6 @@ def _around(places: NDArray[np.int64], reach: int) -> slice:
     return slice(max(0, int(places[0]) - reach), int(places[-1]) + reach + 1) if places.size else slice(0)
 
 
-def _symmetric(values: Floats, taps: Floats) -> Floats:
-    """sum_k taps[|k|] values[j + k] along the first axis; zeros beyond the ends."""
-    out = taps[0] * values
-    for k in range(1, min(taps.size, len(values))):
-        out[k:] += taps[k] * values[:-k]
-        out[:-k] += taps[k] * values[k:]
-    return np.asarray(out)
-
-
 @lru_cache(maxsize=1)  # the maps of all runs share it
 def _tangent_distance(world: TangentWcs | str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
     """``world``: what the header says, or the header itself."""
@@ -268,13 +254,6 @@ def _tangent_distance(world: TangentWcs | str, shape: tuple[int, int], centre: t
         wcs = WCS(world)
     y, x = np.indices(shape)
     phi, theta = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
-    found = _angle(phi, theta, centre)
+    found = separation(phi, theta, centre)
     found.flags.writeable = False
     return found
-
-
-def _angle(phi: Floats, theta: Floats, centre: tuple[float, float]) -> Floats:
-    """Angle [rad] of directions (longitude, latitude) from the centre."""
-    lon, lat = centre
-    half = np.sin((theta - lat) / 2) ** 2 + np.cos(theta) * np.cos(lat) * np.sin((phi - lon) / 2) ** 2
-    return np.asarray(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1))))

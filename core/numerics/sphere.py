@@ -33,3 +33,10 @@ def local_axes(longitude: float, latitude: float) -> Floats:
 def angle_between(a: Floats, b: Floats) -> Floats:
     """Between unit vectors (..., 3) and one (3,)."""
     return np.asarray(np.arccos(np.clip(a @ b, -1, 1)))
+
+
+def separation(longitude: Floats, latitude: Floats, centre: tuple[float, float]) -> Floats:
+    """Angles of directions from ``centre`` (longitude, latitude), accurate for small ones."""
+    lon, lat = centre
+    half = np.sin((latitude - lat) / 2) ** 2 + np.cos(latitude) * np.cos(lat) * np.sin((longitude - lon) / 2) ** 2
+    return np.asarray(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1))))

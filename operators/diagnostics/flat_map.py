@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.gaussian import convolved, gaussian_taps
 from zonda.core.types import AnyFloats
 
 from .sky_axes import SkyAxes
@@ -88,13 +88,13 @@ class FlatMap:
 
     def smoothed(self, fwhm: float) -> FlatMap:
         """As `MapProduct.smoothed`: every plane convolved with a Gaussian of ``fwhm`` [rad], weighted, empty pixels left out."""
-        convolve = gaussian(fwhm / FWHM_PER_SIGMA / self.pixel)
         planes = {}
         for name, values in self.planes.items():
             use = np.isfinite(values) & (self.hits > 0)
             weights = np.where(use, self.weights, np.float32(0))
             with np.errstate(invalid="ignore", divide="ignore"):
-                mean = convolve(weights * np.where(use, values, np.float32(0))) / convolve(weights)
+                total = self._convolve(weights * np.where(use, values, np.float32(0)), fwhm)
+                mean = total / self._convolve(weights, fwhm)
             planes[name] = np.where(use, mean, np.float32(np.nan))
         return replace(self, planes=planes, smoothed_by=math.hypot(self.smoothed_by, fwhm))
 
@@ -103,7 +103,7 @@ class FlatMap:
         ragged then."""
         hits = self.hits
         if self.smooth and self.smoothed_by:
-            hits = gaussian(self.smoothed_by / self.pixel / FWHM_PER_SIGMA)(hits)
+            hits = self._convolve(hits, self.smoothed_by)
         seen = hits[self.hits > 0]
         return np.asarray(hits >= least * np.percentile(seen, 99) if seen.size else self.hits > 0)
 
@@ -124,24 +124,6 @@ class FlatMap:
         w = self.weights[use].astype(np.float64)
         return math.sqrt((w * values[use].astype(np.float64) ** 2).sum() / w.sum()) if w.sum() > 0 else math.nan
 
-
-def gaussian(sigma: float) -> Callable[[AnyFloats], AnyFloats]:
-    """Convolution of an image (ny, nx) with a Gaussian of ``sigma`` pixels, cut at 5 sigma, of sum 1; nothing lies outside."""
-    reach = np.arange(math.ceil(5 * sigma) + 1)
-    kernel = np.exp(-(reach**2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
-    kernel = (kernel / (2 * kernel.sum() - kernel[0])).astype(np.float32)
-
-    def rows(values: AnyFloats) -> AnyFloats:
-        out: AnyFloats = values * kernel[0]
-        part = np.empty_like(values)
-        for k in range(1, min(len(kernel), len(values))):
-            np.multiply(values, kernel[k], out=part)
-            out[k:] += part[:-k]
-            out[:-k] += part[k:]
-        return out
-
-    def convolve(values: AnyFloats) -> AnyFloats:
-        down = rows(np.asarray(values, np.float32))
-        return np.ascontiguousarray(rows(np.ascontiguousarray(down.T)).T)
-
-    return convolve
+    def _convolve(self, values: AnyFloats, fwhm: float) -> AnyFloats:
+        """With a Gaussian of ``fwhm`` [rad], in single precision."""
+        return convolved(values, gaussian_taps(fwhm / FWHM_PER_SIGMA / self.pixel).astype(np.float32))

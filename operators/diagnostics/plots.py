@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
+from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import AnyFloats
 
 from .canvas import CHARACTER, COLOURS, OTHER, PALE, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
@@ -46,10 +47,10 @@ class ScanTrack:
     @classmethod
     def of(cls, observation: Observation, most: int = 20000) -> ScanTrack:
         """Of at most ``most`` samples, evenly spaced."""
+        from zonda.core.numerics.projection import boresights
+
         step = -(-observation.n_samples // most)
-        x, y, z, w = np.asarray(observation.boresight_radec[::step], np.float64).T
-        directions = np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=1)
-        return cls(observation.name, observation.centre, directions)
+        return cls(observation.name, observation.centre, boresights(observation.boresight_radec[::step]).T)
 
 
 def _binned(frequency: AnyFloats, psd: AnyFloats, per_decade: int = 24) -> tuple[AnyFloats, AnyFloats]:
@@ -234,11 +235,8 @@ def plot_scan(observations: Sequence[Observation | ScanTrack], *, ax: Any = None
 
 def _offsets(track: ScanTrack, centre: tuple[float, float]) -> NDArray[np.float64]:
     """(n, 2) arcmin east and north of ``centre`` on its tangent plane; NaN far from it."""
-    ra, dec = centre
-    ahead = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    cosine = track.directions @ ahead
-    plane = track.directions @ np.stack([east, np.cross(ahead, east)], axis=1) / np.where(cosine > 0.1, cosine, np.nan)[:, None]
+    cosine, east, north = local_axes(*centre) @ track.directions.T
+    plane = np.stack([east, north], axis=1) / np.where(cosine > 0.1, cosine, np.nan)[:, None]
     return np.asarray(plane / ARCMIN, np.float64)
 
 

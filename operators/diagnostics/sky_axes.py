@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zonda.core.numerics.sphere import separation
 from zonda.core.types import Floats
 
 _FROM_CENTRE: dict[str, Callable[[Floats], Floats]] = {
@@ -162,8 +163,7 @@ class SkyAxes:
             with np.errstate(invalid="ignore"):
                 return np.asarray(_FROM_CENTRE[self.projection](plane), np.float64)
         lon, lat = np.radians(self.world(np.arange(shape[1])[None, :], np.arange(shape[0])[:, None]))
-        half = np.sin((lat - centre[1]) / 2) ** 2 + np.cos(lat) * np.cos(centre[1]) * np.sin((lon - centre[0]) / 2) ** 2
-        return np.asarray(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1))), np.float64)
+        return separation(lon, lat, centre)
 
     def upright(self, shape: tuple[int, ...]) -> bool:
         """Whether meridians run up and parallels run across, within 30 deg, all along the edges of an image (ny, nx)."""
