@@ -70,9 +70,9 @@ class PointingBackAndForth(Pointing):
         elevation += aim.offset[1]
         _check_turn(self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2), elevation, self.label)
         found = series(3, len(seconds))
-        for some in chunks(len(seconds)):
-            x, _ = self.path(seconds[some])
-            found[some] = unit_vectors(longitude - (x + aim.offset[0]) / math.cos(elevation), np.full(len(x), elevation))
+        for chunk in chunks(len(seconds)):
+            x, _ = self.path(seconds[chunk])
+            found[chunk] = unit_vectors(longitude - (x + aim.offset[0]) / math.cos(elevation), np.full(len(x), elevation))
         return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:

@@ -121,12 +121,12 @@ class Pointing(Operator):
         """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the scan."""
         target, offset = aim.target, aim.offset
         found = series(3, len(seconds))
-        for some in chunks(len(seconds)):
+        for chunk in chunks(len(seconds)):
             if target.frame == "horizontal":
-                x, y = self.path(seconds[some])
-                found[some] = _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])
+                x, y = self.path(seconds[chunk])
+                found[chunk] = _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])
             else:
-                found[some] = aim.transform.horizontal(self._on_the_sky(aim, seconds[some]), seconds[some])
+                found[chunk] = aim.transform.horizontal(self._on_the_sky(aim, seconds[chunk]), seconds[chunk])
         return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
@@ -148,7 +148,7 @@ class Pointing(Operator):
     def boresight(self, aim: Aim, seconds: Floats) -> Boresight:
         """Where the boresight is at ``seconds`` (n,) since the start of the scan."""
         if type(self).directions is Pointing.directions and aim.target.frame != "horizontal":
-            return aim.transform.follow(lambda some: self._on_the_sky(aim, some), seconds)
+            return aim.transform.follow(lambda chunk: self._on_the_sky(aim, chunk), seconds)
         return aim.transform.boresight(self.directions(aim, seconds), seconds)
 
     # -- the scans --

@@ -53,7 +53,7 @@ def _when(horizontal: Floats, transform: CelestialTransform, target: Target, low
     seconds = np.arange(0.0, DAY + 1, 60.0)
     day = CelestialTransform(site, start, DAY, 1e-6).horizontal(unit_vectors(*target.icrs()), seconds)
     _, elevation = angles(day)
-    below, above = _room(horizontal, transform, target)
+    below, above = _span(horizontal, transform, target)
     within = (elevation >= low + below) & (elevation <= (high - above if high < np.pi / 2 else np.pi))
     if not within.any():
         if elevation.max() < low + below:
@@ -70,12 +70,12 @@ def _when(horizontal: Floats, transform: CelestialTransform, target: Target, low
     return f"within the next 24 h it is up (UTC) from {' and from '.join(spans)}: start then ({need})"
 
 
-def _room(horizontal: Floats, transform: CelestialTransform, target: Target) -> tuple[float, float]:
+def _span(horizontal: Floats, transform: CelestialTransform, target: Target) -> tuple[float, float]:
     """How far below and above its target the boresight (n, 3) goes in elevation, over at most 1000 samples."""
     n = len(horizontal)
-    some = np.unique(np.linspace(0, n - 1, min(n, 1000)).astype(int))
-    centre = transform.horizontal(unit_vectors(*target.icrs()), some * (transform.duration / max(n - 1, 1)))
-    lower = np.arcsin(np.clip(centre[:, 2], -1, 1)) - np.arcsin(np.clip(horizontal[some, 2], -1, 1))
+    looked = np.unique(np.linspace(0, n - 1, min(n, 1000)).astype(int))
+    centre = transform.horizontal(unit_vectors(*target.icrs()), looked * (transform.duration / max(n - 1, 1)))
+    lower = np.arcsin(np.clip(centre[:, 2], -1, 1)) - np.arcsin(np.clip(horizontal[looked, 2], -1, 1))
     return max(float(lower.max()), 0.0), max(float(-lower.min()), 0.0)
 
 

@@ -128,9 +128,9 @@ def _doubts(recording: Recording, found: Comb, time: Instant, file: Path) -> lis
 
 def _thinned(scan: Scan) -> Scan:
     """At most about `MOST_CHECKED` samples of a scan."""
-    some = slice(None, None, -(-len(scan.seconds) // MOST_CHECKED))
-    series = {k: getattr(scan, k)[some] for k in ("seconds", "longitude", "latitude", "flags")}
-    return replace(scan, rate=scan.rate / some.step, radec=None if scan.radec is None else scan.radec[some], **series)
+    thin = slice(None, None, -(-len(scan.seconds) // MOST_CHECKED))
+    series = {k: getattr(scan, k)[thin] for k in ("seconds", "longitude", "latitude", "flags")}
+    return replace(scan, rate=scan.rate / thin.step, radec=None if scan.radec is None else scan.radec[thin], **series)
 
 
 def _summary(scan: Scan, frame: str) -> str:
@@ -189,8 +189,8 @@ def _state_celestial(label: str, observation: Observation, computed: Floats, goo
     """State which directions on the sky are used, and how far recorded ones are from those that follow from az and el."""
     text = "recomputed from azimuth, elevation and time"
     if observation.boresight_radec is not computed:
-        some = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
-        apart = np.linalg.norm(_directions(observation.boresight_radec[some]) - _directions(computed[some]), axis=1)
+        looked = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
+        apart = np.linalg.norm(_directions(observation.boresight_radec[looked]) - _directions(computed[looked]), axis=1)
         most = 2 * float(np.arcsin(apart.max(initial=0.0) / 2))
         text = f"as recorded, up to {np.degrees(most) * 3600:.3g} arcsec from those {text}"
         if most > FAR:
@@ -207,6 +207,6 @@ def _directions(quaternions: Floats) -> Floats:
 
 def _middle(radec: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
     """ICRS (ra, dec) of the mean direction."""
-    some = np.flatnonzero(good)[:: max(1, int(good.sum()) // 10_000)]
-    ra, dec = angles(_directions(radec[some]).mean(axis=0))
+    looked = np.flatnonzero(good)[:: max(1, int(good.sum()) // 10_000)]
+    ra, dec = angles(_directions(radec[looked]).mean(axis=0))
     return float(ra % (2 * np.pi)), float(dec)

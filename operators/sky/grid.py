@@ -75,7 +75,7 @@ class Grid:
         *rim, centre = unit_vectors(lon, lat)
         radius = float(angle_between(np.array(rim), centre).max())
         boresight = observation.boresight_radec
-        cosine = max(float((centre @ boresights(boresight[some])).max()) for some in chunks(observation.n_samples))
+        cosine = max(float((centre @ boresights(boresight[chunk])).max()) for chunk in chunks(observation.n_samples))
         nearest = float(np.arccos(np.clip(cosine, -1, 1))) - float(np.arctan(observation.focalplane.radius))
         return bool(nearest <= radius + REACH * SIGMA * widest)
 

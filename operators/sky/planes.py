@@ -113,17 +113,17 @@ def _numbers(
     sides = " x ".join(str(n) for n in reversed(shape))
     long = sorted(axis for axis, length in axes.items() if length > 1) or sorted(axes)
     asked = [axis for axis in long if names[axis] != "STOKES" and axes[axis] > 1]
-    told = [f"1 to {axes[axis]}{f' along {names[axis]}' if names[axis] else f' along axis {axis}'}" for axis in asked]
+    ranges = [f"1 to {axes[axis]}{f' along {names[axis]}' if names[axis] else f' along axis {axis}'}" for axis in asked]
     example = "1" if len(asked) == 1 else f"[{', '.join('1' for _ in asked)}]"
     if wanted is None:
         if asked:
             more = "" if all(names[axis] for axis in asked) else ", or CTYPE3 to STOKES if its planes are I, Q, U"
-            cure = f"set the operator's parameter plane: {example} ({', '.join(told)}){more}"
+            cure = f"set the operator's parameter plane: {example} ({', '.join(ranges)}){more}"
             raise InputError(f"the image is a cube of {sides} pixels", place=place, cure=cure)
         return {}
-    numbered = next((some for some in (long, asked) if len(some) == len(wanted)), None)
+    numbered = next((counted for counted in (long, asked) if len(counted) == len(wanted)), None)
     if not numbered:
-        cure = f"set plane: {example} ({', '.join(told)})" if asked else "remove plane"
+        cure = f"set plane: {example} ({', '.join(ranges)})" if asked else "remove plane"
         raise InputError(f"plane has {len(wanted)} numbers, and the image has {sides} pixels", place=place, cure=cure)
     for axis, number in zip(numbered, wanted, strict=True):
         if not 1 <= number <= axes[axis]:

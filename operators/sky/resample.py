@@ -179,15 +179,15 @@ def pixel_areas(wcs: Any, rows: NDArray[np.int64], columns: NDArray[np.int64]) -
     """Solid angles (ny, nx) [sr] of an image's pixels of any projection, by the edges' midpoints; NaN beyond the projection."""
     areas = np.empty((len(rows), len(columns)))
     for first in range(0, len(rows), ROWS):
-        some = slice(first, first + ROWS)
-        x, y = np.meshgrid(columns.astype(np.float64), rows[some].astype(np.float64))
+        chunk = slice(first, first + ROWS)
+        x, y = np.meshgrid(columns.astype(np.float64), rows[chunk].astype(np.float64))
 
         def ray(dx: float, dy: float, x: Floats = x, y: Floats = y) -> Floats:
             return unit_vectors(*np.radians(from_pixels(wcs, x + dx, y + dy)))
 
         h = 0.25
         across, along = ray(h, 0.0) - ray(-h, 0.0), ray(0.0, h) - ray(0.0, -h)
-        areas[some] = np.linalg.norm(np.cross(across, along), axis=2) / (2 * h) ** 2
+        areas[chunk] = np.linalg.norm(np.cross(across, along), axis=2) / (2 * h) ** 2
     return areas
 
 

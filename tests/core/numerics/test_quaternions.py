@@ -61,8 +61,8 @@ def test_upright_is_from_angles(sweep: float, start: float) -> None:
 
 
 @pytest.mark.parametrize("sweep", [0.1, 2.7, 3.2, 40.0, -40.0])
-def test_upright_goes_on_from_stretch_to_stretch(sweep: float) -> None:
-    """There and back again: signs are those of the whole, whichever way a stretch is worked out."""
+def test_upright_goes_on_from_chunk_to_chunk(sweep: float) -> None:
+    """There and back again: signs are those of the whole, whichever way a chunk is worked out."""
     longitude = 1.0 + sweep * np.sin(np.linspace(0, 3, 5001)) ** 2
     directions = unit_vectors(longitude, 0.9 * np.cos(7 * longitude))
     upright = Upright()
