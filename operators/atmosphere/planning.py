@@ -11,9 +11,9 @@ and, where what all detectors have in common is removed, at most K times what th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -51,6 +51,10 @@ PAYS = 0.3
 """Seconds of evaluation from which coarser nodes are looked for."""
 
 
+InProportion = Callable[[float], dict[str, float]]
+"""The bound of an error that is a share of the fluctuation."""
+
+
 class AtmospherePlanning(Planning[AtmosphereLayers]):
     """Layers, their resolution, spectral approximations, slopes with elevation."""
 
@@ -86,12 +90,11 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         if (key := str(context.coverage)) not in a.averages:
             a.averages[key] = shares(context, a.layers, a.components, first.plane)
         points = _points(context, first, p.tolerance)
-        effects = [
-            *_layer_effects(context, a, points),
-            *_resolution(context, a, first, self.coarser("tolerance")),
-            *_spectral(context, a),
-        ]
-        effects += _slopes(context, a)
+        left = [left_of_layer(context, a, k) for k in range(len(a.layers))]
+        in_proportion = partial(_in_proportion, context, a, left)
+        effects = _layer_effects(context, a, left, points)
+        effects += [_nodes(context, a, first, self.coarser("tolerance")), _lattice_error(a, in_proportion)]
+        effects += [*_spectral(context, a, in_proportion), *_slopes(context, a)]
         points /= len(context.observations)
         fixed = 0.02 + (POINT * (len(a.layers) - len(set(p.omit))) + TRANSFER) * points
         once = 0.05 + (CHOICE[0] + CHOICE[1] * context.first.n_detectors) * len(context.observations)
@@ -216,14 +219,14 @@ def _correlated(context: Context, layer: Layer) -> float:
     return min(slow, 1 / context.cut) if context.cut > 0 else slow
 
 
-def _layer_effects(context: Context, a: Calibrated, points: float) -> list[Effect]:
+def _layer_effects(context: Context, a: Calibrated, left: Sequence[float], points: float) -> list[Effect]:
     text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) a_l x " + (
         "rms left of the layer after subtraction of the detectors' mean" if context.removes_common else "rms behind the beam"
     )
     effects = []
     averages, spectra, p = a.averages[str(context.coverage)], _spectral_shares(context, a), a.model.parameters
     for k, layer in enumerate(a.layers):
-        rms = SAFETY * left_of_layer(context, a, k)
+        rms = SAFETY * left[k]
         bound = context.bound(rms, _correlated(context, layer), common=True)
         bound["map_rms"] = min(bound["map_rms"], averages[k] * rms)
         if context.before_filters:
@@ -240,13 +243,6 @@ def _layer_effects(context: Context, a: Calibrated, points: float) -> list[Effec
     return effects
 
 
-def _left(context: Context, a: Calibrated) -> tuple[float, float]:
-    """rms of what subtraction of the mean leaves of the fluctuation: of a sample, and of its mean in a pixel, K."""
-    left = [left_of_layer(context, a, k) for k in range(len(a.layers))]
-    mapped = ((x * y) ** 2 for x, y in zip(left, a.averages[str(context.coverage)], strict=True))
-    return math.sqrt(sum(x * x for x in left)), math.sqrt(sum(mapped))
-
-
 def _spectral_shares(context: Context, a: Calibrated) -> list[float]:
     """Largest share that each layer has of the stream's power in a range of frequency (20 from 1 / duration to Nyquist),
     white noise included."""
@@ -258,12 +254,18 @@ def _spectral_shares(context: Context, a: Calibrated) -> list[float]:
     return [float(v) for v in (each / np.maximum(total, 1e-300)).max(axis=1)]
 
 
-def _in_proportion(context: Context, a: Calibrated, share: float, correlated: float) -> dict[str, float]:
-    """Bound of an error that is ``share`` of the fluctuation."""
-    sample, pixel = _left(context, a)
-    bound = context.bound(SAFETY * share * sample, correlated, common=True)
+def _in_proportion(context: Context, a: Calibrated, left: Sequence[float], share: float) -> dict[str, float]:
+    """Bound of an error that is ``share`` of the fluctuation, of which ``left`` is what each layer leaves (`left_of_layer`)."""
+    mapped = ((x * y) ** 2 for x, y in zip(left, a.averages[str(context.coverage)], strict=True))
+    sample, pixel = math.sqrt(sum(x * x for x in left)), math.sqrt(sum(mapped))
+    bound = context.bound(SAFETY * share * sample, _longest(context, a), common=True)
     bound["map_rms"] = min(bound["map_rms"], SAFETY * share * pixel)
     return bound | {"psd": 2 * share + share**2}
+
+
+def _longest(context: Context, a: Calibrated) -> float:
+    """Of the layers' correlations over time, s."""
+    return max(_correlated(context, layer) for layer in a.layers)
 
 
 def _points(context: Context, first: AtmosphereModel, tolerance: float) -> float:
@@ -297,14 +299,14 @@ def _opacity_share(a: Calibrated) -> float:
     return abs(float(a.model.band.log_transmission_difference(a.model.pwv, a.model.pwv * step, a.elevations[0]))) / step
 
 
-def _resolution(context: Context, a: Calibrated, first: AtmosphereModel, coarser: Sequence[float]) -> list[Effect]:
-    """Nodes and steps in time; lattice; fidelity."""
+def _nodes(context: Context, a: Calibrated, first: AtmosphereModel, coarser: Sequence[float]) -> Effect:
+    """Nodes and steps in time."""
     p = a.model.parameters
     xi, eta = spread_evenly(context.first.focalplane.xi, context.first.focalplane.eta)
     left = a.kelvin * differential_rms(xi, eta, a.layers, a.model.plane.stretch)
     left = math.hypot(left, _gain_scatter(context, a) * a.rms)
     left = max(left, 0.01 * a.rms if len(xi) == 1 else 0.0)
-    correlated = max(_correlated(context, layer) for layer in a.layers)
+    correlated = _longest(context, a)
     choices = [full(f"within {p.tolerance:g} of what the detectors' mean leaves")]
     text = "(sqrt 2 + 0.1) tolerance x rms left after subtraction of the detectors' mean: nodes, steps in time, mean emission"
     now = _points(context, first, p.tolerance)
@@ -316,33 +318,30 @@ def _resolution(context: Context, a: Calibrated, first: AtmosphereModel, coarser
             saved = POINT * len(a.layers) * (now - _points(context, first, tolerance))
         settings = {"tolerance": tolerance}
         choices.append(Choice("coarse", f"within {tolerance:g}", settings, bound=bound, formula=text, seconds=saved))
-    effects = [Effect("detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text)]
-    wrong = _in_proportion(context, a, 0.5 * FIDELITIES[p.fidelity].structure_error, correlated)
+    return Effect("detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text)
+
+
+def _lattice_error(a: Calibrated, in_proportion: InProportion) -> Effect:
+    fidelity = a.model.parameters.fidelity
     text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
-    effects.append(Effect("turbulence lattice", (full(f"{p.fidelity}, {_lattice(a):g} of the beam"),), wrong, text))
-    return effects
+    wrong = in_proportion(0.5 * FIDELITIES[fidelity].structure_error)
+    return Effect("turbulence lattice", (full(f"{fidelity}, {_lattice(a):g} of the beam"),), wrong, text)
 
 
-def _spectral(context: Context, a: Calibrated) -> list[Effect]:
-    """The band's spectrum and ozone: what the fluctuation would be off by, by radiative transfer at one frequency, without O3."""
-    band, pwv = context.first.instrument.band, a.model.pwv
+def _spectral(context: Context, a: Calibrated, in_proportion: InProportion) -> list[Effect]:
+    """The band's spectrum and ozone: the fluctuation's error by radiative transfer at one frequency, and without O3."""
+    band, pwv, elevation = context.first.instrument.band, a.model.pwv, a.elevations[0]
     layers = replace(a.model.profile.layers, spectra=absorption_of(a.model.parameters))
     middle = Band(name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz")
-    correlated = max(_correlated(context, layer) for layer in a.layers)
-    elevation = a.elevations[0]
     right = _slope(BandTransfer(band, layers), pwv, elevation)
-    one = _slope(BandTransfer(middle, layers), pwv, elevation)
-    clear = _slope(BandTransfer(band, replace(layers, o3=np.zeros_like(layers.o3))), pwv, elevation)
     effects = []
-    for name, what, other in (
-        ("spectral resolution", "the band, in cells of 0.5 GHz", one),
-        ("ozone", "the profile's", clear),
+    for name, what, without, other in (
+        ("spectral resolution", "the band, in cells of 0.5 GHz", "at the band's centre alone", BandTransfer(middle, layers)),
+        ("ozone", "the profile's", "without ozone", BandTransfer(band, replace(layers, o3=np.zeros_like(layers.o3)))),
     ):
-        share = abs(other / right - 1)
-        text = "|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer " + (
-            "at the band's centre alone" if other is one else "without ozone"
-        )
-        effects.append(Effect(name, (full(what),), _in_proportion(context, a, share, correlated), text))
+        text = f"|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer {without}"
+        bound = in_proportion(abs(_slope(other, pwv, elevation) / right - 1))
+        effects.append(Effect(name, (full(what),), bound, text))
     return effects
 
 
