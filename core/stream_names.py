@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
-COMPONENTS = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
+from .signal import BUILT_IN
+
+StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
+"""What a parameter ``streams`` may list."""
+
+COMPONENTS = frozenset(map(str, BUILT_IN))
 """Signal components that a block may hold besides ``signal``."""
 
 

@@ -244,7 +244,7 @@ def _around(places: NDArray[np.int64], reach: int) -> slice:
     return slice(max(0, int(places[0]) - reach), int(places[-1]) + reach + 1) if places.size else slice(0)
 
 
-@lru_cache(maxsize=1)  # the maps of all runs share it
+@lru_cache(maxsize=1)  # the maps of all signals share it
 def _tangent_distance(world: TangentWcs | str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
     """``world``: what the header says, or the header itself."""
     wcs: Any = world

@@ -90,24 +90,13 @@ class Plots(Output):
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
-        written = []
         try:
-            with ThreadPoolExecutor(MOST_AT_ONCE, self.label) as pool:  # while the disk writes one, the next is drawn
-
-                def write(picture: Picture) -> None:
-                    written.append(pool.submit(_write, product_path(folder, picture.name, ".png"), picture.png))
-
-                made = pictures(data, self.style(), self._begun, self._artist, write)
-                if self._artist is not None:
-                    pool.submit(self._artist.close)  # it takes as long to end as a file to be written
+            data.products["pictures"] = _write_all(folder, data, self.style(), self._begun, self._artist)
         finally:
             self._begun = {}
             if self._artist is not None:
                 self._artist.close()
                 self._artist = None
-        for file in written:
-            file.result()
-        data.products["pictures"] = made
 
     def style(self) -> Style:
         """Its parameters, for another process."""
@@ -124,6 +113,22 @@ class Drawing:
     function: Callable[..., list[Picture]]
     arguments: Callable[[], tuple[Any, ...]]
     at_once: bool = False
+
+
+def _write_all(folder: Path, data: Data, style: Style, begun: Mapping[str, Future[Any]], artist: Artist | None) -> list[Picture]:
+    """Write every picture; while the disk writes one, the next is drawn."""
+    written = []
+    with ThreadPoolExecutor(MOST_AT_ONCE, "Plots") as pool:
+
+        def write(picture: Picture) -> None:
+            written.append(pool.submit(_write, product_path(folder, picture.name, ".png"), picture.png))
+
+        made = pictures(data, style, begun, artist, write)
+        if artist is not None:
+            pool.submit(artist.close)  # it takes as long to end as a file to be written
+    for file in written:
+        file.result()
+    return made
 
 
 def _write(path: Path, png: bytes) -> None:

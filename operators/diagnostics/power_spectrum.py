@@ -17,12 +17,10 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.signal import MAIN, TRANSMISSION, is_signal
-from zonda.core.stream_names import StreamsAsked
+from zonda.core.stream_names import StreamName, StreamsAsked
 from zonda.core.types import Floats
 
 from .series import Spectrum, key_of
-
-StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
 
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 """Of spectra in pictures."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -10,7 +10,7 @@ from pydantic import Field
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.stream_names import StreamsAsked
+from zonda.core.stream_names import StreamName, StreamsAsked
 from zonda.core.types import Floats
 
 from .series import TimeStream, key_of
@@ -27,7 +27,7 @@ class TimeStreams(Operator):
     knows_means: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
 
-    streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
+    streams: list[StreamName] = Field(["signal"], min_length=1)
     """Streams to keep; those absent at this step are skipped and counted."""
     detectors: int = Field(3, ge=1, le=64)
     """Number of detectors, chosen evenly."""
@@ -37,11 +37,8 @@ class TimeStreams(Operator):
     def observe(self, data: Data) -> None:
         """Refuse a scan that is not there."""
         if self.observation >= len(data.observations):
-            raise PipelineError(
-                f"there is no observation {self.observation}: the pipeline makes {len(data.observations)}, counted from 0",
-                place=self.label,
-                cure="choose another one",
-            )
+            text = f"there is no observation {self.observation}: the pipeline makes {len(data.observations)}, counted from 0"
+            raise PipelineError(text, place=self.label, cure="choose another one")
 
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:

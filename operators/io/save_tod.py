@@ -20,7 +20,7 @@ from zonda.core.output import output_folder
 from zonda.core.product import Record
 from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
-from zonda.core.stream_names import StreamsAsked
+from zonda.core.stream_names import StreamName, StreamsAsked
 
 from . import fits_table, toast_hdf5
 from .time_ordered_data import TimeOrderedData
@@ -93,7 +93,7 @@ class SaveTOD(Operator):
 
     format: Literal["hdf5", "fits"] = "hdf5"
     """File format: hdf5 (TOAST's layout) or fits (binary tables)."""
-    streams: list[Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]] = Field(["signal"], min_length=1)
+    streams: list[StreamName] = Field(["signal"], min_length=1)
     """Streams to write; components (sky, atmosphere ...) are as they entered the calibrated sum."""
     dtype: Literal["float64", "float32"] = "float64"
     """Number type in the file. TOAST wants float64; float32 rounds a mean of 30 K to 2 uK."""
