@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import Observation
+from ..numerics.radiation import LEAST_TRANSMISSION
 from ..operator import Operator
 from ..scene import Scene
 from ..signal import MAIN, Component, Formed
@@ -267,7 +268,7 @@ def _calibrated_mean(o: Observation) -> NDArray[np.float64]:
     share = o.focalplane.illumination_efficiency / o.focalplane.main_beam_efficiency
     passed: NDArray[Any] = np.ones(1)
     if transmission is not None:
-        passed = np.maximum(-_largest(transmission.weights, -transmission.coefficients), 1e-6)
+        passed = np.maximum(-_largest(transmission.weights, -transmission.coefficients), LEAST_TRANSMISSION)
     return np.asarray(share * _largest(emission.weights, emission.coefficients) / passed, np.float64)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.compilation.jit import nb
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.stream import Stream
 from zonda.core.types import Floats
@@ -60,16 +61,15 @@ def read(stream: Stream, use: Mask, good: Mask) -> Reading:
         range_of = np.empty((2, n))
         range_of[0], range_of[1] = np.inf, -np.inf
         moments = np.zeros((-(-n // TILE_SAMPLES), 2, rows))
-        for k, start in enumerate(range(0, n, TILE_SAMPLES)):
-            stop = min(start + TILE_SAMPLES, n)
-            at = slice(samples.start + start, samples.start + stop)
-            tile, here = part, (start, stop)
+        for here, added in zip(chunks(n, TILE_SAMPLES), moments, strict=True):
+            at = slice(samples.start + here.start, samples.start + here.stop)
+            tile, begin, end = part, here.start, here.stop
             if field is not None or not good[at].all():
-                tile, here = part[:, start:stop].astype(np.float64), (0, stop - start)
+                tile, begin, end = part[:, here].astype(np.float64), 0, here.stop - here.start
                 if field is not None:
                     tile += field.evaluate(detectors, at)
                 tile[:, ~good[at]] = 0
-            _look(tile, *here, use[detectors], sums[:, start:stop], range_of[:, start:stop], moments[k])
+            _look(tile, begin, end, use[detectors], sums[:, here], range_of[:, here], added)
         return sums, range_of, moments
 
     for detectors, samples, (sums, range_of, moments) in stream.sweep(look):

@@ -37,11 +37,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zonda.core.errors import InputError
-
-Array = NDArray[np.float64]
+from zonda.core.types import Floats
 
 TOLERANCE = 0.25
 """A fit whose PSD errs by more is refused."""
@@ -78,16 +77,16 @@ class PowerLawFilter:
         Of the output for unit white input and unit g.
     """
 
-    poles: Array
-    zeros: Array
+    poles: Floats
+    zeros: Floats
     gain: float
     error: float
     plateau: float
     variance: float
-    start: Array
+    start: Floats
     """(K, K): stationary states are ``start @ n`` with n (K,) standard normal."""
 
-    def response(self, frequency: ArrayLike) -> Array:
+    def response(self, frequency: ArrayLike) -> Floats:
         """g |H|^2 at frequencies in units of the sampling rate (0 to 1/2)."""
         sine = 4 * np.sin(np.pi * np.asarray(frequency, np.float64)) ** 2
         return np.asarray(self.gain * np.exp(_log_power(self.zeros, sine).sum(0) - _log_power(self.poles, sine).sum(0)))
@@ -130,7 +129,7 @@ def power_law_filter(f_min: float, slope: float, poles: int) -> PowerLawFilter:
     return best
 
 
-def _log_power(root: Array, sine: Array) -> Array:
+def _log_power(root: Floats, sine: Floats) -> Floats:
     """ln |1 - (1 - r) / z|^2 = ln(r^2 + (1 - r) 4 sin^2(pi f)) for each r: (K, n)."""
     return np.log(root[:, None] ** 2 + (1 - root[:, None]) * sine)
 
@@ -148,7 +147,7 @@ def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
     slowest = 2 * np.pi * f_min * _SLOWEST
     span = _FASTEST - slowest
 
-    def roots(x: Array) -> tuple[Array, Array]:
+    def roots(x: Floats) -> tuple[Floats, Floats]:
         """Roots within their bounds, and their derivatives."""
         s = 1 / (1 + np.exp(-np.clip(x, -40, 40)))
         return slowest + span * s, span * s * (1 - s)
@@ -157,12 +156,12 @@ def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
     share = np.clip((first - slowest) / span, 1e-9, 1 - 1e-9)
     x0 = np.r_[np.log(share / (1 - share)), 0.0]
 
-    def misfit(x: Array) -> Array:
+    def misfit(x: Floats) -> Floats:
         poles, zeros = roots(x[:n])[0], roots(x[n:-1])[0]
         log_response = _log_power(zeros, sine).sum(0) - _log_power(poles, sine).sum(0) + x[-1]
         return np.asarray(np.r_[(log_response - target) * weights, _RIDGE * (x - x0)])
 
-    def jacobian(x: Array) -> Array:
+    def jacobian(x: Floats) -> Floats:
         blocks: list[Any] = []
         for sign, part in ((-1, x[:n]), (1, x[n:-1])):
             root, slope_of_root = roots(part)
@@ -191,7 +190,7 @@ def _fit(f_min: float, slope: float, n: int, ends: int) -> PowerLawFilter:
     )
 
 
-def _least_squares(misfit: Callable[[Array], Array], jacobian: Callable[[Array], Array], x: Array) -> Array:
+def _least_squares(misfit: Callable[[Floats], Floats], jacobian: Callable[[Floats], Floats], x: Floats) -> Floats:
     """Levenberg-Marquardt (Nielsen's damping, Madsen et al. 2004, algorithm 3.16): argmin |misfit|^2 from ``x``."""
     f, j = misfit(x), jacobian(x)
     matrix, slope, cost = j.T @ j, j.T @ f, f @ f
@@ -213,7 +212,7 @@ def _least_squares(misfit: Callable[[Array], Array], jacobian: Callable[[Array],
     return x
 
 
-def _first_guess(f_min: float, slope: float, n: int, ends: int) -> Array:
+def _first_guess(f_min: float, slope: float, n: int, ends: int) -> Floats:
     """Poles then zeros (2 n,): above slope 2 one pole stands alone, the others alternate with zeros."""
     alone = int(slope > 2)
     rest = slope - 2 * alone
@@ -227,7 +226,7 @@ def _first_guess(f_min: float, slope: float, n: int, ends: int) -> Array:
     return np.concatenate([lone, -np.expm1(-pole), 2 - end, np.ones(alone), np.minimum(-np.expm1(-zero), 1.1), 2 - 1.2 * end])
 
 
-def _state_covariance(poles: Array, zeros: Array) -> Array:
+def _state_covariance(poles: Floats, zeros: Floats) -> Floats:
     """Stationary covariance S (K, K) of the states of (2) for unit white input: S = (1 + D) S (1 + D)^T + b b^T.
 
     Written with D = A - 1, so that nothing cancels for slow poles.
