@@ -5,11 +5,10 @@ from __future__ import annotations
 import ast
 import inspect
 import linecache
-import re
 import sys
 import textwrap
 import tokenize
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from typing import Any
 
 from pydantic import BaseModel
@@ -58,30 +57,15 @@ def _docstrings(cls: type) -> dict[str, str]:
 
 def _of_class(lines: list[str], name: str) -> dict[str, str]:
     """As `_docstrings`, from lines that begin with the class statement or its decorators."""
-    for block in (_by_indentation, inspect.getblock):  # the second reads tokens: slow, and never wrong
-        try:
-            statement = ast.parse(textwrap.dedent("".join(block(lines)))).body[0]
-        except (SyntaxError, IndexError, ValueError, tokenize.TokenError):  # the file has changed meanwhile
-            continue
-        if isinstance(statement, ast.ClassDef) and statement.name == name:
-            found = {}
-            for one, after in pairwise([*statement.body, ast.Pass()]):
-                if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
-                    text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else None
-                    found[one.target.id] = inspect.cleandoc(text) if isinstance(text, str) else ""
-            return found
-    return {}
-
-
-def _by_indentation(lines: list[str]) -> list[str]:
-    """The class statement and what is indented more, but for the methods behind the last annotation.
-
-    It may end too early, within brackets or texts.
-    """
-    indent = len(lines[0]) - len(lines[0].lstrip())
-    head = len(list(takewhile(lambda line: not line.lstrip().startswith("class "), lines))) + 1
-    body = list(takewhile(lambda line: not line.strip() or len(line) - len(line.lstrip()) > indent, lines[head:]))
-    inner = next((line[: len(line) - len(line.lstrip())] for line in body if line.strip()), "")
-    last = max((k for k, line in enumerate(body) if re.match(rf"{inner}[A-Za-z_]\w* *:", line)), default=0)
-    methods = next((k for k in range(last, len(body)) if re.match(rf"{inner}(@|def |async |class )", body[k])), len(body))
-    return [*lines[:head], *body[:methods]]
+    try:
+        statement = ast.parse(textwrap.dedent("".join(inspect.getblock(lines)))).body[0]
+    except (SyntaxError, IndexError, ValueError, tokenize.TokenError):  # the file has changed meanwhile
+        return {}
+    if not isinstance(statement, ast.ClassDef) or statement.name != name:
+        return {}
+    found = {}
+    for one, after in pairwise([*statement.body, ast.Pass()]):
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
+            text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else None
+            found[one.target.id] = inspect.cleandoc(text) if isinstance(text, str) else ""
+    return found
