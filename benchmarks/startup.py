@@ -55,6 +55,7 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
     after(run, "load", "read the pipeline file")
     mark("Python and the command line")
     import zonda.core.plan.remembered as remembered
+    from zonda.core.output import Output
     from zonda.core.pipeline import Pipeline
     from zonda.core.run.execution import Execution
 
@@ -62,19 +63,20 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
     after(remembered, "summary", "plan")
     usual = Execution.run
 
-    def run(self: Any, data: Any, *arguments: Any) -> None:
+    def observe(self: Any, *arguments: Any) -> None:
         mark("point the telescope, lay out the map")
-        usual(self, data, *arguments)
-        mark(f"run {data.run or 'main'}")
+        usual(self, *arguments)
+        mark("observe")
 
-    Execution.run = run  # type: ignore[method-assign]
-    finalize = Pipeline._finalize
+    Execution.run = observe  # type: ignore[method-assign]
+    timed = Pipeline._timed
 
-    def finish(self: Any, operator: Any, *arguments: Any) -> None:
-        finalize(self, operator, *arguments)
-        mark(type(operator).__name__ if operator.at_end else "finish the maps")
+    def finish(self: Any, timer: Any, operator: Any, stage: str, *arguments: Any) -> None:
+        timed(self, timer, operator, stage, *arguments)
+        if stage == "finalize":
+            mark(type(operator).__name__ if isinstance(operator, Output) else "finish the maps")
 
-    Pipeline._finalize = finish  # type: ignore[method-assign]
+    Pipeline._timed = finish  # type: ignore[method-assign]
     status = cli.main(["run", pipeline, "--output", folder])
     mark("the rest")
     if status:
@@ -129,6 +131,7 @@ def write(rows: list[list[str]]) -> None:
     lists: dict[Path, list[str]] = {}
     for number, row in enumerate(dict.fromkeys(" ".join(row) for row in rows), 1):
         package = row.split()[1].split(".")[1:3]  # operators, sky
+        package = package if package[0] == "operators" else package[:1]
         lists.setdefault(Path(__file__).parents[1].joinpath(*package, "kernels.py"), []).append(f'    "{number} {row}",')
     for path, lines in lists.items():
         head = path.read_text().partition("KERNELS =")[0]

@@ -157,10 +157,14 @@ def for_child(rows: list[list[str]]) -> list[list[str]]:
 
 
 def text_of(kind: Any) -> str | None:
-    """A numba type as the list has it: ``f8``, ``f4:2C`` (dimensions, layout, ``r``: read only); None: not one for the list."""
+    """A numba type as the list has it: ``f8``, ``f4:2C`` (dimensions, layout, ``r``: read only), ``f4:2C*3`` (a tuple of three);
+    None: not one for the list."""
     from numba import types
     from numba.np.numpy_support import as_dtype
 
+    if isinstance(kind, types.UniTuple):
+        inner = text_of(kind.dtype)
+        return f"{inner}*{kind.count}" if inner and "*" not in inner else None
     array = isinstance(kind, types.Array) and kind.aligned
     scalar = kind.dtype if array else kind
     if type(scalar) not in (types.Boolean, types.Integer, types.Float):
@@ -175,6 +179,9 @@ def type_of(text: str) -> Any:
     from numba import types
     from numba.np.numpy_support import from_dtype
 
+    if "*" in text:
+        inner, _, count = text.partition("*")
+        return types.UniTuple(type_of(inner), int(count))
     found = re.fullmatch(r"(b1|f[48]|[iu][1248])(?::(\d)([CFA])(r?))?", text)
     if found is None:
         raise ValueError(f"no type {text!r}")

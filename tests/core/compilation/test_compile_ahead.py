@@ -25,6 +25,7 @@ CHEAP = ("0.1", "zonda.operators.maps.sums", "_scales", "f8", "f8", "b1")
         types.Array(types.float32, 2, "C"),
         types.Array(types.boolean, 1, "A"),
         types.Array(types.float64, 3, "C", readonly=True),
+        types.UniTuple(types.Array(types.float32, 2, "C"), 3),
     ],
 )
 def test_types_there_and_back(kind):
@@ -32,7 +33,7 @@ def test_types_there_and_back(kind):
 
 
 @pytest.mark.parametrize(
-    "kind", [types.unicode_type, types.UniTuple(types.int64, 2), types.Array(types.complex128, 1, "C").dtype]
+    "kind", [types.unicode_type, types.Tuple((types.int64, types.float32)), types.Array(types.complex128, 1, "C").dtype]
 )
 def test_other_types_are_not_listed(kind):
     assert text_of(kind) is None
