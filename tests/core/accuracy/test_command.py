@@ -14,6 +14,7 @@ from zonda.core.errors import InputError
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
+from zonda.core.plan.planning import Planning
 from zonda.core.site import Site
 
 site = Site(name="za_site", latitude="38 deg", longitude="-79 deg")
@@ -39,7 +40,6 @@ class Stare(Operator):
 class Integral(Operator):
     """The integral of exp over 0 .. 1 by the trapezium rule on n intervals: its error is 1 / (12 n^2) to first order."""
     requires, provides = frozenset({"boresight"}), frozenset({"signal"})
-    knobs = (Knob("n", (1, 2, 4, 8, 64), "an integral by a sum"),)
     n: int = 4
     """Intervals."""
     def prepare(self, observation):
@@ -55,6 +55,10 @@ class Integral(Operator):
         x = np.exp(np.linspace(0, 1, self.n + 1))
         data.products["integral"] = (x[1:] + x[:-1]).mean() / 2 + 1e-9 * data.scene.seed
 
+class IntegralPlanning(Planning[Integral]):
+    of = Integral
+    knobs = (Knob("n", (1, 2, 4, 8, 64), "an integral by a sum"),)
+
 def integral(data):
     return data.products["integral"]
 '''
@@ -62,6 +66,7 @@ GROUPS = {
     "zonda.sites": {"za_site": "za_toys:site"},
     "zonda.instruments": {"za_camera": "za_toys:camera"},
     "zonda.operators": {"ZaStare": "za_toys:Stare", "ZaIntegral": "za_toys:Integral"},
+    "zonda.planning": {"Integral": "za_toys:IntegralPlanning"},
     "zonda.metrics": {"integral": "za_toys:integral"},
 }
 PIPELINE = """
