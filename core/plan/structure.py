@@ -17,7 +17,7 @@ from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
 from ..run.signals import remainder
-from ..signal import TRANSMISSION
+from ..signal import MAIN, TRANSMISSION
 from .context import Work
 
 STREAMS = frozenset(NAMES)
@@ -152,7 +152,7 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
             reason = keep[operator.label]
         elif readers:
             reason = f"read by {', '.join(readers)}"
-        elif made and made <= STREAMS:
+        elif made and made <= STREAMS and (MAIN not in made or type(operator).finalize is Operator.finalize):
             left_out[operator.label] = f"no step that is needed reads {' or '.join(sorted(made))}"
             continue
         elif makes_products(operator) and not made & wanted:

@@ -45,11 +45,12 @@ class Integral(Operator):
     def prepare(self, observation):
         if self.n == 2:
             raise InputError("two is no number", place=self.label)
+        work = np.ones(30000)
+        for _ in range(3 * self.n):  # in proportion to n
+            work = np.sin(work)
         x = np.exp(np.linspace(0, 1, self.n + 1))
         return (x[1:] + x[:-1]).mean() / 2
     def exec(self, block, state):
-        for _ in range(3 * self.n):  # work in proportion to n
-            block.new("signal")[...] = np.sin(block.new("signal"))
         block.new("signal")[...] = state
     def finalize(self, data):
         x = np.exp(np.linspace(0, 1, self.n + 1))
