@@ -286,7 +286,7 @@ class Pipeline:
             for product in data.partial.values():
                 if product.signals and stream_of(name) not in product.signals:
                     product.subtract(stream_of(name), [stream_of(part) for part in parts])
-            data.tally.state(name, "derived as", remainder(parts))
+            data.tally.state(name, "remainder", remainder(parts))
         for operator in self.chain.steps:
             self._timed(timer, operator, "finalize", data)
         self._watch(data, "maps")

@@ -139,9 +139,9 @@ def text(plan: Plan, width: int | None = None) -> str:
     for row in plan.structure.rows:
         groups.setdefault((row.run, row.reason), []).append(row.operator)
     for (run, reason), operators in groups.items():
-        what = ": ".join(filter(None, (f"run {run}" if run else "", ", ".join(filter(None, operators)))))
-        lines += textwrap.wrap(f"left out: {what} ({reason})", width, subsequent_indent="    ")
-    lines += [f"run {run} is not simulated: it is {how}" for run, how in plan.structure.derived.items()]
+        what = ": ".join(filter(None, (f"signal {run}" if run else "", ", ".join(filter(None, operators)))))
+        lines += textwrap.wrap(f"omitted: {what} ({reason})", width, subsequent_indent="    ")
+    lines += [f"signal {run} is a remainder: {how}" for run, how in plan.structure.derived.items()]
     return "\n".join([*lines, "", *_effects(plan, width), "", str(plan.summary)])
 
 
@@ -186,9 +186,9 @@ def short(plan: Plan) -> list[tuple[str, str, str, str]]:
     """For headers: (effect, decision, bound, formula), what is left out by structure first."""
     found = []
     for row in plan.structure.rows:
-        name = f"run {row.run}" + (f": {row.operator}" if row.operator else "") if row.run else row.operator
+        name = f"signal {row.run}" + (f": {row.operator}" if row.operator else "") if row.run else row.operator
         found.append((name, "left out", "", row.reason))
-    found += [(f"run {run}", "not simulated", "", how) for run, how in plan.structure.derived.items()]
+    found += [(f"signal {run}", "remainder", "", how) for run, how in plan.structure.derived.items()]
     for d in plan.decided:
         bound = describe(d.choice.bound, plan.context.metrics) if d.adds_error else ""
         found.append((d.name, f"{d.choice.decision}: {d.choice.what}", bound, d.formula))

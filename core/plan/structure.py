@@ -73,7 +73,7 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
         wanted = every if in_memory else _wanted(pipeline, name)  # where nothing is written, the products are the output
         pinned = dict.fromkeys(keep, "asked for with --keep")
         for other in [n for n in needed if not name and _takes_modes(pipeline, n)]:
-            pinned |= {o.label: f"run {other} takes its modes" for o in steps if o.couples == "all"}
+            pinned |= {o.label: f"signal {other} takes its modes" for o in steps if o.couples == "all"}
         found, left_out = _walk(steps, wanted, pinned)
         if name and (reason := _useless(steps, found, wanted)):
             rows.append(Row(name, "", reason))
@@ -83,7 +83,7 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     instead = _in_place_of_complete(pipeline, needed, {*keep}) if not in_memory else ""
     if instead:
         rows = [r for r in rows if r.run not in ("", instead)]
-        words = "the sky alone" if pipeline.runs[instead].only == ["sky"] else f"run {instead.strip('_')}"
+        words = "the sky alone" if pipeline.runs[instead].only == ["sky"] else f"signal {instead.strip('_')}"
         reason = f"no step reads what a run of everything makes: {words} takes its place"
         rows += [Row("", o.label, reason) for o in pipeline.signals.steps if o.label not in needed[instead]]
         needed[""] = needed.pop(instead)

@@ -97,7 +97,7 @@ def test_a_remainder_is_what_would_be_formed(filters, precision):
     assert np.nanmax(abs(found.half_difference - true.half_difference)) < allowed
     assert np.nanmax(abs(whole.signal - true.signal)) > 100 * allowed, "there is a sky to be taken away"
     assert same(found, true, "hits", "weights", "noise")
-    assert ("rest", "derived as", "the complete signal minus sky") in list(data.tally)
+    assert ("rest", "remainder", "the complete signal minus sky") in list(data.tally)
 
 
 class Unsaid(Operator):
