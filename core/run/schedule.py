@@ -27,6 +27,9 @@ from .whole import knows_means, may_have_means, names_of
 SCRATCH_STREAMS = 2
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
 
+AMPLE = 3.0
+"""Times the streams of all signals: with so much memory unfiltered ones are held across the filters, not made again."""
+
 COMPLETE = (Formed(MAIN, frozenset()),)
 """The complete signal alone."""
 

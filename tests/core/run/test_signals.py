@@ -499,7 +499,7 @@ def test_an_unfiltered_signal_is_mapped_as_it_was_formed(filters):
 
 
 def test_an_unfiltered_signal_is_made_of_its_own_components_alone(monkeypatch):
-    """Behind a filter that measures, the sky is sampled again; the noise is not."""
+    """Behind a filter that measures, where memory has no room for its stream, the sky is sampled again; the noise is not."""
     made: list[tuple[str, bool]] = []
     for cls in (zonda.SkyMap, zonda.WhiteNoise):
         original = cls.exec
@@ -510,9 +510,16 @@ def test_an_unfiltered_signal_is_made_of_its_own_components_alone(monkeypatch):
 
         monkeypatch.setattr(cls, "exec", counted)
         monkeypatch.setattr(cls, "knows_means", True)
-    observed(steps(*FILTERS["modes"]), {"raw": {"only": ["sky"], "filters": "none"}})
+    runs = {"raw": {"only": ["sky"], "filters": "none"}}
+    with monkeypatch.context() as short:
+        short.setattr("zonda.core.run.schedule.AMPLE", np.inf)
+        _, tight = observed(steps(*FILTERS["modes"]), runs)
     assert ("SkyMap", True) in made
     assert ("WhiteNoise", True) not in made
+    made.clear()
+    _, ample = observed(steps(*FILTERS["modes"]), runs, memory=1 << 30)
+    assert ("SkyMap", True) not in made
+    assert same(tight.products["raw/map"], ample.products["raw/map"], "signal", "hits")
 
 
 @pytest.mark.parametrize("filters", FILTERS.values(), ids=FILTERS)
