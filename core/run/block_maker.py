@@ -10,6 +10,7 @@ import copy
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,15 @@ from .whole import exec_whole, knows_means, means_of, names_of
 
 Measured = dict[tuple[str, str], Any]
 """By label and signal: what `Operator.measure` found."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """What a block is to hold: ``samples``, and with its margins ``reach``."""
+
+    detectors: slice
+    samples: slice
+    reach: slice
 
 
 class BlockMaker:
@@ -110,7 +120,8 @@ class BlockMaker:
             first, rest = ([o for o in part if self._is_of_use(o, signals)] for part in (first, rest))
         else:
             first, rest = ([o for o in part if not o.provides or self._is_read(o)] for part in (first, rest))
-        block = self._block(stage, detectors, reach, samples, made if in_place else {}, again, not first or bool(rest), signals)
+        window = Window(detectors, samples, reach)
+        block = self._block(stage, window, made if in_place else {}, again, not first or bool(rest), signals)
         if self._apart and any(isinstance(o, MapMaker) for o in segment.operators):
             self._add_unfiltered(block)
         if first:
@@ -205,9 +216,7 @@ class BlockMaker:
     def _block(
         self,
         stage: Stage,
-        detectors: slice,
-        reach: slice,
-        samples: slice,
+        window: Window,
         made: dict[str, Stream],
         again: bool,
         copied: bool,
@@ -218,6 +227,7 @@ class BlockMaker:
         With margins never in place: others read them too. Not ``copied``: steps work on copies of parts of it alone.
         """
         source, observation = stage.source, self._observation
+        detectors, samples, reach = window.detectors, window.samples, window.reach
         if again:
             observation = copy.copy(observation)
             observation.tally = Tally()

@@ -220,10 +220,10 @@ class Schedule:
         self.elsewhere, self.again = tuple(elsewhere), again
 
     def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
-        """Unfiltered signals, where a filter measures whole streams on the way to the maps, and blocks are not bound to a
-        span."""
+        """Unfiltered signals, where streams are held on the way to the maps and memory is not ample for all of them, and blocks
+        are not bound to a span."""
         unfiltered = tuple(s for s in self.chain.signals if not s.filtered)
-        if not unfiltered:
+        if not unfiltered or AMPLE * len(self.chain.signals) * self.stream_size <= self.settings.memory:
             return ()
         before = [k for k, s in enumerate(segments) if any(forms(o) for o in s.operators)]
         mapped = [k for k, s in enumerate(segments) if any(isinstance(o, MapMaker) for o in s.operators)]
@@ -262,8 +262,7 @@ class Schedule:
             f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
             size,
             spill_seconds=2 * size / rate,
-            readings=self._readings(later),
-            again_seconds=self.shape[0] * self.shape[1] * sample_cost / self.settings.threads,
+            again=(self._readings(later), self.shape[0] * self.shape[1] * sample_cost / self.settings.threads),
             hindrance=hindrance,
             prefer="spilled" if slow else self.settings.prefer,
             refusal=(self.observation.name, self._ceiling_for(2 * (held + size))),

@@ -328,8 +328,7 @@ def choose(
     size: int,
     *,
     spill_seconds: float,
-    readings: int,
-    again_seconds: float,
+    again: tuple[int, float],
     hindrance: str,
     prefer: Held | None,
     refusal: tuple[str, str],
@@ -342,8 +341,8 @@ def choose(
         Streams in words; their bytes.
     spill_seconds
         Left side of equation (1).
-    readings, again_seconds
-        k, and what each reading takes: the right side is their product.
+    again
+        k, and the seconds that each reading takes: the right side is their product.
     hindrance
         Why they cannot be made again; empty: they can.
     refusal
@@ -367,6 +366,6 @@ def choose(
         return "again", f"{size / 1e9:.3g} GB; the disk has room for {disk / 1e9:.3g} GB"
     if hindrance:
         return "spilled", f"{size / 1e9:.2f} GB: {hindrance}"
-    again = readings * again_seconds
-    costs = f"{size / 1e9:.3g} GB: about {spill_seconds:.2g} s by disk, {again:.2g} s to make {readings} times more"
-    return (prefer or ("spilled" if spill_seconds <= again else "again")), costs
+    readings, each = again
+    costs = f"{size / 1e9:.3g} GB: about {spill_seconds:.2g} s by disk, {readings * each:.2g} s to make {readings} times more"
+    return (prefer or ("spilled" if spill_seconds <= readings * each else "again")), costs

@@ -326,9 +326,7 @@ def test_the_quicker_way_is_taken(monkeypatch):
     """Equation (1) of `core.run.streams`: 2 N b / D against k N c / threads."""
     # by disk 2 s; to make it again twice, 1.8 or 2.2 s, on two threads 1.1 s
     for again, how in ((0.9, "again"), (1.1, "spilled"), (0.55, "again")):
-        found, why = choose(
-            "s", 4000, spill_seconds=2.0, readings=2, again_seconds=again, hindrance="", prefer=None, refusal=("", "")
-        )
+        found, why = choose("s", 4000, spill_seconds=2.0, again=(2, again), hindrance="", prefer=None, refusal=("", ""))
         assert found == how
         assert why == f"4e-06 GB: about 2 s by disk, {2 * again:.2g} s to make 2 times more"
 
