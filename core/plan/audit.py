@@ -148,7 +148,7 @@ def audit(
     chosen = [d for d in made.decided if d.chosen > 0]
     size = extent(made, len(chosen) + 2) if seconds is None else Extent(seconds)
     seconds = size.seconds
-    if made.structure.instead:  # nothing that the main run of the file would make is asked for
+    if made.structure.instead:  # nothing that is made of the complete signal is asked for
         file = dataclasses.replace(made, decided=()).apply(file)
     part = sliced(file, seconds, observations, size.every)
     whole = Structure(tuple(o.label for o in part.pipeline().operators), tuple(part.runs), ())
