@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from zonda.core.run.forecast import room
 
 import zonda
 from zonda.core.configuration.pipeline_file import load
@@ -54,9 +53,9 @@ def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_wa
 
 def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     """By the forecast, without running: 372 GB of streams are kept nowhere."""
-    from zonda.core.run.forecast import forecast
-
     from zonda.core.data import Data
+    from zonda.core.run.budget import divided
+    from zonda.core.run.schedule import schedule
     from zonda.core.run.settings import Settings
 
     file = load("atlast_full", ())
@@ -64,10 +63,10 @@ def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     data = Data(scene, output=tmp_path)
     for operator in pipeline.operators:
         operator.observe(data)
-    steps, settings = pipeline.selection.steps(""), Settings(threads=2)
-    left, _ = room(steps, data.observations, settings, 8 * 10**9, "test")
-    found = forecast(steps, data.observations[0], Settings(threads=2, memory=left))
-    assert found.bytes < left
+    longest, settings = data.observations[0], Settings(threads=2, asked=8 * 10**9)
+    left = divided(pipeline.chain, longest, settings, "test")
+    found = schedule(pipeline.chain, longest, left)
+    assert found.bytes < left.memory
     assert any("made again" in what for what in found.elsewhere)
     with pytest.raises(PipelineError, match=r"(?s)the run would hold .*BinMap .* GB.*budget is 1 GB.*larger pixel"):
-        room(steps, data.observations, settings, 10**9, "test")
+        divided(pipeline.chain, longest, Settings(threads=2, asked=10**9), "test")

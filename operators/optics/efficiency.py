@@ -151,7 +151,10 @@ def _make_signal(block: Block, state: Calibration, instantaneous: bool) -> int:
     first = np.array([block.samples.start, divisor.first, level.first], np.int64)
     smooth = divisor.lines, divisor.inside, level.lines, level.inside
     factors = np.array([a[block.detectors] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
-    clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
+    if noisy or instantaneous:
+        clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
+    else:
+        clipped = _calibrate_sky(sky, streams[1], factors[0], signal)
     for name in block.entering("calibrated"):
         signal += have[name]
     have["signal"] = signal
@@ -171,6 +174,22 @@ def _sum(block: Block, name: str, others: Sequence[str]) -> AnyFloats:
     for other in names[1:]:
         total += block.detdata[other]
     return total
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _calibrate_sky(sky, fluctuation, gain, out):  # type: ignore[no-untyped-def]
+    """Equation (2) where there is nothing but the sky: the same bits in a third of the time."""
+    one = out.dtype.type(1)
+    for d in range(out.shape[0]):
+        if not sky.shape[0]:
+            out[d] = 0
+        elif fluctuation.shape[0]:
+            for t in range(out.shape[1]):
+                out[d, t] = gain[d] * sky[d, t] * (one + fluctuation[d, t])
+        else:
+            for t in range(out.shape[1]):
+                out[d, t] = gain[d] * sky[d, t]
+    return 0
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
@@ -201,10 +220,6 @@ def _calibrate(  # type: ignore[no-untyped-def]
             w = white[d, begin : begin + m] if white.shape[0] else nothing[:m]
             p = pink[d, begin : begin + m] if pink.shape[0] else nothing[:m]
             row = out[d, begin : begin + m]
-            if not noisy and not instantaneous:
-                for t in range(m):
-                    row[t] = gain[d] * s[t] * (one + x[t])
-                continue
             scale[:] = one
             if divisor.shape[0]:
                 series_into(divisor[d], cell, inside, start + begin, scale[:m])
