@@ -85,26 +85,24 @@ def scene(instrument):
 
 def one(name, budget, threads):
     """Predicted and actual memory of one case, as JSON."""
-    from zonda.core.run.forecast import forecast, room
-
+    import zonda.core.pipeline
     from zonda.core.errors import PipelineError
-    from zonda.core.run.settings import Settings
+    from zonda.core.run.budget import divided
+    from zonda.core.run.schedule import schedule
 
     case = dict(SCENES[name])
     where = scene(case.pop("instrument"))
     pipeline = chain(**case)
     told = {}
 
-    def listen(operators, observations, settings, ceiling, place):
-        left, products = room(operators, observations, settings, ceiling, place)
-        blocks = forecast(operators, observations[0], Settings(settings.threads, left, settings.dtype))
-        told["predicted"] = (ceiling - left + blocks.bytes) / 1e9
+    def listen(steps, longest, settings, *more):
+        found = divided(steps, longest, settings, *more)
+        blocks = schedule(steps, longest, found)
+        told["predicted"] = (settings.asked - found.memory + blocks.bytes) / 1e9
         told["elsewhere"] = ", ".join(blocks.elsewhere)
-        return left, products
+        return found
 
-    import zonda.core.run.memory_budget
-
-    zonda.core.run.memory_budget.room = listen
+    zonda.core.pipeline.divided = listen
     try:
         data = pipeline.run(where, threads=threads, ceiling=int(budget * 1e9))
     except PipelineError as error:
