@@ -18,6 +18,7 @@ from zonda.operators.atmosphere.turbulence import covariance, lattice
 from zonda.operators.atmosphere.weather import bands
 from zonda.operators.filters import brick_wall, common_mode
 from zonda.operators.maps import bin_map
+from zonda.operators.maps.sums import DATA
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing import recording
@@ -136,7 +137,7 @@ def sums_rounded_by_block(patch: Patch) -> None:
     def rounded(*arguments: Any) -> None:
         add(*arguments)
         sums = arguments[-3]
-        sums[:, bin_map.DATA] = sums[:, bin_map.DATA].astype(np.float32).astype(np.int64)
+        sums[:, DATA] = sums[:, DATA].astype(np.float32).astype(np.int64)
 
     patch.setattr(bin_map, "add_image", rounded)
 

@@ -13,15 +13,13 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from zonda.core.data import Block, Data, Observation, percent
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.numerics.projection import pixel_matrix, share_outside
 from zonda.core.numerics.tiles import TILE_SAMPLES
-from zonda.core.signal import product_name
 
-from .finished import map_of, state_choices
-from .grid import Grid, TangentGrid, in_frame
-from .map_layout import grid_of, image_grid, layout_of
+from .finished import finish
+from .grid import Grid, TangentGrid
+from .map_layout import grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, WEIGHT, Binning, Sums, add_image, add_list
@@ -58,12 +56,7 @@ class BinMap(MapParameters):
 
     def check(self, data: Data) -> list[str]:
         """The share of the samples outside a map of a given width."""
-        if self.width is None or not data.observations:
-            return []
-        longitude, latitude = in_frame(self.centre.icrs() if self.centre else data.observations[0].centre, self.frame)
-        grid = image_grid(self, (float(longitude), float(latitude)), (0.0, 0.0))
-        scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in data.observations)
-        return [f"samples outside the map: about {percent(share_outside(scans, pixel_matrix(grid.wcs), grid.shape), 2)}"]
+        return [] if self.width is None or not data.observations else [outside(self, data.observations)]
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""
@@ -83,67 +76,34 @@ class BinMap(MapParameters):
 
     def prepare(self, observation: Observation) -> list[Binning]:
         """Pointing, weights and empty sums for one observation: one for all signals, or one for each with noise of its own."""
-        weight, noise = weights_of(self, observation, self._layout["variance"])
-        if "white" not in observation.components and self.noise == "net" and self.contents == "all":
-            observation.tally.state(self.label, "noise of a pixel", NO_WHITE)
-        alike = self.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
-        good, pointing = observation.good_samples.astype(np.uint8), self.grid.pointing(observation)
-        signals = 1 if self.contents == "hits" else len(observation.signals)
-        others, count = (0, signals) if self.noise == "scatter" else (signals - 1, 1)
-        return [Binning(self.grid, pointing, good, weight, noise, alike, others, self._spare) for _ in range(count)]
+        return binnings(self, observation, self._layout["variance"], self._spare)
 
     def exec(self, block: Block, state: list[Binning]) -> None:
         """Add one block to this thread's sums."""
-        if self.contents == "hits":
-            nothing = block.buffer("nothing", block.shape)
-            nothing.fill(0)
-            signals = [nothing]
-        else:
-            names = block.signals
-            whole = any(name in block.means for name in names)
-            signals = [block.total(name) if whole else block.detdata[name] for name in names]
-        for binning in state:
-            count = 1 + binning.n_others
-            add_block(self, block, tuple(signals[:count]), binning, self._layout["variance"])
-            signals = signals[count:]
+        add_signals(self, block, state, self._layout["variance"])
 
     def collect(self, data: Data, observation: Observation, state: list[Binning]) -> None:
         """Add this observation to the even or the odd scans' sums."""
-        if self.label not in data.partial:
-            signals = ("signal",) if self.contents == "hits" else observation.signals
-            data.add(self.label, MapSums(self.grid.n_pixels, signals, self.noise == "scatter"))
-        sums: Any = data.partial[self.label]
-        binned, dropped = sums.add(observation, state, self.label)
-        sums.unknown_variance |= self.weights == "inverse_variance" and not (observation.focalplane.net > 0).all()
-        every, tally = observation.n_detectors * observation.n_samples, observation.tally
-        tally.count(self.label, "samples binned", binned, every)
-        for what, number in (("outside the map", OUTSIDE), ("flagged", FLAGGED), ("not finite", NOT_FINITE)):
-            tally.count(self.label, f"samples dropped: {what}", int(dropped[number]), every)
-        if dropped[TOO_LARGE]:
-            raise PipelineError(
-                f"{int(dropped[TOO_LARGE])} samples are too large for the map's fixed-point sums",
-                place=f"{self.label}, {observation.name}",
-                cure="look for the operator that makes them; a signal is below 1e4 K",
-            )
+        add_scan(self, data, observation, state)
 
     def finalize(self, data: Data) -> None:
         """Turn the sums into one `MapProduct` for each signal, under the name `product`."""
         self._spare.clear()
         sums: MapSums | None = data.take(self.label)
-        if sums is None:
-            return
-        for stream in sums.signals:
-            key = product_name(stream, self.product)
-            if key in data.products:
-                raise PipelineError(
-                    f"two steps make the product {self.product!r}", place=self.label, cure="give one of them another product name"
-                )
-            product = map_of(self, self.grid, self._layout, sums, stream)
-            if stream == "signal":
-                state_choices(self, product, sums, data.tally)
-            if self.smooth is not None:
-                product = product.smoothed(self._layout["fwhm"] if self.smooth == "beam" else float(self.smooth))
-            data.products[key] = product
+        if sums is not None:
+            finish(self, data, self.grid, self._layout, sums)
+
+
+def binnings(step: BinMap, observation: Observation, reference: float, spare: list[Sums]) -> list[Binning]:
+    """What `BinMap.prepare` makes. ``reference``: unit of the variance, K^2; ``spare``: see `Binning`."""
+    weight, noise = weights_of(step, observation, reference)
+    if "white" not in observation.components and step.noise == "net" and step.contents == "all":
+        observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
+    alike = step.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
+    good, pointing = observation.good_samples.astype(np.uint8), step.grid.pointing(observation)
+    signals = 1 if step.contents == "hits" else len(observation.signals)
+    others, count = (0, signals) if step.noise == "scatter" else (signals - 1, 1)
+    return [Binning(step.grid, pointing, good, weight, noise, alike, others, spare) for _ in range(count)]
 
 
 def weights_of(step: BinMap, observation: Observation, reference: float) -> tuple[Any, Any]:
@@ -172,6 +132,21 @@ def weights_of(step: BinMap, observation: Observation, reference: float) -> tupl
     return weight, weight**2 * variance
 
 
+def add_signals(step: BinMap, block: Block, state: list[Binning], reference: float) -> None:
+    """Add all signals of a block to this thread's sums; zeros where only the hits are wanted."""
+    if step.contents == "hits":
+        nothing = block.buffer("nothing", block.shape)
+        nothing.fill(0)
+        signals = [nothing]
+    else:
+        whole = any(name in block.means for name in block.signals)
+        signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
+    for binning in state:
+        count = 1 + binning.n_others
+        add_block(step, block, tuple(signals[:count]), binning, reference)
+        signals = signals[count:]
+
+
 def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], binning: Binning, reference: float) -> None:
     """Add the signals of a block to this thread's sums."""
     sums, dropped, largest = binning.of_thread()
@@ -189,3 +164,23 @@ def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], binning: Bin
         index = np.empty((len(xi), stop - start), np.int32)
         binning.grid.pixels(binning.pointing, start, stop, xi, eta, index)
         add_list(signals, start - begin, index, *how)
+
+
+def add_scan(step: BinMap, data: Data, observation: Observation, state: list[Binning]) -> None:
+    """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples that are too large."""
+    if step.label not in data.partial:
+        signals = ("signal",) if step.contents == "hits" else observation.signals
+        data.add(step.label, MapSums(step.grid.n_pixels, signals, step.noise == "scatter"))
+    sums: Any = data.partial[step.label]
+    binned, dropped = sums.add(observation, state, step.label)
+    sums.unknown_variance |= step.weights == "inverse_variance" and not (observation.focalplane.net > 0).all()
+    every, tally = observation.n_detectors * observation.n_samples, observation.tally
+    tally.count(step.label, "samples binned", binned, every)
+    for what, number in (("outside the map", OUTSIDE), ("flagged", FLAGGED), ("not finite", NOT_FINITE)):
+        tally.count(step.label, f"samples dropped: {what}", int(dropped[number]), every)
+    if dropped[TOO_LARGE]:
+        raise PipelineError(
+            f"{int(dropped[TOO_LARGE])} samples are too large for the map's fixed-point sums",
+            place=f"{step.label}, {observation.name}",
+            cure="look for the operator that makes them; a signal is below 1e4 K",
+        )

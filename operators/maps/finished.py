@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.data import Data
+from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.chunks import empty
+from zonda.core.signal import product_name
 from zonda.core.tally import Tally
 from zonda.core.types import Floats
 
@@ -21,6 +24,21 @@ from .sums import DATA, HITS, NOISE, VALUE, WEIGHT, WEIGHTS, Sums
 
 AT_ONCE = 1 << 15
 """Pixels whose maps are made at a time: what is only used for a moment stays in the cache."""
+
+
+def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any], sums: MapSums) -> None:
+    """Add the map of each signal to the products. Raises PipelineError where another step has made one of this name."""
+    for stream in sums.signals:
+        key = product_name(stream, step.product)
+        if key in data.products:
+            text = f"two steps make the product {step.product!r}"
+            raise PipelineError(text, place=step.label, cure="give one of them another product name")
+        product = map_of(step, grid, layout, sums, stream)
+        if stream == "signal":
+            state_choices(step, product, sums, data.tally)
+        if step.smooth is not None:
+            product = product.smoothed(layout["fwhm"] if step.smooth == "beam" else float(step.smooth))
+        data.products[key] = product
 
 
 def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: MapSums, stream: str) -> MapProduct:

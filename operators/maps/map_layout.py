@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.data import Observation
+from zonda.core.data import Observation, percent
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.numerics.projection import pixel_matrix, share_outside
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
 
@@ -77,3 +78,11 @@ def image_grid(step: MapParameters, middle: tuple[float, float], half: Sequence[
             f"a map of {nx} x {ny} pixels is too large", place=step.label, cure="choose larger pixels or a smaller width"
         )
     return TangentGrid(middle, step.pixel, (ny, nx), step.frame)
+
+
+def outside(step: MapParameters, observations: Sequence[Observation]) -> str:
+    """The share of the samples outside an image of a given width."""
+    longitude, latitude = in_frame(step.centre.icrs() if step.centre else observations[0].centre, step.frame)
+    grid = image_grid(step, (float(longitude), float(latitude)), (0.0, 0.0))
+    scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in observations)
+    return f"samples outside the map: about {percent(share_outside(scans, pixel_matrix(grid.wcs), grid.shape), 2)}"
