@@ -8,6 +8,7 @@ from dataclasses import fields
 from typing import Any, ClassVar, Self
 
 from .discovery import API_VERSION
+from .errors import PipelineError
 
 
 class Product(ABC):
@@ -37,11 +38,15 @@ class Product(ABC):
         """What `arrays` gave, put together again."""
 
     def subtract(self, stream: str, parts: Sequence[str]) -> None:
-        """Make that of the signal ``stream``: that of ``signal`` minus those of ``parts``, all of which are in `signals`.
+        """Add what belongs to the signal ``stream``: that of ``signal`` minus those of ``parts``, all of which are in `signals`.
 
-        Only asked of products of map makers (`core.mapmaker`) that are linear.
+        Called for products of linear map makers only (`core.mapmaker`). Raises PipelineError where the class does not have it.
         """
-        raise NotImplementedError
+        raise PipelineError(
+            f"a {type(self).__name__} cannot subtract signals from one another, which a linear map maker needs",
+            place=stream,
+            cure=f"write {type(self).__name__}.subtract, or leave linear = True out of its map maker",
+        )
 
 
 class Record(Product):

@@ -7,7 +7,7 @@ The calibrated sum of all components is the stream ``signal``; that of a subset,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
@@ -26,12 +26,16 @@ class Component(str):
     """The name of a stream that becomes part of the signal; an operator that adds something to the data provides one.
 
     ``enters`` says where: ``above the atmosphere`` (as the sky does, seen through its transmission), ``at the detector`` (as
-    noise does, before calibration), or ``calibrated`` (in K_RJ on the calibrated sky, added last).
+    noise does, before calibration), or ``calibrated`` (in K_RJ on the calibrated sky, added last). Raises ValueError for
+    any other.
     """
 
     enters: Entrance
 
     def __new__(cls, name: str, enters: Entrance = "at the detector") -> Component:
+        if enters not in get_args(Entrance):
+            places = ", ".join(map(repr, get_args(Entrance)))
+            raise ValueError(f"component {name!r} cannot enter {enters!r}: choose from {places}")
         made = super().__new__(cls, name)
         made.enters = enters
         return made

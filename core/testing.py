@@ -13,28 +13,23 @@ import dataclasses
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from .configuration.docstrings import described
-from .configuration.time import Instant
 from .data import STREAMS, Block, Data, Observation, Stream
-from .instrument import Band, Instrument, Telescope
-from .mapmaker import filters
-from .numerics.random import normals
-from .numerics.smooth import SmoothField
+from .made_up import N_DETECTORS, N_SAMPLES, Given, Points, given_signal, made_up_scan, made_up_scene
+from .mapmaker import MapMaker, filters
 from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
 from .output import Output
-from .pipeline import Pipeline
+from .pipeline import Part, Pipeline
 from .plan.planning import planning_of
-from .scene import Scene
-from .site import Site
-
-N_DETECTORS, N_SAMPLES, RATE = 37, 3 * TILE_SAMPLES + 321, 50.0
+from .product import Product
+from .signal import Component
 
 
 def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] | None = None) -> None:
@@ -91,12 +86,37 @@ def check_declared_streams(operator: Operator) -> None:
     """`exec` reads only what is declared as required or optional, makes only what is provided, and changes nothing else."""
     if isinstance(operator, Output) or "boresight" in operator.provides:
         return
-    observation = _observation()
-    steps = [_Given(), operator]
+    before, watched = _one_block(operator)
+    allowed = operator.requires | operator.optional | operator.provides
+    made = set(watched) - set(before)
+    assert made <= operator.provides, f"makes {sorted(made - operator.provides)}, which it does not provide"
+    assert not (undeclared := watched.read - allowed), f"reads {sorted(undeclared)}, which it does not declare"
+    for name in set(before) - operator.provides:
+        assert np.array_equal(before[name], dict.__getitem__(watched, name), equal_nan=True), (
+            f"changes {name}, which it does not provide"
+        )
+
+
+def check_components(operator: Operator) -> None:
+    """A stream of its own becomes part of the signal: it is a `Component`.
+
+    A stream that only another step reads is an expected failure.
+    """
+    if isinstance(operator, Output) or "boresight" in operator.provides:
+        return
+    before, watched = _one_block(operator)
+    plain = sorted(set(watched) - set(before) - _streams_of(operator))
+    assert not plain, f"makes {plain}, which is not part of the signal: provide zonda.Component({plain[0]!r}, 'at the detector')"
+
+
+def _one_block(operator: Operator) -> tuple[dict[str, Any], _Watched]:
+    """The given streams, and the same after a step acted on them as one block."""
+    observation = made_up_scan()
+    steps = [Given(), operator]
     states = []
     with tempfile.TemporaryDirectory() as folder:
         observation.output = Path(folder)
-        data = Data(_scene(), [observation], output=observation.output)
+        data = Data(made_up_scene(), [observation], output=observation.output)
         operator.observe(data)
         for step in steps:
             step.configure(observation)
@@ -111,14 +131,12 @@ def check_declared_streams(operator: Operator) -> None:
         block.detdata = watched
         operator.exec(block, states[1])
         operator.discard(observation, states[1])
-    allowed = operator.requires | operator.optional | operator.provides
-    made = set(watched) - set(before)
-    assert made <= operator.provides, f"makes {sorted(made - operator.provides)}, which it does not provide"
-    assert not (undeclared := watched.read - allowed), f"reads {sorted(undeclared)}, which it does not declare"
-    for name in set(before) - operator.provides:
-        assert np.array_equal(before[name], dict.__getitem__(watched, name), equal_nan=True), (
-            f"changes {name}, which it does not provide"
-        )
+    return before, watched
+
+
+def _streams_of(operator: Operator) -> set[str]:
+    """The streams that a step provides, products apart."""
+    return {name for name in operator.provides if name in STREAMS or isinstance(name, Component)}
 
 
 def check_same_bits(operator: Operator) -> None:
@@ -134,10 +152,10 @@ def check_linear(operator: Operator) -> None:
     `Operator.measure` found in the sum (``modes: full``)."""
     if not (operator.linear and filters(operator)):
         return
-    observation = _observation()
+    observation = made_up_scan()
     operator.configure(observation)
     state = operator.prepare(observation)
-    parts = [_given_signal(observation, factor) for factor in (1.0, -0.3)]
+    parts = [given_signal(observation, factor) for factor in (1.0, -0.3)]
     parts[1][:, ::7] += np.float32(2e-3)
     whole, nothing = parts[0] + parts[1], np.zeros_like(parts[0])
     model = operator.measure(_stream(observation, whole, state)) if operator.couples == "all" else None
@@ -167,12 +185,29 @@ def check_means(operator: Operator) -> None:
         if isinstance(operator, Output) or name not in operator.requires | operator.optional:
             continue
         beside, inside = (
-            _products(operator, threads=1, memory=1 << 30, given=_Given(mean=name, beside=b), precision="float64")
+            _products(operator, threads=1, memory=1 << 30, given=Given(mean=name, beside=b), precision="float64")
             for b in (True, False)
         )
         assert (wrong := _unlike(beside, inside)) is None, (
             f"{wrong} is another where the mean of {name} stands beside the stream (block.means, observation.smooth), not in it: "
             "leave knows_means out, or add that mean"
+        )
+
+
+def check_products(operator: Operator) -> None:
+    """Partial products are restored from their `arrays`; those of a linear map maker can be subtracted."""
+    if isinstance(operator, Output) or "boresight" in operator.provides:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        pipeline = Pipeline([Points(), Given(), operator])
+        layouts = pipeline.point(made_up_scene(), {}, Path(folder)).layouts
+        data = pipeline.run_part(made_up_scene(), Part(layouts=layouts), threads=1, memory=1 << 30, output=folder)
+    for product in data.partial.values():
+        kind = type(product)
+        arrays = _comparable(product.arrays())
+        assert _same(_comparable(kind.of(product.arrays()).arrays()), arrays), f"{kind.__name__}.of does not restore its arrays()"
+        assert not (isinstance(operator, MapMaker) and operator.linear) or kind.subtract is not Product.subtract, (
+            f"a linear map maker, but {kind.__name__} has no subtract()"
         )
 
 
@@ -188,104 +223,16 @@ CHECKS: tuple[Callable[[Operator], None], ...] = (
     check_parameters_survive_text,
     check_knobs,
     check_declared_streams,
+    check_components,
     check_same_bits,
     check_linear,
     check_means,
+    check_products,
     check_finite,
 )
 
 
-# ---- the made-up run
-
-
-class _Point(Operator):
-    """Points at the made-up scan."""
-
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
-
-    def observe(self, data: Data) -> None:
-        data.observations.append(_observation())
-
-
-class _Given(Operator):
-    """Provides every stream: a slow wave, common to all detectors, with noise of each detector's own.
-
-    ``mean`` names one that has a mean of some 30 K, ``beside`` it or in it.
-    """
-
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset(STREAMS)
-    knows_means: ClassVar[bool] = True
-    mean: str = ""
-    beside: bool = True
-
-    def prepare(self, observation: Observation) -> SmoothField:
-        """The mean: of each detector its own, falling slowly."""
-        field = SmoothField.from_values(*_slow(observation.n_samples), MEAN_STEP, observation.n_samples)
-        if self.mean == "atmosphere" and self.beside:
-            observation.smooth["atmosphere"] = field
-        return field
-
-    def exec(self, block: Block, state: Any) -> None:
-        start, stop = block.samples.start, block.samples.stop
-        wave = np.sin(np.arange(start, stop) / RATE / 3.0)
-        for number, name in enumerate(STREAMS):
-            stream = block.new(name)
-            for d in range(block.detectors.start, block.detectors.stop):
-                noise = normals(block.observation.key("given", name, d), start, stop)
-                stream[d - block.detectors.start] = 1e-3 * (3 * wave * (number + 1) + noise)
-        if self.mean == "signal" and self.beside:
-            block.means["signal"] = state
-        elif self.mean and not self.beside:
-            block.detdata[self.mean] += state.evaluate(block.detectors, block.samples)
-
-
-MEAN_STEP = 256
-"""Samples between the coefficients of the made-up mean."""
-
-
-def _slow(n_samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights (detector, node) and node values of a mean: 30 K and more, falling by 0.3 K in a straight line."""
-    weights = np.stack([30 + 0.1 * np.arange(N_DETECTORS), np.linspace(0.5, 1, N_DETECTORS)], axis=1)
-    n = -(-n_samples // MEAN_STEP) + 3
-    return weights, np.stack([np.ones(n + 24), -0.3 * np.arange(n + 24) / n])
-
-
-def _scene() -> Scene:
-    camera = Instrument(
-        name="conformance",
-        telescope=Telescope(name="dish", diameter="10 m"),
-        band=Band(name="band", low="140 GHz", high="160 GHz"),
-        detectors=N_DETECTORS,
-        field_of_view="10 arcmin",
-        main_beam_efficiency=0.5,
-        illumination_efficiency=0.9,
-        net="1 mK s(1/2)",
-        knee="0.2 Hz",
-        pink_minimum_frequency="10 mHz",
-        sample_rate=f"{RATE} Hz",
-    )
-    site = Site(name="somewhere", latitude="38.4 deg", longitude="-79.8 deg", altitude="800 m", climatology="green_bank")
-    return Scene(site=site, instrument=camera, time=Instant.parse("2024-11-25T07:00"), target="05h +20d", seed=11)
-
-
-def _observation() -> Observation:
-    """A scan in circles of 5 arcmin around RA 75 deg, Dec 20 deg, at 60 deg of elevation."""
-    scene = _scene()
-    t = np.arange(N_SAMPLES) / RATE
-    ra, dec = np.radians(75.0), np.radians(20.0)
-    reach = np.radians(5 / 60)
-    x, y = reach * np.cos(t / 3), reach * np.sin(t / 3)
-    return Observation(
-        "scan-000", 0, scene.site, scene.instrument, scene.instrument.focalplane(), scene.time, t, RATE,
-        _quaternions(-1.0 - x / np.cos(1.05), 1.05 + y), _quaternions(ra + x / np.cos(dec), dec + y), (ra, dec), scene.seed,
-    )  # fmt: skip
-
-
-def _quaternions(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rz(lon) Ry(pi/2 - lat), (n, 4) in the order x y z w."""
-    a, b = lon / 2, (np.pi / 2 - lat) / 2
-    return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
+# ---- runs
 
 
 def _products(
@@ -299,10 +246,10 @@ def _products(
     if isinstance(operator, Output):
         return {}
     pointing = "boresight" in operator.provides
-    steps = [operator] if pointing else [_Point(), given or _Given(), operator]
-    keep = sorted(operator.provides & set(STREAMS))
+    steps = [operator] if pointing else [Points(), given or Given(), operator]
+    keep = sorted(_streams_of(operator))
     with tempfile.TemporaryDirectory() as folder:
-        data = Pipeline(steps, precision=precision).run(_scene(), threads=threads, memory=memory, keep=keep, output=folder)
+        data = Pipeline(steps, precision=precision).run(made_up_scene(), threads=threads, memory=memory, keep=keep, output=folder)
     found: dict[str, Any] = {}
     for observation in data.observations:
         if "atmosphere" in observation.detdata and "atmosphere" in observation.smooth:
@@ -312,14 +259,6 @@ def _products(
         if pointing:
             found |= {f"{observation.name} {name}": getattr(observation, name) for name in ("boresight_azel", "boresight_radec")}
     return found | {name: _comparable(product) for name, product in data.products.items()}
-
-
-def _given_signal(observation: Observation, factor: float) -> NDArray[np.float32]:
-    """A whole scan of the given signal, times a factor."""
-    block = Block(observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES))
-    given = _Given()
-    given.exec(block, given.prepare(observation))
-    return np.asarray(block.detdata["signal"] * np.float32(factor), np.float32)
 
 
 def _stream(observation: Observation, array: Any, state: Any, signal: str = "signal", name: str = "signal") -> Stream:

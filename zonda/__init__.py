@@ -34,6 +34,7 @@ _WHERE = {
     "Product": "zonda.core.product",
     "Component": "zonda.core.signal",
     "Signal": "zonda.core.signal",
+    "product_name": "zonda.core.signal",
     "MapMaker": "zonda.core.mapmaker",
     "Output": "zonda.core.output",
     "Planning": "zonda.core.plan.planning",
@@ -91,6 +92,7 @@ if TYPE_CHECKING:
     from zonda.core.scene import Scene as Scene
     from zonda.core.signal import Component as Component
     from zonda.core.signal import Signal as Signal
+    from zonda.core.signal import product_name as product_name
     from zonda.core.site import Site as Site
     from zonda.core.stream import Stream as Stream
     from zonda.core.weather import Column as Column

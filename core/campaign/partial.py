@@ -54,12 +54,19 @@ class Partial:
         Raises `NotCombined` for a product that no campaign can add up.
         """
         kinds = {label: type(product) for label, product in data.partial.items()}
-        unknown = [label for label, kind in kinds.items() if not _registered(kind)]
-        for name in (*data.products, *unknown):
+        place = str(data.provenance["name"])
+        for label, kind in kinds.items():
+            if not _registered(kind):
+                raise NotCombined(
+                    f"{label} adds up a {kind.__name__}, a class that is not registered: other processes cannot find it",
+                    place=place,
+                    cure=f"register it in the entry-point group zonda.products under the name {kind.__name__}",
+                )
+        for name in data.products:
             raise NotCombined(
                 f"the product {name!r} cannot be combined with those of other observations",
-                place=str(data.provenance["name"]),
-                cure="its operator must hand a registered Product to data.add(), see docs/plugins.md; or run them one by one",
+                place=place,
+                cure="its operator must hand a zonda.Product to data.add(), see docs/plugins.md; or run them one by one",
             )
         # figures of scans of one number share a row, whatever the entry: there may be a million entries
         tally = _tally({**_rows(data.tally), "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.tally.figures()]})

@@ -221,7 +221,8 @@ class _Check(Mistakes):
                         Pipeline(operators, runs={name: Signal.model_validate({which: [component]})})
                     except PipelineError as err:
                         span = self.document.mark(("runs", name, which, i)).value
-                        self.wrong(err.message, span, nearest(component, components), err.cure)
+                        near = nearest(component, components)
+                        self.wrong(err.message, span, near, err.cure if err.cure != near else "")
         if self.found:
             return
         for name in [*header.runs, ""]:  # the last: signals that outputs ask for themselves

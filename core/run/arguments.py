@@ -42,7 +42,7 @@ def runs(given: Any, name: str) -> dict[str, Signal]:
     made = {}
     for key, value in (given or {}).items():
         if not isinstance(value, Signal | Mapping):
-            raise PipelineError(f"run {key} is a dict, not {_what(value)}", place=name, cure=cure)
+            raise PipelineError(f"signal {key} is a dict, not {_what(value)}", place=name, cure=cure)
         made[key] = value if isinstance(value, Signal) else Signal(**value)
     return made
 

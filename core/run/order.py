@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ..mapmaker import place_of_signal
+from ..mapmaker import forms, place_of_signal
 from ..operator import Operator
 from ..output import Output
 from ..registry import makers
+from ..signal import Component
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,9 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                 cure = f"{' or '.join(found)} would" if found else ""
                 message = f"{name} needs {what}, which no step provides"
                 problems.append(OrderProblem(index, message, f"add a step that provides {what} above", cure))
-        for what in sorted((operator.optional - operator.requires) & set(later)):
+        adds_up = forms(operator) and (operator.requires | operator.optional) - {"boresight"}
+        components = {what for what in later if isinstance(what, Component)} if adds_up else set()
+        for what in sorted(((operator.optional | components) - operator.requires) & set(later)):
             if not isinstance(operator, Output):
                 problems.append(
                     OrderProblem(

@@ -66,8 +66,8 @@ class Signals:
         for name, signal in self.runs.items():
             if not name.isidentifier() or name.startswith("_"):
                 cure = "use letters, digits and underscores, the first a letter"
-                raise PipelineError(f"{name!r} cannot name a run", place=place, cure=cure)
-            self._check_components(signal, f"run {name} names")
+                raise PipelineError(f"{name!r} cannot name a signal", place=place, cure=cure)
+            self._check_components(signal, f"signal {name} names")
         if self._only:
             self._check_components(self._only, "--only names")
             self.runs = {name: s for name, s in self.runs.items() if self._is_left(s)}

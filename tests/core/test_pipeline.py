@@ -217,6 +217,17 @@ def test_streams_are_kept_when_asked(scene):
     assert "scan-0" in data.observations[0]._repr_html_()
 
 
+class Glitches(Component):
+    """A component with a name of its own."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({zonda.Component("glitches", "at the detector")})
+
+
+def test_a_component_enters_at_a_place_that_there_is():
+    with pytest.raises(ValueError, match=r"component 'glitches' cannot enter 'at detector': choose from .*'at the detector'"):
+        zonda.Component("glitches", "at detector")
+
+
 @pytest.mark.parametrize(
     ("steps", "words"),
     [
@@ -224,6 +235,7 @@ def test_streams_are_kept_when_asked(scene):
         ([White(), Point()], "White needs boresight, which Point provides only later"),
         ([Point(), Total()], "Total needs signal, which no step provides"),
         ([Point(), Sum(), Sky()], "Sky provides sky only after Sum has used it"),
+        ([Point(), Sky(), Sum(), Glitches()], "Glitches provides glitches only after Sum has used it"),
         ([Sum()], "no step points the telescope"),
     ],
 )
@@ -262,7 +274,7 @@ def test_all_mistakes_of_order_at_once():
 
 
 def test_unknown_component_of_a_run():
-    with pytest.raises(PipelineError, match=r"(?s)run quiet names 'noise'.*choose from: sky, white"):
+    with pytest.raises(PipelineError, match=r"(?s)signal quiet names 'noise'.*choose from: sky, white"):
         Pipeline([Point(), Sky(), White(), Sum()], runs={"quiet": {"without": ["noise"]}})
 
 

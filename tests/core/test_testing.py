@@ -7,8 +7,11 @@ import pytest
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Kelvin
+from zonda.core.mapmaker import MapMaker
 from zonda.core.operator import Operator
+from zonda.core.product import Product
 from zonda.core.registry import operators
+from zonda.core.signal import Component
 from zonda.testing import check_operator
 
 SIGNAL = frozenset({"signal"})
@@ -100,6 +103,71 @@ class Invents(Good):
         block.new("glitches")
 
 
+class Forgets(Good):
+    """Makes a stream that never reaches the signal."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"glitches"})
+
+    def exec(self, block, state):
+        block.new("glitches")[...] = 1e-3
+
+
+class ComponentOfBlocks(Good):
+    """Makes a component whose values depend on the limits of the blocks."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({Component("glitches", "at the detector")})
+
+    def exec(self, block, state):
+        block.new("glitches")[...] = np.arange(block.shape[1])
+
+
+class Forgetful(Product):
+    """A sum that loses its digits when it is written, and that cannot be subtracted."""
+
+    total = np.zeros(1)
+
+    def __iadd__(self, other):
+        self.total = self.total + other.total
+        return self
+
+    def arrays(self):
+        return {"total": self.total}
+
+    @classmethod
+    def of(cls, arrays):
+        return cls()
+
+
+class Faithful(Forgetful):
+    """A sum that cannot be subtracted."""
+
+    @classmethod
+    def of(cls, arrays):
+        made = cls()
+        made.total = arrays["total"]
+        return made
+
+
+class Counts(MapMaker):
+    """A linear map maker."""
+
+    requires: ClassVar[frozenset[str]] = SIGNAL
+    provides: ClassVar[frozenset[str]] = frozenset({"counts"})
+    linear: ClassVar[bool] = True
+    kind: ClassVar[type[Product]] = Forgetful
+
+    def collect(self, data, observation, state):
+        sums = self.kind()
+        sums.total = np.array([observation.n_samples])
+        data.add(self.label, sums)
+
+
+class CountsFaithfully(Counts):
+    """A linear map maker."""
+
+    kind: ClassVar[type[Product]] = Faithful
+
+
 class DependsOnBlocks(Good):
     """Subtracts the mean of the block."""
 
@@ -123,6 +191,10 @@ class Blows(Good):
         (Meddles(), "changes white, which it does not provide"),
         (Invents(), r"makes \['glitches'\]"),
         (DependsOnBlocks(), "other bits with"),
+        (Forgets(), r"check_components: makes \['glitches'\].*provide zonda.Component\('glitches'"),
+        (ComponentOfBlocks(), "other bits with"),
+        (Counts(), r"Forgetful.of does not restore its arrays\(\)"),
+        (CountsFaithfully(), r"Faithful has no subtract\(\)"),
         (Blows(), "signal is not finite"),
     ],
 )

@@ -131,7 +131,7 @@ STEPS = [zonda.PointingDaisy(scan_duration="2 s"), zonda.WhiteNoise(), zonda.Eff
         (lambda: zonda.Pipeline([zonda.SkyMap]), ["step 1 is the class SkyMap", "make one of the class at step 1: SkyMap(...)"]),
         (lambda: zonda.Pipeline(STEPS[::-1]), ["step 1: BinMap needs boresight", "move it below PointingDaisy"]),
         (lambda: zonda.Pipeline(STEPS, runs={"a": {"onyl": ["sky"]}}), ["unknown parameter 'onyl'", "did you mean 'only'?"]),
-        (lambda: zonda.Pipeline(STEPS, runs={"a": "sky"}), ["run a is a dict, not the text 'sky'"]),
+        (lambda: zonda.Pipeline(STEPS, runs={"a": "sky"}), ["signal a is a dict, not the text 'sky'"]),
         (lambda: zonda.Pipeline(STEPS, runs=["a"]), ["runs is a dict of signals"]),
         (
             lambda: zonda.Pipeline(STEPS, precision="float23"),

@@ -591,7 +591,7 @@ def test_outputs_ask_for_signals():
 
 
 def test_a_signal_cannot_take_a_name_of_the_steps_own():
-    with pytest.raises(PipelineError, match="cannot name a run"):
+    with pytest.raises(PipelineError, match="cannot name a signal"):
         run(chain(), {"_sky": {"only": ["sky"]}})
 
 
