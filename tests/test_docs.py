@@ -88,7 +88,7 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     import zonda
     import zonda.testing
 
-    first, *others = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S)[:4]
+    first, *others = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S)
     assert set(re.findall(r"^(?:import|from) .*", first, re.M)) == {"import numpy as np", "import zonda"}
     (tmp_path / "page_for_authors.py").write_text(first + "".join(others))  # a file: docstrings of fields are read from it
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -98,6 +98,7 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     zonda.testing.check_operator(demean)
     zonda.testing.check_operator(page.Rms())
     zonda.testing.check_operator(page.GroundPickup())
+    zonda.testing.check_operator(page.Peak())
 
     def signal(*steps):
         scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5)
@@ -122,6 +123,20 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     left, _ = signal(demean)
     true = plain - plain.mean(axis=1, keepdims=True)
     assert np.abs(left - true).max() < 2.0**-24 * np.abs(true).max()
+
+
+    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5)
+    steps = [
+        zonda.PointingStare(scan_duration="5 s"),
+        zonda.WhiteNoise(),
+        page.GroundPickup(slope="1 K"),
+        zonda.Efficiency(),
+        page.Peak(),
+        page.SavePeak(),
+    ]
+    data = zonda.Pipeline(steps, runs={"clean": {"without": ["ground"]}}).run(scene, output=tmp_path)
+    assert (tmp_path / "peaks.txt").read_text().split()[::2] == ["peak", "clean/peak"]
+    assert abs(data.products["peak"] - data.products["clean/peak"]) > 1
 
 
 def test_the_operator_that_contributing_shows_keeps_the_contract(tmp_path, monkeypatch):
