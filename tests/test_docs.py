@@ -124,7 +124,6 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     true = plain - plain.mean(axis=1, keepdims=True)
     assert np.abs(left - true).max() < 2.0**-24 * np.abs(true).max()
 
-
     scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5)
     steps = [
         zonda.PointingStare(scan_duration="5 s"),
