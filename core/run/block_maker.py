@@ -21,7 +21,7 @@ from ..faults import PluginError, whose
 from ..mapmaker import MapMaker, filters, forms
 from ..numerics.tiles import TILE_SAMPLES
 from ..operator import Operator
-from ..signal import MAIN, Formed
+from ..signal import Formed
 from ..stream import Stream
 from ..tally import Tally
 from ..types import AnyFloats
@@ -73,13 +73,16 @@ class BlockMaker:
         self._schedule = schedule
         self._labels = {id(step): step.label for step in chain.steps}  # the property is slow
         acting = [o for o in chain.steps if type(o).exec is not Operator.exec]
-        self._declared = {o.label: names_of(o) for o in acting if not knows_means(o)}
+        self._declared = {o.label: names_of(o, self._observation.signals) for o in acting if not knows_means(o)}
         self._due: dict[str, frozenset[str]] = {}
         """By label: streams that a step must have made, for a later one requires them."""
         required = frozenset[str]()
         for step in reversed(chain.steps):
             self._due[step.label] = frozenset(n for n in step.provides & required if unused(n))
             required |= step.requires if step in acting else frozenset()
+        self._measures = {o.label: (o.label, name) for o in acting if o.couples == "all" for name in o.requires - {"boresight"}}
+        # an unfiltered signal may be finite where a filter has spoilt the others
+        self._masks_maps = not all(signal.filtered for signal in chain.signals)
         self._local = threading.local()
 
     @property
@@ -117,7 +120,8 @@ class BlockMaker:
         in_place = bool(made) and not segment.halo and (not rest or reach == slice(0, n_samples))
         passed_on = set(stage.wanted).union(*(self._chain.expanded(o.requires | o.optional) for o in rest))
         if again:
-            first, rest = ([o for o in part if self._is_of_use(o, signals)] for part in (first, rest))
+            of_use = self._of_use(signals)
+            first, rest = ([o for o in part if id(o) in of_use] for part in (first, rest))
         else:
             first, rest = ([o for o in part if not o.provides or self._is_read(o)] for part in (first, rest))
         window = Window(detectors, samples, reach)
@@ -143,12 +147,11 @@ class BlockMaker:
         streams = [n for n in step.provides if unused(n)]
         return len(streams) < len(step.provides) or any(n in self._streams for n in streams)
 
-    def _is_of_use(self, step: Operator, signals: Sequence[Formed]) -> bool:
-        """Whether a step changes the streams of a block that is made again, of which only ``signals`` are of use."""
-        if not step.provides & self._streams:
-            return False
+    def _of_use(self, signals: Sequence[Formed]) -> set[int]:
+        """The steps, by identity, that change the streams of a block that is made again, of which only ``signals`` are of use."""
         few = len(signals) < len(self._chain.signals)
-        return not few or MAIN in step.provides or step in self._chain.needed_for(signals)
+        steps = self._chain.needed_for(signals, filtered=True) if few else self._chain.steps
+        return {id(step) for step in steps if step.provides & self._streams}
 
     # ---- steps
 
@@ -163,7 +166,9 @@ class BlockMaker:
             elif filters(step):
                 self._filter(step, label, block)
             else:
-                self._act(step, block, self._states[label])
+                if self._masks_maps and isinstance(step, MapMaker):
+                    share_mask(block, block.signals)
+                self._act(step, block, self._measured.get(self._measures.get(label, ("", "")), self._states[label]))
             now = time.thread_time()
             self._timer.add(label, "exec", now - start)
             start = now
@@ -261,7 +266,7 @@ class BlockMaker:
     def _add_unfiltered(self, block: Block) -> None:
         """Put the signals that pass no filter into a block of a map maker, made again from their components."""
         signals = [s for s in self._chain.signals if s.stream in self._apart]
-        stage = Stage.without_filters(self._chain.needed_for(signals), frozenset(self._apart))
+        stage = Stage.without_filters(self._chain.needed_for(signals, filtered=False), frozenset(self._apart))
         found = self.make(stage, block.detectors, block.samples, {}, again=True, signals=signals)
         for name in self._apart:
             block.detdata[name] = found.detdata[name]
@@ -302,9 +307,9 @@ def share_mask(block: Block, streams: Sequence[str]) -> None:
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
 def _finite(row):  # type: ignore[no-untyped-def]
     """Whether all samples of a row are finite."""
-    total = row.dtype.type(0)
+    total = zero = row.dtype.type(0)
     for t in range(row.size):
-        total += row[t] - row[t]
+        total += row[t] * zero  # row[t] - row[t] would be cancelled where sums are reassociated
     return total == 0
 
 

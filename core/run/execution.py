@@ -27,10 +27,11 @@ from ..data import Data
 from ..discovery import RAISED
 from ..errors import PipelineError
 from ..machine import resident_memory
+from ..mapmaker import filters
 from ..numerics.smooth import SmoothField
 from ..observation import Observation
 from ..operator import Operator
-from ..signal import MAIN, Formed
+from ..signal import MAIN, Formed, is_signal
 from ..stream import Stream, forget_pages, in_order
 from ..tally import Tally
 from ..types import AnyFloats
@@ -262,7 +263,7 @@ class Execution:
     # ---- steps that measure whole streams
 
     def _measure(self, operator: Operator, source: Source) -> None:
-        """Let a step measure each signal, the complete one first; or the one other stream that it requires."""
+        """Let a filter measure each signal, the complete one first; let another step measure the one stream that it requires."""
         names = sorted(operator.requires & source.names)
         if len(names) != 1:
             raise PipelineError(
@@ -270,8 +271,8 @@ class Execution:
             )
         self._before(operator=operator, observation=self.observation, stage="measure")
         start, others = time.process_time(), self._seconds("exec") + self._ahead.seconds()
-        one = Formed(names[0], frozenset())
-        signals = [s for s in self.chain.signals if s.filtered and s.stream in source.names] if names == [MAIN] else [one]
+        one = self.chain.signals[0] if names == [MAIN] else Formed(names[0], frozenset())
+        signals = [s for s in self.chain.signals if s.filtered and s.stream in source.names] if filters(operator) else [one]
         for signal in signals:
             lent: list[AnyFloats] = []
             model = self.measured.get((operator.label, MAIN)) if signal.model and signal.stream != MAIN else None
@@ -283,7 +284,7 @@ class Execution:
 
     def _stream(self, operator: Operator, source: Source, signal: Formed, lent: list[AnyFloats]) -> Stream:
         """A stream for a step that measures: under the name that it knows, with its own mean alone."""
-        held, name = signal.stream, MAIN if signal.stream.startswith(MAIN) else signal.stream
+        held, name = signal.stream, MAIN if is_signal(signal.stream) else signal.stream
         observation, threads, means = self.observation, self.settings.threads, dict(source.means)
         if name == MAIN:
             means = {MAIN: source.means[held]} if held in source.means else {}

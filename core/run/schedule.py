@@ -13,7 +13,7 @@ import numpy as np
 
 from ..block import STREAMS
 from ..errors import PipelineError
-from ..mapmaker import MapMaker, forms, makes_products
+from ..mapmaker import MapMaker, filters, forms, makes_products
 from ..numerics.tiles import TILE_DETECTORS
 from ..observation import Observation
 from ..operator import Operator
@@ -74,13 +74,12 @@ class Chain:
         parts = frozenset[str]().union(*(s.components for s in signals))
         return frozenset(n for n in step.requires | step.optional | parts if unknown or n in parts or n not in self.components)
 
-    def needed_for(self, signals: Collection[Formed]) -> list[Operator]:
-        """The steps up to the one that forms signals, without those that make nothing for these."""
+    def needed_for(self, signals: Collection[Formed], *, filtered: bool) -> list[Operator]:
+        """The steps that form signals, those that filter them if so wanted, and those that make what these read."""
         found: list[Operator] = []
         names = frozenset[str]()
-        last = next(k for k, o in enumerate(self.steps) if forms(o))
-        for step in reversed(self.steps[: last + 1]):
-            if forms(step):
+        for step in reversed(self.steps):
+            if forms(step) or (filtered and filters(step)):
                 names |= self.of(step, signals)
             elif step.provides & names:
                 names |= step.requires | step.optional
@@ -221,14 +220,15 @@ class Schedule:
 
     def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
         """Unfiltered signals, where streams are held on the way to the maps and memory is not ample for all of them, and blocks
-        are not bound to a span."""
+        need neither a span nor neighbours."""
         unfiltered = tuple(s for s in self.chain.signals if not s.filtered)
         if not unfiltered or AMPLE * len(self.chain.signals) * self.stream_size <= self.settings.memory:
             return ()
         before = [k for k, s in enumerate(segments) if any(forms(o) for o in s.operators)]
         mapped = [k for k, s in enumerate(segments) if any(isinstance(o, MapMaker) for o in s.operators)]
-        spans = {o.couples for o in self.chain.needed_for(unfiltered)}
-        return unfiltered if before and mapped and min(mapped) > before[0] and spans == {"sample"} else ()
+        needed = self.chain.needed_for(unfiltered, filtered=False)
+        bound = any(o.couples != "sample" or o.halo(self.observation) for o in needed)
+        return unfiltered if before and mapped and min(mapped) > before[0] and not bound else ()
 
     def _keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
         """Whether ``size`` bytes of streams beside those held stay in memory: in half of it, and leave room for blocks."""
@@ -320,7 +320,7 @@ class Schedule:
         """Arrays of the run's precision that whole streams and one mean take, float64, where a step does not know of means."""
         each = 8 // np.dtype(self.settings.dtype).itemsize
         paying = [o for o in operators if (o.requires | o.optional) & self.means and not knows_means(o)]
-        return each * (1 + max(len(names_of(o) & self.streams) for o in paying)) if paying else 0
+        return each * (1 + max(len(names_of(o, self.observation.signals) & self.streams) for o in paying)) if paying else 0
 
     def _ceiling_for(self, need: int) -> str:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""

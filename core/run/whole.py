@@ -19,8 +19,10 @@ from typing import Any
 import numpy as np
 
 from ..data import Block, Observation, Stream
+from ..mapmaker import MapMaker
 from ..numerics.smooth import SmoothField
 from ..operator import Operator
+from ..signal import MAIN
 from ..types import AnyFloats
 
 EMISSION = "atmosphere"
@@ -35,9 +37,10 @@ def knows_means(operator: Operator) -> bool:
     return bool(operator.knows_means) and says <= does
 
 
-def names_of(operator: Operator) -> frozenset[str]:
-    """Names that the step declares."""
-    return operator.requires | operator.optional | operator.provides
+def names_of(operator: Operator, signals: Sequence[str]) -> frozenset[str]:
+    """Names that the step declares; for a map maker those of all ``signals``."""
+    names = operator.requires | operator.optional | operator.provides
+    return names.union(signals) if isinstance(operator, MapMaker) and MAIN in names else names
 
 
 def may_have_means(operators: Sequence[Operator]) -> frozenset[str]:
@@ -73,9 +76,10 @@ def exec_whole(
     """
     means = {name: field for name, field in block.means.items() if name not in fields}
     whole = Block(
-        block.observation, block.detectors, block.samples, means=means, dtype=np.float64, buffers=buffers, again=block.again
-    )
-    names = names_of(operator)
+        block.observation, block.detectors, block.samples, means=means, dtype=np.float64, buffers=buffers, again=block.again,
+        components=block.components,
+    )  # fmt: skip
+    names = names_of(operator, block.signals)
     for name, stream in block.detdata.items():
         whole.detdata[name] = stream
         if name in names:

@@ -169,7 +169,7 @@ def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], binning: Bin
 def add_scan(step: BinMap, data: Data, observation: Observation, state: list[Binning]) -> None:
     """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples that are too large."""
     if step.label not in data.partial:
-        signals = ("signal",) if step.contents == "hits" else observation.signals
+        signals = () if step.contents == "hits" else observation.signals
         data.add(step.label, MapSums(step.grid.n_pixels, signals, step.noise == "scatter"))
     sums: Any = data.partial[step.label]
     binned, dropped = sums.add(observation, state, step.label)

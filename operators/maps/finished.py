@@ -13,7 +13,7 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.chunks import empty
-from zonda.core.signal import product_name
+from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
 from zonda.core.types import Floats
 
@@ -28,13 +28,13 @@ AT_ONCE = 1 << 15
 
 def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any], sums: MapSums) -> None:
     """Add the map of each signal to the products. Raises PipelineError where another step has made one of this name."""
-    for stream in sums.signals:
+    for stream in sums.signals or (MAIN,):
         key = product_name(stream, step.product)
         if key in data.products:
             text = f"two steps make the product {step.product!r}"
             raise PipelineError(text, place=step.label, cure="give one of them another product name")
         product = map_of(step, grid, layout, sums, stream)
-        if stream == "signal":
+        if stream == MAIN:
             state_choices(step, product, sums, data.tally)
         if step.smooth is not None:
             product = product.smoothed(layout["fwhm"] if step.smooth == "beam" else float(step.smooth))

@@ -28,7 +28,7 @@ class MapSums(Product):
     n_pixels
         Of the map.
     signals
-        Streams of the signals, the complete one first.
+        Streams of the signals, the complete one first; none where only the hits are wanted.
     scatter
         Whether each signal has noise of its own, from the scatter of its samples.
 
@@ -71,7 +71,7 @@ class MapSums(Product):
                 _, _, _, found = binnings[1 + n].fold(own, _nothing(own))
                 self.others[name][k] += own[:, DATA]
                 self.scatters[name][k] += own[:, NOISE]
-                high = float(found.max())
+                high, largest[NOISE] = float(found[DATA]), max(largest[NOISE], found[NOISE])
             self._largest_of[name] = max(self._largest_of[name], high)
         self.scans.append(observation.name)
         self.rates.add(float(observation.sample_rate))

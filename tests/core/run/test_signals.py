@@ -146,6 +146,12 @@ def test_noise_from_the_scatter_is_each_signals_own():
     assert quiet < 0.5 * loud
 
 
+def test_hits_alone_are_of_no_signal_and_no_remainder_is_taken_from_them():
+    _, data = observed([*steps(HIGHPASS), zonda.BinMap(pixel="8 arcsec", contents="hits", product="seen")], BOTH)
+    assert same(data.products["map"], data.products["seen"], "hits")
+    assert {"rest/map", "sky/map"} < data.products.keys()
+
+
 # ---- bits
 
 
@@ -211,6 +217,35 @@ def test_only_a_signal_with_the_atmosphere_has_its_mean():
     assert level["sky"] < 0.1 > level["quiet"]
 
 
+def test_a_map_maker_that_does_not_know_of_means_sees_whole_signals():
+    """Tens of kelvin in the signals with the atmosphere, under all their names."""
+    runs = {"air": {"only": ["atmosphere"]}, "sky": {"only": ["sky"]}}
+    _, data = observed([*steps()[:-1], Keep()], runs, scans=1)
+    level = {name: data.products[f"signal/{name}" if name else "signal"].mean() for name in ("", *runs)}
+    assert level[""] == pytest.approx(level["air"], rel=1e-3)
+    assert level["air"] > 10 > 0.1 > level["sky"]
+
+
+class Plain(Operator):
+    """Adds up the components, whatever their names; a mean that stands beside one is in it."""
+
+    optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere", "white", "pink"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    linear: ClassVar[bool] = True
+
+    def exec(self, block: Block, state: object) -> None:
+        names = block.entering("at the detector") + [n for n in block.entering("above the atmosphere") if n != "transmission"]
+        block.new("signal")[...] = sum(block.detdata[name] for name in names)
+
+
+def test_a_step_that_forms_signals_and_does_not_know_of_means_is_told_the_components():
+    operators = [*steps()[:3], Plain(), zonda.BinMap(pixel="8 arcsec")]
+    _, data = observed(operators, {"air": {"only": ["atmosphere"]}}, scans=1, precision="float64")
+    level = {name: np.nanmean(data.products[f"{name}map"].signal) for name in ("", "air/")}
+    assert level[""] == pytest.approx(level["air/"], rel=1e-3)
+    assert level["air/"] > 10
+
+
 def test_instantaneous_calibration_divides_the_signals_that_have_the_transmission():
     """(1 + x) is in the sky and divided out: `full` is then what `own` modes are without x, to rounding."""
     operators = steps()
@@ -249,6 +284,18 @@ def test_what_is_not_finite_in_one_signal_is_in_none(filters):
     assert np.nanmax(abs(sky.signal + rest.signal - whole.signal)) < 4 * 2.0**-36
 
 
+def test_a_filter_bridges_the_same_gaps_in_all_signals():
+    """The mask is shared before the filter: what is formed of a part is the remainder of the others, behind it too (float64)."""
+    operators = steps(HIGHPASS)
+    operators.insert(2, Gaps())
+    _, both = observed(operators, BOTH, precision="float64", keep=("signal", "signal/sky"))
+    _, formed = observed(operators, {"rest": REST}, precision="float64")
+    whole, sky = (both.observations[0].detdata[name] for name in ("signal", "signal/sky"))
+    assert np.isnan(sky).any()
+    assert np.array_equal(np.isnan(whole), np.isnan(sky))
+    assert np.nanmax(abs(both.products["rest/map"].signal - formed.products["rest/map"].signal)) < 4 * 2.0**-36
+
+
 class Holes(Operator):
     """Puts NaN where the signal looks like glitches, in each signal elsewhere: it is not linear."""
 
@@ -270,6 +317,15 @@ def test_a_step_that_is_not_linear_acts_on_each_signal_and_they_share_its_mask()
     assert 0 < whole.hits.sum() < 0.99 * 2 * 19 * 6000
     assert same(whole, sky, "hits")
     assert same(whole, rest, "hits")
+
+
+def test_unfiltered_signals_share_the_mask_of_the_filters_in_maps_with_noise_of_their_own():
+    """Hits are those of all signals: what a filter spoils in others is not added up in the unfiltered one either."""
+    runs = {"raw": {"only": ["sky"], "filters": "none"}}
+    _, net = observed(steps(HIGHPASS, Holes()), runs)
+    _, scatter = observed(steps(HIGHPASS, Holes(), noise="scatter"), runs)
+    assert net.products["map"].hits.sum() < 0.99 * 2 * 19 * 6000
+    assert same(net.products["raw/map"], scatter.products["raw/map"], "signal", "hits")
 
 
 # ---- measuring, on streams that are given
@@ -448,6 +504,50 @@ def test_a_third_party_step_is_told_what_it_found_in_the_complete_data():
     np.testing.assert_array_equal(own.products["signal/sky"], sky)
 
 
+class Centred(Operator):
+    """Subtracts the mean of a component over all samples."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"white"})
+    provides: ClassVar[frozenset[str]] = frozenset({"white"})
+    couples: ClassVar = "all"
+
+    def measure(self, stream, model=None):
+        assert model is None
+        return float(stream.array.mean())
+
+    def exec(self, block: Block, state: float) -> None:
+        block.detdata["white"] -= state
+
+
+class Peak(Operator):
+    """Reads the signal twice: its peak, and how many samples come near it."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"near"})
+    couples: ClassVar = "all"
+    _measured: list[str] = PrivateAttr(default_factory=list)
+    _near: int = PrivateAttr(0)
+
+    def measure(self, stream, model=None):
+        self._measured.append(stream.signal)
+        return float(stream.array.max())
+
+    def exec(self, block: Block, state: float) -> None:
+        self._near += int((block.detdata["signal"] > 0.9 * state).sum())
+
+    def finalize(self, data: Data) -> None:
+        data.products["near"] = self._near, self._measured
+
+
+def test_exec_is_given_what_was_found_in_a_component_or_in_the_complete_signal():
+    sky, noise = streams(dead=False)
+    given = chain(dead=False)
+    data = run([*given[:2], Centred(), given[2], Peak(), Keep()])
+    whole = sky + (noise - noise.mean())
+    np.testing.assert_allclose(data.products["signal"], whole, rtol=0, atol=1e-12)
+    assert data.products["near"] == (int((data.products["signal"] > 0.9 * data.products["signal"].max()).sum()), ["signal"])
+
+
 def test_the_complete_signal_decides_which_detectors_are_dead():
     """Detector 4 has no noise and no sky: dead. In the sky alone detector 5, which sees nothing, is a valid zero."""
     operators = chain(zonda.CommonModeFilter(), dead=False)
@@ -538,6 +638,63 @@ def test_narrowed_to_the_noise_its_level_is_that_of_the_scene():
     assert same(full.products["white/map"], narrow.products["map"], "signal", "noise")
     assert "sky/map" not in narrow.products
     assert pipeline.signals.all["white"].components == {"white", "transmission"}
+
+
+class Template(Operator):
+    """A stream that is no component."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({"template"})
+
+    def exec(self, block: Block, state: object) -> None:
+        block.new("template")[...] = np.sin(np.arange(block.samples.start, block.samples.stop) / 300)
+
+
+class Responds(Operator):
+    """A gain that follows the template."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal", "template"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    linear: ClassVar[bool] = True
+
+    def exec(self, block: Block, state: object) -> None:
+        block.detdata["signal"] *= 1 + 0.01 * block.detdata["template"]
+
+
+def test_a_signal_that_is_made_again_alone_has_what_its_filters_read(monkeypatch):
+    """Streams that do not fit in memory are swept, one signal after the other, through filters that read other streams."""
+    operators = [Template(), *steps(Responds(), *FILTERS["mean"])]
+    _, ample = observed(operators, BOTH, scans=1, threads=1)
+    monkeypatch.setattr("zonda.core.run.schedule.Schedule._keeps", lambda *arguments: False)
+    monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 0)
+    _, tight = observed(operators, BOTH, scans=1, threads=1)
+    assert any("made again" in what for _, what, _ in tight.tally)
+    for name in ("map", "sky/map", "rest/map"):
+        assert same(ample.products[name], tight.products[name], "signal", "hits")
+
+
+class Smear(Operator):
+    """The mean of a sample of the sky and its neighbours."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"sky"})
+    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+
+    def halo(self, observation: Observation) -> int:
+        return 2
+
+    def exec(self, block: Block, state: object) -> None:
+        padded = np.pad(block.detdata["sky"], ((0, 0), (2, 2)), mode="edge")
+        block.detdata["sky"][...] = sum(padded[:, k : k + block.shape[1]] for k in range(5)) / 5
+
+
+def test_an_unfiltered_signal_whose_components_need_neighbours_is_held(monkeypatch):
+    runs = {"raw": {"only": ["sky"], "filters": "none"}}
+    operators = [Smear(), *steps(*FILTERS["modes"])]
+    _, ample = observed(operators, runs, memory=1 << 30)
+    monkeypatch.setattr("zonda.core.run.schedule.AMPLE", np.inf)
+    monkeypatch.setattr("zonda.core.run.blocks.PIECE", 2048)
+    _, tight = observed(operators, runs)
+    assert same(tight.products["raw/map"], ample.products["raw/map"], "signal", "hits")
 
 
 # ---- components with names of their own
