@@ -1,8 +1,8 @@
 """A second process that draws while this one computes: matplotlib holds Python's lock, so a thread would not do.
 
-It is a child that hears from nobody but its parent, through pipes, and ends with it. When it is ready it makes a twin of itself
-(Linux), so that two pictures are drawn at a time. Whatever goes wrong there (no processes allowed, killed for memory, a warning
-or an error while drawing) is no matter: the caller draws the picture itself.
+It is a child that hears from nobody but its parent, through pipes, and ends with it. On Linux it has two processes of its own,
+made when all is imported, so that two pictures are drawn at a time. Whatever goes wrong there (no processes allowed, killed for
+memory, a warning or an error while drawing) is no matter: the caller draws the picture itself.
 """
 
 from __future__ import annotations
@@ -13,69 +13,54 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from queue import SimpleQueue
-from threading import Thread
-from typing import Any, BinaryIO
+from threading import Event, Lock, Thread
+from typing import IO, Any
 
 from zonda.core import children
 
-LAID_IN = (1, 2, 1, 2, 2, 1, 2, 4)
-"""Numbers of axes of the figures that are made ahead, for the pictures of a run with a noiseless and a source-free one."""
-
-Tasks = SimpleQueue[tuple[Future[Any], Any] | None]
+Calls = SimpleQueue[tuple[Future[Any], Any] | None]
+Waiting = dict[int, Future[Any]]
 
 
 class Artist:
-    """Calls functions of modules in a second process and its twin, in the order in which they are submitted.
+    """Calls functions of modules in a second process, in the order in which they are submitted.
 
     Raises OSError where there can be no such process.
     """
 
     def __init__(self) -> None:
         self._closed = False
-        twin = [*os.pipe(), *os.pipe()] if sys.platform == "linux" else []
-        theirs, ours = twin[::3], twin[1:3]
-        try:
-            self._process = subprocess.Popen(
-                children.command("zonda.operators.diagnostics.artist", "serve", *theirs),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C is the parent's affair
-                pass_fds=theirs,
-            )
-        except BaseException:
-            for end in ours:
-                os.close(end)
-            raise
-        finally:
-            for end in theirs:
-                os.close(end)
+        self._process = subprocess.Popen(
+            children.command("zonda.operators.diagnostics.artist", "serve"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is the parent's affair
+        )
+        self._calls: Calls = SimpleQueue()
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._tasks: Tasks = SimpleQueue()
-        others: list[str] = ["twin"] if twin else []
-        lines = [(self._process.stdin, self._process.stdout, False)]
-        lines += [(os.fdopen(ours[0], "wb"), os.fdopen(ours[1], "rb"), True)] if twin else []
-        for outbox, inbox, later in lines:
-            Thread(target=_converse, args=(outbox, inbox, self._tasks, others, later), name="artist", daemon=True).start()
+        waiting, ended = Waiting(), Event()
+        for line in (partial(_ask, self._process.stdin, self._calls), partial(_hear, self._process.stdout)):
+            Thread(target=line, args=(waiting, ended), name="artist", daemon=True).start()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """What ``function(*arguments)`` returned there; None where it failed, warned, or there is no process any more."""
         future: Future[Any] = Future()
         if self._closed:
             future.set_result(None)
-            return future
-        self._tasks.put((future, (function, arguments)))
+        else:
+            self._calls.put((future, (function, arguments)))
         return future
 
     def close(self) -> None:
-        """End the process and its twin; the rest of the answers are None."""
+        """End the process and its children; the rest of the answers are None."""
         self._closed = True
-        for _ in range(2):
-            self._tasks.put(None)
+        self._calls.put(None)
         if self._process.returncode is None:  # nobody has waited for it: dead or not, the group's number is still its own
             if hasattr(os, "killpg"):
                 with suppress(OSError):
@@ -89,78 +74,81 @@ class Artist:
             self.close()
 
 
-def _converse(outbox: BinaryIO, inbox: BinaryIO, tasks: Tasks, others: list[str], later: bool) -> None:
-    """Send tasks and receive answers, one by one. A daemon's work: nobody waits for it where the run fails.
+def _ask(outbox: IO[bytes], calls: Calls, waiting: Waiting, ended: Event) -> None:
+    """Send calls. A daemon's work, as `_hear`: nobody waits for it where the run fails."""
+    while (call := calls.get()) is not None:
+        future, task = call
+        waiting[id(future)] = future
+        try:
+            pickle.dump((id(future), pickle.dumps(task, pickle.HIGHEST_PROTOCOL)), outbox, pickle.HIGHEST_PROTOCOL)
+            outbox.flush()
+        except Exception:  # something that cannot be pickled, or nobody there
+            _answer(waiting, id(future), None)
+        if ended.is_set():
+            _answer(waiting, id(future), None)
+    with suppress(OSError):
+        outbox.close()
 
-    ``others``: who goes on where this line is dead; nobody: the answers are None. ``later``: the other end says when it is there.
-    """
-    dead = later and not inbox.read(1)
-    while not (dead and _leaves(others)) and (task := tasks.get()) is not None:
-        future, call = task
-        answer = None
-        with suppress(Exception):  # something that cannot be pickled
-            body = pickle.dumps(call, protocol=pickle.HIGHEST_PROTOCOL)
-            try:
-                outbox.write(body)
-                outbox.flush()
-                answer = pickle.load(inbox)
-            except (OSError, EOFError):
-                dead = True
+
+def _hear(inbox: IO[bytes], waiting: Waiting, ended: Event) -> None:
+    """Receive answers until the other end hangs up; the rest of them are None."""
+    with suppress(Exception):
+        while True:
+            key, body = pickle.load(inbox)
+            _answer(waiting, key, pickle.loads(body))
+    ended.set()
+    for key in list(waiting):
+        _answer(waiting, key, None)
+    inbox.close()
+
+
+def _answer(waiting: Waiting, key: int, answer: Any) -> None:
+    if (future := waiting.pop(key, None)) is not None:
         future.set_result(answer)
-    for pipe in (inbox, outbox):
-        with suppress(OSError):
-            pipe.close()
 
 
-def _leaves(others: list[str]) -> bool:
-    """Whether somebody else goes on; may be true once."""
-    with suppress(IndexError):
-        others.pop()
-        return True
-    return False
+def serve() -> None:
+    """The child's side: until the parent hangs up."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
 
-
-def serve(*twin: int) -> None:
-    """The child's side: until the parent hangs up. ``twin``: where a twin of this process reads and writes."""
-    inbox, outbox = sys.stdin.buffer, sys.stdout.buffer
+    inbox, outbox, lock = sys.stdin.buffer, sys.stdout.buffer, Lock()
     sys.stdout = sys.stderr  # what anybody prints must not come between
     _prepare()
-    if twin:
-        _divide(*twin)
-    while _answer(inbox, outbox):
-        pass
+    if sys.platform == "linux":
+        pool: Executor = ProcessPoolExecutor(2, get_context("fork"), _hang_up)
+    else:
+        pool = ThreadPoolExecutor(1)
+
+    def reply(key: int, done: Future[bytes]) -> None:
+        with lock:
+            pickle.dump((key, pickle.dumps(None) if done.exception() else done.result()), outbox)
+            outbox.flush()
+
+    with suppress(EOFError):
+        while True:
+            key, task = pickle.load(inbox)
+            pool.submit(_draw, task).add_done_callback(partial(reply, key))
 
 
-def _answer(inbox: BinaryIO, outbox: BinaryIO) -> bool:
-    """One task; False: the parent has hung up."""
+def _hang_up() -> None:
+    """Leave the pipes to the process that listens to them."""
+    for pipe in (0, 1):
+        os.dup2(2, pipe)
+
+
+def _draw(task: bytes) -> bytes:
+    """The answer to one call."""
     import warnings
 
-    try:
-        function, arguments = pickle.load(inbox)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            answer = function(*arguments)
-    except EOFError:
-        return False
-    except Exception:
-        answer = None
-    _send(outbox, answer)
-    return True
-
-
-def _divide(reads: int, writes: int) -> None:
-    """Make a twin of this process, which reads and writes there instead, and says so."""
-    with suppress(OSError):
-        if os.fork() == 0:
-            os.dup2(reads, 0)
-            os.dup2(writes, 1)
-            os.write(1, b"!")
-    os.close(reads)
-    os.close(writes)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        function, arguments = pickle.loads(task)
+        return pickle.dumps(function(*arguments), pickle.HIGHEST_PROTOCOL)
 
 
 def _prepare() -> None:
-    """Import and make what drawing needs while the parent has nothing to draw yet."""
+    """Import what drawing needs while the parent has nothing to draw yet."""
     import gc
     from importlib import import_module
 
@@ -171,17 +159,4 @@ def _prepare() -> None:
         with suppress(Exception):
             import_module(name)
     gc.freeze()
-    with suppress(Exception):
-        lay_in = import_module("zonda.operators.diagnostics.canvas").lay_in
-        for count in LAID_IN:
-            lay_in(count)
     gc.enable()
-
-
-def _send(outbox: BinaryIO, answer: Any) -> None:
-    try:
-        body = pickle.dumps(answer, protocol=pickle.HIGHEST_PROTOCOL)
-    except Exception:
-        body = pickle.dumps(None)
-    outbox.write(body)
-    outbox.flush()

@@ -9,19 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .quick_axis import prepare
-
 LEVEL = 2
 """Of zlib: higher ones save some per cent of the bytes and double the time."""
 
 
 def png_of(ax: Any) -> bytes:
-    """The figure of ``ax``, drawn once: without the rehearsal and the opaque alpha channel of ``figure.savefig``. Nothing but
-    this may be done with it afterwards: its axes and images are simplified."""
+    """The figure of ``ax``, drawn once: without the rehearsal and the opaque alpha channel of ``figure.savefig``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(ax.figure)
-    prepare(ax.figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
     return encoded(pixels, ax.figure.dpi, {"Software": "zonda"})

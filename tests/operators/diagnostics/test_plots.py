@@ -17,11 +17,10 @@ from matplotlib.text import Text
 from zonda.core.errors import OutputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.operators.diagnostics import canvas, pictures
+from zonda.operators.diagnostics import pictures
 from zonda.operators.diagnostics.healpix_plane import on_plane
 from zonda.operators.diagnostics.plot_operators import Plots, _flat
 from zonda.operators.diagnostics.plots import map_axes, plot_coverage, plot_map, plot_scan, plot_spectra, plot_tod, plot_transfer
-from zonda.operators.diagnostics.png import png_of
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 from zonda.operators.diagnostics.sky_axes import SkyAxes
 from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
@@ -581,17 +580,3 @@ def test_maps_side_by_side_have_their_latitudes_written_once(values, wcs):
     assert first.get_position().width == pytest.approx(second.get_position().width)
     assert second.get_position().x1 < 1
     assert second.bar_axes.get_position().x1 < 1
-
-
-def test_figures_made_ahead_have_the_same_pixels_and_are_used_once(values, wcs, spectrum, stream):
-    def every():
-        sides = map_axes(values.shape, SkyAxes.of(wcs), 2)
-        made = [plot_map(values, SkyAxes.of(wcs), fwhm=9 * ARCSEC), plot_spectra(spectrum), plot_tod(stream)]
-        return [png_of(ax) for ax in [plot_map(values, SkyAxes.of(wcs), ax=sides[1]), *made]]
-
-    plain = every()
-    for count in (1, 1, 2, 4):
-        canvas.lay_in(count)
-    assert every() == plain
-    assert not any(canvas._ready.values())
-    assert every() == plain

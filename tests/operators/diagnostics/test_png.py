@@ -35,31 +35,13 @@ def figure(kind):
     elif kind == "log":
         ax.loglog(x, x**3)
         ax.grid(which="both")
-    elif kind == "offset":
-        ax.plot(x, 1e-7 * x + 1e6)
-        ax.invert_xaxis()
-    elif kind == "other edges":
-        ax.plot(x, x)
-        ax.xaxis.tick_top()
-        ax.xaxis.set_label_position("top")
-        ax.yaxis.tick_right()
-        ax.yaxis.set_label_position("right")
-    elif kind == "no labels":
-        ax.tick_params(labelbottom=False, labelleft=False, direction="inout", length=9)
-    elif kind == "hidden":
-        ax.yaxis.set_visible(False)
-        ax.set_xticks([])
-    elif kind == "minor":
-        ax.plot(x, x)
-        ax.minorticks_on()
-        ax.tick_params(which="both", top=True, right=True, labelright=True)
     ax.set_xlabel("abscissa")
     ax.set_ylabel("ordinate")
     ax.set_title("A title")
     return drawn
 
 
-@pytest.mark.parametrize("kind", ["image", "log", "offset", "other edges", "no labels", "hidden", "minor"])
+@pytest.mark.parametrize("kind", ["image", "log"])
 def test_the_pixels_are_those_of_savefig(kind):
     stream = io.BytesIO()
     figure(kind).savefig(stream, format="png")
