@@ -32,7 +32,7 @@ class SkySignal(Operator):
 
     @property
     def label(self) -> str:
-        """In timings."""
+        """Its name in timings."""
         return "(sky as signal)"
 
     def exec(self, block: Block, state: Any) -> None:

@@ -237,7 +237,7 @@ class Pipeline:
     def _execute(
         self, data: Data, settings: Settings, keep: tuple[str, ...], timer: Timer, memory: int | None, fresh: bool = True
     ) -> None:
-        """All observations, one after the other; the next is prepared meanwhile."""
+        """Run all observations in order; the next one is prepared while one is executed."""
         if not data.observations:
             raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
         hooks, chain = manager().hook, replace(self.chain, keep=keep)
@@ -303,7 +303,7 @@ class Pipeline:
                 operator.watch(data, done)
 
     def _timed(self, timer: Timer, operator: Operator, stage: Literal["observe", "finalize"], data: Data) -> None:
-        """One call of an operator with all data, timed; who listens is told of ``finalize``."""
+        """Call an operator with all data and time it; hooks are called around ``finalize``."""
         hooks = manager().hook
         if stage == "finalize":
             hooks.zonda_before_operator(operator=operator, observation=None, stage=stage)

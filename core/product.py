@@ -30,7 +30,7 @@ class Product(ABC):
 
     @abstractmethod
     def arrays(self) -> Mapping[str, Any]:
-        """All of it as plain values (numbers, texts, lists and mappings of these) and numpy arrays."""
+        """Its content as plain values (numbers, texts, lists and mappings of these) and numpy arrays."""
 
     @classmethod
     @abstractmethod

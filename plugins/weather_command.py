@@ -1,4 +1,4 @@
-"""``zonda weather``: the air above a site, printed and drawn; ``zonda weather fetch``: ERA5 from the Climate Data Store.
+"""``zonda weather``: the atmosphere above a site, printed and drawn; ``zonda weather fetch``: ERA5 from the Climate Data Store.
 
 Only click is imported with this module; each command imports what it needs.
 """
@@ -28,7 +28,7 @@ class WithDefault(click.Group):
 
 @click.group(cls=WithDefault, subcommand_metavar="SITE [OPTIONS] | fetch SITE [OPTIONS]")
 def weather() -> None:
-    """Show the air above a site: profile, water, and what instruments see of it; `fetch` gets ERA5.
+    """Show the atmosphere above a site: profile, PWV, and what instruments see; `fetch` gets ERA5.
 
     SITE is a registered name (`zonda plugins`), or 'latitude, longitude, altitude', e.g. '46.5 deg, 8 deg, 3500 m'.
     """
@@ -46,8 +46,8 @@ _time = click.option("--time", metavar="TIME", help="UTC unless it carries an of
 @_time
 @click.option("--instrument", "instruments", multiple=True, metavar="NAME", help="Whose bands to show; may be repeated.")
 @click.option("--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]")
-@click.option("--file", metavar="FILE.nc", help="ERA5 file to take the air from, instead of the climatology.")
-@click.option("--table", metavar="FILE.csv", help="Table to take the air from, instead of the climatology.")
+@click.option("--file", metavar="FILE.nc", help="ERA5 file to take the weather from, instead of the climatology.")
+@click.option("--table", metavar="FILE.csv", help="Table to take the weather from, instead of the climatology.")
 @click.option("--elevation", default="90 deg", show_default=True, metavar="ANGLE", help="Of the line of sight.")
 @click.option("--seed", default=0, show_default=True, help="Of a random PWV.")
 @click.option(
@@ -64,7 +64,7 @@ def show(
     seed: int,
     output: Path | None,
 ) -> None:
-    """Print the profile, the water by month and hour, and what bands see; draw them (also as PDF or SVG)."""
+    """Print the profile, the PWV by month and hour, and what bands see; draw them (also as PDF or SVG)."""
     from zonda.core import registry, weather
     from zonda.core.configuration.units import Unit
     from zonda.core.storage.files import atomic_path, product_path

@@ -1,4 +1,4 @@
-"""Pictures of the air above a site: profile, water by month and hour, spectra with the bands of instruments."""
+"""Pictures of the atmosphere above a site: profile, PWV by month and hour, spectra with the bands of instruments."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LINE_COLOURS = {"H₂O": "#0072B2", "O₂": "#D55E00", "O₃": "#009E73"}
 
 
 def plot_profile(air: Profile, ax: Any = None) -> Any:
-    """Temperature, and on a second scale water and wind, up to 20 km above the site."""
+    """Temperature, and on a second scale water vapour and wind, up to 20 km above the site."""
     ax = _axes(ax)
     low = air.height <= 20e3
     km = air.height[low] / 1e3
@@ -149,7 +149,7 @@ def spread(places: Sequence[float], least: float, low: float, high: float) -> li
 def weather_figure(
     title: str, air: Profile, water: PwvByMonth | None, elevation: float = math.pi / 2, bands: Sequence[Band] = ()
 ) -> Figure:
-    """Profile, water by month and hour (where it is known), emission and transmission: one figure, not pyplot's."""
+    """Profile, PWV by month and hour (where it is known), emission and transmission: one figure, not pyplot's."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 9.5), dpi=110, layout="constrained")
@@ -160,7 +160,7 @@ def weather_figure(
         plot_pwv(water, axes[0, 1])
     else:
         axes[0, 1].set_axis_off()
-        axes[0, 1].text(0.5, 0.5, "no climatology here: no water by month", ha="center")
+        axes[0, 1].text(0.5, 0.5, "no climatology here: no PWV by month", ha="center")
     plot_spectrum(air, elevation, bands, "brightness", axes[1, 0])
     plot_spectrum(air, elevation, bands, "transmission", axes[1, 1])
     figure.legend(*axes[1, 1].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)

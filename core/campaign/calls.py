@@ -42,7 +42,7 @@ class Work(ABC, Generic[T, R]):
 
     @abstractmethod
     def began(self, items: list[T]) -> None:
-        """They are about to be sent."""
+        """Record that these calls are about to be sent."""
 
     @abstractmethod
     def ended(self, item: T, result: R | Lost) -> bool:

@@ -166,7 +166,7 @@ def _campaign_of(job: Job) -> Campaign:
 
 @contextlib.contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
-    """On an interrupt of a campaign that has begun, show the command that resumes it."""
+    """Show the command that resumes a campaign when that is interrupted."""
     from .job import FILE
 
     try:
@@ -230,7 +230,7 @@ def _lines(job: Job, table: Table, listed: bool) -> list[str]:
 
 
 def _machines(done: Table) -> list[str]:
-    """On what the tasks ran."""
+    """The machines that the tasks ran on."""
     from .job import plural
     from .machines import EFFECT, differences, kinds, short
 

@@ -83,7 +83,7 @@ class Task:
         return f"{self.number:06d}-{self.key[:16]}.npz"
 
     def path(self, folder: Path) -> Path:
-        """Of its partial product, in the campaign's folder."""
+        """Path of its partial product, in the campaign's folder."""
         return folder / TASKS / self.product
 
 
@@ -132,7 +132,7 @@ class Job:
 
     @property
     def samples(self) -> int:
-        """Of all tasks."""
+        """Number of samples of all tasks."""
         return sum(task.samples for task in self.tasks)
 
     @property
@@ -150,11 +150,11 @@ class Job:
         return {task.combination for task in self.tasks if task.number not in done}
 
     def tasks_of(self, combination: int) -> list[Task]:
-        """In the order of the reduction."""
+        """The tasks of a combination, in the order of the reduction."""
         return [task for task in self.tasks if task.combination == combination]
 
     def write(self, folder: Path) -> None:
-        """Into its folder, atomically. Raises `OutputError`."""
+        """Write it to its folder, atomically. Raises `OutputError`."""
         text = json.dumps({"format": FORMAT, **asdict(self)}, indent=None, separators=(",", ":"))
         write_text(folder / FILE, json.dumps({"digest": digest_of_text(text)}) + "\n" + text + "\n")
 
@@ -197,7 +197,7 @@ def key_of(version: str, pipeline: str, seed: int, time: int, scans: tuple[int, 
 
 
 def _inside(folder: str) -> bool:
-    """Whether a relative path stays in its folder by its letters."""
+    """Whether a relative path, read as text, stays inside its folder."""
     return not Path(folder).is_absolute() and ".." not in Path(folder).parts and "\0" not in folder
 
 

@@ -71,7 +71,7 @@ class Log:
                 self._db.execute(f"CREATE TABLE IF NOT EXISTS {table}")
 
     def check(self) -> None:
-        """Raise `InputError` where the file is damaged, also where nobody has read yet."""
+        """Read the whole file; raise `InputError` where it is damaged."""
         with self._errors():
             found = [str(row[0]) for row in self._db.execute("PRAGMA integrity_check")]
             if found != ["ok"]:
@@ -82,11 +82,11 @@ class Log:
         with self._errors():
             found: dict[int, str] = dict(self._db.execute("SELECT number, layout FROM combined"))
             if not found.items() <= layouts.items():
-                raise sqlite3.DatabaseError("it names what is no set of products of this campaign")
+                raise sqlite3.DatabaseError("it names products that are not of this campaign")
             return set(found)
 
     def combine(self, number: int, layout: str) -> None:
-        """A combination's products are written."""
+        """Record that a combination's products are written."""
         self._write("INSERT OR IGNORE INTO combined VALUES (?, ?)", [(number, layout)])
 
     def begin(self, numbers: Iterable[int]) -> None:
@@ -94,11 +94,11 @@ class Log:
         self._write("INSERT OR IGNORE INTO tasks VALUES (?, 'waiting', 0, '', '', 0, '', 0)", ((n,) for n in numbers))
 
     def claim(self, numbers: Iterable[int]) -> None:
-        """Tasks are given to workers."""
+        """Record that tasks are given to workers."""
         self._write("UPDATE tasks SET state = 'claimed', attempts = attempts + 1 WHERE number = ?", ((n,) for n in numbers))
 
     def done(self, number: int, host: str, seconds: float, digest: str, machine: str = "") -> None:
-        """A task's product is there."""
+        """Record that a task's product is complete."""
         with self.together():
             self._write("INSERT OR IGNORE INTO machines (text) VALUES (?)", [(machine,)])
             self._write(
@@ -190,12 +190,12 @@ def _rows(database: sqlite3.Connection) -> list[TaskRow]:
     found = [TaskRow(*values) for values in database.execute(query)]
     kinds = (int, str, int, str, str, float | int, str, str)
     if any(row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found):
-        raise sqlite3.DatabaseError("it holds what is no state of a task")
+        raise sqlite3.DatabaseError("it holds an unknown state of a task")
     return found
 
 
 def _error(err: Exception, path: Path) -> Exception:
-    """Of the disk, or of another process that holds the file, `OutputError`; all else is damage."""
+    """`OutputError` for a fault of the disk or a locked file; `InputError` (damaged) for all else."""
     kind = (getattr(err, "sqlite_errorname", None) or "").removeprefix("SQLITE_").partition("_")[0]
     number = {"FULL": errno.ENOSPC, "READONLY": errno.EROFS, "PERM": errno.EACCES}.get(kind)
     of_the_header = kind == "READONLY" and os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)

@@ -48,7 +48,7 @@ def share_out(pool: Pool, need: int, place: str) -> None:
 
 
 def _each(pool: Pool, need: int, place: str) -> None:
-    """Where every process has a budget of its own."""
+    """Budgets where every process has one of its own."""
     if pool.memory is not None and pool.memory < need and pool.asked is None:
         pool.memory = None  # half of a share: the task may have more, if that is free where it runs
     if pool.memory is not None and pool.memory < need:

@@ -84,13 +84,13 @@ class Partial:
         return self
 
     def write(self, path: Path, identity: str) -> str:
-        """Into a file; its digest."""
+        """Write it to a file; return the digest."""
         products = {label: {"kind": type(p).__name__, "arrays": p.arrays()} for label, p in self.products.items()}
         return parts.write(path, identity, {"products": products, "scans": self.scans, "tally": _rows(self.tally)})
 
     @classmethod
     def read(cls, path: Path, identity: str, digest: str) -> Partial:
-        """From a file. Raises `InputError` where it is missing or damaged."""
+        """Read it from a file. Raises `InputError` where that is missing or damaged."""
         tree = parts.read(path, identity, digest)
         products = {label: registry.products.get(p["kind"]).of(p["arrays"]) for label, p in tree["products"].items()}
         return cls(products, _tally(tree["tally"]), tree["scans"])
@@ -126,7 +126,7 @@ class Thinned(Observation):
 
     @classmethod
     def made(cls, scan: dict[str, Any], index: int, scene: Scene, plane: Focalplane) -> Thinned:
-        """From what `_thinned` kept."""
+        """Restore a scan from what `_thinned` kept."""
         samples, detectors = (np.ones(number, np.uint8) for number in scan["flagged"])
         own = {k: v for k, v in scan.items() if k not in ("start", "centre", "focal_plane", "flagged")}
         return cls(

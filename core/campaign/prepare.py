@@ -38,7 +38,7 @@ class CampaignFile:
 
     @property
     def campaign(self) -> Campaign:
-        """Its own, or one of a single entry."""
+        """The file's campaign, or one of a single entry."""
         return self.file.header.campaign or Campaign()
 
 
@@ -52,7 +52,7 @@ class Look:
     place: str
 
     def scene(self, files: Sequence[PipelineFile]) -> Scene:
-        """Of one of these files, at its time."""
+        """The scene of one of these files, at its time."""
         return scene_of(files[self.pipeline], self.seed, self.time)
 
 
@@ -119,7 +119,7 @@ class _Draft:
         self._entries = 0
 
     def add(self, source: CampaignFile) -> None:
-        """All entries of a pipeline file."""
+        """Add all entries of a pipeline file."""
         found = _entries(source)
         self.inputs |= _inputs(source.file)
         together: dict[str, list[tuple[int, Entry]]] = {}

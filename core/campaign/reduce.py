@@ -71,7 +71,7 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
 
 
 def _sum(tasks: Sequence[Task], folder: Path, digests: Mapping[int, str], first: int, level: int) -> Partial:
-    """Of ``FAN**level`` parts from the ``first`` on; one sum is held for each level."""
+    """Sum of ``FAN**level`` parts from the ``first`` on; one sum is held for each level."""
     if level == 0:
         task = tasks[first]
         return Partial.read(task.path(folder), task.key, digests[task.number])

@@ -1,4 +1,4 @@
-"""`zonda plan --audit`: does what was left out stay within its bound?
+"""`zonda plan --audit`: do the omitted effects stay within their bounds?
 
 A slice of the scan, short enough for its cost, is simulated in full, and once more for each effect that the plan drops or
 coarsens, with the same random numbers, through the same filters. The bounds are those that the operators state for the slice. An
@@ -93,7 +93,7 @@ class Checked:
 
     @property
     def verdict(self) -> str:
-        """In words."""
+        """The verdict in words."""
         if self.within is not None:
             return "DISAGREES" if self.violated else "agrees"
         return "VIOLATED" if self.violated else "holds" if self.exercised else "not exercised"

@@ -1,4 +1,4 @@
-"""What an operator tells the planner: how large its effects are, what coarser forms would err by, what they cost."""
+"""Estimates of an operator for the planner: the size of its effects, the errors of coarser forms, their costs."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Effect:
-    """Something that the sky, the air, the telescope or the arithmetic does to the products.
+    """Something that the sky, the atmosphere, the telescope or the arithmetic does to the products.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Cost:
     kernel: Literal["random", "stream", "python"] = "stream"
 
     def seconds(self, n_times: int, n_detectors: int) -> float:
-        """Of one observation in one run."""
+        """CPU seconds of one observation in one run."""
         return self.fixed + self.per_time * n_times + self.per_sample * n_times * n_detectors
 
 

@@ -26,7 +26,7 @@ def kelvin(value: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """In s, min or h."""
+    """A duration as text, in s, min or h."""
     if seconds < 120:
         return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

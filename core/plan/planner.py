@@ -1,4 +1,4 @@
-"""`zonda plan`: what a scene calls for, what each effect costs, and what is left out or coarsened within an error budget."""
+"""`zonda plan`: the effects of a scene, their costs, and which are omitted or coarsened within an error budget."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _with_savings(now: Prediction, decided: Iterable[Decided]) -> Prediction:
 def _everything_on(
     pipeline: Pipeline, everything: Structure, context: Context, estimates: Mapping[str, Estimate]
 ) -> tuple[Context, dict[str, Cost | None]]:
-    """The context and the costs of the pipeline where nothing is left out."""
+    """The context and the costs of the complete pipeline."""
     whole = dataclasses.replace(context, operators=list(pipeline.operators), work=work(pipeline, everything))
     costs: dict[str, Cost | None] = {}
     for operator in pipeline.operators:

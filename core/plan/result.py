@@ -64,7 +64,7 @@ class Plan:
         return PlanSummary(self.operators, self.structure.runs, self.settings(), short(self), self.prediction, self.unpruned)
 
     def apply(self, file: PipelineFile) -> PipelineFile:
-        """The pipeline that is run: an ordinary one, with parameters changed and operators left out."""
+        """The pipeline that is run: an ordinary one, with parameters changed and operators omitted."""
         return self.summary.apply(file)
 
     def settings(self) -> dict[str, dict[str, Any]]:
@@ -183,7 +183,7 @@ def _effects(plan: Plan, width: int) -> list[str]:
 
 
 def short(plan: Plan) -> list[tuple[str, str, str, str]]:
-    """For headers: (effect, decision, bound, formula), what is left out by structure first."""
+    """Rows for headers: (effect, decision, bound, formula), steps that are omitted by structure first."""
     found = []
     for row in plan.structure.rows:
         name = f"signal {row.run}" + (f": {row.operator}" if row.operator else "") if row.run else row.operator

@@ -25,7 +25,7 @@ STREAMS = frozenset(NAMES)
 
 @dataclass(frozen=True)
 class Row:
-    """What is left out, and why: an operator of a signal (empty: the complete one), or (``operator`` empty) a signal."""
+    """What is omitted, and why: an operator of a signal (empty: the complete one), or (``operator`` empty) a signal."""
 
     run: str
     operator: str
@@ -58,7 +58,7 @@ class Structure:
 
     @classmethod
     def of_all(cls, pipeline: Pipeline) -> Structure:
-        """Of a pipeline from which nothing is left out."""
+        """The structure of a pipeline from which nothing is omitted."""
         return cls(tuple(o.label for o in pipeline.operators), tuple(pipeline.runs), derived=remainders(pipeline, pipeline.runs))
 
 
@@ -130,7 +130,7 @@ def _takes_modes(pipeline: Pipeline, name: str) -> bool:
 
 
 def _useless(steps: Sequence[Operator], found: Mapping[str, str], wanted: set[str]) -> str:
-    """Why a signal is of no use; empty: it is of use."""
+    """Why a signal is not needed; empty: it is needed."""
     acting = [o for o in steps if o.label in found]
     if not any(_makes_something(o, wanted) for o in acting):
         made = any(o.provides - STREAMS - {"boresight"} for o in steps)
@@ -141,7 +141,7 @@ def _useless(steps: Sequence[Operator], found: Mapping[str, str], wanted: set[st
 
 
 def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
-    """(needed, left out) by label with reasons, going back through one signal's steps."""
+    """(needed, omitted) by label with reasons, going back through one signal's steps."""
     read: dict[str, str] = {}  # stream or field -> who reads it
     needed: dict[str, str] = {}
     left_out: dict[str, str] = {}
@@ -195,7 +195,7 @@ def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
 
 
 def remainders(pipeline: Pipeline, names: Iterable[str]) -> dict[str, str]:
-    """Of these signals, those that are not formed, and how they follow from others."""
+    """The remainders among these signals: those that are not formed but follow from others."""
     kept = {*names}
     return {name: remainder(parts) for name, parts in pipeline.signals.remainders.items() if {name, *parts} <= kept}
 

@@ -14,7 +14,7 @@ from .figures import duration
 
 @dataclass(frozen=True)
 class Prediction:
-    """CPU seconds by operator, memory, and the operators whose cost nobody stated."""
+    """CPU seconds by operator, memory, and the operators of unknown cost."""
 
     seconds: Mapping[str, float]
     bytes: float
@@ -52,7 +52,7 @@ class PlanSummary:
     unpruned: Prediction
 
     def apply(self, file: PipelineFile) -> PipelineFile:
-        """The pipeline that is run: an ordinary one, with parameters changed and operators left out."""
+        """The pipeline that is run: an ordinary one, with parameters changed and operators omitted."""
         return apply(file, self.operators, self.runs, self.settings)
 
     def __str__(self) -> str:

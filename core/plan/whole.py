@@ -1,4 +1,4 @@
-"""`--drop OPERATOR`: an operator that is left out altogether is charged with all that its absence changes."""
+"""`--drop OPERATOR`: the error of omitting an operator altogether, with all that its absence changes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAME = "everything"
 
 
 def without(file: PipelineFile, structure: Structure, dropped: Sequence[str]) -> Context:
-    """What the bounds are judged by where these operators (labels) are left out.
+    """The context of the bounds without these operators (labels).
 
     Raises
     ------

@@ -143,7 +143,7 @@ class BlockMaker:
     # ---- which steps act
 
     def _is_read(self, step: Operator) -> bool:
-        """Whether anybody reads one of a step's streams; a step that makes products is read by nobody, and acts."""
+        """Whether a step must act: one of its streams is read later, or it makes products."""
         streams = [n for n in step.provides if unused(n)]
         return len(streams) < len(step.provides) or any(n in self._streams for n in streams)
 

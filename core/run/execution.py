@@ -127,7 +127,7 @@ class Execution:
         self.states.clear()
 
     def _tell(self, operator: Operator, stage: str, used: float) -> None:
-        """Note CPU seconds, and tell who listens."""
+        """Note CPU seconds and call the hooks."""
         self.timer.add(operator.label, stage, used)
         self._after(operator=operator, observation=self.observation, stage=stage, seconds=used)
 

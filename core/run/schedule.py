@@ -61,7 +61,7 @@ class Chain:
 
     @property
     def read(self) -> frozenset[str]:
-        """Names of the streams that are of use: what steps read in `Operator.exec`, and what is to be kept."""
+        """Names of the streams that are needed: what steps read in `Operator.exec`, and what is to be kept."""
         names = frozenset(self.keep)
         for step in self.steps:
             if type(step).exec is not Operator.exec:
@@ -110,7 +110,7 @@ class Planned:
 
     @property
     def segment(self) -> Segment:
-        """Its steps."""
+        """The segment's steps."""
         return self.stage.segment
 
     @property

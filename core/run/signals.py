@@ -149,7 +149,7 @@ class Signals:
             operator._shown = tuple(names)
 
     def _kind(self, signal: Signal | None) -> tuple[frozenset[str], bool, bool]:
-        """What tells signals apart: steps of components, filters, whether modes and transmission are the complete data's."""
+        """What distinguishes signals: steps of components, filters, whether modes and transmission are the complete data's."""
         kept = frozenset(o.label for o in self._generators if self._keeps(signal, o))
         changing = [o for o in self.operators if filters(o)]
         filtered = signal is None or signal.filters == "all" or not changing

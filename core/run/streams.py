@@ -90,7 +90,7 @@ class Stage:
 
     @classmethod
     def without_filters(cls, steps: list[Operator], wanted: frozenset[str]) -> Stage:
-        """Of the steps up to the one that forms signals."""
+        """A stage of the steps up to the one that forms signals."""
         return cls(Segment(steps), Source(), wanted, swept=True, apart=True)
 
     @property
@@ -136,7 +136,7 @@ class Source:
 
     @classmethod
     def of(cls, streams: dict[str, Stream], means: dict[str, SmoothField]) -> Source:
-        """Of streams that are held."""
+        """A source of streams that are held."""
         return cls(streams, None, frozenset(streams), means)
 
 
@@ -171,7 +171,7 @@ class StreamMadeAgain(Stream):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of its parts."""
+        """Type of its values."""
         return self._dtype
 
     def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:

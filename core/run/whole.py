@@ -44,7 +44,7 @@ def names_of(operator: Operator, signals: Sequence[str]) -> frozenset[str]:
 
 
 def may_have_means(operators: Sequence[Operator]) -> frozenset[str]:
-    """Streams beside which a mean may stand, told before anything runs: steps that know of means put it there."""
+    """Streams beside which a mean may stand, known before anything runs: steps that know of means put it there."""
     return frozenset({EMISSION}).union(*(o.provides for o in operators if knows_means(o)))
 
 

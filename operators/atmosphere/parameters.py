@@ -27,7 +27,7 @@ class Wind(Parameters):
 
     @property
     def vector(self) -> Floats:
-        """Velocity of the air towards (east, north), m/s."""
+        """Wind velocity towards (east, north), m/s."""
         return -self.speed * np.array([math.sin(self.direction), math.cos(self.direction)])
 
 

@@ -122,7 +122,7 @@ class Calibrated:
 
     @property
     def rms(self) -> float:
-        """Of one calibrated sample, K."""
+        """Rms of one calibrated sample, K."""
         return self.kelvin * math.sqrt(sum(m.amplitude**2 * v for m, v in zip(self.layers, self.variances, strict=True)))
 
     def of_layer(self, k: int) -> float:
@@ -175,7 +175,7 @@ def _gains(observation: Observation, band: BandAtmosphere, pwv: float, elevation
 
 
 def _velocities(o: Observation, plane: ScanPlane, layers: list[Layer]) -> list[Floats]:
-    """Velocities (2, n) [m/s] of the boresight's ray relative to the air of each layer, at some instants of the scan."""
+    """Velocities (2, n) [m/s] of the boresight's ray relative to each layer, at some instants of the scan."""
     if o.n_samples < 2:
         return [np.zeros((2, 1))] * len(layers)
     at = np.unique(np.linspace(0, o.n_samples - 2, INSTANTS).astype(int))
@@ -264,7 +264,7 @@ def _in_proportion(context: Context, a: Calibrated, left: Sequence[float], share
 
 
 def _longest(context: Context, a: Calibrated) -> float:
-    """Of the layers' correlations over time, s."""
+    """Longest correlation time of the layers, s."""
     return max(_correlated(context, layer) for layer in a.layers)
 
 

@@ -143,7 +143,7 @@ class _Timing:
         self._tried: dict[int, tuple[list[float], float]] = {}
 
     def path_errors(self, step: int) -> tuple[list[float], float]:
-        """Of the position in each layer [m], and of the elevation [rad].
+        """Errors of the position in each layer [m], and of the elevation [rad].
 
         Between steps samples count as a comb: where they are none, the wind moves on by its speed times their `jitter`.
         """

@@ -131,7 +131,7 @@ class Response:
 
 
 def airmass(elevation: Floats, height: float) -> Floats:
-    """Of a spherical shell at ``height`` [m]: equation (1) of `radiative_transfer`."""
+    """Airmass of a spherical shell at ``height`` [m]: equation (1) of `radiative_transfer`."""
     return np.asarray(1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64)
 
 
@@ -146,19 +146,19 @@ def _points(n: int) -> Floats:
 
 @lru_cache
 def _to_series(n: int) -> Floats:
-    """From values at `_points` to Chebyshev coefficients, (n, n)."""
+    """Matrix (n, n) from values at `_points` to Chebyshev coefficients."""
     return np.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(_points(n), n - 1)), np.float64)
 
 
 @lru_cache
 def _vander(number: int, which: int, n: int) -> Floats:
-    """From Chebyshev coefficients to values at the points of `_ends`, (number, n)."""
+    """Matrix (number, n) from Chebyshev coefficients to values at the points of `_ends`."""
     return np.asarray(np.polynomial.chebyshev.chebvander(_ends(number)[which], n - 1), np.float64)
 
 
 @lru_cache
 def _to_powers(n: int) -> Floats:
-    """From Chebyshev to power coefficients, lowest first, (n, n)."""
+    """Matrix (n, n) from Chebyshev to power coefficients, lowest first."""
     matrix = np.zeros((n, n))
     for k in range(n):
         powers = np.polynomial.chebyshev.cheb2poly(np.eye(n)[k])

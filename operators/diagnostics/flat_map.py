@@ -87,7 +87,7 @@ class FlatMap:
         return self.header if self.axes is None else self.axes
 
     def smoothed(self, fwhm: float) -> FlatMap:
-        """As `MapProduct.smoothed`: every plane convolved with a Gaussian of ``fwhm`` [rad], weighted, empty pixels left out."""
+        """As `MapProduct.smoothed`: every plane convolved with a Gaussian of ``fwhm`` [rad], weighted, without empty pixels."""
         planes = {}
         for name, values in self.planes.items():
             use = np.isfinite(values) & (self.hits > 0)
@@ -125,5 +125,5 @@ class FlatMap:
         return math.sqrt((w * values[use].astype(np.float64) ** 2).sum() / w.sum()) if w.sum() > 0 else math.nan
 
     def _convolve(self, values: AnyFloats, fwhm: float) -> AnyFloats:
-        """With a Gaussian of ``fwhm`` [rad], in single precision."""
+        """Convolve with a Gaussian of ``fwhm`` [rad], in single precision."""
         return convolved(values, gaussian_taps(fwhm / FWHM_PER_SIGMA / self.pixel).astype(np.float32))

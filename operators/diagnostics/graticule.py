@@ -80,7 +80,7 @@ class Graticule:
 
 
 def graticule(axes: Projected, shape: tuple[int, ...], per_character: float, per_line: float) -> Graticule:
-    """Of an image (ny, nx). ``per_character``, ``per_line``: pixels that a character is wide, and a line of text is high."""
+    """The graticule of an image (ny, nx). ``per_character``, ``per_line``: width of a character, height of a line, pixels."""
     image = _Image(axes, shape, per_character, per_line)
     polar = image.polar
     if polar:

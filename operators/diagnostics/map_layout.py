@@ -92,7 +92,7 @@ def _stretched(names: tuple[str, str], sky: tuple[str, str, str], ratio: float) 
 
 
 def _marks(axes: SkyAxes | AstropyAxes, shape: tuple[int, ...], width: float, height: float) -> _Marks:
-    """Of an image that is so wide and high, in."""
+    """Tick marks of an image of this width and height, in."""
     ny, nx = shape
     lon, lat, frame = axes.names
     ticks = axes.ticks(shape, width / CHARACTER, height / LINE) if isinstance(axes, SkyAxes) else None
@@ -163,5 +163,5 @@ def _mark(ax: Any, marks: _Marks, shape: tuple[int, ...]) -> None:
 
 
 def _tick_style(marker: int) -> dict[str, Any]:
-    """Of tick marks that no axis draws."""
+    """Style of tick marks that no axis draws."""
     return {"linestyle": "none", "marker": marker, "markersize": 3.5, "markeredgewidth": 0.8, "color": "black", "clip_on": False}

@@ -46,7 +46,7 @@ class ScanTrack:
 
     @classmethod
     def of(cls, observation: Observation, most: int = 20000) -> ScanTrack:
-        """Of at most ``most`` samples, evenly spaced."""
+        """The track of a scan, from at most ``most`` evenly spaced samples."""
         from zonda.core.numerics.projection import boresights
 
         step = -(-observation.n_samples // most)

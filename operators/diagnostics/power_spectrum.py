@@ -134,7 +134,7 @@ class Periodograms:
             self.found[detector] = found
 
     def mean(self, observation: Observation) -> Spectrum | None:
-        """Of all detectors; None where there is nothing, which is counted."""
+        """Mean spectrum of all detectors; None where there is none, which is counted."""
         if self.welch is None or not any(self.found.values()):
             why = "too short for" if self.welch is None else "without a detector that has"
             observation.tally.count(self.place, f"scans {why} a power spectrum", 1)

@@ -174,7 +174,7 @@ def _scene(data: Data) -> str:
 
 
 def _net(data: Data) -> str:
-    """Of all detectors in all scans, which differ where the noise follows from the load; of a campaign, in the first."""
+    """NET of all detectors in all scans (they differ where noise follows from the load); of a campaign, in the first scan."""
     known = data.observations[:1] if "campaign" in data.provenance else data.observations
     text = spread(np.concatenate([o.focalplane.net for o in known]) * 1e3, " mK_RJ √s")
     if not has_white_noise(data):
@@ -241,7 +241,7 @@ def _tally(data: Data) -> str:
 
 
 def _plan(data: Data) -> str:
-    """What was left out, dropped or coarsened, and what that may cost (`core.plan`)."""
+    """What was omitted, dropped or coarsened, and the errors that this may cause (`core.plan`)."""
     head = ("effect", "decision", "error bound", "formula or reason")
     table = folded(list(data.provenance.get("plan", [])), head, "decisions")
     return f'<div class="steps">{table}</div>' if table else ""

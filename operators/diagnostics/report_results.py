@@ -33,7 +33,7 @@ def brightness(kelvin: float) -> str:
 
 
 def flux_density(kelvin: float, fwhm: float, data: Data) -> str:
-    """Of a point source with a flat spectrum whose peak is ``kelvin`` behind a Gaussian beam of ``fwhm`` [rad]."""
+    """Flux density of a point source with a flat spectrum whose peak is ``kelvin`` behind a Gaussian beam of ``fwhm`` [rad]."""
     jansky = kelvin / to_kelvin_rj("Jy/beam", data.scene.instrument.band, beam_solid_angle=math.pi / math.log(16) * fwhm**2)
     return scaled(jansky, ((1, "\u00a0Jy"), (1e3, "\u00a0mJy"), (1e6, "\u00a0µJy")), least=0.9995)
 

@@ -110,12 +110,12 @@ class SkyAxes:
         return float(x), float(y)
 
     def thinned(self, step: int) -> SkyAxes:
-        """Of every ``step``-th pixel, from the first."""
+        """The axes of every ``step``-th pixel, from the first."""
         x, y = self.reference
         return replace(self, reference=(x / step, y / step), matrix=self.matrix * step)
 
     def shifted(self, x: int, y: int) -> SkyAxes:
-        """Of the part of the image that begins at pixel (x, y)."""
+        """The axes of the part of the image that begins at pixel (x, y)."""
         return replace(self, reference=(self.reference[0] - x, self.reference[1] - y))
 
     def world(self, x: Any, y: Any) -> tuple[Floats, Floats]:

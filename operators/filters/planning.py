@@ -39,7 +39,7 @@ class HighpassPlanning(Planning[HighpassFilter]):
         return 120 * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost, and what fewer knots would save and err by."""
+        """Its cost, and the saving and error of fewer knots."""
         o, cut, full_q = context.first, self.operator.frequency, self.operator.oversampling
         knots = full_q * cut * o.duration
         cost = Cost(fixed=0.01, per_time=5e-8, per_sample=2e-9 + 2e-8 * knots / o.n_samples)
@@ -72,7 +72,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
     knobs = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
 
     def traits(self, observation: Observation) -> Traits:
-        """It removes what is common."""
+        """Traits of a filter that removes the common mode."""
         return Traits(removes_common=observation.n_detectors > 1)
 
     def memory(self, observation: Observation) -> int:
@@ -88,7 +88,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         return 1 if self.operator.method == "mean" else 0
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost, and what larger residuals would save and err by."""
+        """Its cost, and the saving and error of larger residuals."""
         modes, tightest, svd = self.operator.modes, self.operator.residual, self.operator.method == "svd"
         count = steps(tightest, modes, context) if svd else 1.0
         cost = Cost(fixed=0.01, per_sample=0.4e-9 + LANCZOS * count)

@@ -48,7 +48,7 @@ class Provenance:
 
     @classmethod
     def of(cls, data: Data) -> Provenance:
-        """Of a run that has ended."""
+        """Provenance of a run that has ended."""
         return cls(_origin(data), b"".join(_tables(data)))
 
 
@@ -95,7 +95,7 @@ class MapFile:
         return Cards([("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")] if degrees else ())
 
     def first(self, about: Provenance) -> Cards:
-        """Of the first header: the name, where it comes from, and its own cards."""
+        """Cards of the first header: the name, where it comes from, and its own cards."""
         return Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(about.cards)
 
     def write(self, path: Path, about: Provenance) -> Path:

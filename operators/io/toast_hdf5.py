@@ -265,7 +265,7 @@ def azimuth_elevation(boresight_azel: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
 
 
 def _read_flags(file: Any, names: list[str]) -> tuple[Flags, Flags]:
-    """Of samples and of detectors, in TOAST's bits."""
+    """Flags of samples and of detectors, in TOAST's bits."""
     shared, other = file["shared"], file["metadata/other"].attrs
     found = json.loads(file.attrs["observation_detector_flags"])
     flags = shared["flags"][:] if "flags" in shared else np.zeros(len(shared["times"]), np.uint8)

@@ -48,7 +48,7 @@ class FixedNet(NoiseModel):
 
     @classmethod
     def of(cls, level: float | None, reference: Literal["sky", "detector"]) -> FixedNet:
-        """From a checked level in K_RJ sqrt(s)."""
+        """The noise model of a checked level in K_RJ sqrt(s)."""
         return cls.model_construct(level=level, reference=reference)
 
     def net(self, observation: Observation) -> Floats:

@@ -74,7 +74,7 @@ class PinkPlanning(Planning[PinkNoise]):
         return Traits(rms=rms, faster=faster)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size and its cost; what fewer poles, or no pink noise, would save and err by."""
+        """Its size and cost; the saving and error of fewer poles, or of no pink noise."""
         pink, o = self.operator, context.lowest
         spectrum = PinkSpectrum.of(pink, o)
         if spectrum is None:

@@ -144,7 +144,7 @@ def _summary(scan: Scan, frame: str) -> str:
 
 
 def _observation(step: PointingRecorded, data: Data, scan: Scan, recording: Recording) -> Observation:
-    """Of one scan. Raises PointingError where the telescope cannot look there."""
+    """The observation of one scan. Raises PointingError where the telescope cannot look there."""
     scene = data.scene
     start = (recording.start or scene.time).shifted(float(scan.seconds[0]))
     seconds = scan.seconds - scan.seconds[0]

@@ -152,7 +152,7 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
 
 
 def longest_rising(values: Floats) -> NDArray[np.intp]:
-    """Indices of as many of ``values`` (n,) as there are in strictly rising order: what is left out is out of order, however far.
+    """Indices of the longest strictly rising subsequence of ``values`` (n,); the others are out of order, however far.
 
     Of several such choices, that whose values rise least (Schensted 1961); of equal values the first. O(n log n).
     """

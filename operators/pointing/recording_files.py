@@ -170,7 +170,7 @@ def _hdf5(path: Path, place: str) -> RecordedTable:
 
 
 def _fits_intervals(rows: Any) -> dict[str, Floats]:
-    """Of SaveTOD's table: (2, n) by name."""
+    """Intervals of SaveTOD's table: (2, n) by name."""
     if not {"NAME", "START", "STOP"} <= set(rows.names):
         return {}
     names = np.asarray(rows["NAME"]).astype(str)
@@ -219,7 +219,7 @@ def _recording(table: RecordedTable, clock: Clock, mask: int | None, place: str)
 
 
 def _flags(values: Any, bits: Literal["toast", "before", "any"], mask: int | None) -> NDArray[np.uint8]:
-    """In bits of `core.flags`. What is not a number excludes a sample."""
+    """Flags in bits of `core.flags`. A value that is not a number excludes the sample."""
     number = np.asarray(values, np.float64)
     whole = np.where(np.isfinite(number), number, 255).astype(np.int64)
     if bits == "any":

@@ -52,7 +52,7 @@ class SamplesPerBeam:
         return [(f"samples per FWHM of {self._beam}", f"{text} (not simulated: samples are instants)")]
 
     def warnings(self) -> list[str]:
-        """Where there are fewer than `FEW`."""
+        """Warnings where there are fewer than `FEW`."""
         if self.least >= FEW:
             return []
         folded = math.exp(-((math.pi * self.least) ** 2) / (16 * math.log(2)))

@@ -33,7 +33,7 @@ POOR = "grid points whose neighbours determine no third-order fit, taken as thei
 
 @dataclass(frozen=True)
 class Conversion:
-    """From the unit of a map to K_RJ.
+    """Conversion from the unit of a map to K_RJ.
 
     Attributes
     ----------

@@ -30,7 +30,7 @@ LATTICE = 17
 
 @dataclass(frozen=True)
 class Footprint:
-    """Where a map lies.
+    """Centre and extent of a map on the sky.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Footprint:
 
     @property
     def target(self) -> Target:
-        """Its centre, to 1e-9 deg: as somebody would write it."""
+        """Its centre as text, to 1e-9 deg."""
         ra, dec = np.degrees(angles(self.centre))
         return Target.parse(f"{ra:.9f} deg {dec:.9f} deg")
 

@@ -61,7 +61,7 @@ class Grid:
 
     @property
     def nbytes(self) -> int:
-        """Of the map there, and of what is kept of the file where that is another."""
+        """Bytes of the map there, and of what is kept of the file where that is another."""
         ny, nx = self.shape
         return 8 * ny * nx + (ny * nx if self.resampled else 0)
 
@@ -92,7 +92,7 @@ class Grid:
 
     @property
     def seconds(self) -> float:
-        """On the reference machine, to read the file and bring it onto the grid."""
+        """Seconds on the reference machine to read the file and bring it onto the grid."""
         size = self.source.values.size
         return (PER_VALUE * size if size > LARGE else 0.0) + self.interpolation
 

@@ -125,6 +125,6 @@ class MapFile(Operator):
         return source
 
     def _progress(self, what: str) -> Progress:
-        """Moves the progress bar."""
+        """Callback that moves the progress bar."""
         hook, text = manager().hook, f"{self.label}: {what}"
         return lambda done, total: hook.zonda_progress(done=done, total=total, what=text)

@@ -65,7 +65,7 @@ class Region:
 
 
 def region(observation: Observation, step: float, reach: float, disc: Disc | None, place: str) -> Region:
-    """Of the lattice of ``step`` [rad] about the observation's centre; one tile that is not reached where there is none.
+    """Region of the lattice of ``step`` [rad] about the observation's centre; one tile that is not reached where there is none.
 
     Parameters
     ----------

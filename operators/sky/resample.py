@@ -63,7 +63,7 @@ def _blocks(target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, th
 
 
 def no_progress(done: int, total: int) -> None:
-    """Report to nobody."""
+    """Progress callback that does nothing."""
 
 
 # ------------------------------------------------------------------------------------------------------------ images

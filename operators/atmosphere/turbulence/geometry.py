@@ -211,7 +211,7 @@ class ScanPlane:
         return across, along
 
     def affine(self, height: float, wind: Floats) -> tuple[Floats, Floats, Floats]:
-        """Of equation (2): (across, along) = matrix (2, 2) unrolled + start (2,) [m] + velocity (2,) [m/s] seconds."""
+        """Terms of equation (2): (across, along) = matrix (2, 2) unrolled + start (2,) [m] + velocity (2,) [m/s] seconds."""
         along = self.frame @ wind
         speed = float(np.hypot(*along))
         c, s = along / speed if speed > 0 else (1.0, 0.0)

@@ -152,7 +152,7 @@ def grid_error(x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[L
 
 
 def _weights_and_nearness(layers: Sequence[Layer], components: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Of the components of all layers: a_l^2 w, and z^2 / 4e."""
+    """a_l^2 w and z^2 / 4e of the components of all layers."""
     weight = np.concatenate([layer.amplitude**2 * w for layer, (_, w) in zip(layers, components, strict=True)])
     return weight, np.concatenate([layer.distance**2 / (4 * e) for layer, (e, _) in zip(layers, components, strict=True)])
 

@@ -130,7 +130,7 @@ class Profile:
 
     @cached_property
     def layers(self) -> Layers:
-        """The layers between the heights, and one more of the uppermost air up to zero pressure, for radiative transfer."""
+        """The layers between the heights, and one more up to zero pressure, for radiative transfer."""
         return Layers(
             pressure=np.append(self.pressure, 0.0),
             temperature=np.append(self.temperature, self.temperature[-1]),
@@ -287,7 +287,7 @@ def _ozone(column: Column, log_pressure: Floats) -> Floats:
 
 
 def _inverted(profile: Profile, ground_temperature: float) -> Profile:
-    """With the inversion that a temperature on the ground means; cold air there holds no more water than saturates it."""
+    """The profile with the inversion that a temperature on the ground implies; vapour is limited to saturation."""
     temperature = profile.temperature + (ground_temperature - profile.temperature[0]) * np.exp(-profile.height / INVERSION_DEPTH)
     saturated = saturation_pressure(temperature) / profile.pressure
     cold = (profile.height < 5 * INVERSION_DEPTH) & (profile.h2o > saturated)

@@ -45,7 +45,7 @@ ELEVATION_MIN, ELEVATION_MAX = math.radians(4.5), math.radians(90.0)
 
 @dataclass(frozen=True)
 class Layers:
-    """Layers of air, ground first.
+    """Layers of the atmosphere, ground first.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Layers:
         return replace(self, h2o=h2o)
 
     def cross_sections(self, cells: slice = slice(None)) -> CrossSections:
-        """Of each layer at its mean pressure and temperature (they do not depend on the water)."""
+        """Cross-sections of each layer at its mean pressure and temperature (independent of the water vapour)."""
         pressure, temperature = (self.pressure[1:] + self.pressure[:-1]) / 2, (self.temperature[1:] + self.temperature[:-1]) / 2
         return self.table.cross_sections(pressure, temperature, cells)
 

@@ -39,7 +39,7 @@ class PwvByMonth:
 
 
 def pwv_by_month(site: Site, year: int = 2023) -> PwvByMonth:
-    """From the site's climatology. Raises `InputError` where there is none."""
+    """PWV by month, from the site's climatology. Raises `InputError` where there is none."""
     median, quantiles = np.empty((12, len(HOURS))), np.zeros((12, len(QUANTILES)))
     for month in range(12):
         for k, hour in enumerate(HOURS):
@@ -99,7 +99,8 @@ def pwv_lines(water: PwvByMonth) -> list[str]:
 def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> list[str]:
     """Emission and transmission of bands at several PWVs and an elevation [rad]."""
     steps = pwv_steps(profile)
-    lines = [f"at an elevation of {math.degrees(elevation):g} deg: emission of the air (background 0 K), transmission, opacity"]
+    at = f"at an elevation of {math.degrees(elevation):g} deg"
+    lines = [f"{at}: emission of the atmosphere (background 0 K), transmission, opacity"]
     for band in bands:
         seen = BandAtmosphere(band, profile, min(max(*steps, 1e-4) * 1.01, PWV_MAX))
         lines.append(f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)")

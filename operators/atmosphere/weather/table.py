@@ -65,7 +65,7 @@ def read_table(path: Path, site: Site) -> Column:
         _limits(values, [number for number, _ in lines[1:]])
         if len(height) < 5 or height[-1] < HIGHEST:
             cause = f"has {len(height)} heights up to {height[-1]:g} m above sea level"
-            raise InputError(cause, cure=f"give at least 5, up to {HIGHEST:g} m: the water and most of the oxygen lie below")
+            raise InputError(cause, cure=f"give at least 5, up to {HIGHEST:g} m: vapour and most of the oxygen lie below")
     humidity: dict[str, Callable[[Floats], Floats]] = {
         "relative humidity": lambda x: from_relative(x, pressure, temperature),
         "vapour density": lambda x: from_density(x, pressure, temperature),
