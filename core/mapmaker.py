@@ -36,7 +36,7 @@ class SkySignal(Operator):
         return "(sky as signal)"
 
     def exec(self, block: Block, state: Any) -> None:
-        block.new(MAIN, zero=False)[...] = block.detdata["sky"]
+        block.new(MAIN, zero=False)[...] = block.detdata.get("sky", 0.0)  # a signal without the sky is nothing
         if "sky" in block.means:
             block.means[MAIN] = block.means["sky"]
 

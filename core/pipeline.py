@@ -94,7 +94,7 @@ class Pipeline:
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             cures = dict.fromkeys(p.cure for p in problems if p.cure)
             raise PipelineError("\n".join(lines), place=self.name, cure="\n".join(cures))
-        self.signals = Signals(self.operators, arguments.runs(runs, name), only, self.name)
+        self.signals = Signals(self.operators, arguments.runs(runs, name), arguments.components(only, name), self.name)
 
     @property
     def runs(self) -> dict[str, Signal]:
@@ -146,6 +146,7 @@ class Pipeline:
             Entries added to ``data.provenance``.
         """
         data, settings = self._begin(scene, output, {"threads": threads, "memory": memory, "ceiling": ceiling}, keep, provenance)
+        self.signals.check_kept(keep)
         if data.output is not None:
             check_output_folder(data.output)
         hooks, timer = manager().hook, Timer()

@@ -43,8 +43,16 @@ def runs(given: Any, name: str) -> dict[str, Signal]:
     for key, value in (given or {}).items():
         if not isinstance(value, Signal | Mapping):
             raise PipelineError(f"signal {key} is a dict, not {_what(value)}", place=name, cure=cure)
-        made[key] = value if isinstance(value, Signal) else Signal(**value)
+        made[str(key)] = value if isinstance(value, Signal) else Signal(**value)
     return made
+
+
+def components(only: Any, name: str) -> Sequence[str]:
+    """``only``, a list of names. Raises PipelineError."""
+    if isinstance(only, str) or not isinstance(only, Sequence) or not all(isinstance(what, str) for what in only):
+        cure = f"write only=[{only!r}]" if isinstance(only, str) else "write only=['sky']"
+        raise PipelineError(f"only is a list of components, not {_what(only)}", place=name, cure=cure)
+    return only
 
 
 def precision(given: Any, name: str) -> Any:

@@ -221,7 +221,7 @@ class Schedule:
     def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
         """Unfiltered signals, where streams are held on the way to the maps and memory is not ample for all of them, and blocks
         need neither a span nor neighbours."""
-        unfiltered = tuple(s for s in self.chain.signals if not s.filtered)
+        unfiltered = tuple(s for s in self.chain.signals if not s.filtered and s.stream not in self.chain.keep)
         if not unfiltered or AMPLE * len(self.chain.signals) * self.stream_size <= self.settings.memory:
             return ()
         before = [k for k, s in enumerate(segments) if any(forms(o) for o in s.operators)]

@@ -19,7 +19,7 @@ from ..errors import PipelineError
 from ..mapmaker import MapMaker, SkySignal, filters, forms, place_of_signal
 from ..operator import Operator
 from ..output import Output
-from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, stream_of
+from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, is_signal, stream_of
 
 MOST_PARTS = 4
 """Signals that may be taken from the complete one: each adds its rounding."""
@@ -99,6 +99,19 @@ class Signals:
         made = operator.provides & (known | self._inputs)
         named = {c: c for c in known}
         return frozenset(named.get(name) or Component(name) for name in made)  # type: ignore[call-overload]
+
+    def check_kept(self, streams: Sequence[str]) -> None:
+        """Refuse to keep a signal that has no stream."""
+        made = [formed.stream for formed in self.formed]
+        for stream in streams:
+            if not is_signal(stream) or stream in made or stream == MAIN:
+                continue
+            parts = self.remainders.get(stream.partition("/")[2], ())
+            what, cure = "there is no such signal", nearest(stream, made) or f"choose from: {', '.join(made)}"
+            if parts:
+                what = f"it is {remainder(parts)}, in the maps alone"
+                cure = f"keep {' and '.join([MAIN, *(stream_of(part) for part in parts)])}, and subtract"
+            raise PipelineError(f"the stream {stream!r} cannot be kept: {what}", place=self._place, cure=cure)
 
     # ---- what a signal is
 

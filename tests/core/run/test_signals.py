@@ -774,3 +774,37 @@ def test_in_a_pipeline_file():
     assert parse(file.resolved_yaml()).runs == file.runs
     with pytest.raises(ZondaError, match=r"(?s)modes.*own.*full"):
         parse(FILE.replace("modes: full", "modes: mine"))
+
+
+@pytest.mark.parametrize(
+    ("runs", "settings", "message"),
+    [
+        ({1: SKY}, {}, "'1' cannot name a signal"),
+        (BOTH, {"only": "sky"}, r"only is a list of components, not the text 'sky'\n.*write only=\['sky'\]"),
+        (
+            BOTH,
+            {"keep": ["signal/rest"]},
+            r"(?s)'signal/rest' cannot be kept: it is the complete signal minus sky.*signal/sky, and sub",
+        ),
+        (BOTH, {"keep": ["signal/skyy"]}, r"(?s)there is no such signal.*did you mean 'signal/sky'"),
+    ],
+    ids=["a number", "a text", "a remainder", "a typing mistake"],
+)
+def test_what_is_asked_for_and_cannot_be_is_refused(runs, settings, message):
+    with pytest.raises(PipelineError, match=message):
+        observed(steps(), runs, **settings)
+
+
+def test_an_unfiltered_signal_can_be_kept(monkeypatch):
+    monkeypatch.setattr("zonda.core.run.schedule.AMPLE", np.inf)
+    _, data = observed(steps(*FILTERS["modes"]), {"raw": {"only": ["sky"], "filters": "none"}}, keep=["signal/raw"])
+    assert 0.04 < data.observations[0].detdata["signal/raw"].max() < 0.06
+
+
+def test_without_the_sky_a_scene_of_the_sky_alone_is_empty():
+    sky = Sky()
+    sky._values = streams()[0]
+    data = run([sky, zonda.BinMap(pixel="10 arcsec")], {"rest": REST, "sky": {"only": ["sky"]}})
+    assert same(data.products["map"], data.products["rest/map"], "hits")
+    assert same(data.products["map"], data.products["sky/map"], "signal")
+    assert np.nanmax(abs(data.products["rest/map"].signal)) == 0.0
