@@ -22,7 +22,7 @@ LIMITS = {
     "imports between siblings of operators": 0,
     "upward imports": 0,
     "operators that core names": 0,
-    "operators whose class is over 60 lines": 1,
+    "operators whose class is over 60 lines": 0,
     "lines of framework hooks in BinMap": 5,
 }
 

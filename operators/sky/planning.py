@@ -14,6 +14,7 @@ from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, ful
 from zonda.core.plan.planning import Planning
 
 from .brightness import conversion
+from .convolved import beam_widths, brightness_on, grid_of
 from .grid import Grid
 from .resample import extremes
 from .skymap import SkyMap
@@ -51,27 +52,27 @@ class SkyPlanning(Planning[SkyMap]):
 
     def memory(self, observation: Observation) -> int:
         """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""
-        widths, _ = self.operator.beams(observation)
-        grid = self.operator.grid(observation)
+        widths, _ = beam_widths(self.operator, observation)
+        grid = grid_of(self.operator, observation)
         return (5 + 2 * len(widths)) * grid.nbytes + (grid.source.nbytes if grid.resampled else 0)
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
-        sky, grid, band = self.operator, self.operator.grid(observation), observation.instrument.band
+        sky, grid, band = self.operator, grid_of(self.operator, observation), observation.instrument.band
         if not grid.reached(observation, self._widest(observation)):
             return Traits(peak=abs(sky.outside))
         if not grid.resampled:
-            return Traits(peak=float(np.nanmax(np.abs(sky.sky(grid, band).values - sky.outside), initial=0.0)))
+            return Traits(peak=float(np.nanmax(np.abs(brightness_on(grid, sky, band).values - sky.outside), initial=0.0)))
         factor = sky.scale * conversion(grid, band, sky.spectral_index).typical
         return Traits(peak=max(abs(v * factor - sky.outside) for v in extremes(grid.source, grid.wcs, grid.tiles)))
 
     def _widest(self, observation: Observation) -> float:
-        return float(self.operator.beams(observation)[0].max(initial=0.0))
+        return float(beam_widths(self.operator, observation)[0].max(initial=0.0))
 
     def estimate(self, context: Context) -> Estimate:
         """Each effect as a share of a point source's peak."""
         o, widest = context.first, self._widest(context.first)
-        grids = [self.operator.grid(observation) for observation in context.observations]
+        grids = [grid_of(self.operator, observation) for observation in context.observations]
         reached = any(g.reached(x, widest) for x, g in zip(context.observations, grids, strict=True))
         grid, distinct = grids[0], {g.key: g for g in grids}
         fwhm = float(self.operator.fwhm or o.focalplane.fwhm.max()) if self.operator.beam == "gaussian" and reached else 0.0

@@ -102,6 +102,16 @@ class SkyState:
     _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     _chunks: Cache = field(default_factory=lambda: Cache(2**22))
 
+    def tell(self, tally: Tally, label: str) -> None:
+        """State what was chosen, and count what was taken for something else."""
+        for what, text in self.sky.notes.items():
+            tally.state(label, what, text)
+        for what, number in self.sky.counts.items():
+            if number:
+                tally.count(label, what, number)
+        for beam in self.beams:
+            beam.tell(tally, label)
+
     def sample(self, block: Block, out: AnyFloats, linear: bool, over: bool) -> None:
         """Add the sky to a block's stream (`sampling.sample`), and count the samples that see none."""
         plane, index = block.observation.focalplane, self.index[block.detectors]

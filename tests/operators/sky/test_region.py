@@ -6,7 +6,9 @@ import pytest
 
 from zonda.core.errors import InputError
 from zonda.core.plan.planning import planning_of
+from zonda.operators.sky import convolved
 from zonda.operators.sky import region as regions
+from zonda.operators.sky.convolved import grid_of
 from zonda.operators.sky.region import TILE, Disc, region, tangent_wcs
 from zonda.operators.sky.resample import resample_healpix, resample_image
 from zonda.operators.sky.skymap import SkyMap
@@ -59,7 +61,7 @@ def test_a_small_map_under_a_wide_scan_asks_for_a_small_grid(made, save):
     values[127:129, 127:129] = 1.0
     scan = strip(made, 26.0, fwhm=9.0)
     operator = SkyMap(file=save(values, header))
-    assert max(operator.grid(scan).shape) < 1500
+    assert max(grid_of(operator, scan).shape) < 1500
     got = made.look(operator, scan)
     assert got.max() > 0.05
     assert scan.tally.get("SkyMap", "samples outside the input map") > 0.9 * scan.n_samples
@@ -87,10 +89,10 @@ def test_tiles_and_blocks_change_nothing(made, save, tmp_path, monkeypatch, kind
     monkeypatch.setattr(regions, "SPARSE", 1.0)
     some = SkyMap(file=path)
     parts = made.look(some, scan)
-    assert not some.grid(scan).tiles.all()
+    assert not grid_of(some, scan).tiles.all()
     monkeypatch.setattr(regions, "SPARSE", 0.0)
     every = SkyMap(file=path)
-    assert every.grid(scan).tiles is None
+    assert grid_of(every, scan).tiles is None
     # MARGIN points beyond the beam: 0.27^16 = 8e-10 of what is left out there; HEALPix: 1e-9 of the polynomials' rounding
     np.testing.assert_allclose(parts, made.look(every, scan), atol=1e-8)
 
@@ -128,13 +130,13 @@ def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
     small, wide = strip(made, 5.0, fwhm=3600.0), strip(made, 60.0, fwhm=3600.0)
     assert planning_of(operator).traits(wide).peak == pytest.approx(2.0)
     assert planning_of(operator).memory(wide) > planning_of(operator).memory(small) > 0
-    assert operator.grid(wide).seconds > 2 * operator.grid(small).seconds > 0
+    assert grid_of(operator, wide).seconds > 2 * grid_of(operator, small).seconds > 0
 
 
 def test_the_progress_bar_hears_of_interpolation_and_its_end(made, tmp_path, monkeypatch):
     healpy.write_map(tmp_path / "h.fits", np.full(12 * 64**2, 2.0), coord="C", column_units="K_RJ", dtype=np.float64)
     told = []
-    monkeypatch.setattr(SkyMap, "_progress", lambda self, what: lambda done, total: told.append((what, done, total)))
+    monkeypatch.setattr(convolved, "_progress", lambda step, what: lambda done, total: told.append((what, done, total)))
     SkyMap(file=tmp_path / "h.fits").prepare(strip(made, fwhm=3600.0))
     assert {what for what, _, _ in told} == {"interpolating h.fits"}
     assert told[0][1] == 0

@@ -258,11 +258,11 @@ def test_a_sky_that_no_detector_reaches(made, save):
 
 
 def test_a_sky_that_no_detector_reaches_is_not_convolved(made, save, monkeypatch):
-    from zonda.operators.sky import skymap
+    from zonda.operators.sky import convolved
 
     path = save(np.ones((20, 20)), made.tan_header((20, 20)))
     calls = []
-    monkeypatch.setattr(skymap, "convolve", lambda *a, **k: calls.append(1) or (_ for _ in ()).throw(RuntimeError))
+    monkeypatch.setattr(convolved, "convolve", lambda *a, **k: calls.append(1) or (_ for _ in ()).throw(RuntimeError))
     far = made.observation(np.full(300, np.radians(75.0)), np.radians(25.0), xi=[0, 1e-3], eta=[0, 0])
     assert not SkyMap(file=path).prepare(far).beams
     assert not calls

@@ -6,6 +6,7 @@ import pytest
 from astropy.io import fits
 
 from zonda.core.errors import InputError
+from zonda.operators.sky.convolved import read_of
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.skymap import SkyMap
 from zonda.operators.sky.stokes import STOKES, is_polarized
@@ -85,4 +86,4 @@ def test_extensions_q_and_u(made, tmp_path):
 def test_skymap_warns(tmp_path):
     healpix_file(tmp_path / "iqu.fits")
     with pytest.warns(UserWarning, match=r"SkyMap: .*iqu\.fits: column TEMPERATURE is read as I; .* are not used"):
-        SkyMap(file=str(tmp_path / "iqu.fits"))._read()
+        read_of(SkyMap(file=str(tmp_path / "iqu.fits")))

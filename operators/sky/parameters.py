@@ -1,4 +1,4 @@
-"""Base of a step that reads a map of the sky: its file, how it is read, and where it lies."""
+"""What a user says of the map of the sky, and the checks that need nothing but its header."""
 
 from __future__ import annotations
 
@@ -8,29 +8,21 @@ from typing import Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
-from zonda.core.configuration.units import Angle
-from zonda.core.data import Data, Observation, percent
+from zonda.core.configuration.units import Angle, Kelvin
+from zonda.core.data import Data, percent
 from zonda.core.errors import InputError
-from zonda.core.hooks import manager
 from zonda.core.numerics.projection import share_outside
 from zonda.core.operator import Operator
 
+from .beam import PIXELS_PER_FWHM
 from .cache import Cache
 from .footprint import Footprint, footprint, off_the_map, position
-from .grid import Grid, own_pixels, tangent_grid
-from .inputs import HealpixMap, WcsMap
-from .placement import placed, turned
-from .read import read_map
-from .resample import Progress, no_progress
-from .stokes import STOKES
-
-LARGE = 1 << 26
-"""Bytes of a file above which the progress bar shows that it is read."""
 
 
-class MapFile(Operator):
-    """Base of a step that reads a map of the sky. What is computed of the map is kept from observation to observation."""
+class SkyParameters(Operator):
+    """Parameters of `SkyMap`. What is computed of the map is kept from observation to observation."""
 
     file: InputPath
     """FITS image (with or without a celestial WCS) or HEALPix table. A relative path starts at the pipeline file's folder."""
@@ -50,13 +42,30 @@ class MapFile(Operator):
     """Extension of the file by number (0: the primary one) or name. Default: the first image or HEALPix table."""
     missing: Literal["error", "zero"] = "error"
     """What NaN or infinite pixels do: stop with an error, or count as 0 in the map's unit (and be counted)."""
+    beam: Literal["gaussian", "none"] = "gaussian"
+    """Shape of the main beam; `none` for a map that is convolved already."""
+    fwhm: Angle | None = Field(None, gt=0)
+    """Full width at half maximum of the beam. Default: each detector's own."""
+    outside: Kelvin = quantity("0 K")
+    """Brightness of the sky beyond the map's edge, K_RJ; samples there are counted."""
+    scale: float = Field(1.0, ge=-1e30, le=1e30)
+    """Factor on the whole map (not on `outside`)."""
+    spectral_index: float = Field(0.0, ge=-100, le=100)
+    """Slope of the flux density, S ~ frequency^index, within the band; for maps in Jy/pixel, Jy/beam and MJy/sr."""
+    pixels_per_fwhm: float = Field(PIXELS_PER_FWHM, ge=2, le=16)
+    """Fewest points per FWHM between which the convolved map is interpolated; a finer input is used on its own pixels."""
+    interpolation: Literal["cubic", "linear"] = "cubic"
+    """By cubic B-splines, or linear with its mean smoothing divided out: within 0.92 / n^2 of a point source's peak, n the points
+    per FWHM (0.36 % of it for 16)."""
 
     _cache: Cache = PrivateAttr(default_factory=Cache)
 
     @model_validator(mode="after")
-    def _centre_is_on_the_sky(self) -> MapFile:
+    def _consistent(self) -> SkyParameters:
         if isinstance(self.centre, Target) and self.centre.frame == "horizontal":
             raise ValueError("centre must be fixed on the sky (ICRS or galactic), not horizontal")
+        if self.beam == "none" and self.fwhm is not None:
+            raise ValueError("beam: none has no width; remove fwhm, or set beam: gaussian")
         return self
 
     @property
@@ -90,41 +99,3 @@ class MapFile(Operator):
             scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in data.observations)
             lines.append(f"samples outside the input map: about {percent(share_outside(scans, found.matrix, found.shape), 2)}")
         return lines
-
-    def grid_for(self, observation: Observation, beam: tuple[float, float]) -> Grid:
-        """Where the map will be convolved: nothing is convolved or interpolated yet.
-
-        ``beam``: how far it reaches, and the step of the grid that it needs [rad].
-        """
-        stamp = self.file.stat() if self.file.exists() else None
-        identity = ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
-        source: WcsMap | HealpixMap = self._cache.get(identity, self._read)
-        band = observation.instrument.band
-        key = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
-        if isinstance(source, WcsMap):
-            centre = self.centre.icrs() if isinstance(self.centre, Target) else None
-            if self.centre == "target" or (centre is None and source.wcs is None):
-                centre = observation.centre
-            wcs = placed(source, centre)
-            if wcs is not None:
-                return own_pixels(source, wcs, key)
-            if centre is not None:
-                return tangent_grid(turned(source, centre, self.place), observation, beam, (*key, centre), self.place)
-        return tangent_grid(source, observation, beam, key, self.place)
-
-    def _read(self) -> WcsMap | HealpixMap:
-        large = self.file.exists() and self.file.stat().st_size > LARGE
-        progress = self._progress(f"reading {self.file.name}") if large else no_progress
-        progress(0, 1)
-        given = {name: getattr(self, name) for name in ("unit", "pixel_size", "missing", "input_beam", "coordsys", "hdu")}
-        plane = (self.plane,) if isinstance(self.plane, int) else self.plane
-        source = read_map(self.file, centred=self.centre is not None, plane=plane, **given)
-        progress(0, 0)
-        if STOKES in source.notes:
-            warnings.warn(f"{self.label}: {self.file}: {source.notes[STOKES]}", stacklevel=2)
-        return source
-
-    def _progress(self, what: str) -> Progress:
-        """Callback that moves the progress bar."""
-        hook, text = manager().hook, f"{self.label}: {what}"
-        return lambda done, total: hook.zonda_progress(done=done, total=total, what=text)
