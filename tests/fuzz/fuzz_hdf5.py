@@ -84,7 +84,8 @@ def seeds() -> Iterator[bytes]:
     import importlib.util
 
     yield b"\1" + save_tod(FILE, tiny_scan()).read_bytes()
-    spec = importlib.util.spec_from_file_location("era5_files", ROOT / "tests" / "operators" / "atmosphere" / "weather" / "era5_files.py")
+    path = ROOT / "tests" / "operators" / "atmosphere" / "weather" / "era5_files.py"
+    spec = importlib.util.spec_from_file_location("era5_files", path)
     assert spec is not None
     assert spec.loader is not None
     era5_files = importlib.util.module_from_spec(spec)
