@@ -15,6 +15,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -116,7 +117,8 @@ def cost(case: str) -> None:
 
 def implied_error(layer, ratio: float) -> tuple[float, float]:
     """Largest errors of C (of the variance) and S (of itself), along, across and oblique, from one cell to 3 r0."""
-    from zonda.operators.atmosphere.turbulence.implied import implied_covariance
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from tests.checks.implied import implied_covariance
 
     top = max(400, int(3 * ratio * layer.sigma / layer.spacing))
     lags = np.unique(np.r_[1, 2, 3, 5, 8, np.geomspace(12, top, 8).astype(int)])

@@ -7,14 +7,13 @@ from functools import cache
 import pytest
 
 from zonda.core.checks import Result
-from zonda.plugins.checks import determinism, lattice
+from zonda.plugins.checks import determinism
 
-from .checks import lattice as slow_lattice
-from .checks import matrix, opacity
+from .checks import lattice, matrix, opacity
 from .mutations import MUTATIONS, Mutation
 
 CHECKS = {check.name: check for check in matrix()}
-CACHED = (lattice.implied_error, slow_lattice._strip, opacity._air, opacity._band, determinism._once)
+CACHED = (lattice.implied_error, lattice._strip, opacity._air, opacity._band, determinism._once)
 
 
 def run_anew(name: str) -> Result:

@@ -18,9 +18,9 @@ import zonda
 from zonda.core.data import Observation
 from zonda.core.instrument import Band
 from zonda.core.numerics.random import lattice_normals, stream_key
-from zonda.operators.atmosphere.turbulence.implied import implied_covariance
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
+from ...checks.implied import implied_covariance
 from .test_layers import PWV, instrument, observe, quaternions
 
 Floats = NDArray[np.float64]

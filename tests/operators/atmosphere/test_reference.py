@@ -20,9 +20,9 @@ from zonda.operators.atmosphere.model import beam_sigma
 from zonda.operators.atmosphere.turbulence.beams import widened
 from zonda.operators.atmosphere.turbulence.covariance import NU, beam_correlation, beam_structure, mixture
 from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, scan_planes
-from zonda.operators.atmosphere.turbulence.implied import implied_covariance
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
+from ...checks.implied import implied_covariance
 from .test_layers import instrument, layers_of, observe, operator, quaternions, water
 
 Floats = NDArray[np.float64]

@@ -14,9 +14,10 @@ from zonda.core.errors import ZondaError
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.turbulence.beams import Aperture
 from zonda.operators.atmosphere.turbulence.covariance import beam_structure, correlation, structure
-from zonda.operators.atmosphere.turbulence.implied import implied_covariance
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 from zonda.operators.atmosphere.turbulence.nodes import Layer
+
+from ....checks.implied import implied_covariance
 
 Floats = NDArray[np.float64]
 OUTER_SCALE = 500.0

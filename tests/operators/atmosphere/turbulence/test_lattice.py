@@ -13,9 +13,10 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.random import lattice_normals
 from zonda.operators.atmosphere.turbulence import lattice
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
-from zonda.operators.atmosphere.turbulence.implied import implied_covariance
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 from zonda.operators.atmosphere.turbulence.levels import FIDELITIES
+
+from ....checks.implied import implied_covariance
 
 LAGS = (0, 1, 2, 5, 20, 130, 400)
 DIRECTIONS = ((0, 1), (1, 0), (1, 1))  # along, across and diagonal

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.types import Floats
-
-from .lattice import Turbulence
+from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
 
 def implied_covariance(field: Turbulence, a: NDArray[np.integer], b: NDArray[np.integer]) -> Floats:
