@@ -62,7 +62,7 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
     Raises
     ------
     PipelineError
-        Where the engine is gone for good.
+        Where the engine has stopped for good.
     """
     waiting, suspects = deque(items), deque[T]()
     at_work: dict[Future[R], T] = {}
@@ -118,4 +118,4 @@ def _result(future: Future[R], folder: Path) -> R | Lost:
 
 
 def _gone(folder: Path) -> PipelineError:
-    return PipelineError("the engine is gone", place=str(folder), cure=f"zonda resume {folder}")
+    return PipelineError("the engine has stopped", place=str(folder), cure=f"zonda resume {folder}")

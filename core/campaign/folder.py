@@ -127,7 +127,7 @@ def opened(path: Path, tasks: Sequence[Task], layouts: Mapping[int, str], say: S
     try:
         log = open_log(path, tasks)
         if {row.number for row in log.rows()} != {task.number for task in tasks}:
-            raise InputError("it is of another campaign", place=str(path))
+            raise InputError("it belongs to another campaign", place=str(path))
         log.check()
         log.combined(layouts)
         return log

@@ -250,7 +250,7 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
     path = layout_path(folder, number)
     if parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]}) != job.combinations[number].layout:
         raise InputError(
-            "is not what it was",
+            "differs from the layout that was planned",
             place=str(path),
             cure="the pointing has changed since (another version?): run the campaign again",
         )

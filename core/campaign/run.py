@@ -135,13 +135,13 @@ def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
         reasons.append(f"it began with zonda {job.version}, this is {__version__}")
     for path, text in zip(sources_of(job, folder), job.source, strict=True):
         if not path.is_file() or digest_of_text(path.read_text(encoding="utf-8", errors="replace")) != digest_of_text(text):
-            reasons.append(f"{path} is not what it was")
+            reasons.append(f"{path} has changed")
     reasons += [f"{path} has changed or is gone" for path in changed(job)]
     if reasons and not anyway:
         raise InputError(
             "; ".join(reasons),
             place=str(folder),
-            cure="the maps would be of two kinds: run the campaign anew in another folder, or go on all the same with --anyway",
+            cure="the maps would mix two versions: run the campaign anew in another folder, or continue with --anyway",
         )
 
 

@@ -145,4 +145,4 @@ def check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Seq
         mine = [d for d in effects if name in (d.name, d.effect.name)]
         if mine and name not in labels and all(len(d.effect.choices) == 1 for d in mine):
             what = "has no coarser form" if mine[0].simulated else "is not simulated"
-            raise ZondaError(f"{name!r} cannot be dropped: it {what}", place="zonda plan", cure="leave out --drop for it")
+            raise ZondaError(f"{name!r} cannot be dropped: it {what}", place="zonda plan", cure="remove this --drop")

@@ -36,7 +36,7 @@ def without(file: PipelineFile, structure: Structure, dropped: Sequence[str]) ->
                 raise ZondaError(
                     f"{label!r} cannot be dropped: {o.label} reads its {what}, which no other step makes",
                     place="zonda plan",
-                    cure="leave out --drop for it, or drop both",
+                    cure="remove this --drop, or drop both",
                 )
     kept = tuple(label for label in structure.operators if label not in dropped)
     return look(pipeline, file.scene(), dataclasses.replace(structure, operators=kept))

@@ -293,7 +293,8 @@ def columns(array: AnyFloats, samples: slice) -> AnyFloats:
             while left:
                 read = _read_at(file, left, place)
                 if not read:
-                    raise OutputError("was cut short", place=str(array.filename), cure="leave the temporary folder alone")
+                    cure = "do not change files in the temporary folder while zonda runs"
+                    raise OutputError("the temporary file was truncated", place=str(array.filename), cure=cure)
                 place, left = place + read, left[read:]
     return found
 

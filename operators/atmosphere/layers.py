@@ -106,7 +106,7 @@ def _check_pointing(observation: Observation) -> None:
             raise PointingError(
                 f"the boresight of sample {bad[0]} is not a number ({len(bad)} of {observation.n_samples} samples)",
                 place=observation.name,
-                cure="repair the pointing, or leave these samples out",
+                cure="repair the pointing, or remove these samples",
             )
         lowest = min(lowest, 1 - 2 * float((x * x + y * y).max()))
     if lowest > math.sin(ELEVATION_MIN) + 1e-9:

@@ -93,7 +93,7 @@ def _planned(step: HighpassFilter, observation: Observation) -> HighpassPlan:
         observation.tally.state(step.label, f"{observation.name} is shorter than 1/frequency", text)
     elif plan.cut >= n:
         raise PipelineError(
-            f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz hold no faster wave",
+            f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz contain no higher frequency",
             place=f"{step.label}, {observation.name}",
             cure=f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan",
         )

@@ -244,7 +244,7 @@ class Pointing(Operator):
         seconds += self.jitter * normals(key, 0, n).astype(np.float64)
         if (np.diff(seconds) <= 0).any():
             raise PointingError(
-                f"a jitter of {self.jitter * 1e3:.4g} ms makes samples change places: they come every {1e3 / rate:.4g} ms",
+                f"a jitter of {self.jitter * 1e3:.4g} ms would reorder samples: they come every {1e3 / rate:.4g} ms",
                 place=self.label,
                 cure=f"lower jitter to {100 / rate:.3g} ms",
             )

@@ -141,7 +141,7 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
         scans.append(_scan(recording, rows[part], seconds[part], ahead[part[:-1]].astype(np.int64), good[part]))
     counts["rows alone between gaps, dropped"] = alone
     if not scans:
-        raise InputError("no two directions next to each other are numbers", place=place, cure="check the columns")
+        raise InputError("no two consecutive directions are numbers", place=place, cure="check the columns")
     missing = sum(len(s.seconds) for s in scans) - (len(rows) - alone)
     flagged = sum(int(np.count_nonzero(s.flags & NOT_RECORDED)) for s in scans)
     counts["samples in gaps, flagged"] = missing

@@ -263,7 +263,7 @@ def _times(values: Any, unit: str | None, clock: Clock, place: str) -> tuple[Flo
         year = 0
     if not 1980 <= year <= 2150:
         raise InputError(
-            f"the first time, {finite[0]:.10g}, is not of our days as {'an MJD' if days else 'seconds since 1970'}",
+            f"the first time, {finite[0]:.10g}, is not a plausible date as {'an MJD' if days else 'seconds since 1970'}",
             place=place,
             cure="set clock: unix (seconds since 1970), mjd, or scene (seconds since the scene's time)",
         )

@@ -316,7 +316,7 @@ def test_resume_refuses_what_has_changed(bench, monkeypatch, capsys):
     (bench.folder / "p.yaml").write_text(text)
     (out / "resolved.yaml").write_text("seed: 3\n")
     assert bench.command("resume", out, *SERIAL) == 2
-    assert "resolved.yaml is not what it was" in capsys.readouterr().err
+    assert "resolved.yaml has changed" in capsys.readouterr().err
     assert bench.command("resume", out, *SERIAL, "--anyway") == 0
 
 
