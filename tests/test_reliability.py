@@ -207,7 +207,7 @@ def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
     assert np.array_equal(part, array[:, 2048:4096])
     assert np.array_equal(columns(np.asarray(array[:3]), slice(7, 9)), array[:3, 7:9])
     os.truncate(array.filename, 1000)
-    with pytest.raises(zonda.core.errors.OutputError, match="cut short"):
+    with pytest.raises(zonda.core.errors.OutputError, match="was truncated"):
         columns(array, slice(2048, 4096))
     store.close()
 

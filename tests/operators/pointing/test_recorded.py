@@ -110,7 +110,7 @@ def test_what_is_no_comb_is_refused() -> None:
         comb(recording(t), 60, "test")
     with pytest.raises(InputError, match="1 rows with increasing times"):
         comb(recording([0.0]), 60, "test")
-    with pytest.raises(InputError, match="no two directions next to each other"):
+    with pytest.raises(InputError, match="no two consecutive directions"):
         comb(Recording(None, np.arange(9.0), np.full(9, NAN), np.zeros(9), "azel", np.zeros(9, bool)), 60, "test")
 
 
