@@ -10,7 +10,7 @@ import numpy as np
 
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather.summary import HOURS, MONTHS, QUANTILES, PwvByMonth, pwv_steps
-from zonda.operators.diagnostics.canvas import DPI, SEQUENCE
+from zonda.operators.diagnostics.canvas import SEQUENCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,9 +29,8 @@ LINES = {
 LINE_COLOURS = {"H₂O": "#0072B2", "O₂": "#D55E00", "O₃": "#009E73"}
 
 
-def plot_profile(air: Profile, ax: Any = None) -> Any:
+def plot_profile(ax: Any, air: Profile) -> None:
     """Temperature, and on a second scale water vapour and wind, up to 20 km above the site."""
-    ax = _axes(ax)
     low = air.height <= 20e3
     km = air.height[low] / 1e3
     ax.plot(air.temperature[low], km, color=SEQUENCE[1])
@@ -46,12 +45,10 @@ def plot_profile(air: Profile, ax: Any = None) -> Any:
     other.set_xlim(left=0)
     other.set_xlabel(f"wind [m/s], {label}")
     other.legend(loc="upper right", fontsize=8, framealpha=0.85, edgecolor="none")
-    return ax
 
 
-def plot_pwv(water: PwvByMonth, ax: Any = None) -> Any:
+def plot_pwv(ax: Any, water: PwvByMonth) -> None:
     """PWV over the year: the medians of eight hours of the day, and the quantiles of the months."""
-    ax = _axes(ax)
     month = np.arange(12)
     low, lower, _, upper, high = water.quantiles.T * 1e3
     ax.fill_between(
@@ -72,14 +69,10 @@ def plot_pwv(water: PwvByMonth, ax: Any = None) -> Any:
     ax.yaxis.set_minor_formatter(_some_minor)
     ax.set_xlabel("month")
     ax.legend(fontsize=6.5, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, columnspacing=1.0)
-    return ax
 
 
-def plot_spectrum(
-    air: Profile, elevation: float = math.pi / 2, bands: Sequence[Band] = (), which: str = "brightness", ax: Any = None
-) -> Any:
+def plot_spectrum(ax: Any, air: Profile, elevation: float, bands: Sequence[Band], which: str) -> None:
     """Emission (``brightness``) or ``transmission`` from 1 to 1000 GHz for several PWVs; bands are shaded, lines named above."""
-    own_figure, ax = ax is None, _axes(ax)
     low, high = LOWEST, HIGHEST
     for k, pwv in enumerate(pwv_steps(air)):
         seen = spectrum(air.scaled(pwv).layers, elevation, low=low, high=high)
@@ -112,9 +105,6 @@ def plot_spectrum(
     ax.set_xlabel("frequency [GHz]")
     ax.set_ylabel("emission [K$_\\mathrm{RJ}$]" if which == "brightness" else "transmission")
     ax.grid(alpha=0.25, lw=0.5)
-    if own_figure:
-        ax.legend(fontsize=7, loc="best")
-    return ax
 
 
 NAME = 21.0
@@ -155,25 +145,16 @@ def weather_figure(
     figure = Figure(figsize=(11, 9.5), dpi=110, layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(2, 2)
-    plot_profile(air, axes[0, 0])
+    plot_profile(axes[0, 0], air)
     if water is not None:
-        plot_pwv(water, axes[0, 1])
+        plot_pwv(axes[0, 1], water)
     else:
         axes[0, 1].set_axis_off()
         axes[0, 1].text(0.5, 0.5, "no climatology here: no PWV by month", ha="center")
-    plot_spectrum(air, elevation, bands, "brightness", axes[1, 0])
-    plot_spectrum(air, elevation, bands, "transmission", axes[1, 1])
+    plot_spectrum(axes[1, 0], air, elevation, bands, "brightness")
+    plot_spectrum(axes[1, 1], air, elevation, bands, "transmission")
     figure.legend(*axes[1, 1].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return figure
-
-
-def _axes(ax: Any) -> Any:
-    """``ax``, or the Axes of a new figure."""
-    if ax is not None:
-        return ax
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained").add_subplot()
 
 
 def _some_minor(value: float, _: int) -> str:

@@ -17,10 +17,10 @@ from zonda.core import checks as core_checks
 from zonda.core import registry
 from zonda.core.checks import Case, Check, Family, Result, registered
 from zonda.core.cli import main
-from zonda.plugins.checks import covariance, machine
+from zonda.plugins.checks import machine
 from zonda.plugins.checks.cases import MACHINE
 
-from .checks import matrix
+from .checks import covariance, matrix
 from .checks.cases import MATRIX
 
 ROOT = Path(__file__).parents[1]

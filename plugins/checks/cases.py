@@ -4,18 +4,6 @@ from __future__ import annotations
 
 from zonda.core.checks import Case
 
-NEAR = Case(
-    "structure function as r -> 0",
-    "relative error <= 1e-13 for x from 1e-12 to 50, against mpmath",
-)
-FAR = Case(
-    "r -> infinity, r0 -> infinity, r0 << cell, r0 >> strip",
-    "finite; implied covariance within the stated error for r0/cell from 1e-1 to 1e6; a clear refusal beyond",
-)
-OVERLAP = Case(
-    "beams that overlap almost completely (D = 100 m, detectors 0.2 m apart)",
-    "implied difference structure function between neighbours within 1 % of analytic",
-)
 DECADES = Case(
     "7 decades between atmosphere (30 K) and signal (1 uK)",
     "noiseless transfer function with and without a 30 K atmospheric mean differ by < 1e-3; a common mode 1e7 "

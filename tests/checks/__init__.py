@@ -2,10 +2,10 @@
 
 from zonda.core.checks import Check, registered
 
-from . import determinism, filters, geometry, lattice, maps, means, noise, opacity, pointing, timing
+from . import covariance, determinism, filters, geometry, lattice, maps, means, noise, opacity, pointing, timing
 from .cases import MATRIX
 
-FAMILIES = (lattice, geometry, filters, maps, opacity, noise, pointing, timing, determinism, means)
+FAMILIES = (covariance, lattice, geometry, filters, maps, opacity, noise, pointing, timing, determinism, means)
 
 
 def matrix() -> list[Check]:

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from zonda.core import registry, weather
 from zonda.core.configuration.time import Instant
@@ -52,7 +53,8 @@ def test_named_lines_are_lines_of_their_species(species, name):
 @pytest.mark.parametrize("which", ["brightness", "transmission"])
 def test_spectra_reach_1_thz_with_any_bands(air, bands, which):
     for chosen in ([], bands[:1], bands):
-        ax = plot_spectrum(air, math.pi / 2, chosen, which)
+        ax = Figure().add_subplot()
+        plot_spectrum(ax, air, math.pi / 2, chosen, which)
         assert ax.get_xlim() == (1.0, 1000.0)
         names = {t.get_text() for t in ax.texts}
         assert {"H₂O 183", "H₂O 557", "O₂ 119", "O₃ 250"} <= names
