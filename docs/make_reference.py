@@ -6,7 +6,7 @@ import json
 import typing
 from pathlib import Path
 
-from zonda.core.configuration.describe import written_choices
+from zonda.core.configuration.describe import choices, members, types_in
 from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Unit
 from zonda.core.instrument import Band, Instrument, Telescope
@@ -73,6 +73,18 @@ def table(cls: typing.Any, but: str = "") -> list[str]:
             text = " ".join(filter(None, (text, written_choices(field))))
             lines.append(f"| `{name}` | {default(field)} | {text} |")
     return lines
+
+
+def written_choices(field: typing.Any) -> str:
+    """The choices as Markdown, empty where there are none."""
+    chosen = [f"`{value}`" if isinstance(value, str) else f"`{json.dumps(value)}`" for value in choices(field)]
+    if not chosen:
+        return ""
+    others = [m for m in members(field) if m is not type(None) and typing.get_origin(m) is not typing.Literal]
+    named = f"one of {', '.join(chosen)}" if len(chosen) > 1 else chosen[0]
+    if any(typing.get_origin(t) is typing.Literal for other in others for t in types_in(other)):
+        named, others = f"one or several of {', '.join(chosen)}", []
+    return f"Or {named}." if others else f"{named[0].upper()}{named[1:]}{'.' if len(chosen) > 1 else ' only.'}"
 
 
 def default(field: typing.Any) -> str:

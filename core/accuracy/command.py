@@ -92,8 +92,7 @@ def accuracy(
 
     from . import store as stored
     from .figure import save
-    from .fragment import fragment
-    from .table import lines, percent
+    from .table import fragment, lines, percent
 
     text = "\n".join(lines(found))
     write_text(folder / "accuracy.txt", text + "\n")

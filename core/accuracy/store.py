@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,14 +63,7 @@ def fingerprint(file: PipelineFile) -> str:
     scene = file.scene()
     described: list[Any] = [
         {k: _plain(getattr(scene, k)) for k in type(scene).model_fields if k != "seed"},
-        [
-            (
-                step.key,
-                _described(step.operator, {*(k.parameter for k in planning_of(step.operator).knobs), *_length(step.operator)}),
-            )
-            for step in file.steps
-            if not isinstance(step.operator, Output)
-        ],
+        [(step.key, _described(step.operator)) for step in file.steps if not isinstance(step.operator, Output)],
     ]
     return hashlib.blake2b(json.dumps(described, sort_keys=True).encode(), digest_size=8).hexdigest()
 
@@ -184,12 +176,9 @@ def _plain(value: Any) -> str:
     return f"{type(value).__name__}({', '.join(f'{name}={_plain(inner)}' for name, inner in fields)})"
 
 
-def _length(operator: Operator) -> tuple[str, ...]:
-    return LENGTH if "boresight" in operator.provides else ()
-
-
-def _described(value: Any, without: Iterable[str] = ()) -> dict[str, Any]:
-    fields = value.model_dump(exclude_defaults=True, exclude=set(without))
+def _described(operator: Operator) -> dict[str, Any]:
+    length = LENGTH if "boresight" in operator.provides else ()
+    fields = operator.model_dump(exclude_defaults=True, exclude={*length, *(k.parameter for k in planning_of(operator).knobs)})
     return {k: [v.name, v.stat().st_size] if isinstance(v, Path) else repr(v) for k, v in fields.items()}
 
 

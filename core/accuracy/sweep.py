@@ -205,7 +205,7 @@ def _alone(bench: Bench, knob: PipelineKnob, others: Setting) -> Alone:
     for value in knob.ladder[:-1]:
         setting = others | {knob.key: value}
         try:
-            error, resolution = (bench.mean_error if knob.redraws else _paired(bench))(setting, reference)
+            error, resolution = bench.mean_error(setting, reference) if knob.redraws else (bench.error(setting, reference), 0.0)
         except ZondaError as err:
             rungs.append(Rung(value, None, note=f"refused: {err.message}".splitlines()[0]))
             continue
@@ -219,10 +219,6 @@ def _alone(bench: Bench, knob: PipelineKnob, others: Setting) -> Alone:
     steps = tuple(compare(a, b) for a, b in pairwise(good))
     left, how = convergence(steps, [r.resolution for r in rungs if r.error is not None])
     return Alone(knob, tuple(rungs), steps, left, how)
-
-
-def _paired(bench: Bench) -> Callable[[Setting, Setting], tuple[float, float]]:
-    return lambda setting, reference: (bench.error(setting, reference), 0.0)
 
 
 def convergence(steps: Sequence[float], resolutions: Sequence[float] = ()) -> tuple[float, str]:

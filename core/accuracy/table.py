@@ -1,11 +1,12 @@
-"""A study as lines of text."""
+"""A study as lines of text; a setting as what to write into a pipeline file, and what to type."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
 
-from .fragment import arguments
 from .pareto import Point, least
+from .settings import overrides
 from .study import Study
 from .sweep import Alone, Rung, differences
 
@@ -27,6 +28,34 @@ def percent(value: float | None) -> str:
     if value is None:
         return "-"
     return f"{100 * value:.{3 if abs(value) >= 1 else 2}g} %"
+
+
+def fragment(setting: Mapping[str, str], heading: str) -> str:
+    """YAML of the setting: parameters under the step they belong to, to be merged into the file's steps by hand.
+
+    A comment line holds the same for the command line.
+    """
+    steps: dict[str, list[str]] = {}
+    top = []
+    for key, value in setting.items():
+        step, dot, parameter = key.rpartition(".")
+        if dot:
+            text = repr(value) if set(value) & set(",[]{}#:") else value
+            steps.setdefault(step, []).append(f"{parameter}: {text}")
+        else:
+            top.append(f"{key}: {value}")
+    rows = [f"# {line}" for line in (heading, f"on the command line: {arguments(setting)}")]
+    rows += [*top, "operators:"] if steps else top
+    for step, parameters in steps.items():
+        name, _, number = step.rpartition(".")
+        name, which = (name, f"  # the {number}. of that name") if number.isdigit() else (step, "")
+        rows.append(f"  - {name}: {{{', '.join(parameters)}}}{which}")
+    return "\n".join(rows) + "\n"
+
+
+def arguments(setting: Mapping[str, str]) -> str:
+    """``--set`` arguments for a shell."""
+    return " ".join(f"--set {shlex.quote(text)}" for text in overrides(setting))
 
 
 def _heading(study: Study) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass
@@ -33,14 +33,16 @@ class Lost:
 class Work(ABC, Generic[T, R]):
     """A list of calls, one for each item: how they are made and how their results are recorded."""
 
-    stop = False
-    """Set to begin no more of them."""
+    def __init__(self) -> None:
+        self.stop = False
+        """Set to begin no more of them."""
+        self.attempts = Counter[T]()
+        """How often each was begun."""
 
     @abstractmethod
     def call(self, item: T) -> tuple[Callable[..., R], *tuple[Any, ...]]:
         """A function and its arguments, to be sent to a worker."""
 
-    @abstractmethod
     def began(self, items: list[T]) -> None:
         """Record that these calls are about to be sent."""
 
@@ -79,6 +81,7 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
                     batch.append(waiting.popleft())
                 if suspects and not batch and not at_work and not work.stop:
                     batch.append(suspects.popleft())
+                work.attempts.update(batch)
                 work.began(batch)
             for item in batch:
                 at_work[_submit(pool, *work.call(item))] = item

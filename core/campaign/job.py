@@ -12,6 +12,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from ..errors import InputError
 from ..storage.files import write_text
 
@@ -22,7 +24,6 @@ FILE = "campaign.json"
 LOG = "jobs.sqlite"
 TASKS = "tasks"
 """Folder of partial products and layouts."""
-
 
 Say = Callable[[str], None]
 """Shows the user a line."""
@@ -171,13 +172,12 @@ class Job:
                 what = f"holds a campaign of zonda {values['version']}, whose partial products cannot be used any more"
                 cure = "remove it, choose another output folder, or finish it with that version"
                 raise OtherFormat(what, place=str(folder), cure=cure)
-            combinations = tuple(Combination(**c) for c in values.pop("combinations"))
-            tasks = tuple(Task(**{**t, "scans": tuple(t["scans"])}) for t in values.pop("tasks"))
-            if not all(_inside(c.folder) for c in combinations) or not all(re.fullmatch("[0-9a-f]{32}", t.key) for t in tasks):
+            job: Job = TypeAdapter(cls).validate_python(values)
+            if not all(_inside(c.folder) for c in job.combinations) or not all(
+                re.fullmatch("[0-9a-f]{32}", t.key) for t in job.tasks
+            ):
                 raise ValueError("it names files outside its folder")
-            pipelines, source = tuple(values.pop("pipelines")), tuple(values.pop("source"))
-            plans = tuple(tuple(tuple(row) for row in plan) for plan in values.pop("plans"))
-            return cls(**values, pipelines=pipelines, source=source, plans=plans, combinations=combinations, tasks=tasks)
+            return job
         except FileNotFoundError:
             raise InputError("holds no campaign", place=str(folder), cure="zonda run FILE --output DIR begins one") from None
         except (OSError, ValueError, KeyError, TypeError) as err:

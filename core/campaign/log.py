@@ -22,7 +22,6 @@ DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 
 STATES = ("waiting", "claimed", "done", "failed")
 
-
 TABLES = (
     "tasks (number INTEGER PRIMARY KEY, state TEXT NOT NULL, attempts INTEGER NOT NULL, error TEXT NOT NULL, host TEXT NOT NULL, "
     "seconds REAL NOT NULL, digest TEXT NOT NULL, machine INTEGER NOT NULL)",

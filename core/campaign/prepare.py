@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..configuration.files import paths_in
 from ..errors import InputError, ZondaError
 from ..storage.files import product_path
 from . import parts
@@ -292,17 +293,9 @@ def _placed(place: str) -> Iterator[None]:
 
 def _inputs(file: PipelineFile) -> dict[str, str]:
     """The file and the inputs that it names, each with its stamp."""
-    found: dict[str, str] = {}
-    if Path(file.place).is_file():
-        path = Path(file.place).resolve()
-        found[str(path)] = _stamp(path, "text")
-    models: list[Any] = [*file.operators, file.scene().weather]
-    for model in filter(None, models):
-        for field in type(model).model_fields:
-            value = getattr(model, field)
-            if isinstance(value, Path) and value.is_file():
-                found[str(value)] = _stamp(value, "file")
-    return found
+    own = [Path(file.place).resolve()] if Path(file.place).is_file() else []
+    inputs = [path for path in paths_in([file.scene(), *file.operators]) if path.is_file()]
+    return {str(p): _stamp(p, "text") for p in own} | {str(p): _stamp(p, "file") for p in inputs}
 
 
 def _stamp(path: Path, kind: str) -> str:

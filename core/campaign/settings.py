@@ -112,7 +112,3 @@ class Campaign(Parameters):
         keys = list(dict.fromkeys(key for entry in self.observations for key in entry))
         first = ["observation", *keys] if self.observations else []
         return [*first, *self.grid, *(["night"] if self.nights else []), *(["realization"] if self.realizations > 1 else [])]
-
-    def combines(self, axis: str) -> bool:
-        """Whether maps are co-added over an axis."""
-        return self.combine == "all" or axis in self.combine

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import resource
 import socket
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -66,26 +64,22 @@ class Outcome:
         Whether the other tasks would fail alike.
     seconds
         Wall time.
-    peak
-        Largest resident memory of the worker so far, bytes.
     machine
         On what it ran (`machines.here`).
     """
 
-    number: int
     host: str
     seconds: float
     digest: str = ""
     error: str = ""
     final: bool = False
     stop: bool = False
-    peak: int = 0
     machine: str = ""
 
 
 def perform(order: Order) -> Outcome:
     """Run a task. Never raises an `Exception`: the outcome states what failed."""
-    begin, number, host = time.monotonic(), order.task.number, f"{socket.gethostname()}:{os.getpid()}"
+    begin, host = time.monotonic(), f"{socket.gethostname()}:{os.getpid()}"
     try:
         from zonda import __version__
 
@@ -97,14 +91,14 @@ def perform(order: Order) -> Outcome:
     except ZondaError as err:
         final = isinstance(err, PipelineError | PointingError)
         stop = isinstance(err, OutputError | NotCombined)
-        return Outcome(number, host, time.monotonic() - begin, error=str(err), final=final, stop=stop, peak=_peak())
+        return Outcome(host, time.monotonic() - begin, error=str(err), final=final, stop=stop)
     except Exception as err:
         import traceback
 
         text = "".join(traceback.format_exception(err)).rstrip()
         stop = isinstance(err, OSError)
-        return Outcome(number, host, time.monotonic() - begin, error=text, stop=stop, peak=_peak())
-    return Outcome(number, host, time.monotonic() - begin, digest, peak=_peak(), machine=machines.here())
+        return Outcome(host, time.monotonic() - begin, error=text, stop=stop)
+    return Outcome(host, time.monotonic() - begin, digest, machine=machines.here())
 
 
 @faults_named()
@@ -142,7 +136,3 @@ def layouts_in(path: Path, digest: str) -> Mapping[str, Any]:
     except InputError as err:
         raise InputError(err.message, place=err.place, cure="can this worker see the campaign's folder?") from None
     return layouts
-
-
-def _peak() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

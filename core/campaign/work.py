@@ -52,9 +52,9 @@ class Tasks(Work[Task, Outcome]):
     """The tasks of a campaign. ``watch`` compares the machines that they run on."""
 
     def __init__(self, job: Job, folder: Path, log: Log, pool: Pool, watch: Watch) -> None:
+        super().__init__()
         self.job, self.folder, self.log, self.pool, self.watch = job, folder, log, pool, watch
         self.result = CampaignResult(folder)
-        self._attempts: dict[int, int] = {}
         self._claimed: set[int] = set()
         self._failures = 0
 
@@ -88,20 +88,18 @@ class Tasks(Work[Task, Outcome]):
 
     def began(self, items: list[Task]) -> None:
         """See `Work.began`."""
-        for task in items:
-            self._attempts[task.number] = self._attempts.get(task.number, 0) + 1
         self._claimed |= {task.number for task in items}
         self.log.claim(task.number for task in items)
 
     def ended(self, item: Task, result: Outcome | Lost) -> bool:
         """Record the outcome of a task."""
         number = item.number
-        outcome = Outcome(number, LOST, 0.0, error=str(result)) if isinstance(result, Lost) else result
+        outcome = Outcome(LOST, 0.0, error=str(result)) if isinstance(result, Lost) else result
         self._claimed.discard(number)
         if not outcome.error and (error := self.watch.meet(outcome.machine, f"task {number} on {outcome.host}")):
             discard(item.path(self.folder))
             outcome = replace(outcome, error=error, final=True, stop=True)
-        again = bool(outcome.error) and not outcome.final and self._attempts[number] <= self.job.retries
+        again = bool(outcome.error) and not outcome.final and self.attempts[item] <= self.job.retries
         if not outcome.error:
             self.log.done(number, outcome.host, outcome.seconds, outcome.digest, outcome.machine)
             self.result.tasks += 1
@@ -123,9 +121,9 @@ class Combinations(Work[int, Combined]):
     """The sets of products, by number. They are combined on workers: pictures and reports take time and memory."""
 
     def __init__(self, job: Job, folder: Path, log: Log, result: CampaignResult) -> None:
+        super().__init__()
         self.job, self.folder, self.log, self.result = job, folder, log, result
         self._digests = {row.number: row.digest for row in log.rows()}
-        self._attempts: dict[int, int] = {}
         self._error: ZondaError | None = None
 
     def run(self, numbers: Sequence[int], pool: Pool) -> None:
@@ -138,17 +136,12 @@ class Combinations(Work[int, Combined]):
         """See `Work.call`."""
         return combine, self.folder.resolve(), item, {t.number: self._digests[t.number] for t in self.job.tasks_of(item)}
 
-    def began(self, items: list[int]) -> None:
-        """See `Work.began`."""
-        for number in items:
-            self._attempts[number] = self._attempts.get(number, 0) + 1
-
     def ended(self, item: int, result: Combined | Lost) -> bool:
         """Record that products are written, and remove their parts."""
         if isinstance(result, Lost):
             if not engine_failed(result.error):
                 raise result.error
-            if self._attempts[item] <= self.job.retries:
+            if self.attempts[item] <= self.job.retries:
                 return True
             message = f"the engine failed when it combined the maps: {result}"
             error: ZondaError | None = PipelineError(message, place=str(self.folder), cure=f"zonda resume {self.folder}")

@@ -25,9 +25,8 @@ from typing import Any
 from .. import children
 from ..discovery import RAISED, discover
 from ..machine import available_threads
-from ..program import fingerprint
 from ..storage import user_cache
-from ..versions import versions
+from ..versions import fingerprint, versions
 from .compiled import cache_folder
 
 GROUP = "zonda.kernels"
@@ -79,9 +78,9 @@ class Helper:
             self._thread = Thread(target=compile_listed, args=(modules, False, self._enough), daemon=True)
             self._thread.start()
         if self._process is not None and self._process.stdin is not None:
-            from . import keep_kernels
+            from .jit import share
 
-            keep_kernels.share()
+            share()
             with suppress(OSError):  # it has ended
                 self._process.stdin.write(json.dumps(modules).encode() + b"\n")
                 self._process.stdin.flush()
@@ -107,7 +106,7 @@ class Helper:
 def serve() -> None:
     """The child's side: it ends when there is nothing left to compile, or when the parent has hung up."""
     from ..numerics import random  # the second with numba, whose compiler is made ready while the parent reads its file
-    from . import keep_kernels
+    from .jit import share
 
     random.fill_normals.targetctx.refresh()
     random.fill_normals.typingctx.refresh()
@@ -118,7 +117,7 @@ def serve() -> None:
         os._exit(0)
 
     Thread(target=leave_with_parent, daemon=True).start()
-    keep_kernels.share(polite=True)
+    share(polite=True)
     gc.freeze()
     gc.set_threshold(*COMPILING)
     compile_listed(modules)

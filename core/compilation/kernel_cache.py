@@ -15,7 +15,6 @@ import hashlib
 import io
 import os
 import pickle
-import secrets
 import sys
 import time
 import warnings
@@ -34,13 +33,13 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from ..storage import user_cache
+from ..storage.files import discard, put
 from ..storage.own_files import ForeignFile, own_folder, read_own
 from .without_cache import CHANGED, left_to_numba
 
 FORMAT = 3
 _DIGEST = 16
 SUFFIX = ".zkc"
-
 
 WAIT = 120.0
 """Seconds [s] for which another process's kernel is waited for; then it is compiled here."""
@@ -86,8 +85,7 @@ class _Claims:
     def release(self, path: Path | None) -> None:
         """Give up a claim, if there is one."""
         if path in self.held:
-            with suppress(OSError):
-                _claim(path).unlink(missing_ok=True)
+            discard(_claim(path))
             os.close(self.held.pop(path))
 
 
@@ -286,29 +284,18 @@ class KernelFiles:
     def save(self, key: Any, data: Any) -> None:
         """Keep ``data`` under ``key``: whole, or not at all. Raises OSError."""
         path, body = self.path(key), dumps(_without_bitcode(data))
-        temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(_checksum(path, body) + body)
-            temporary.chmod(0o644)  # whatever the umask: what others may write to is not read
-            os.replace(temporary, path)
-        except BaseException:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
-            raise
+        put(path, _checksum(path, body) + body)
 
     def give_up(self) -> None:
         """Remove the file that was asked for last, and say so."""
         warnings.warn("compiled code in the cache was damaged; it is compiled again", stacklevel=2)
         if self.asked is not None:
-            with suppress(OSError):
-                self.asked.unlink(missing_ok=True)
+            discard(self.asked)
 
     def flush(self) -> None:
         """Remove all."""
         for path in self.folder.glob(f"{self.base}.*{SUFFIX}"):
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
+            discard(path)
 
 
 def _checksum(path: Path, body: Any) -> bytes:

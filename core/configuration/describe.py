@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from types import NoneType, UnionType
+from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
@@ -35,12 +34,12 @@ def choices(field: FieldInfo) -> tuple[Any, ...]:
 
 def kind(field: FieldInfo) -> str:
     """What a parameter takes: a kind of quantity with an example, its choices, or a type in words."""
-    members = _members(field)
+    kinds = members(field)
     unit = unit_of(field)
-    words = [f"{unit.kind.noun} such as '{unit.example}'"] if unit and float in members else []
+    words = [f"{unit.kind.noun} such as '{unit.example}'"] if unit and float in kinds else []
     chosen = [repr(value) for value in choices(field)]
     words += [f"{', '.join(chosen[:-1])} or {chosen[-1]}" if len(chosen) > 1 else chosen[0]] if chosen else []
-    for member in members:
+    for member in kinds:
         if get_origin(member) in (list, tuple):
             words.append("a list")
         elif get_origin(member) is dict:
@@ -62,7 +61,7 @@ def document(cls: type[BaseModel]) -> str:
     """The docstring with a section of parameters: what each takes, its default, what it is."""
     lines = [own_doc(cls), "", "Parameters", "----------"]
     for name, field in described(cls).items():
-        default = "required" if field.is_required() else f"default {_default(field)}"
+        default = "required" if field.is_required() else f"default {_value(field)!r}"
         lines.append(f"{name} : {kind(field)}; {default}")
         lines += [f"    {line}" for line in (field.description or "").splitlines()]
     return "\n".join(lines).strip()
@@ -78,27 +77,11 @@ def signature(cls: type[BaseModel]) -> inspect.Signature:
     return inspect.Signature(made)
 
 
-def written_choices(field: FieldInfo) -> str:
-    """The choices as Markdown, empty where there are none."""
-    chosen = [f"`{value}`" if isinstance(value, str) else f"`{json.dumps(value)}`" for value in choices(field)]
-    if not chosen:
-        return ""
-    others = [m for m in _members(field) if m is not NoneType and get_origin(m) is not Literal]
-    named = f"one of {', '.join(chosen)}" if len(chosen) > 1 else chosen[0]
-    if any(get_origin(t) is Literal for other in others for t in types_in(other)):
-        named, others = f"one or several of {', '.join(chosen)}", []
-    return f"Or {named}." if others else f"{named[0].upper()}{named[1:]}{'.' if len(chosen) > 1 else ' only.'}"
-
-
 def _value(field: FieldInfo) -> Any:
     return field.get_default(call_default_factory=True)
 
 
-def _default(field: FieldInfo) -> str:
-    return repr(_value(field))
-
-
-def _members(field: FieldInfo) -> tuple[Any, ...]:
+def members(field: FieldInfo) -> tuple[Any, ...]:
     """The types of which a parameter takes one, without what they are annotated with."""
     annotation = field.annotation
     members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)

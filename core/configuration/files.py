@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, ValidationInfo
+from pydantic import BaseModel, BeforeValidator, ValidationInfo
 
 from .diagnostics import nearest
 from .values import mistake
@@ -30,16 +31,24 @@ def find(value: Any, info: ValidationInfo) -> Path:
             message = f"'{value}' is not a file" + (" but a folder" if candidate.is_dir() else "")
             raise mistake(message, help=f"it is {candidate}")
     where = " and ".join(str(p.parent) for p in tried)
-    raise mistake(f"no such file: '{value}', looked in {where}", _similar(tried))
+    beside = ((path.name, path.parent.iterdir()) for path in tried if path.parent.is_dir())
+    hints = (nearest(name, (p.name for p in others if p.is_file())) for name, others in beside)
+    raise mistake(f"no such file: '{value}', looked in {where}", next(filter(None, hints), ""))
 
 
-def _similar(tried: list[Path]) -> str:
-    for path in tried:
-        if path.parent.is_dir():
-            hint = nearest(path.name, (p.name for p in path.parent.iterdir() if p.is_file()))
-            if hint:
-                return hint
-    return ""
+def paths_in(value: Any) -> Iterator[Path]:
+    """Every path among parameters."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from paths_in(getattr(value, name))
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from paths_in(item)
+    elif isinstance(value, list | tuple | set | frozenset):
+        for item in value:
+            yield from paths_in(item)
 
 
 InputPath = Annotated[Path, BeforeValidator(find)]

@@ -32,7 +32,6 @@ from .yaml_places import Document, Source, Span
 
 EXAMPLE = "write at least: site, instrument, time, and operators (a list of steps); `zonda pipelines` lists examples"
 
-
 MOST_STEPS = 1000
 """Longer pipelines are refused before they are looked at."""
 
@@ -84,8 +83,9 @@ class _Check(Mistakes):
         self.tree: dict[Any, Any] = document.value
 
     def run(self) -> PipelineFile:
+        kind: type[Header] = Header if self.tree.get("campaign") is None else registry.sections.get("campaign").header
         head = {k: v for k, v in self.tree.items() if k not in (*SCENE_KEYS, "operators") and not str(k).startswith("x-")}
-        header = self.validate(self.kind_of_header(), head, (), "the pipeline", KEYS)
+        header = self.validate(kind, head, (), "the pipeline", KEYS)
         self.sizes()
         self.requirements()
         scene = self.scene()
@@ -138,13 +138,6 @@ class _Check(Mistakes):
         except ZondaError as err:
             self.refused(err, at)
             return scene
-
-    def kind_of_header(self) -> type[Header]:
-        """The class that the header is checked against."""
-        if self.tree.get("campaign") is None:
-            return Header
-        header: type[Header] = registry.sections.get("campaign").header
-        return header
 
     def without_campaign(self, document: Document) -> list[Diagnostic]:
         """What is wrong with a document but for its campaign."""

@@ -39,7 +39,6 @@ LEAST = 1e-30
 """Smallest value (SI) besides zero that is computed with: squares and products of a few such values, and of `Kind.most`, are
 still numbers."""
 
-
 KINDS = {
     "rad": Kind("an angle", ("4 arcmin", "11 arcsec", "0.5 deg"), ("deg", "arcmin", "arcsec", "rad"), 1e6),
     "rad / s": Kind("an angular speed", ("51 arcsec/s", "0.5 deg/s"), ("deg/s", "arcmin/s", "arcsec/s", "rad/s"), 1e6),

@@ -191,13 +191,10 @@ class Context:
     @cached_property
     def before_filters(self) -> bool:
         """Whether a stream is saved, measured or drawn above a filter: what the filters remove is then in it."""
-        filters = [k for k, o in enumerate(self.operators) if self._filters(o.label)]
+        filtering = {label for label, t in self.traits.items() if t.removes_common or t.response is not None}
+        filters = [k for k, o in enumerate(self.operators) if o.label in filtering]
         readers = [k for k, o in enumerate(self.operators) if o.label in self.readers]
         return bool(filters and readers) and min(readers) < max(filters)
-
-    def _filters(self, label: str) -> bool:
-        traits = self.traits.get(label)
-        return traits is not None and (traits.removes_common or traits.response is not None)
 
     @property
     def samples(self) -> int:

@@ -8,19 +8,19 @@ Nothing is remembered where other distributions provide operators, models or tab
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
+from ..configuration.files import paths_in
 from ..configuration.pipeline_file import PipelineFile
 from ..discovery import HOST, discover, normalized
 from ..machine import available_memory, available_threads
-from ..program import fingerprint
 from ..storage import user_cache
-from ..versions import versions
+from ..versions import fingerprint, versions
 from .summary import PlanSummary
 
 KIND = "plan"
@@ -66,7 +66,7 @@ def _key(file: PipelineFile, options: Mapping[str, Any]) -> dict[str, Any] | Non
     if any(type(o).__module__.partition(".")[0] != HOST for o in file.operators):
         return None
     try:
-        files = [(str(p), *_state(p)) for p in sorted(set(_paths([file.scene(), *file.operators])))]
+        files = [(str(p), *_state(p)) for p in sorted(set(paths_in([file.scene(), *file.operators])))]
     except OSError:
         return None  # the plan will say what is wrong with it
     return {
@@ -83,18 +83,3 @@ def _state(path: Path) -> tuple[int, ...]:
     """What changes with a file's content: its times, the second of which nobody sets (``cp -p``, ``touch -r``), and its size."""
     state = path.stat()
     return state.st_mtime_ns, state.st_ctime_ns, state.st_ino, state.st_size
-
-
-def _paths(value: Any) -> Iterator[Path]:
-    """Every path among the parameters."""
-    if isinstance(value, Path):
-        yield value
-    elif isinstance(value, BaseModel):
-        for name in type(value).model_fields:
-            yield from _paths(getattr(value, name))
-    elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _paths(item)
-    elif isinstance(value, (list, tuple, set, frozenset)):
-        for item in value:
-            yield from _paths(item)

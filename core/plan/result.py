@@ -7,7 +7,6 @@ import shutil
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -75,11 +74,6 @@ class Plan:
                 mine = found.setdefault(d.operator, {})
                 mine[key] = [*mine.get(key, []), *value] if isinstance(value, list) else value
         return found
-
-    @cached_property
-    def coarsened(self) -> tuple[Decided, ...]:
-        """What is not simulated in full although the pipeline asks for it."""
-        return tuple(d for d in self.decided if d.chosen > 0)
 
     def saved_seconds(self, d: Decided) -> float:
         """CPU time that a decision saves, all signals [reference s]."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -53,7 +53,16 @@ class PlanSummary:
 
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators omitted."""
-        return apply(file, self.operators, self.runs, self.settings)
+        labels = [o.label for o in file.pipeline().operators]
+        steps, kept = [], []
+        for label, step in zip(labels, file.steps, strict=True):
+            if label in self.operators:
+                update = self.settings.get(label, {})
+                steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
+                kept.append(label)
+        runs = {name: run for name, run in file.runs.items() if name in self.runs}
+        header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **self.settings.get("pipeline", {})})
+        return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
 
     def __str__(self) -> str:
         p, u = self.prediction, self.unpruned
@@ -61,22 +70,6 @@ class PlanSummary:
         if u.total - p.total > 0.01 * u.total:
             words += f" (everything on: {duration(u.total)}, {u.bytes / 1e9:.2g} GB)"
         return words + (f", not counting {', '.join(p.unknown)}" if p.unknown else "")
-
-
-def apply(
-    file: PipelineFile, operators: Collection[str], names: Collection[str], settings: Mapping[str, Mapping[str, Any]]
-) -> PipelineFile:
-    """``file`` with these operators (labels) and signals only, parameters changed by ``settings``."""
-    labels = [o.label for o in file.pipeline().operators]
-    steps, kept = [], []
-    for label, step in zip(labels, file.steps, strict=True):
-        if label in operators:
-            update = settings.get(label, {})
-            steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
-            kept.append(label)
-    runs = {name: run for name, run in file.runs.items() if name in names}
-    header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **settings.get("pipeline", {})})
-    return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
 
 
 def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:

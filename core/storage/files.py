@@ -127,6 +127,22 @@ def temporary_sibling(path: str | os.PathLike[str]) -> Path:
     return path.with_name(f".{path.stem[:100]}.{os.getpid()}-{secrets.token_hex(4)}.part{path.suffix}")
 
 
+def put(path: Path, content: bytes) -> None:
+    """Write a file for later runs, whole or not at all, readable by all and written by this user alone; raises OSError.
+
+    Unlike a product it need not outlive a crash of the machine: nothing waits for the disk.
+    """
+    temporary = temporary_sibling(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(content)
+        temporary.chmod(0o644)  # whatever the umask: compiled code that others may write to is not read
+        os.replace(temporary, path)
+    except BaseException:
+        discard(temporary)
+        raise
+
+
 def publish(temporary: Path, path: str | os.PathLike[str]) -> None:
     """Move a finished temporary file to its name in one step. Raises `OutputError`; the temporary file is gone either way."""
     try:

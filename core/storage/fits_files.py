@@ -19,7 +19,6 @@ from .files import check_memory, reading
 COMPRESSED = (".gz", ".bz2", ".xz", ".z", ".zip")
 """Suffixes of files whose length says nothing about what is in them."""
 
-
 FIELDS_MAX = 999
 """Axes of an array, and columns of a table, that FITS 4.0 allows (4.4.1, 7.3.1); astropy loops over what is claimed."""
 HEADER_MAX = 10_000_000
@@ -43,16 +42,12 @@ def opened(path: str | os.PathLike[str], place: str, cure: str, kind: str = "FIT
 def check_size(path: str | os.PathLike[str], hdu: Any, place: str) -> None:
     """Before data are read: OSError where the file ends before them, `InputError` where they need more memory than is free."""
     size = _data_bytes(hdu.header)
-    if (hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU") and size > packed.UNPACKED_MAX:
+    tiled = hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU"
+    if tiled and size > packed.UNPACKED_MAX:
         raise packed.too_large(size, packed.UNPACKED_MAX, place, least=False)
     check_memory(size, "the array or table", place)
     info = hdu.fileinfo()
-    if (
-        info is None
-        or Path(path).suffix.lower() in COMPRESSED
-        or hdu.header.get("ZIMAGE")
-        or type(hdu).__name__ == "CompImageHDU"
-    ):
+    if info is None or tiled or Path(path).suffix.lower() in COMPRESSED:
         return
     needed, found = info["datLoc"] + size, os.path.getsize(path)
     if found < needed:

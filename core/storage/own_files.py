@@ -34,15 +34,11 @@ def own_folder(folder: Path, otherwise: Path) -> Path:
         if not _foreign(os.stat(folder)):
             return folder
     except OSError:  # not there yet: it will be made by this user
-        if not _foreign_parent(folder):
+        there = next((p for p in folder.parents if p.exists()), None)
+        if there is None or not _foreign(os.stat(there)):
             return folder
     otherwise.mkdir(parents=True, exist_ok=True, mode=0o700)
     return otherwise
-
-
-def _foreign_parent(folder: Path) -> bool:
-    there = next((p for p in folder.parents if p.exists()), None)
-    return there is not None and bool(_foreign(os.stat(there)))
 
 
 def _foreign(state: os.stat_result) -> str:

@@ -10,12 +10,13 @@ import hashlib
 import json
 import os
 import platform
-import secrets
 import sys
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from .files import put
 
 RESTRAINTS = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE", "GLIBC_TUNABLES")
 """Variables with which other instructions are chosen than the processor's own."""
@@ -53,13 +54,7 @@ def remember(kind: str, key: Any, value: Any) -> None:
         if json.loads(body)["value"] != value:
             return
         path = _path(kind, text)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
-        try:
-            temporary.write_text(body, encoding="utf-8")
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        put(path, body.encode())
         for old in sorted(path.parent.glob(f"{kind}-*.json"), key=lambda p: p.stat().st_mtime)[:-MOST]:
             old.unlink(missing_ok=True)
 

@@ -151,7 +151,7 @@ def failing(times, error="it broke", **more):
     def work(order):
         if order.task.number == 3 and left[0]:
             left[0] -= 1
-            return Outcome(3, "here", 0.1, error=error, **more)
+            return Outcome("here", 0.1, error=error, **more)
         return perform(order)
 
     return work
@@ -270,7 +270,7 @@ def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypa
 
 def half(bench, monkeypatch):
     """A campaign of which tasks 0 to 4 are done."""
-    monkeypatch.setattr(campaign, "perform", lambda order: Outcome(0, "", 0.0, error="no", final=True) if order.task.number > 4
+    monkeypatch.setattr(campaign, "perform", lambda order: Outcome("", 0.0, error="no", final=True) if order.task.number > 4
                         else perform(order))  # fmt: skip
     out = bench.run(bench.CAMPAIGN, *SERIAL, status=2)
     monkeypatch.setattr(campaign, "perform", perform)

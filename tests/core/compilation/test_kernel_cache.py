@@ -330,13 +330,13 @@ from numba.core import environment
 {change}
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
-    from zonda.core.compilation import keep_kernels
+    from zonda.core.compilation import jit
     from zonda.core.numerics import random
     for name in ("toy_inner", "toy_outer"):
         spec = importlib.util.spec_from_file_location(f"zonda.{{name}}", f"{{sys.argv[1]}}/{{name}}.py")
         module = sys.modules[f"zonda.{{name}}"] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-    keep_kernels.share()
+    jit.share()
     print(module.outer(2.0), module.outer(2), len(told), *{{str(w.message).partition(" (")[0] for w in told}}, sep="|")
 """
 

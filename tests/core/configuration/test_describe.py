@@ -9,37 +9,35 @@ from typing import Any
 import pytest
 
 import zonda
-from zonda.core.configuration.describe import choices, kind, written_choices
+from zonda.core.configuration.describe import choices, kind
 from zonda.core.configuration.docstrings import own_doc
 from zonda.core.registry import operators
 
 
 @pytest.mark.parametrize(
-    ("cls", "parameter", "words", "markdown"),
+    ("cls", "parameter", "words"),
     [
-        ("BinMap", "pixel", "an angle such as '4 arcmin'", ""),
-        ("BinMap", "frame", "'icrs' or 'galactic'", "One of `icrs`, `galactic`."),
-        ("BinMap", "projection", "'TAN'", "`TAN` only."),
-        ("BinMap", "half_difference", "True or False", ""),
-        ("SkyMap", "file", "the path of a file", ""),
-        ("SkyMap", "beam", "'gaussian' or 'none'", "One of `gaussian`, `none`."),
-        ("SkyMap", "centre", "'target', or a position such as '05h00m00s +20d00m00s'", "Or `target`."),
-        ("PointingDaisy", "offsets", "'none' or 'box', or a list", "Or one of `none`, `box`."),
-        ("PointingDaisy", "scans", "a whole number", ""),
+        ("BinMap", "pixel", "an angle such as '4 arcmin'"),
+        ("BinMap", "frame", "'icrs' or 'galactic'"),
+        ("BinMap", "projection", "'TAN'"),
+        ("BinMap", "half_difference", "True or False"),
+        ("SkyMap", "file", "the path of a file"),
+        ("SkyMap", "beam", "'gaussian' or 'none'"),
+        ("SkyMap", "centre", "'target', or a position such as '05h00m00s +20d00m00s'"),
+        ("PointingDaisy", "offsets", "'none' or 'box', or a list"),
+        ("PointingDaisy", "scans", "a whole number"),
         (
             "AtmosphereLayers",
             "outputs",
             "'pwv', 'opacity' or 'path_delay', or a list",
-            "One or several of `pwv`, `opacity`, `path_delay`.",
         ),
-        ("Scene", "site", "a Site", ""),
-        ("Scene", "time", "a time such as '2024-11-25T07:00:00Z'", ""),
+        ("Scene", "site", "a Site"),
+        ("Scene", "time", "a time such as '2024-11-25T07:00:00Z'"),
     ],
 )
-def test_what_a_parameter_takes(cls: str, parameter: str, words: str, markdown: str) -> None:
+def test_what_a_parameter_takes(cls: str, parameter: str, words: str) -> None:
     field = getattr(zonda, cls).model_fields[parameter]
     assert kind(field) == words
-    assert written_choices(field) == markdown
 
 
 @pytest.mark.parametrize("name", [*operators, "Scene", "Site", "Instrument", "Telescope", "Band"])
