@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationInfo
 
 from .configuration.parameters import Parameters
@@ -14,12 +12,11 @@ from .configuration.units import Unit
 from .configuration.values import TextValue, mistake, refusal
 from .errors import InputError, ZondaError
 from .registry import weather_sources
+from .types import Floats
 
 if TYPE_CHECKING:
     from .configuration.time import Instant
     from .site import Site
-
-Array = NDArray[np.float64]
 
 PWV_MAX = 60e-3
 """m: more water vapour than any atmosphere on Earth holds above a telescope."""
@@ -118,17 +115,17 @@ class Column:
         One line for the reports: where these levels come from.
     """
 
-    pressure: Array
-    height: Array
-    temperature: Array
-    h2o: Array
-    wind_east: Array
-    wind_north: Array
-    ozone_pressure: Array | None = None
-    ozone: Array | None = None
-    log_vapour_spread: Array | None = None
-    wind_east_spread: Array | None = None
-    wind_north_spread: Array | None = None
+    pressure: Floats
+    height: Floats
+    temperature: Floats
+    h2o: Floats
+    wind_east: Floats
+    wind_north: Floats
+    ozone_pressure: Floats | None = None
+    ozone: Floats | None = None
+    log_vapour_spread: Floats | None = None
+    wind_east_spread: Floats | None = None
+    wind_north_spread: Floats | None = None
     column_spread: tuple[float, float] | None = None
     ground_temperature: float | None = None
     stated: str = ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -67,7 +67,6 @@ def accuracy(
     meets the target at least cost.
     """
     from ..configuration.pipeline_file import load
-    from ..configuration.units import Unit
     from ..run.first_look import first_look
     from .metrics import get
     from .settings import knobs_of, shortened
@@ -76,7 +75,7 @@ def accuracy(
     file = load(pipeline, settings)
     get(metric)
     first_look(file.pipeline(), file.scene(), saved=False)
-    wanted = _fraction(target, Unit(""))
+    wanted = _fraction(target)
     if check:
         return _retest(file, pipeline, metric)
     turned = knobs_of(file, knobs)
@@ -130,11 +129,13 @@ def _retest(file: PipelineFile, pipeline: str, metric: str) -> int:
     return 0 if all(r.good for r in results) else NOT_MET
 
 
-def _fraction(text: str, unit: Any) -> float:
+def _fraction(text: str) -> float:
     from pydantic_core import PydanticCustomError
 
+    from ..configuration.units import Unit
+
     try:
-        return float(unit.parse(text))
+        return Unit("").parse(text)
     except (PydanticCustomError, ValueError) as err:
         message = err.message() if isinstance(err, PydanticCustomError) else f"expected a fraction such as '1 %', got {text!r}"
         raise click.BadParameter(message, param_hint="--target") from None

@@ -163,19 +163,20 @@ def audit(
         return Audit(tuple(rows), words)
     stated = {d.name: d for d in whole_plan.decided}
     same = [s for d in chosen if (s := _on_slice(d, stated)) is not None]
-    in_full = dataclasses.replace(whole_plan, structure=whole, decided=()).apply(part)
-    reference = _run(_with_sky_given(in_full), whole_plan.context, threads)
+
+    def decided(*those: Decided, structure: Structure = whole) -> PipelineFile:
+        return dataclasses.replace(whole_plan, structure=structure, decided=those).apply(part)
+
+    reference = _run(_with_sky_given(decided()), threads)
     for d in same:
-        one = dataclasses.replace(whole_plan, structure=whole, decided=(d,))
-        rows += _compare(d.name, d.choice, reference, _run(one.apply(part), whole_plan.context, threads), whole_plan.context)
+        rows += _compare(d.name, d.choice, reference, _run(decided(d), threads), whole_plan.context)
     if fewer != whole.operators and reference.map is not None:
-        bare = dataclasses.replace(whole_plan, structure=dataclasses.replace(whole, operators=fewer), decided=())
-        result = dataclasses.replace(_run(bare.apply(part), whole_plan.context, threads), signal=[], sky=None)
+        bare = decided(structure=dataclasses.replace(whole, operators=fewer))
+        result = dataclasses.replace(_run(bare, threads), signal=[], sky=None)
         nothing = Choice("dropped", "what no output depends on", bound={"map_rms": 0.0})
         rows += _compare("structure", nothing, reference, result, whole_plan.context)
     if len(same) > 1:
-        together = dataclasses.replace(whole_plan, structure=whole, decided=tuple(same))
-        result = _run(together.apply(part), whole_plan.context, threads)
+        result = _run(decided(*same), threads)
         bound: dict[str, float] = {}
         for d in same:
             sky = d.choice.bound.get("peak", 0.0)  # what is bounded for the sky alone is in the stream and the map too
@@ -235,7 +236,7 @@ class _Result:
     """The sky alone as it comes in, not filtered, which a transfer function is relative to."""
 
 
-def _run(file: PipelineFile, context: Context, threads: int | None) -> _Result:
+def _run(file: PipelineFile, threads: int | None) -> _Result:
     made = any("signal" in s.operator.provides for s in file.steps)
     data = file.pipeline().run(file.scene(), threads=threads, keep=["signal"] if made else ())
     maps = [k for k, v in data.products.items() if hasattr(v, "hits") and hasattr(v, "signal")]

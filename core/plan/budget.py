@@ -47,22 +47,9 @@ def limits(budget: Any, map_noise: float, sample_noise: float) -> dict[str, floa
     ZondaError
         For a share that is not a number from 0 to 1.
     """
-    if isinstance(budget, Limits):
-        in_map = SHARE * map_noise if budget.map_rms is None else budget.map_rms
-        return {
-            "map_rms": in_map,
-            "peak": in_map if budget.peak is None else budget.peak,
-            "transfer": TRANSFER if budget.transfer is None else budget.transfer,
-            "tod": SHARE * sample_noise if budget.tod is None else budget.tod,
-            "psd": SHARE if budget.psd is None else budget.psd,
-        }
-    share = float(budget)
+    given = {metric: v for metric, v in budget if v is not None} if isinstance(budget, Limits) else {}
+    share = SHARE if isinstance(budget, Limits) else float(budget)
     if not 0 <= share <= 1:
         raise ZondaError(f"the budget is a share of the noise from 0 to 1, got {share:g}", place="budget", cure="write e.g. 10 %")
-    return {
-        "map_rms": share * map_noise,
-        "peak": share * map_noise,
-        "transfer": TRANSFER * min(1.0, share / SHARE),
-        "tod": share * sample_noise,
-        "psd": share,
-    }
+    in_map, transfer = given.get("map_rms", share * map_noise), TRANSFER * min(1.0, share / SHARE)
+    return {"map_rms": in_map, "peak": in_map, "transfer": transfer, "tod": share * sample_noise, "psd": share, **given}
