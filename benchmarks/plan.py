@@ -52,7 +52,7 @@ def one(scene, folder, prune):
         "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, "noise": made.noise[1],
         "stages": {k: [v, timed.get(k, 0.0)] for k, v in made.prediction.seconds.items()},
         "steps": sum(timed.values()),
-        "decided": [f"{d.name}: {d.choice.what}" for d in made.coarsened],
+        "decided": [f"{d.name}: {d.choice.what}" for d in made.decided if d.chosen > 0],
         "left_out": [f"{r.run} {r.operator}".strip() for r in made.structure.rows],
     }  # fmt: skip
     print(json.dumps(found))

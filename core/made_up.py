@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .configuration.time import Instant
 from .data import STREAMS, Block, Data, Observation
 from .instrument import Band, Instrument, Telescope
+from .numerics.quaternions import from_angles
 from .numerics.random import normals
 from .numerics.smooth import SmoothField
 from .numerics.tiles import TILE_SAMPLES
@@ -101,14 +102,8 @@ def made_up_scan() -> Observation:
     x, y = reach * np.cos(t / 3), reach * np.sin(t / 3)
     return Observation(
         "scan-000", 0, scene.site, scene.instrument, scene.instrument.focalplane(), scene.time, t, RATE,
-        _quaternions(-1.0 - x / np.cos(1.05), 1.05 + y), _quaternions(ra + x / np.cos(dec), dec + y), (ra, dec), scene.seed,
+        from_angles(-1.0 - x / np.cos(1.05), 1.05 + y), from_angles(ra + x / np.cos(dec), dec + y), (ra, dec), scene.seed,
     )  # fmt: skip
-
-
-def _quaternions(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rz(lon) Ry(pi/2 - lat), (n, 4) in the order x y z w."""
-    a, b = lon / 2, (np.pi / 2 - lat) / 2
-    return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
 
 
 def given_signal(observation: Observation, factor: float) -> NDArray[np.float32]:

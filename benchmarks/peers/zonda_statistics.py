@@ -15,8 +15,9 @@ from zonda_atmosphere import observation
 import zonda
 from zonda.core.data import Block
 from zonda.core.instrument import SPEED_OF_LIGHT
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.operators.atmosphere.layers import AtmosphereLayers
-from zonda.operators.atmosphere.turbulence.beams import GAUSSIAN_FWHM, widened
+from zonda.operators.atmosphere.turbulence.beams import widened
 
 OUTER_SCALE = 1000 / math.sqrt(5 / 3)
 """m: maria's layers have r0 = 1000 m in its definition, sqrt(2 nu) times ours."""
@@ -47,7 +48,9 @@ def main() -> None:
         y=np.array(y, np.float32),
         step=1 / c["rate"],
         amplitude=[rms * layer.amplitude for layer in layers],
-        sigma=[widened(c["diameter"], SPEED_OF_LIGHT / c["band_centre"], layer.height / sin) / GAUSSIAN_FWHM for layer in layers],
+        sigma=[
+            widened(c["diameter"], SPEED_OF_LIGHT / c["band_centre"], layer.height / sin) / FWHM_PER_SIGMA for layer in layers
+        ],
         outer_scale=[OUTER_SCALE] * len(layers),
         positions=[layer.height / sin * offsets for layer in layers],
         speed=np.hypot(across, along * sin),

@@ -14,15 +14,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..instrument import SPEED_OF_LIGHT
+from ..types import Floats
 
 if TYPE_CHECKING:
     from ..instrument import Band
-
-Array = NDArray[np.float64]
 
 PLANCK = 6.62607015e-34
 """J s (SI, exact)."""
@@ -39,7 +38,7 @@ UNITS = ("K_RJ", "K_CMB", *SURFACE_BRIGHTNESS_UNITS, "y")
 """Units of a sky map that `to_kelvin_rj` knows."""
 
 
-def rayleigh_jeans(frequency: ArrayLike, temperature: ArrayLike) -> Array:
+def rayleigh_jeans(frequency: ArrayLike, temperature: ArrayLike) -> Floats:
     """Rayleigh-Jeans brightness of a black body, J = (h nu / k) / (exp(h nu / k T) - 1). Hz, K -> K; shapes broadcast."""
     nu, temperature = np.asarray(frequency, np.float64), np.asarray(temperature, np.float64)
     x = PLANCK * nu / (BOLTZMANN * temperature)
@@ -47,14 +46,14 @@ def rayleigh_jeans(frequency: ArrayLike, temperature: ArrayLike) -> Array:
         return np.asarray(temperature * x / np.expm1(x))
 
 
-def cmb_slope(frequency: ArrayLike) -> Array:
+def cmb_slope(frequency: ArrayLike) -> Floats:
     """dT_RJ / dT_CMB = x^2 e^x / (e^x - 1)^2 at 2.72548 K, with x = h nu / k T. Hz -> K_RJ per K_CMB."""
     half = PLANCK * np.asarray(frequency, np.float64) / (2 * BOLTZMANN * T_CMB)
     with np.errstate(over="ignore"):
         return np.asarray((half / np.sinh(half)) ** 2)
 
 
-def thermal_sz(frequency: ArrayLike) -> Array:
+def thermal_sz(frequency: ArrayLike) -> Floats:
     """Non-relativistic thermal Sunyaev-Zel'dovich effect, T_CMB (x coth(x/2) - 4) dT_RJ/dT_CMB. Hz -> K_RJ per Compton-y.
 
     Sunyaev & Zel'dovich (1972); negative below 217.5 GHz. Relativistic terms (-3 % for gas of 10 keV) are left out.
@@ -63,12 +62,12 @@ def thermal_sz(frequency: ArrayLike) -> Array:
     return np.asarray(T_CMB * (x / np.tanh(x / 2) - 4) * cmb_slope(frequency))
 
 
-def intensity_to_kelvin(frequency: ArrayLike) -> Array:
+def intensity_to_kelvin(frequency: ArrayLike) -> Floats:
     """Rayleigh-Jeans kelvin per unit of specific intensity, c^2 / (2 k nu^2). Hz -> K / (W m^-2 Hz^-1 sr^-1)."""
     return np.asarray(SPEED_OF_LIGHT**2 / (2 * BOLTZMANN * np.asarray(frequency, np.float64) ** 2))
 
 
-def band_average(band: Band, function: Callable[[Array], Array]) -> float:
+def band_average(band: Band, function: Callable[[Floats], Floats]) -> float:
     """Equation (1) of ``function`` (Hz array -> array): Gauss-Legendre between the band's tabulated points.
 
     Intervals wider than 1 % of their frequency are divided, so that smooth spectra are integrated to 1e-12.
@@ -118,7 +117,7 @@ def to_kelvin_rj(
     if unit in SURFACE_BRIGHTNESS_UNITS:
         centre = band.centre
 
-        def power_law(nu: Array) -> Array:
+        def power_law(nu: Floats) -> Floats:
             return np.asarray((nu / centre) ** spectral_index * intensity_to_kelvin(nu))
 
         return band_average(band, power_law) * _intensity(unit, pixel_solid_angle, beam_solid_angle)

@@ -13,6 +13,7 @@ import numpy as np
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.observation import Observation
 from zonda.core.registry import spectra
@@ -22,7 +23,7 @@ from zonda.core.weather import GroundWeather, WeatherSource
 from .distribution import Fluctuation, largest_pwv
 from .parameters import LayerParameters, Wind
 from .resolution import Resolution, choose_resolution
-from .turbulence.beams import GAUSSIAN_FWHM, Aperture, widened
+from .turbulence.beams import Aperture, widened
 from .turbulence.geometry import ScanPlane, axes_at, rays, scan_planes
 from .turbulence.lattice import Turbulence
 from .turbulence.nodes import Layer, times_with_margin
@@ -206,7 +207,7 @@ def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
 
     From the paper's near-field FWHM(z) = D sqrt(z^-2 + z_r^-2) rad, z_r = pi (D/2)^2 / lambda at the band centre.
     """
-    return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance) / GAUSSIAN_FWHM
+    return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance) / FWHM_PER_SIGMA
 
 
 def _shares(parameters: LayerParameters, profile: Profile, heights: Floats) -> Floats:

@@ -9,12 +9,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
 from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.numerics.quaternions import from_angles
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
 from zonda.core.scene import Scene
@@ -62,15 +63,9 @@ def scan(
     (az, el), (ra, dec) = np.radians([azimuth, elevation]), np.radians(TARGET)
     x, y = reach * np.cos(turn), reach * np.sin(turn)
     return Observation(
-        "scan-000", 0, SITE, instrument, plane, START, t, 100.0, _quaternions(-az - x / np.cos(el), el + y),
-        _quaternions(ra + x / np.cos(dec), dec + y), (float(ra), float(dec)), 7,
+        "scan-000", 0, SITE, instrument, plane, START, t, 100.0, from_angles(-az - x / np.cos(el), el + y),
+        from_angles(ra + x / np.cos(dec), dec + y), (float(ra), float(dec)), 7,
     )  # fmt: skip
-
-
-def _quaternions(lon: AnyFloats, lat: AnyFloats) -> NDArray[np.float64]:
-    """Rz(lon) Ry(pi/2 - lat), (n, 4) in the order x y z w."""
-    a, b = lon / 2, (np.pi / 2 - lat) / 2
-    return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
 
 
 class Points(Operator):

@@ -30,8 +30,6 @@ from zonda.core.types import Floats
 
 from .covariance import NU
 
-GAUSSIAN_FWHM = math.sqrt(8 * math.log(2))
-
 
 def widened(diameter: float, wavelength: float, distance: float) -> float:
     """D sqrt(1 + (z / z_r)^2), z_r = pi (D / 2)^2 / lambda: width [m] of the column at ``distance`` along the line of sight."""
