@@ -106,6 +106,11 @@ class Formed:
         return self.stream.partition("/")[2]
 
 
+def can_be_named(name: str) -> bool:
+    """Whether a pipeline's author may call a signal so; names that begin with an underscore are those of outputs."""
+    return name.isidentifier() and not name.startswith("_")
+
+
 def stream_of(name: str) -> str:
     """The stream of the signal ``name`` (empty: the complete one)."""
     return f"{MAIN}/{name}" if name else MAIN

@@ -15,7 +15,7 @@ from ..operator import Operator
 from ..pipeline import Pipeline
 from ..run.order import check_order
 from ..scene import Scene
-from ..signal import Signal
+from ..signal import Signal, can_be_named
 from ..weather import WeatherSource, resolve
 from . import overrides as settings
 from . import yaml_places
@@ -208,6 +208,8 @@ class _Check(Mistakes):
             return
         components = sorted(set().union(*(operator.provides for operator in operators)))
         for name, run in header.runs.items():
+            if not can_be_named(name):
+                continue  # said below, at the name
             for which in ("only", "without"):
                 for i, component in enumerate(getattr(run, which) or ()):
                     try:

@@ -19,7 +19,7 @@ from ..errors import PipelineError
 from ..mapmaker import MapMaker, SkySignal, filters, forms, place_of_signal
 from ..operator import Operator
 from ..output import Output
-from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, is_signal, stream_of
+from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, can_be_named, is_signal, stream_of
 
 MOST_PARTS = 4
 """Signals that may be taken from the complete one: each adds its rounding."""
@@ -64,7 +64,7 @@ class Signals:
         self.components = frozenset[Component]().union(*(self.components_of(o) for o in self._generators))
         self._only = Signal(only=list(only)) if only else None
         for name, signal in self.runs.items():
-            if not name.isidentifier() or name.startswith("_"):
+            if not can_be_named(name):
                 cure = "use letters, digits and underscores, the first a letter"
                 raise PipelineError(f"{name!r} cannot name a signal", place=place, cure=cure)
             self._check_components(signal, f"signal {name} names")

@@ -774,6 +774,9 @@ def test_in_a_pipeline_file():
     assert parse(file.resolved_yaml()).runs == file.runs
     with pytest.raises(ZondaError, match=r"(?s)modes.*own.*full"):
         parse(FILE.replace("modes: full", "modes: mine"))
+    with pytest.raises(ZondaError, match=r"(?s)'_quiet' cannot name a signal.*use letters") as found:
+        parse(FILE.replace("quiet:", "_quiet:"))
+    assert "did you mean" not in str(found.value), "the component is not the mistake"
 
 
 @pytest.mark.parametrize(
