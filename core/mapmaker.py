@@ -14,6 +14,8 @@ from .signal import BUILT_IN, MAIN, Component
 class MapMaker(Operator):
     """A step that makes products of every signal: its `exec` sees all of them, under the names `Block.signals`.
 
+    What is not finite in one of them is NaN in all.
+
     Where it is `linear`, the product of a remainder is subtracted (`core.product.Product.subtract`), not simulated.
     """
 

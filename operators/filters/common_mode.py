@@ -41,9 +41,6 @@ from . import focal_plane_mean
 from .gram import Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
 
-OF_THE_SKY = frozenset({"sky", "transmission"})
-"""Components that a working detector may not see at all. All see the atmosphere."""
-
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
 
@@ -201,7 +198,8 @@ def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str)
 def _sees_nothing(stream: Stream) -> bool:
     """Whether a constant signal may be that of a detector in order: where it is the sky alone, or not the complete signal, which
     shows what is dead."""
-    return stream.signal != MAIN or (bool(stream.components) and stream.components <= OF_THE_SKY)
+    of_the_sky = bool(stream.components) and all(c.enters == "above the atmosphere" for c in stream.components)
+    return stream.signal != MAIN or of_the_sky
 
 
 @dataclass

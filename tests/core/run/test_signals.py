@@ -560,6 +560,30 @@ def test_the_complete_signal_decides_which_detectors_are_dead():
     assert same(alone.products["map"], data.products["map"], "signal")
 
 
+def test_a_sky_of_two_components_is_the_sky_alone():
+    """Detector 5, which sees nothing of either, is a valid zero as it is in one."""
+
+    class Background(Given):
+        """Another part of the sky."""
+
+        provides: ClassVar[frozenset[str]] = frozenset({Component("background", "above the atmosphere")})
+
+    class Both(Operator):
+        """Adds up the two."""
+
+        requires: ClassVar[frozenset[str]] = frozenset({"sky", "background"})
+        provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+        def exec(self, block: Block, state: object) -> None:
+            block.new("signal")[...] = block.detdata["sky"] + block.detdata["background"]
+
+    sky, background = Sky(), Background()
+    sky._values = background._values = streams()[0].copy()
+    sky._values[5] = 0.0
+    data = run([sky, background, Both(), zonda.CommonModeFilter(), zonda.BinMap(pixel="10 arcsec")], {})
+    assert not data.observations[0].detector_flags.any()
+
+
 class Boxcar(Operator):
     """The mean of the sample and its neighbours: a finite filter."""
 
