@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights, frame_rotation, rotation_matrices, wcs_frame_rotation
-from zonda.core.numerics.sphere import angle_between, unit_vectors
+from zonda.core.numerics.projection import boresights, frame_rotation, pixel_matrix, rotation_matrices, wcs_frame_rotation
+from zonda.core.numerics.sphere import angle_between
 from zonda.core.types import Floats
 
 from .beam import REACH, SIGMA
@@ -69,10 +69,8 @@ class Grid:
         """Whether any detector of an observation comes within a beam of FWHM ``widest`` [rad] of the map."""
         ny, nx = self.shape
         corners = [[-0.5, -0.5], [-0.5, ny - 0.5], [nx - 0.5, -0.5], [nx - 0.5, ny - 0.5], [(nx - 1) / 2, (ny - 1) / 2]]
-        lon, lat = np.radians(self.wcs.celestial.wcs_pix2world(corners, 0).T)
-        if not np.isfinite([lon, lat]).all():
-            return True
-        *rim, centre = unit_vectors(lon, lat)
+        rays = np.column_stack([corners, np.ones(5)]) @ np.linalg.inv(pixel_matrix(self.wcs)).T
+        *rim, centre = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         radius = float(angle_between(np.array(rim), centre).max())
         boresight = observation.boresight_radec
         cosine = max(float((centre @ boresights(boresight[chunk])).max()) for chunk in chunks(observation.n_samples))
@@ -81,7 +79,7 @@ class Grid:
 
     def behind(self, quaternions: Floats, xi: Floats, eta: Floats) -> int:
         """Samples more than 90 deg from the tangent point, of detectors at offsets (n_det,) about boresights (n, 4)."""
-        tangent = unit_vectors(*np.radians(self.wcs.wcs.crval))
+        tangent = pixel_matrix(self.wcs)[2]
         along = np.einsum("nij,i->nj", rotation_matrices(quaternions), tangent)  # the tangent point in the boresight's frame
         return int((along @ np.array([-eta, -xi, np.ones(len(xi))]) <= 0).sum())
 

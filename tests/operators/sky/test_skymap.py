@@ -271,6 +271,20 @@ def test_a_sky_that_no_detector_reaches_is_not_convolved(made, save, monkeypatch
         SkyMap(file=path).prepare(near)
 
 
+@pytest.mark.parametrize("axes", [("RA---TAN", "DEC--TAN"), ("DEC--TAN", "RA---TAN"), ("GLON-TAN", "GLAT-TAN")])
+def test_a_map_is_reached_whatever_its_axes(made, save, axes):
+    header = made.tan_header((20, 20))
+    header["CTYPE1"], header["CTYPE2"] = axes
+    if axes[0] == "DEC--TAN":
+        header["CRVAL1"], header["CRVAL2"], header["CDELT1"], header["CDELT2"] = 20.0, 75.0, header["CDELT2"], header["CDELT1"]
+    if axes[0] == "GLON-TAN":
+        del header["RADESYS"]
+    middle = WCS(header).pixel_to_world(9.5, 9.5).icrs
+    operator, scan = SkyMap(file=save(np.ones((20, 20)), header)), made.observation(np.full(30, middle.ra.rad), middle.dec.rad)
+    np.testing.assert_allclose(made.look(operator, scan), 1.0, rtol=0.05)
+    assert scan.tally.get("SkyMap", "samples outside the input map") == 0
+
+
 def test_a_block_made_twice_is_counted_once(made, save):
     operator = SkyMap(file=save(np.ones((20, 20)), made.tan_header((20, 20))))
     scan = made.observation(np.full(30, np.radians(80)), np.radians(20))
