@@ -111,7 +111,7 @@ def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
     Needs a (free) key and the package cdsapi: pip install 'zonda[weather]', then https://cds.climate.copernicus.eu/how-to-api.
     """
     from zonda.core.storage.files import atomic_path
-    from zonda.operators.atmosphere.weather.era5_fetch import retrieve
+    from zonda.operators.atmosphere.weather.era5 import retrieve
 
     place, when = _place(site), _instant(time)
     with atomic_path(output) as temporary:

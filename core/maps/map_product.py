@@ -14,8 +14,8 @@ from ..errors import InputError
 from ..notebook import html_table
 from ..numerics import tangent
 from ..numerics.angles import ARCMIN, FWHM_PER_SIGMA
-from ..numerics.gaussian import convolved, gaussian_taps
 from ..numerics.sphere import separation
+from ..numerics.transforms import convolved, gaussian_taps
 from ..types import Floats
 
 if TYPE_CHECKING:

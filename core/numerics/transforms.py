@@ -1,11 +1,16 @@
-"""Transforms that `scipy.fft` and `scipy.ndimage` have too, which take 0.3 s to import: cosines, B-splines, good lengths."""
+"""Transforms that `scipy.fft` and `scipy.ndimage` have too, which take 0.3 s to import.
+
+Cosines, B-splines, good lengths, images convolved with a Gaussian.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..types import Floats
+from ..types import AnyFloats, Floats
 
 
 def cosine_transform(values: Floats) -> Floats:
@@ -45,3 +50,26 @@ def fast_length(n: int, primes: tuple[int, ...] = (2, 3, 5)) -> int:
 def _mirrored(rows: Floats) -> Floats:
     """One period (..., 2 n - 2) of rows (..., n) that are mirrored about both ends."""
     return np.concatenate([rows, rows[..., -2:0:-1]], axis=-1)
+
+
+def gaussian_taps(sigma: float) -> Floats:
+    """(n,) the middle and one side of a Gaussian of ``sigma`` pixels, cut at 5 sigma, of sum 1 over both sides."""
+    reach = math.ceil(5 * sigma)
+    kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
+    return np.asarray(kernel / kernel.sum())[reach:]
+
+
+def convolved(values: AnyFloats, taps: AnyFloats) -> AnyFloats:
+    """An image (ny, nx) convolved along both axes with a symmetric kernel; nothing lies outside. Both of one type."""
+    return np.ascontiguousarray(_along_columns(np.ascontiguousarray(_along_columns(values, taps).T), taps).T)
+
+
+def _along_columns(values: AnyFloats, taps: AnyFloats) -> AnyFloats:
+    """sum_k taps[|k|] values[j + k] along the first axis; zeros beyond the ends."""
+    out: AnyFloats = values * taps[0]
+    part = np.empty_like(values)
+    for k in range(1, min(len(taps), len(values))):
+        np.multiply(values, taps[k], out=part)
+        out[k:] += part[:-k]
+        out[:-k] += part[k:]
+    return out

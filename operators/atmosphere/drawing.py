@@ -1,20 +1,27 @@
-"""Turbulence drawn for one observation: the layers laid out along its lines of sight, and the band's response to them."""
+"""Turbulence drawn for one observation, the band's response to it, and what the report says of both."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from zonda.core.instrument import SPEED_OF_LIGHT
 from zonda.core.types import Floats
 
 from .fluctuations import AtNodes, OfDetectors, times, units_fit
 from .model import AtmosphereModel
-from .path_delay import delay_per_vapour
-from .response import Response
-from .statements import statements
+from .response import Response, delay_per_vapour
+from .turbulence.beams import rayleigh_distance, widened
+from .turbulence.lines_of_sight import LinesOfSight
 from .turbulence.sampling import Drifting, DriftingLayers
+
+PLANES = {
+    "transverse": "transverse to the mean line of sight",
+    "cone": "the unrolled cone of the mean elevation (wide throw or field)",
+    "horizontal": "horizontal (the throw is too wide to unroll)",
+}
 
 
 def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
@@ -40,7 +47,7 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
         observation.tally.count(label, "values of the PWV clipped to the table", count)
         return y
 
-    for what, text in statements(model, path):
+    for what, text in _statements(model, path):
         observation.tally.state(label, what, text)
     if "path_delay" in parameters.outputs:
         observation.tally.state(label, "wet path delay", f"{per_vapour:.3f} times the PWV (non-dispersive)")
@@ -81,3 +88,60 @@ def in_time_order(model: AtmosphereModel) -> bool:
     if chosen.nodes.shape:
         return False
     return not units_fit(o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs)))
+
+
+def _statements(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[str, str]]:
+    """(what, text) of a model that is evaluated along a path."""
+    for what, text in model.profile.stated:
+        if what != "wind" or model.parameters.wind == "profile":
+            yield what, text
+    yield from _of_the_pwv(model)
+    yield from _of_the_beam(model, path)
+    yield from _of_the_resolution(model)
+
+
+def _of_the_pwv(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
+    law = model.fluctuation
+    before, after = law.before_and_after()
+    yield "mean PWV", f"{model.pwv * 1e3:.3f} mm" + ("" if model.parameters.pwv else " (of the weather)")
+    yield "PWV rms", f"{before:.3%} of the mean before the beam, {after:.3%} after it"
+    yield "distribution of the PWV", "log-normal" if law.log_normal else "normal"
+    each = (
+        f"{layer.height:.0f} m: {law.scale * layer.amplitude * math.sqrt(field.variance):.3%}"
+        for layer, field in zip(model.layers, model.turbulence, strict=True)
+    )
+    yield "PWV rms after the beam, per layer", ", ".join(each)
+
+
+def _of_the_beam(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[str, str]]:
+    layers, fields, footprint = model.layers, model.turbulence, model.parameters.beam
+    sizes = (f"{field.sigma:.3g} m / {field.spacing:g} m" for field in fields)
+    yield "beam sigma / lattice spacing, per layer", ", ".join(dict.fromkeys(sizes))
+    instrument = model.observation.instrument
+    diameter, wavelength = instrument.telescope.diameter, SPEED_OF_LIGHT / instrument.band.centre
+    sines = math.sin(model.plane.elevation) / np.array([path.high, path.low])
+    ends = [widened(diameter, wavelength, layers[-1].distance * k) for k in (*sines, 1.0)]
+    text = f"{ends[0] / ends[2]:.3f} to {ends[1] / ends[2]:.3f} of the one used, in the highest layer"
+    yield "width of the beam over the elevations of field and scan", text
+    if footprint != "gaussian":
+        far = rayleigh_distance(diameter, wavelength)
+        beyond = sum(layer.distance > far for layer in layers)
+        yield "footprint", f"{footprint}; {beyond} of {len(layers)} layers lie beyond {far:.0f} m, where beams lose their rim"
+    yield "turbulence covariance", f"within {fields[0].fidelity.error:.1%} of the variance ({model.parameters.fidelity})"
+
+
+def _of_the_resolution(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
+    chosen, plane = model.resolution(), model.plane
+    error = f"; expected rms error {chosen.focal_plane_error:.1e} of the fluctuation" if chosen.nodes.shape else ""
+    yield "nodes", f"{chosen.nodes}{error}"
+    several = len(set(chosen.steps)) > 1
+    steps = f"{min(chosen.steps)} to {max(chosen.steps)} samples, by layer" if several else f"{min(chosen.steps)} samples"
+    yield "step in time", f"{steps}; expected rms error {chosen.time_error:.1e} of the fluctuation"
+    yield "nodes and step of the mean emission", f"{chosen.mean_nodes}; {chosen.mean_step} samples"
+    both = "each, for nodes and for the step" if chosen.nodes.shape else "x sqrt(2) for the step"
+    yield "error allowed", f"{chosen.tolerance:.1e} of the fluctuation {both}"
+    text = f"{chosen.differential:.1e} of the fluctuation is left after subtraction of the focal-plane mean"
+    yield "differential signal", text
+    yield "plane of the turbulence", f"{PLANES[plane.kind]}; squared separations within {plane.bound:.1%}"
+    if plane.kind == "cone":
+        yield "wind on the unrolled cone", f"drifts within {plane.drift_bound:.1%} at the ends of the scan"

@@ -23,6 +23,10 @@ from zonda.core.types import Floats
 from .weather.bands import BandAtmosphere
 from .weather.radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
 
+WATER_DENSITY = 1000.0  # kg / m3
+VAPOUR_GAS_CONSTANT = 461.52  # J / (kg K)
+K2, K3 = 0.221, 3739.0  # K / Pa, K2 / Pa: k_2' and k_3
+
 ERROR = 1e-5
 """Largest error of f / y, of the largest |f / y|."""
 
@@ -30,6 +34,17 @@ LOOKED_AT = 13
 """Points along each axis at which a fit of low degree is judged; twice as many for others."""
 
 _DEGREES = ((2, 2), (3, 3), (4, 4), (5, 6), (7, 8), (10, 12), (14, 16))
+
+
+def delay_per_vapour(temperature: Floats, weights: Floats) -> float:
+    """Excess path length per PWV, Pi = 1e-6 rho R_v (k_3 / T_m + k_2'), of vapour at temperatures [K] with weights (any unit).
+
+    T_m = int rho_v dz / int (rho_v / T) dz, rho the density of water, R_v the gas constant of vapour (Bevis et al. 1994, J. Appl.
+    Meteor. 33, 379, after Thayer). Pi is 6.4 at T_m = 273 K and falls with temperature, 0.35 % per K. It holds for radio waves
+    far from water lines; dispersion in the submillimetre windows (some per cent, more beside 557 GHz) is not in it.
+    """
+    mean = float(weights.sum() / (weights / temperature).sum())
+    return 1e-6 * WATER_DENSITY * VAPOUR_GAS_CONSTANT * (K3 / mean + K2)
 
 
 class Response:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
-from zonda.core.numerics.gaussian import convolved, gaussian_taps
+from zonda.core.numerics.transforms import convolved, gaussian_taps
 from zonda.core.types import AnyFloats
 
 from .sky_axes import SkyAxes

@@ -23,11 +23,10 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .limits import LargestMotion, check_elevation, excess
+from .limits import LargestMotion, check_elevation, excess, what_fits
 from .motion import POINTS, LargestDerivative, Quantity, motion
 from .observed import Samples, centre_of, observed, report, state_times
 from .samples_per_beam import SamplesPerBeam
-from .slower import what_fits
 from .transform import Boresight, CelestialTransform
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from zonda.core.types import Floats
 
 from .beam import REACH, SIGMA, convolve, distinct
 from .brightness import Brightness, conversion, interpolated, on_own_pixels, too_bright
+from .geometry import placed, turned
 from .grid import Grid, own_pixels, tangent_grid
 from .inputs import HealpixMap, WcsMap
 from .parameters import SkyParameters
-from .placement import placed, turned
 from .read import read_map
 from .resample import Progress, no_progress
 from .state import Beam

@@ -17,10 +17,9 @@ from zonda.core.storage.fits_files import opened
 from zonda.core.storage.fits_image import read_image
 from zonda.core.types import Floats
 
-from .geometry import geometry, is_plain_tan
+from .geometry import geometry, is_plain_tan, placed, turned
 from .healpix import is_healpix
 from .inputs import WcsMap
-from .placement import placed, turned
 from .planes import chosen
 from .region import Disc
 

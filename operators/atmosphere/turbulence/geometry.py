@@ -97,13 +97,18 @@ def rays(axes: Floats, xi: Floats, eta: Floats) -> Floats:
     x, y, z = (axes[:, :, k].T[:, None, :] for k in range(3))
     u = z - np.asarray(eta)[None, :, None] * x - np.asarray(xi)[None, :, None] * y
     u = u / np.sqrt((u * u).sum(0))
-    if u.size and u[2].min() <= 0:
+    check_above_horizon(float(u[2].min(initial=1.0)))
+    return np.asarray(u, np.float64)
+
+
+def check_above_horizon(sine: float) -> None:
+    """Raise `PointingError` where the lowest line of sight, of this ``sine`` of the elevation, is at or below the horizon."""
+    if sine <= 0:
         raise PointingError(
-            f"a line of sight is {-np.degrees(np.arcsin(u[2].min())):.2f} deg below the horizon",
+            f"a line of sight is {-math.degrees(math.asin(sine)):.2f} deg below the horizon",
             place="atmosphere",
             cure="raise the target, or choose a smaller field of view",
         )
-    return np.asarray(u, np.float64)
 
 
 def crossing(u: Floats) -> Floats:

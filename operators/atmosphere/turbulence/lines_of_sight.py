@@ -24,7 +24,7 @@ from zonda.core.data import Observation
 from zonda.core.errors import PointingError
 from zonda.core.types import Floats
 
-from .geometry import Cone, ScanPlane, axes_at, rim
+from .geometry import Cone, ScanPlane, axes_at, check_above_horizon, rim
 
 _ERROR = 1e-9
 """Error of a polynomial in equation (1): micrometres at a layer kilometres away."""
@@ -100,12 +100,7 @@ class LinesOfSight:
         for a, b, n in zip(xi, eta, norm, strict=True):
             sine = (up[:, 0] + a * up[:, 1] + b * up[:, 2]) * n
             low, high = min(low, float(sine.min())), max(high, float(sine.max()))
-        if low <= 0:
-            raise PointingError(
-                f"a line of sight is {-math.degrees(math.asin(low)):.2f} deg below the horizon",
-                place="atmosphere",
-                cure="raise the target, or choose a smaller field of view",
-            )
+        check_above_horizon(low)
         radius = math.atan(float(np.hypot(xi, eta).max()))
         if math.asin(min(float(up[:, 0].max()), 1.0)) + radius > math.pi / 2:  # the zenith may lie inside the field
             high = 1.0

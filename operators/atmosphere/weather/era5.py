@@ -3,15 +3,17 @@
 Both layouts are read: NetCDF-4 with ``valid_time`` and ``pressure_level`` (from 2024), and NetCDF-3 with packed values,
 ``time`` and ``level`` (before). Only what surrounds the place and the time is read from the disk. Interpolation is bilinear in
 longitude and latitude and linear in time, of the temperature, the winds, the geopotential and the logarithm of humidity.
-Heights are geopotential heights z / g.
+Heights are geopotential heights z / g. `retrieve` downloads such a file through the store's own client ``cdsapi``.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -281,3 +283,56 @@ def _linear(points: Floats, wanted: float) -> dict[int, float]:
         return {min(k, len(points) - 1): 1.0}
     share = float((wanted - points[k - 1]) / (points[k] - points[k - 1]))
     return {k: 1.0} if share == 1 else {k - 1: 1 - share, k: share}
+
+
+DATASET = "reanalysis-era5-pressure-levels"
+_HIGH = (1, 2, 3, 5, 7, 10, 20, 30, 50, 70, 100, 125, 150, 175, 200, 225, 250, 300, 350, 400, 450, 500, 550, 600, 650, 700)
+LEVELS = (*_HIGH, 750, 775, 800, 825, 850, 875, 900, 925, 950, 975, 1000)
+"""hPa: all of them."""
+KEY = "https://cds.climate.copernicus.eu/how-to-api says how to get a free key and where to put it"
+
+
+def request(site: Site, time: Instant, hours: int) -> dict[str, Any]:
+    """What to ask for: the cells around the site, and every hour from that before ``time`` to ``hours`` later.
+
+    The store takes whole days times hours of the day, so a period over midnight gets more than that.
+    """
+    first = time.datetime.replace(minute=0, second=0, microsecond=0)
+    stamps = [first + timedelta(hours=k) for k in range(hours + 2)]
+    latitude, longitude = math.degrees(site.latitude), math.degrees(site.longitude)
+    longitude = (longitude + 180) % 360 - 180
+    south, west = max(math.floor(latitude * 4) / 4, -90.0), math.floor(longitude * 4) / 4
+    north, east = min(south + 0.25, 90.0), west + 0.25
+    return {
+        "product_type": ["reanalysis"],
+        "variable": [VARIABLES[name] for name in ("t", "q", "u", "v", "z", "o3")],
+        "year": sorted({f"{s:%Y}" for s in stamps}),
+        "month": sorted({f"{s:%m}" for s in stamps}),
+        "day": sorted({f"{s:%d}" for s in stamps}),
+        "time": sorted({f"{s:%H}:00" for s in stamps}),
+        "pressure_level": [str(level) for level in sorted(LEVELS)],
+        "area": [north, west, south, east],
+        "data_format": "netcdf",
+        "download_format": "unarchived",
+    }
+
+
+def retrieve(site: Site, time: Instant, hours: int, path: Path) -> None:
+    """Download to ``path``.
+
+    Raises
+    ------
+    InputError
+        Without the package, without a key, or when the store refuses, in its own words.
+    """
+    try:
+        client = import_module("cdsapi").Client
+    except ImportError:
+        raise InputError(
+            "the package cdsapi is not installed", place="zonda weather fetch", cure="pip install 'zonda[weather]'"
+        ) from None
+    try:
+        client(quiet=True).retrieve(DATASET, request(site, time, hours), str(path))
+    except Exception as err:  # cdsapi raises bare Exceptions: no key, no licence accepted, no network
+        text = str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__
+        raise InputError(f"the Climate Data Store did not deliver: {text}", place="zonda weather fetch", cure=KEY) from None

@@ -676,7 +676,7 @@ def test_outputs_can_be_kept_by_a_pipeline(bench: Any) -> None:
 
 
 def test_delay_per_vapour_is_that_of_bevis() -> None:
-    from zonda.operators.atmosphere.path_delay import delay_per_vapour
+    from zonda.operators.atmosphere.response import delay_per_vapour
 
     # Bevis et al. (1994): T_m = 270 K, 0.15 being a rule of thumb for its inverse.
     assert 1 / delay_per_vapour(np.array([270.0]), np.ones(1)) == pytest.approx(0.154, abs=1e-3)

@@ -477,7 +477,7 @@ def test_fetch_asks_for_the_cells_around_the_site(monkeypatch, tmp_path):
     import sys
     import types
 
-    from zonda.operators.atmosphere.weather.era5_fetch import request, retrieve
+    from zonda.operators.atmosphere.weather.era5 import request, retrieve
 
     asked = request(sites.create("llano_de_chajnantor"), Instant.parse("2022-08-01T23:30"), 2)
     assert asked["area"] == [-23.0, -68.0, -23.25, -67.75]
