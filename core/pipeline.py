@@ -27,7 +27,7 @@ from .run.execution import Execution
 from .run.order import check_order
 from .run.schedule import Chain
 from .run.settings import Settings, Timer
-from .run.signals import Signals, remainder
+from .run.signals import Signals, note_signals, remainder
 from .scene import Scene
 from .signal import Signal, stream_of
 from .storage.files import check_output_folder
@@ -211,7 +211,7 @@ class Pipeline:
     def least_memory(self, observations: Sequence[Observation]) -> int:
         """Bytes with which a process runs the pipeline over these observations on one thread, libraries included."""
         observation = longest_of(observations)
-        observation.signals = tuple(sorted(s.stream for s in self.signals.formed))
+        note_signals([observation], self.signals.components, self.signals.formed)
         return least_memory(self.chain, observation, Settings(dtype=self._dtype))
 
     @property
@@ -244,18 +244,17 @@ class Pipeline:
         hooks, chain = manager().hook, replace(self.chain, keep=keep)
         for observation in data.observations:
             observation.output, observation.focalplane = data.output, observation.focalplane.copy()
-            observation.components = frozenset(map(str, self.signals.components))
-            observation.signals = tuple(sorted(s.stream for s in self.signals.formed))
+        note_signals(data.observations, self.signals.components, self.signals.formed)
         self._watch(data, "pointing")
         listeners = hooks.zonda_before_operator.get_hookimpls() or hooks.zonda_after_operator.get_hookimpls()
         ahead = Ahead(settings.threads > 1 and not listeners)  # who listens hears of one observation after the other
         settings = self._divided(chain, data, settings, ahead, memory, fresh)
         calls = hooks.zonda_before_operator, hooks.zonda_after_operator
         executions = [Execution(chain, o, settings, timer, *calls) for o in data.observations]
-        if self.signals.unmodelled:
-            for signal in self.signals.runs:
-                if self.signals.runs[signal].modes == "full":
-                    data.tally.state(signal, "modes", f"its own, not those of the complete signal: {self.signals.unmodelled}")
+        for name, signal in self.signals.runs.items():
+            if self.signals.not_linear and signal.modes == "full":
+                why = f"{self.signals.not_linear} is not linear"
+                data.tally.state(name, "modes", f"its own, not those of the complete signal: {why}")
         try:
             for execution, following in zip(executions, [*executions[1:], None], strict=True):
                 execution.run(data, ahead, following)

@@ -12,6 +12,7 @@ from ..data import Data, Observation
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
+from ..run.signals import note_signals
 from ..scene import Scene
 from .context import Context, Depth
 from .coverage import cover
@@ -31,9 +32,7 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
         if operator.label not in readers and not isinstance(operator, Output):
             operator.observe(data)
     acting = work(pipeline, structure)
-    for observation in data.observations:
-        observation.components = frozenset(map(str, acting.components))
-        observation.signals = tuple(sorted(signal.stream for signal in acting.signals))
+    note_signals(data.observations, acting.components, acting.signals)
     shown = _some(data.observations)
     for observation in shown:
         for operator in operators:

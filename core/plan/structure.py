@@ -12,11 +12,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ..block import STREAMS as NAMES
-from ..mapmaker import MapMaker, filters, forms, makes_products, with_sky_signal
+from ..mapmaker import MapMaker, filters, forms, makes_products
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
-from ..run.signals import remainder
+from ..run.signals import acting_steps, remainder
 from ..signal import MAIN, TRANSMISSION
 from .context import Work
 
@@ -209,7 +209,7 @@ def work(pipeline: Pipeline, structure: Structure) -> Work:
     """What the operators that take part do with each observation."""
     signals = tuple(pipeline.signals.all[name] for name in ["", *structure.runs] if name not in structure.derived)
     acting = [o for o in pipeline.operators if o.label in structure.operators]
-    steps = tuple(with_sky_signal([o for o in acting if not isinstance(o, Output) and "boresight" not in o.provides]))
+    steps = tuple(acting_steps(acting))
     others, filtered = len(signals) - 1, sum(s.filtered for s in signals) - 1
     times = dict.fromkeys(structure.operators, 1.0)
     for o in steps:

@@ -11,12 +11,13 @@ the others, exactly.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 
 from ..configuration.diagnostics import nearest
 from ..errors import PipelineError
-from ..mapmaker import MapMaker, SkySignal, filters, forms, place_of_signal
+from ..mapmaker import MapMaker, filters, forms, with_sky_signal
+from ..observation import Observation
 from ..operator import Operator
 from ..output import Output
 from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, can_be_named, is_signal, stream_of
@@ -52,8 +53,9 @@ class Signals:
         Those that are made of their components, the complete one first.
     remainders
         By name of the others: the names of the signals that are taken from the complete one, equation (1).
-    unmodelled
-        Why signals with ``modes: full`` have modes of their own; empty: they have not.
+    not_linear
+        Label of a filter that is not linear; empty: all are. Signals with ``modes: full`` then have modes of their own, and there
+        are no remainders.
     """
 
     def __init__(self, operators: Sequence[Operator], runs: Mapping[str, Signal], only: Sequence[str], place: str) -> None:
@@ -72,10 +74,9 @@ class Signals:
             self._check_components(self._only, "--only names")
             self.runs = {name: s for name, s in self.runs.items() if self._is_left(s)}
         self._add_needed()
-        stranger = next((o.label for o in operators if filters(o) and not o.linear), "")
-        self.unmodelled = f"{stranger} is not linear" if stranger else ""
+        self.not_linear = next((o.label for o in operators if filters(o) and not o.linear), "")
         self.all = {name: self._formed(name, signal) for name, signal in [("", None), *self.runs.items()]}
-        self.remainders = {} if stranger else self._remainders()
+        self.remainders = {} if self.not_linear else self._remainders()
         self.formed = tuple(f for name, f in self.all.items() if name not in self.remainders)
 
     # ---- steps
@@ -83,10 +84,7 @@ class Signals:
     @property
     def steps(self) -> list[Operator]:
         """The operators that act on observations, in order."""
-        steps = [o for o in self.operators if not isinstance(o, Output) and "boresight" not in o.provides]
-        if place_of_signal(self.operators) is not None:
-            steps.insert(place_of_signal(steps) or 0, SkySignal())
-        return steps
+        return acting_steps(self.operators)
 
     def makers(self, name: str) -> frozenset[str]:
         """Labels of the steps whose components a signal consists of."""
@@ -126,7 +124,7 @@ class Signals:
         if signal is not None and model and TRANSMISSION not in (signal.without or ()):
             components |= {c for c in self.components if c == TRANSMISSION}
         filtered = signal is None or signal.filters == "all"
-        return Formed(stream_of(name), components, model and not self.unmodelled and len(kept) < len(self._generators), filtered)
+        return Formed(stream_of(name), components, model and not self.not_linear and len(kept) < len(self._generators), filtered)
 
     def _is_left(self, signal: Signal) -> bool:
         """Whether a signal is another than the narrowed complete one, and not empty."""
@@ -199,6 +197,18 @@ class Signals:
         narrowed = self._only is not None
         whole = kept == self.makers("")
         return signal.modes == "full" and signal.filters == "all" and not names_it and bool(kept) and not whole and not narrowed
+
+
+def acting_steps(operators: Sequence[Operator]) -> list[Operator]:
+    """Of these, the operators that act on observations; with the step that makes the sky the signal, where nothing else does."""
+    return with_sky_signal([o for o in operators if not isinstance(o, Output) and "boresight" not in o.provides])
+
+
+def note_signals(observations: Iterable[Observation], components: Iterable[str], formed: Iterable[Formed]) -> None:
+    """Note in observations which components there are and which signals are formed."""
+    names, streams = frozenset(map(str, components)), tuple(sorted(signal.stream for signal in formed))
+    for observation in observations:
+        observation.components, observation.signals = names, streams
 
 
 def _generators(operators: Sequence[Operator]) -> list[Operator]:
