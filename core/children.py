@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import ModuleType
 
 SAFE = "PYTHONSAFEPATH"
 
@@ -41,3 +42,17 @@ def restore(before: str | None) -> None:
         os.environ.pop(SAFE, None)
     else:
         os.environ[SAFE] = before
+
+
+@contextmanager
+def without_script() -> Iterator[None]:
+    """Processes that `multiprocessing` starts in the body do not import the user's script again: they need nothing of it.
+
+    So a script that begins a campaign needs no ``if __name__ == "__main__"``.
+    """
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script

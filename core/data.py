@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .block import STREAMS, Block
 from .errors import PipelineError
+from .kept import kept, one_scan, product_of
 from .notebook import html_table
 from .observation import Observation
 from .product import Product
@@ -59,6 +63,48 @@ class Data:
     def take(self, label: str) -> Any:
         """The partial product of a step, None where it has none; it is not held here any longer."""
         return self.partial.pop(label, None)
+
+    def __getitem__(self, name: str) -> Any:
+        """The product of this name: ``data["map"]``, ``data["noiseless/map"]``. Raises InputError where there is none."""
+        return product_of(self.products, name)
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is a product of this name."""
+        return name in self.products
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the products."""
+        return iter(self.products)
+
+    def tod(self, stream: str = "signal", scan: str | int | None = None) -> NDArray[np.float64]:
+        """(n_det, n_samp) float64: all of a stream that ``Pipeline.run(..., keep=["signal"])`` kept, its mean emission included.
+
+        Parameters
+        ----------
+        stream
+            ``signal`` or ``signal/noiseless`` as they stand after the last step, or a component as it was made, before
+            efficiencies and calibration (``atmosphere``, ``white``, ``sky`` ...); K_RJ.
+        scan
+            Name (``scan-001``) or number of the scan; needed where there are several.
+
+        Raises
+        ------
+        InputError
+            For a scan or a stream that there is not; the message says what was kept.
+        """
+        return kept(one_scan(self.observations, scan), stream)
+
+    def blocks(
+        self, stream: str = "signal", scan: str | int | None = None, detectors: int = 64
+    ) -> Iterator[tuple[Observation, slice, NDArray[np.float64]]]:
+        """(observation, detectors, part of `tod`) of one scan, or of all, at most so many ``detectors`` at a time."""
+        if detectors < 1:
+            raise PipelineError(f"{detectors} detectors at a time", place="data.blocks", cure="take 1 or more")
+        scans = self.observations if scan is None else [one_scan(self.observations, scan)]
+        for observation in scans:
+            for first in range(0, observation.n_detectors, detectors):
+                rows = slice(first, min(first + detectors, observation.n_detectors))
+                yield observation, rows, kept(observation, stream, rows)
 
     def __repr__(self) -> str:
         return f"<Data: {len(self.observations)} observations, products {sorted(self.products)}>"

@@ -191,6 +191,12 @@ class Instrument(Parameters):
     def _band_by_name(cls, value: Any) -> Any:
         return named(bands, value)
 
+    def varied(self, **changes: Any) -> Instrument:
+        """This instrument with fields changed, as ``{like: ..., ...}`` in a pipeline file (`core.variants.variant`)."""
+        from .variants import LIKE, variant
+
+        return variant({LIKE: self, **changes})
+
     @property
     def identity(self) -> tuple[str, ...]:
         """What tells its detectors' random numbers from those of another instrument or band: names and passband."""

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from .block import Block
 from .operator import Operator
 from .output import Output
-from .signal import BUILT_IN, MAIN, Component
+from .signal import MAIN, is_stream
 
 
 class MapMaker(Operator):
@@ -73,6 +73,5 @@ def filters(operator: Operator) -> bool:
 def makes_products(operator: Operator) -> bool:
     """Whether all that it makes are products in memory: map makers, spectra. (What a step writes while it runs, it does not
     provide.)"""
-    streams = {"boresight", *BUILT_IN, MAIN}
     names = operator.provides
-    return bool(names) and not any(n in streams or isinstance(n, Component) for n in names) and not isinstance(operator, Output)
+    return bool(names) and not any(n == "boresight" or is_stream(n) for n in names) and not isinstance(operator, Output)

@@ -79,12 +79,19 @@ class Observation:
         there is no atmosphere.
     noise_levels
         Levels of the white noise by step, in their order. Pink noise refers to the last.
+    closed_forms
+        By component: power spectra on the calibrated sky, one for each step that makes it. Functions of frequencies (n,) [Hz]
+        that return one-sided densities (n,) [K_RJ^2/Hz], the mean over detectors, once all steps are prepared.
     quoted_net
         (n_det,) ``focalplane.net`` before a step with white noise set it to what it comes to on the sky; None: there is none.
+    windows
+        By step, (n_samp,) factors by which it multiplied the filtered signals (`window`).
     components
         Names of the streams that the steps make before there is a signal: ``sky``, ``white`` ...
     signals
         Names of the streams of all signals that are formed, the complete one first (`core.signal`).
+    unfiltered
+        Those of them on which no filter acts.
     tally
         What was counted or approximated.
     output
@@ -110,12 +117,15 @@ class Observation:
     smooth: dict[str, SmoothField] = field(default_factory=dict)
     detdata: dict[str, AnyFloats] = field(default_factory=dict)
     noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
+    closed_forms: dict[str, list[Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = field(default_factory=dict)
     quoted_net: NDArray[np.float64] | None = None
     tally: Tally = field(default_factory=Tally)
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None
     components: frozenset[str] = frozenset()
     signals: tuple[str, ...] = ("signal",)
+    unfiltered: frozenset[str] = frozenset()
+    windows: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.flags.size:
@@ -147,6 +157,11 @@ class Observation:
     def good_detectors(self) -> NDArray[np.bool_]:
         """(n_det,) True where no flag excludes the detector."""
         return good(self.detector_flags, EXCLUDE_DETECTOR)
+
+    @property
+    def window(self) -> NDArray[np.float64] | None:
+        """(n_samp,) product of `windows`, 0 to 1, by which maps weigh samples; None: there is none."""
+        return reduce(np.multiply, self.windows.values()) if self.windows else None
 
     @property
     def duration(self) -> float:

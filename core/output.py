@@ -35,10 +35,18 @@ class Output(Operator):
         """
         return ()
 
+    def named_signals(self) -> tuple[str, ...]:
+        """Names of signals of the pipeline that its parameters name; a name that `runs` does not have is refused."""
+        return ()
+
     @property
     def shown(self) -> tuple[str, ...]:
         """Names of what `signals` asks for, in its order; empty text: the complete signal."""
         return self._shown
+
+    def reads(self, signal: str) -> bool:
+        """Whether it reads products of the signal of that name (empty: the complete one)."""
+        return signal in self.shown if self.signals() or signal.startswith("_") else True
 
     def watch(self, data: Data, done: Progress) -> None:
         """Called once the telescope is pointed, after every scan, and when all maps are made: time to begin, in the background,

@@ -22,7 +22,7 @@ from .operator import Operator
 from .output import Output, Progress
 from .run import arguments
 from .run.ahead import Ahead
-from .run.budget import divided, least_memory, longest_of, with_scan_ahead
+from .run.budget import check_kept_memory, divided, least_memory, longest_of, with_scan_ahead
 from .run.execution import Execution
 from .run.order import check_order
 from .run.schedule import Chain
@@ -89,12 +89,13 @@ class Pipeline:
     ) -> None:
         self.operators = arguments.steps(operators, name)  # copies: labels are this pipeline's own
         self.name, self.description, self.precision = name, description, arguments.precision(precision, name)
+        self.only = tuple(arguments.components(only, name))
         self._name_steps()
         if problems := check_order(self.operators):
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             cures = dict.fromkeys(p.cure for p in problems if p.cure)
             raise PipelineError("\n".join(lines), place=self.name, cure="\n".join(cures))
-        self.signals = Signals(self.operators, arguments.runs(runs, name), arguments.components(only, name), self.name)
+        self.signals = Signals(self.operators, arguments.runs(runs, name), self.only, self.name)
 
     @property
     def runs(self) -> dict[str, Signal]:
@@ -141,7 +142,8 @@ class Pipeline:
             Bytes that the process may hold (``--memory``); default, where no ``memory`` is given: what it holds now and half
             of the free memory. A run that would not fit is refused before it starts.
         keep
-            Streams to keep in ``observation.detdata`` (float64, mean emission included) as they stand after the last step.
+            Streams to keep for `Data.tod`, as they stand after the last step: 8 bytes for each sample of each scan, which count
+            in the budget.
         provenance
             Entries added to ``data.provenance``.
         """
@@ -253,8 +255,8 @@ class Pipeline:
         executions = [Execution(chain, o, settings, timer, *calls) for o in data.observations]
         for name, signal in self.signals.runs.items():
             if self.signals.not_linear and signal.modes == "full":
-                why = f"{self.signals.not_linear} is not linear"
-                data.tally.state(name, "modes", f"its own, not those of the complete signal: {why}")
+                text = f"its own from {self.signals.not_linear} on, which is not linear, instead of those of the complete signal"
+                data.tally.state(name, "modes", text)
         try:
             for execution, following in zip(executions, [*executions[1:], None], strict=True):
                 execution.run(data, ahead, following)
@@ -265,8 +267,11 @@ class Pipeline:
 
     def _divided(self, chain: Chain, data: Data, settings: Settings, ahead: Ahead, memory: int | None, fresh: bool) -> Settings:
         """The settings with the memory that is left for streams and blocks."""
+        kept = 8 * len(chain.keep) * sum(o.n_detectors * o.n_samples for o in data.observations)
         if memory is not None and settings.asked is None:
+            check_kept_memory(kept, available_memory(), self.name)
             return settings
+        settings = replace(settings, kept=kept)
         longest, most = longest_of(data.observations), settings.memory
         settings = divided(chain, longest, settings, self.name, fresh)
         if memory is not None:

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field, SerializeAsAny, field_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationInfo, field_validator
 
 from .configuration.parameters import Parameters, named
 from .configuration.target import Target
 from .configuration.time import Instant
+from .configuration.values import mistake
 from .errors import ZondaError
 from .instrument import Instrument
 from .registry import instruments, sites
 from .site import Site
+from .variants import is_variant, variant
 from .weather import WeatherSource, weather_source
 
 EARTH = 6371e3
 """Mean radius, m."""
 NEAR = 1e3
 """m: what stands nearer than this stands at the same site."""
+HIGHER = 200.0
+"""m: what stands no higher or lower than this has the same climatology."""
 
 
 class Scene(Parameters):
@@ -28,7 +33,8 @@ class Scene(Parameters):
     site: Site
     """Where the telescope stands: a registered name (`zonda plugins`) or a Site."""
     instrument: Instrument
-    """Telescope and camera: a registered name (`zonda plugins`) or an Instrument."""
+    """Telescope and camera: a registered name (`zonda plugins`), an Instrument, or a variant of one, e.g. {like: mustang2,
+    detectors: 170}."""
     time: Instant
     """Start of the first scan, UTC unless it carries an offset, e.g. 2024-11-25T07:00 or 2024-11-25T02:00-05:00."""
     target: Target | None = None
@@ -43,12 +49,45 @@ class Scene(Parameters):
     @field_validator("site", mode="before")
     @classmethod
     def _site_by_name(cls, value: Any) -> Any:
-        return named(sites, value)
+        return site_at(value) if hasattr(value, "to_geodetic") else named(sites, value)
 
     @field_validator("instrument", mode="before")
     @classmethod
-    def _instrument_by_name(cls, value: Any) -> Any:
-        return named(instruments, value)
+    def _instrument_by_name(cls, value: Any, info: ValidationInfo) -> Any:
+        return variant(value, info.context) if is_variant(value) else named(instruments, value)
+
+    def replace(self, **changes: Any) -> Scene:
+        """The scene with other values, checked: ``scene.replace(seed=8)``. Raises `ParameterError`."""
+        return type(self)(**({name: getattr(self, name) for name in self.model_fields_set} | changes))
+
+
+def site_at(location: Any) -> Site:
+    """The site at an astropy `EarthLocation`, with the climatology of a registered site that is nearer than `NEAR`.
+
+    Raises PydanticCustomError for more than one place.
+    """
+    if not getattr(location, "isscalar", True):
+        raise mistake(f"expected one place, got {location.size}")
+    place = location.to_geodetic("WGS84")
+    latitude, longitude, altitude = float(place.lat.rad), float(place.lon.rad), float(place.height.to_value("m"))
+    name = str(getattr(getattr(location, "info", None), "name", None) or f"{place.lat.deg:.4f} deg {place.lon.deg:.4f} deg")
+    given: dict[str, Any] = {
+        "name": name, "latitude": f"{latitude!r} rad", "longitude": f"{longitude!r} rad", "altitude": f"{altitude!r} m",
+        "provenance": "astropy EarthLocation",
+    }  # fmt: skip
+    for known in sites:
+        with suppress(ZondaError):
+            other = sites.create(known)
+            if distance((latitude, longitude), other) < NEAR and abs(other.altitude - altitude) < HIGHER:
+                return Site(**given, climatology=other.climatology, description=f"near {other.name}")
+    return Site(**given)
+
+
+def distance(here: tuple[float, float], site: Site) -> float:
+    """m along the ground between (latitude, longitude) [rad] and a site: Haversine formula on a sphere."""
+    a, b = np.array(here), np.array([site.latitude, site.longitude])
+    half = np.sin((a - b) / 2) ** 2
+    return 2 * EARTH * float(np.arcsin(np.sqrt(min(1.0, half[0] + np.cos(a[0]) * np.cos(b[0]) * half[1]))))
 
 
 def elsewhere(scene: Scene) -> str:
@@ -60,12 +99,10 @@ def elsewhere(scene: Scene) -> str:
         home = None
     if home is None:
         return ""
-    a, b = (np.array([s.latitude, s.longitude]) for s in (home, scene.site))
-    half = np.sin((a - b) / 2) ** 2
-    distance = 2 * EARTH * float(np.arcsin(np.sqrt(min(1.0, half[0] + np.cos(a[0]) * np.cos(b[0]) * half[1]))))
-    if distance < NEAR:
+    away = distance((home.latitude, home.longitude), scene.site)
+    if away < NEAR:
         return ""
     return (
-        f"{telescope.name} stands at {home.name}, {distance / 1e3:.0f} km away: here it looks through the atmosphere of "
+        f"{telescope.name} stands at {home.name}, {away / 1e3:.0f} km away: here it looks through the atmosphere of "
         f"{scene.site.name}; write 'site: {telescope.site}' for its own"
     )

@@ -93,12 +93,19 @@ class Formed:
         It takes the singular modes of ``signal`` (`Signal.modes`).
     filtered
         Filters act on it.
+    own
+        Labels of the filters that measure it by itself although it has a ``model``: the first that is not linear, and all behind.
     """
 
     stream: str
     components: frozenset[Component]
     model: bool = False
     filtered: bool = True
+    own: frozenset[str] = frozenset()
+
+    def takes_model(self, label: str) -> bool:
+        """Whether a filter takes from the complete signal what it measures for this one."""
+        return self.model and self.stream != MAIN and label not in self.own
 
     @property
     def name(self) -> str:
@@ -119,6 +126,14 @@ def stream_of(name: str) -> str:
 def is_signal(stream: str) -> bool:
     """Whether it is the name of a signal's stream."""
     return stream == MAIN or stream.startswith(f"{MAIN}/")
+
+
+def is_stream(name: str) -> bool:
+    """Whether what an operator provides under this name is nothing but a stream of a block: a component, or a signal.
+
+    Its only use is to be read by a later step. Any other name may be a product as well.
+    """
+    return isinstance(name, Component) or name in BUILT_IN or is_signal(name)
 
 
 def product_name(stream: str, product: str) -> str:

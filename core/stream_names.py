@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any
 
-from .signal import BUILT_IN
+from pydantic import Field
 
-StreamName = Literal["signal", "sky", "atmosphere", "transmission", "white", "pink"]
-"""What a parameter ``streams`` may list."""
+from .signal import BUILT_IN, MAIN
+
+StreamName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+"""What a parameter ``streams`` may list: ``signal``, a component (``sky``, or one of a plugin), or what else a step makes
+(``pwv``)."""
 
 COMPONENTS = frozenset(map(str, BUILT_IN))
-"""Signal components that a block may hold besides ``signal``."""
+"""Signal components of zonda's own operators."""
+
+UNITS = {"transmission": "", "opacity": "", "flags": "", "pwv": "m", "path_delay": "m"}
+"""Units of streams that are not in K."""
 
 
 class StreamsAsked:
@@ -20,6 +26,15 @@ class StreamsAsked:
     """
 
     def __get__(self, operator: Any, owner: type) -> frozenset[str]:
-        if operator is None or operator.streams is None:
-            return COMPONENTS
-        return COMPONENTS & frozenset(operator.streams)
+        asked = getattr(operator, "streams", None)
+        return COMPONENTS if asked is None else COMPONENTS & frozenset(asked)
+
+
+class StreamsNeeded:
+    """The ``requires`` of such an operator: ``signal``, and streams that are no components of zonda's own.
+
+    Nobody makes these by default: a name that no step provides is an error.
+    """
+
+    def __get__(self, operator: Any, owner: type) -> frozenset[str]:
+        return frozenset({MAIN, *(getattr(operator, "streams", None) or ())}) - COMPONENTS

@@ -29,7 +29,7 @@ from .output import Output
 from .pipeline import Part, Pipeline
 from .plan.planning import planning_of
 from .product import Product
-from .signal import Component
+from .signal import is_stream
 
 
 def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] | None = None) -> None:
@@ -136,7 +136,7 @@ def _one_block(operator: Operator) -> tuple[dict[str, Any], _Watched]:
 
 def _streams_of(operator: Operator) -> set[str]:
     """The streams that a step provides, products apart."""
-    return {name for name in operator.provides if name in STREAMS or isinstance(name, Component)}
+    return {name for name in operator.provides if is_stream(name)}
 
 
 def check_same_bits(operator: Operator) -> None:

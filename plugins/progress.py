@@ -1,54 +1,74 @@
-"""A progress line on the terminal: a plugin of zonda's own hooks, and a pattern for others."""
+"""Progress on stderr: a line that moves on a terminal, and in a log a line every ten seconds.
+
+A plugin of zonda's own hooks, and a pattern for others.
+"""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from zonda.core.hooks import hookimpl
 
 INTERVAL = 0.1
-"""Seconds between two updates."""
+"""Seconds between two updates on a terminal."""
+LOGGED = 10.0
+"""Seconds before the first line of a log, and between two."""
 
 
 class Progress:
-    """Writes to stderr, and only where that is a terminal."""
+    """Writes to stderr.
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    Parameters
+    ----------
+    clock
+        Seconds since any moment.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._lock, self._clock = threading.Lock(), clock
         self._what, self._began, self._shown, self._visible = "", 0.0, 0.0, False
+        self._logged: float | None = None
+
+    @hookimpl
+    def zonda_pipeline_start(self, pipeline: Any) -> None:
+        """A log begins to count its ten seconds."""
+        with self._lock:
+            self._logged = self._clock()
 
     @hookimpl
     def zonda_progress(self, done: int, total: int, what: str) -> None:
         """One line: ``what [#####.....] 50 %, 12 s left``."""
-        if not sys.stderr.isatty():
-            return
         if total == 0:
             self._clear()
             return
-        now = time.monotonic()
+        now = self._clock()
         with self._lock:
             if what != self._what:
                 self._what, self._began, self._shown = what, now, 0.0
-            if done < total and now - self._shown < INTERVAL:
-                return
-            self._shown, self._visible = now, True
-            sys.stderr.write("\r\033[K" + line(done, total, what, now - self._began))
-            sys.stderr.flush()
+            self._show(now, done == total, line(done, total, what, now - self._began))
 
     @hookimpl
     def zonda_campaign_progress(self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float) -> None:
         """One line: ``tasks 12 of 100 [##........] 12 %, 3.1e+06 samples/s, 80 s left``."""
-        if not sys.stderr.isatty():
-            return
-        now = time.monotonic()
         with self._lock:
-            if done < total and now - self._shown < INTERVAL:
-                return
+            self._show(self._clock(), done == total, campaign_line(done, total, failed, samples, all_samples, seconds))
+
+    def _show(self, now: float, last: bool, text: str) -> None:
+        """Write where it is time: on a terminal over the line before, in a log as a line of its own."""
+        if not sys.stderr.isatty():
+            if self._logged is None:
+                self._logged = now
+            if now - self._logged >= LOGGED:
+                self._logged = now
+                sys.stderr.write(text + "\n")
+                sys.stderr.flush()
+        elif last or now - self._shown >= INTERVAL:
             self._shown, self._visible = now, True
-            sys.stderr.write("\r\033[K" + campaign_line(done, total, failed, samples, all_samples, seconds))
+            sys.stderr.write("\r\033[K" + text)
             sys.stderr.flush()
 
     @hookimpl

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("core", "operators", "plugins", "pipelines", "zonda", "tests/data")
-CODE = {".py", ".md", ".yaml", ".css", ".typed"}
+CODE = {".py", ".md", ".yaml", ".css", ".typed", ".tmpl"}
 
 
 def data_files():

@@ -1,13 +1,15 @@
 """What the documentation shows, runs."""
 
 import importlib
+import importlib.util
+import json
 import re
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(language):
@@ -27,7 +29,8 @@ def defined_before(text):
         return {}
     page = next(page for page in map(Path.read_text, PAGES) if text in page)
     names = {}
-    exec(compile(re.search(r"```python\n(.*?)```", page, re.S)[1], "documentation", "exec"), names)
+    first = re.search(r"```python\n(.*?)```", page, re.S)[1].replace('"5 min"', '"20 s"')
+    exec(compile(first, "documentation", "exec"), names)
     return names
 
 
@@ -39,7 +42,12 @@ def test_python(text, tmp_path, monkeypatch):
     assert names
 
 
-@pytest.mark.parametrize("text", [b for b in blocks("yaml") if "operators:" in b.values[0]])
+def gallery():
+    for path in sorted((ROOT / "docs" / "gallery").glob("*.yaml")):
+        yield pytest.param(path.read_text(), id=path.stem)
+
+
+@pytest.mark.parametrize("text", [*(b for b in blocks("yaml") if "operators:" in b.values[0]), *gallery()])
 def test_yaml(text, tmp_path, monkeypatch, capsys):
     """As `zonda check` sees it: its targets are up, its scans within the telescope's limits."""
     from zonda.core import cli
@@ -66,18 +74,84 @@ def test_the_readme_shows_one_pipeline_twice(tmp_path, monkeypatch):
     assert [repr(o) for o in names["pipeline"].operators] == [repr(o) for o in file.operators]
 
 
+def script(name):
+    """A script of docs/, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_links():
+    made = {(ROOT / "docs" / page).resolve() for page in script("site_pages").made_pages()}
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name}: {target}"
+            found = page.parent / target
+            assert found.exists() or found.resolve() in made, f"{page.name}: {target}"
+
+
+def test_every_page_is_in_the_navigation_of_the_site_once():
+    import yaml
+
+    def pages(entry):
+        if isinstance(entry, str):
+            return [entry]
+        return [page for part in (entry.values() if isinstance(entry, dict) else entry) for page in pages(part)]
+
+    named = pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
+    written = [str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")]
+    assert len(named) == len(set(named))
+    assert set(named) == {*written, *script("site_pages").made_pages()}
+
+
+def test_every_public_name_is_in_the_python_reference():
+    import zonda
+    from zonda.core.registry import operators
+
+    pages = "\n".join(script("site_pages").api_pages().values())
+    builtin = {c.name for c in operators.candidates() if c.distribution == "zonda"}
+    for name in {*zonda.__all__, *builtin} - {"__version__"}:
+        assert re.search(rf"^::: .*\.{name}$|`zonda\.{name}`", pages, re.M), name
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs" / "tutorials").glob("*.ipynb")), ids=lambda p: p.stem)
+def test_notebooks_are_kept_without_results(path):
+    """`.ci/site` executes them."""
+    cells = json.loads(path.read_text())["cells"]
+    assert cells[0]["cell_type"] == "markdown"
+    assert "".join(cells[0]["source"]).startswith("# ")
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            assert not cell["outputs"]
+            assert cell["execution_count"] is None
+            if not "".join(cell["source"]).startswith("%%"):  # files and commands
+                compile("".join(cell["source"]), path.name, "exec")
+
+
+def test_what_is_in_the_gallery_says_what_it_shows():
+    pages = script("site_pages")
+    for path in sorted((ROOT / "docs" / "gallery").glob("*.yaml")):
+        about = pages.header(path)
+        assert about["title"]
+        assert about["text"].endswith("."), path.name
+        assert about["picture"].endswith(".png")
+
+
+def test_the_site_links_to_files_that_it_has(tmp_path):
+    """What stands elsewhere in the repository is named; a notebook is its page; benchmarks/README.md is a page of the site."""
+    from types import SimpleNamespace
+
+    change = script("site_pages").on_page_markdown
+    shown = SimpleNamespace(file=SimpleNamespace(src_uri="performance.md"))
+    code = "\n```sh\n[x](../LICENSE)\n```\n"
+    text = "[b](../benchmarks/README.md#x) [t](tutorials/plugin.ipynb) [`l`](../LICENSE) [m](maps.md#y) [plan.md](plan.md)"
+    title = (ROOT / "docs" / "plan.md").read_text().splitlines()[0].removeprefix("# ")
+    wanted = f"[b](development/benchmarks.md#x) [t](tutorials/plugin.md) `LICENSE` [m](maps.md#y) [{title}](plan.md)"
+    assert change(text + code, shown, None, None) == wanted + code
 
 
 def test_the_reference_is_made_from_the_operators():
-    import importlib.util
-
-    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = script("make_reference")
     assert module.PAGE.read_text() == module.page(), "run python docs/make_reference.py"
 
 

@@ -1,6 +1,8 @@
 """Every importable folder is listed in pyproject.toml (an editable install would hide an omission)."""
 
+import json
 import pathlib
+import re
 import tomllib
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -32,7 +34,22 @@ def test_version_is_the_same_everywhere():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert zonda.__version__ == project["version"]
     assert f"version: {zonda.__version__}" in (ROOT / "CITATION.cff").read_text()
+    assert json.loads((ROOT / ".zenodo.json").read_text())["version"] == zonda.__version__
     assert f"## [{zonda.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_what_the_badges_and_the_archive_say_is_what_pyproject_says():
+    import yaml
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    versions = re.findall(r"Python :: (3\.\d+)", " ".join(project["classifiers"]))
+    assert f"Python: {' | '.join(versions)}" in (ROOT / "docs" / "images" / "python.svg").read_text()
+    assert f"licence: {project['license']}" in (ROOT / "docs" / "images" / "licence.svg").read_text()
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    archive = json.loads((ROOT / ".zenodo.json").read_text())
+    assert archive["license"] == citation["license"] == project["license"]
+    assert archive["title"] == citation["title"]
+    assert archive["keywords"] == citation["keywords"] == project["keywords"]
 
 
 def test_operators_are_found_by_tab_and_misspellings_are_named():

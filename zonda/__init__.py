@@ -27,6 +27,9 @@ _WHERE = {
     "ZondaError": "zonda.core.errors",
     "load": "zonda.core.configuration.pipeline_file",
     "plan": "zonda.core.plan.planner",
+    "campaign": "zonda.core.campaign.python",
+    "measure": "zonda.core.figures",
+    "sensitivity": "zonda.plugins.forecast.sensitivity",
     "hookimpl": "zonda.core.hooks",
     # for authors of operators
     "Block": "zonda.core.block",
@@ -38,9 +41,12 @@ _WHERE = {
     "MapMaker": "zonda.core.mapmaker",
     "Output": "zonda.core.output",
     "Planning": "zonda.core.plan.planning",
+    "Figure": "zonda.core.figures",
+    "FigureMetric": "zonda.core.figures",
     "Knob": "zonda.core.knobs",
     "NoiseModel": "zonda.operators.noise.models",
     "register": "zonda.core.registry",
+    "operator": "zonda.core.function_operator",
     "normals": "zonda.core.numerics.random",
     "uniforms": "zonda.core.numerics.random",
     "quantity": "zonda.core.configuration.parameters",
@@ -58,6 +64,7 @@ __all__ = ["__version__", *_WHERE]
 
 if TYPE_CHECKING:
     from zonda.core.block import Block as Block
+    from zonda.core.campaign.python import campaign as campaign
     from zonda.core.configuration.parameters import quantity as quantity
     from zonda.core.configuration.pipeline_file import load as load
     from zonda.core.configuration.units import Angle as Angle
@@ -73,7 +80,11 @@ if TYPE_CHECKING:
     from zonda.core.data import Data as Data
     from zonda.core.data import Observation as Observation
     from zonda.core.errors import ZondaError as ZondaError
+    from zonda.core.figures import Figure as Figure
+    from zonda.core.figures import FigureMetric as FigureMetric
+    from zonda.core.figures import measure as measure
     from zonda.core.focalplane import Focalplane as Focalplane
+    from zonda.core.function_operator import operator as operator
     from zonda.core.hooks import hookimpl as hookimpl
     from zonda.core.instrument import Band as Band
     from zonda.core.instrument import Instrument as Instrument
@@ -98,6 +109,9 @@ if TYPE_CHECKING:
     from zonda.core.weather import Column as Column
     from zonda.core.weather import WeatherSource as WeatherSource
     from zonda.operators.noise.models import NoiseModel as NoiseModel
+
+    sensitivity: Any
+    # imported here by its module, it would close a circle: the forecast knows map makers, whose files name this version
 
 
 def __getattr__(name: str) -> Any:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ..cli import complete
+
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
 
@@ -16,13 +18,13 @@ NOT_MET = 1
 
 
 @click.command()
-@click.argument("pipeline", metavar="FILE_OR_NAME")
+@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
 @click.option(
     "--metric",
     default="map_rms",
     show_default=True,
     metavar="NAME",
-    help="map_rms, peak, transfer, psd, structure, or a plugin's.",
+    help="map_rms, peak, transfer, psd, structure; a figure, e.g. 'central_rms(radius=30 arcsec)'; or a plugin's.",
 )
 @click.option("--target", default="1 %", show_default=True, metavar="ERROR", help="Error that the metric may have.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value of the file, as for `zonda run`.")

@@ -6,12 +6,16 @@ returns a number or an array: its error is then |m - m0| / |m0| (Euclidean norms
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from .. import registry
+from ..configuration import yaml_places
+from ..configuration.parameters import Parameters
+from ..errors import InputError
 from ..types import Floats
 
 if TYPE_CHECKING:
@@ -75,8 +79,36 @@ class OfFunction(Metric):
 
 
 def get(name: str) -> Metric:
-    """The metric of that name. Raises `RegistryError` with the nearest name where there is none."""
-    found = registry.metrics.get(name)
+    """The metric that ``name`` stands for: a name, or name(parameter=value, ...) with values as in YAML.
+
+    Raises `RegistryError` with the nearest name where there is none, `ParameterError` for parameters that are wrong.
+    """
+    return chosen(name)
+
+
+def chosen(name: str, parameters: Mapping[str, Any] | None = None) -> Metric:
+    """As `get`, with parameters given apart. Raises `InputError` where a metric has none."""
+    head, parenthesis, rest = name.strip().partition("(")
+    if parenthesis and not rest.endswith(")"):
+        raise InputError(f"cannot read the metric {name!r}", place="metric", cure="write name(parameter=value, ...)")
+    given = {**_arguments(name, rest[:-1]), **(parameters or {})}
+    found = registry.metrics.get(head.strip())
     if isinstance(found, type) and issubclass(found, Metric):
-        return found()
+        if given and not issubclass(found, Parameters):
+            raise InputError(f"the metric {head} has no parameters", place="metric", cure=f"write {head} alone")
+        return found(**given)
+    if given:
+        raise InputError(f"the metric {head} has no parameters", place="metric", cure=f"write {head} alone")
     return found if isinstance(found, Metric) else OfFunction(found)
+
+
+def _arguments(name: str, text: str) -> dict[str, Any]:
+    """``a=1, b=2 arcmin`` as a mapping; commas inside brackets belong to values."""
+    found: dict[str, Any] = {}
+    for part in re.split(r",(?![^\[\]{}]*[\]}])", text) if text.strip() else []:
+        key, equals, value = part.partition("=")
+        new = yaml_places.load(yaml_places.Source("metric", name), text=value.strip())
+        if not equals or not key.strip() or new.faults:
+            raise InputError(f"cannot read {part.strip()!r} in the metric {name!r}", place="metric", cure="write parameter=value")
+        found[key.strip()] = new.value
+    return found

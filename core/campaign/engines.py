@@ -123,7 +123,7 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
 
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
             """See `Executor.submit`."""
-            with children.safe_path(), _ctrl_c_held_back():
+            with children.safe_path(), children.without_script(), _ctrl_c_held_back():
                 return super().submit(fn, *args, **kwargs)
 
     count = workers or available_threads()

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -24,6 +25,9 @@ FILE = "campaign.json"
 LOG = "jobs.sqlite"
 TASKS = "tasks"
 """Folder of partial products and layouts."""
+
+INPUTS = "inputs"
+"""Folder of arrays that were given in Python."""
 
 Say = Callable[[str], None]
 """Shows the user a line."""
@@ -96,6 +100,8 @@ class Combination:
     folder: str
     layout: str
     """Digest of the layout's file."""
+    axes: tuple[tuple[str, Any], ...] = ()
+    """Values on the axes over which nothing is co-added."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,8 @@ class Job:
     same_machine
         Whether what ran on another kind of machine than the first task is refused.
     files
-        The pipeline files: path and digest of the text; input files: path, size and time of change.
+        The pipeline files: path and digest of the text; input files: path, size and time of change; of arrays in Python: path
+        and hash.
     """
 
     name: str
@@ -128,6 +135,8 @@ class Job:
     combinations: tuple[Combination, ...]
     tasks: tuple[Task, ...] = field(repr=False)
     same_machine: bool = False
+    figures: bool = False
+    """Whether the figures of all combinations are written as one table."""
     need: int = 0
     """Least bytes with which a process runs any task; 0: not known."""
 

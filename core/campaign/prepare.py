@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from ..errors import InputError, ZondaError
 from ..storage.files import product_path
 from . import parts
 from .entries import Entry, entries
-from .job import Combination, Job, Task, digest_of_text, key_of, layout_path, plural
+from .job import INPUTS, Combination, Job, Task, digest_of_text, key_of, layout_path, plural
 from .settings import MOST_TASKS, Campaign
 
 if TYPE_CHECKING:
@@ -101,6 +102,7 @@ def job(
         combinations=tuple(draft.combinations),
         tasks=tuple(draft.tasks),
         same_machine=first.same_machine,
+        figures=any(source.campaign.figures for source in sources),
         need=draft.need,
     )
 
@@ -122,7 +124,7 @@ class _Draft:
     def add(self, source: CampaignFile) -> None:
         """Add all entries of a pipeline file."""
         found = _entries(source)
-        self.inputs |= _inputs(source.file)
+        self.inputs |= _inputs(source.file, self._folder)
         together: dict[str, list[tuple[int, Entry]]] = {}
         for number, entry in enumerate(found, self._entries):
             together.setdefault(repr(entry.combination), []).append((number, entry))
@@ -151,7 +153,7 @@ class _Draft:
         self._files.append(made.apply(file))
         self.pipelines.append(self._files[-1].resolved_yaml())
         self.plans.append(tuple(tuple(map(str, row)) for row in made.summary.short))
-        self.inputs |= _inputs(self._files[-1])
+        self.inputs |= _inputs(self._files[-1], self._folder)
         return len(self.pipelines) - 1
 
     def _combine(self, source: CampaignFile, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]) -> None:
@@ -164,7 +166,7 @@ class _Draft:
             self.need = max(self.need, pipeline.least_memory(data.observations))
         name, subfolder = _names(source, members[0][1], self.combinations)
         digest = parts.write(layout_path(self._folder, len(self.combinations)), "layout", {"layouts": layouts})
-        self.combinations.append(Combination(name, subfolder, digest))
+        self.combinations.append(Combination(name, subfolder, digest, members[0][1].combination))
         before = 0
         for (number, _), look, samples in zip(members, looks, scans, strict=True):
             every = tuple(range(len(samples)))
@@ -291,17 +293,21 @@ def _placed(place: str) -> Iterator[None]:
         raise
 
 
-def _inputs(file: PipelineFile) -> dict[str, str]:
-    """The file and the inputs that it names, each with its stamp."""
-    own = [Path(file.place).resolve()] if Path(file.place).is_file() else []
+def _inputs(file: PipelineFile, folder: Path) -> dict[str, str]:
+    """The file and the inputs that it names, each with its stamp; of those in the campaign's own ``folder`` a hash."""
+    own, arrays = [Path(file.place).resolve()] if Path(file.place).is_file() else [], folder.resolve() / INPUTS
     inputs = [path for path in paths_in([file.scene(), *file.operators]) if path.is_file()]
-    return {str(p): _stamp(p, "text") for p in own} | {str(p): _stamp(p, "file") for p in inputs}
+    stamps = {str(p): _stamp(p, "bytes" if p.is_relative_to(arrays) else "file") for p in inputs}
+    return {str(p): _stamp(p, "text") for p in own} | stamps
 
 
 def _stamp(path: Path, kind: str) -> str:
     try:
         if kind == "text":
             return f"text:{digest_of_text(path.read_text(encoding='utf-8', errors='replace'))}"
+        if kind == "bytes":
+            with open(path, "rb") as content:
+                return f"bytes:{hashlib.file_digest(content, 'blake2b').hexdigest()[:32]}"
         stat = path.stat()
     except OSError:
         return "missing"

@@ -16,6 +16,7 @@ from ..data import Data
 from ..errors import ZondaError
 from ..faults import faults_named
 from ..storage.files import check_output_folder
+from . import table
 from .job import Job, Task, layout_path, plural
 from .partial import Partial
 from .prepare import scene_of
@@ -67,7 +68,10 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
         depth += 1
     whole = _sum(tasks, folder, digests, 0, depth)
     data.partial, data.tally, data.observations = whole.products, whole.tally, whole.observations(scene)
-    return pipeline.finish(data)
+    pipeline.finish(data)
+    if job.figures:
+        table.keep(folder, number, data)
+    return data
 
 
 def _sum(tasks: Sequence[Task], folder: Path, digests: Mapping[int, str], first: int, level: int) -> Partial:

@@ -10,7 +10,7 @@ from pathlib import Path
 from .. import hooks
 from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..storage.files import check_output_folder
-from . import parts
+from . import parts, table
 from .engines import Pool
 from .folder import (
     RESOLVED,
@@ -162,6 +162,8 @@ def _work(job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: S
     _fail(result, len(job.tasks))
     if len(done) < len(job.tasks):
         raise PipelineError(f"{len(job.tasks) - len(done)} tasks were not run", place=str(folder), cure=f"zonda resume {folder}")
+    if job.figures:
+        table.write(job, folder)
     if not job.keep_tasks:
         shutil.rmtree(folder / TASKS, ignore_errors=True)
     return result

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 from ..configuration import overrides
 from ..configuration.diagnostics import Diagnostic
 from ..configuration.header import KEYS, Header
+from ..configuration.mistakes import Mistakes
 from ..configuration.section import Section
+from ..registry import makers, operators
 from .entries import setting
-from .settings import MOST_TASKS, Campaign
+from .settings import MOST_TASKS, Campaign, Sweep
 
 if TYPE_CHECKING:
     from ..configuration.yaml_places import Document
@@ -23,6 +25,8 @@ class CampaignHeader(Header):
     campaign: Campaign | None = None
     """Many observations of this pipeline as tasks: a grid or a list of sites, times, seeds or steps' parameters, nights,
     realizations; and the engine that works on them."""
+    sweep: Sweep | None = None
+    """The pipeline at several values of its keys, and a table of the figures that it measures at each. Not beside `campaign`."""
 
 
 class CampaignSection(Section):
@@ -44,7 +48,42 @@ class CampaignSection(Section):
         document: Document, value: Campaign, known: list[Diagnostic], check: Callable[[Document], list[Diagnostic]]
     ) -> list[Diagnostic]:
         """See `Section.mistakes`. The axes are checked only in a file without other mistakes."""
-        return [_at_axis(mistake, document, value) for mistake in known] or _mistakes(document, value, check)
+        found = [_at_axis(mistake, document, value) for mistake in known] or _mistakes(document, value, check)
+        if not found and value.figures and not _measures(document):
+            steps = " or ".join(f"- {name}: {{metrics: [...]}}" for name in makers("figures"))
+            at = document.mark(("campaign", "figures")).start
+            found = [Diagnostic("no step measures figures for the table", at, "", f"add {steps or 'a step that does'}")]
+        return found
+
+
+class SweepSection(Section):
+    """What pipeline files ask about their key ``sweep``: it is rewritten to a campaign that co-adds nothing."""
+
+    header = CampaignHeader
+
+    @staticmethod
+    def rewrite(document: Document) -> list[Diagnostic]:
+        """See `Section.rewrite`. Mistakes in the axes are the campaign's to find, at their places in the sweep."""
+        value = document.value.pop("sweep")
+        mistakes = Mistakes(document, None, [])
+        if "campaign" in document.value:
+            mistakes.wrong(
+                "a pipeline has either a sweep or a campaign", document.mark(("sweep",)).start, "", "remove one of them"
+            )
+        elif mistakes.validate(Sweep, value, ("sweep",), "sweep") is not None:
+            called = {key: Sweep.CALLED.get(key, key) for key in value}
+            document.value["campaign"] = {called[key]: value[key] for key in value} | {"combine": [], "figures": True}
+            for path, mark in list(document.marks.items()):
+                if path[0:1] == ("sweep",):
+                    document.marks[("campaign", *(called.get(k, k) for k in path[1:2]), *path[2:])] = mark
+        return mistakes.found
+
+
+def _measures(document: Document) -> bool:
+    """Whether a step of a document without mistakes makes figures."""
+    items = document.value["operators"]
+    names = [item if isinstance(item, str) else next(iter(item)) for item in items]
+    return any("figures" in operators.get(name).provides for name in names)
 
 
 def _mistakes(document: Document, campaign: Campaign, check: Callable[[Document], list[Diagnostic]]) -> list[Diagnostic]:
@@ -89,5 +128,5 @@ def _at_axis(mistake: Diagnostic, document: Document, campaign: Campaign) -> Dia
     return mistake
 
 
-REFUSED = ("version", "name", "description", "requires", "outputs", "campaign", "runs", "operators")
+REFUSED = ("version", "name", "description", "requires", "outputs", "campaign", "sweep", "runs", "operators")
 REFUSED_WHY = "an axis is a key of the scene (seed, site, instrument, time, target, weather), precision, or a step's parameter"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -82,6 +82,9 @@ class Campaign(Parameters):
     keep_tasks: bool = False
     """Keep the tasks' partial products when they are combined."""
 
+    figures: bool = False
+    """Make one table of the figures that are measured of each set of products, `sweep.ecsv`; a `sweep` does."""
+
     same_machine: bool = False
     """Refuse tasks of another kind of machine (other instructions of the CPU) than the first one's, or of other libraries: their
     bits may differ. Otherwise they are reported."""
@@ -112,3 +115,27 @@ class Campaign(Parameters):
         keys = list(dict.fromkeys(key for entry in self.observations for key in entry))
         first = ["observation", *keys] if self.observations else []
         return [*first, *self.grid, *(["night"] if self.nights else []), *(["realization"] if self.realizations > 1 else [])]
+
+
+class Sweep(Parameters):
+    """One pipeline at several values of its keys, and a table of the figures that it measures at each."""
+
+    over: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
+    """Every combination of these values, e.g. {HighpassFilter.frequency: [0.04 Hz, 0.08 Hz]}; keys are those of `--set`."""
+    points: list[Annotated[dict[str, Any], Field(min_length=1)]] = Field(default_factory=list)
+    """Values that change together, one point after the other. With `over` too, each of them crosses it."""
+    seeds: int = Field(1, ge=1, le=100_000)
+    """Realizations of each point, with the same random numbers at all points."""
+    engine: Engine = "processes"
+    """What works on the runs."""
+    workers: int | None = Field(None, ge=1, le=100_000)
+    """Worker processes of `processes`; where absent, one for each CPU."""
+
+    @model_validator(mode="after")
+    def _something(self) -> Sweep:
+        if not self.over and not self.points and self.seeds == 1:
+            raise ValueError("give over, points or seeds")
+        return self
+
+    CALLED: ClassVar[dict[str, str]] = {"over": "grid", "points": "observations", "seeds": "realizations"}
+    """What a campaign calls its keys."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import click
 
+from . import complete
 from .run import load
 
 
 @click.command()
-@click.argument("pipeline", metavar="FILE_OR_NAME")
+@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..command_types import Bytes, Share
+from . import complete
 from .request import RunRequest
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("pipelines", metavar="FILE_OR_NAME...", nargs=-1, required=True)
+@click.argument("pipelines", metavar="FILE_OR_NAME...", nargs=-1, required=True, shell_complete=complete.pipelines)
 @click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, e.g. Step.parameter='0.5 Hz' or seed=8."
 )
@@ -129,6 +130,8 @@ def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
         file, keep=request.keep, drop=request.drop, prune_all=not request.no_prune, threads=request.threads, memory=request.memory
     )
     click.echo(str(made), err=True)
+    if omitted := made.omitted(file):
+        click.echo(f"omitted: {', '.join(omitted)} (zonda plan says why)", err=True)
     whole, file = len(file.steps), made.apply(file)
     resolved = file.resolved_yaml()
     provenance = {"resolved_yaml": resolved, "command": request.command, "plan": made.short}

@@ -48,6 +48,8 @@ def kind(field: FieldInfo) -> str:
             words.append(f"a{'n' * (member.__name__[0] in 'AEIOU')} {member.__name__}")
         elif isinstance(member, type) and member in _WORDS and not (unit and member is float):
             words.append(_WORDS[member])
+        elif isinstance(noun := getattr(member, "NOUN", None), str):  # a value type of an operator
+            words.append(noun)
     return ", or ".join(dict.fromkeys(words)) or "see below"
 
 

@@ -166,7 +166,7 @@ class _Validated:
             quoted = self.python and isinstance(e["input"], str)
             span = span.inner(caret[0] + 1, caret[1]) if quoted else span.part(*caret)
         message, label = self.message(e, unit_of(field) if field else None, path)
-        message = message[:1].lower() + message[1:] if not message[:2].isupper() else message
+        message = message[:1].lower() + message[1:] if re.match(r"[A-Z][a-z]+\b", message) else message
         text = "\n".join(filter(None, (context.get("help"), _description(field))))
         return Diagnostic(f"{self.name(loc)}: {message}", span, label, text)
 
@@ -178,6 +178,8 @@ class _Validated:
         if kind == "literal_error":
             expected = context.get("expected", "")
             return f"must be {expected}, got {given}", nearest(e["input"], re.findall(r"'([^']*)'", expected))
+        if kind == "too_short":
+            return f"needs at least {context['min_length']} of them, got {context['actual_length']}", ""
         if kind == "string_pattern_mismatch":
             within = ", '.', '+', '-' and spaces within" if " " in context.get("pattern", "") else ""
             return f"{given} has a character that is not allowed here", f"use letters, digits and '_'{within}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, Self, runtime_checkable
 
 from pydantic import BaseModel, BeforeValidator, ValidationInfo
 
@@ -49,6 +49,15 @@ def paths_in(value: Any) -> Iterator[Path]:
     elif isinstance(value, list | tuple | set | frozenset):
         for item in value:
             yield from paths_in(item)
+
+
+@runtime_checkable
+class InMemory(Protocol):
+    """A step that may hold arrays in place of a file that a pipeline file names."""
+
+    def in_files(self, path: Path) -> Self:
+        """The step with its arrays in a FITS file at ``path``, to the same bits; itself where it holds none."""
+        ...
 
 
 InputPath = Annotated[Path, BeforeValidator(find)]

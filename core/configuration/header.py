@@ -52,6 +52,8 @@ class Header(Parameters):
     """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
     campaign: Any = None
     """None; a file with a campaign has the header of its `Section`."""
+    sweep: Any = None
+    """None; see `Section`."""
     outputs: Path | None = None
     """Folder for products, relative to the working directory; where absent, out/<name>."""
 

@@ -15,6 +15,7 @@ from ..operator import Operator
 from ..pipeline import Pipeline
 from ..scene import Scene
 from ..signal import Signal
+from ..variants import is_variant, written
 from . import yaml_places
 from .header import KEYS, Header
 
@@ -84,10 +85,12 @@ class PipelineFile:
     def resolved_yaml(self) -> str:
         """The file with every default filled in, which loads again to the same thing.
 
-        Site and instrument stay names where they were names; what the names stand for is written under ``x-resolved``.
+        Site and instrument stay names where they were names, and a variant stays one; what they stand for is written under
+        ``x-resolved``.
         """
         header = self.header.model_dump(mode="json")
         header["runs"] = {name: run.model_dump(mode="json", exclude_none=True) for name, run in self.runs.items()}
+        del header["sweep"]  # it is a campaign now
         if self.header.campaign is None:
             del header["campaign"]
         else:
@@ -95,8 +98,12 @@ class PipelineFile:
         scene = self._scene.model_dump(mode="json")
         for kind in ("site", "instrument"):  # each as its own class, with all its fields
             scene[kind] = getattr(self._scene, kind).model_dump(mode="json")
-        named = {kind: scene[kind] for kind in ("site", "instrument") if isinstance(self.parameters[kind], str)}
+        named = {
+            k: scene[k] for k in ("site", "instrument") if isinstance(self.parameters[k], str) or is_variant(self.parameters[k])
+        }
         values = header | scene | {kind: self.parameters[kind] for kind in named}
+        if is_variant(self.parameters["instrument"]):
+            values["instrument"] = written(self.parameters["instrument"], self._scene.instrument)
         tree = {key: values[key] for key in KEYS if key in values}
         tree["operators"] = [{step.key: _filled(step.operator)} for step in self.steps]
         if named:

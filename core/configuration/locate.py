@@ -18,6 +18,13 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(Path(zonda.pipelines.__file__).parent.glob("*.yaml"))}
 
 
+def folders() -> dict[str, Path]:
+    """Shipped pipelines in folders, which are not listed: ``validation/mustang2_as_coded``."""
+    every = sorted(Path(zonda.pipelines.__file__).parent.glob("*/*.yaml"))
+    found = [path for path in every if "operators:" in path.read_text("utf-8").splitlines()]
+    return {f"{path.parent.name}/{path.stem}": path for path in found}
+
+
 def locate(path_or_name: str | Path) -> Path:
     """The file that a path, or a shipped pipeline's name, stands for. Raises InputError where there is none."""
     if not isinstance(path_or_name, str | Path):
@@ -28,7 +35,7 @@ def locate(path_or_name: str | Path) -> Path:
     if not path.is_file():
         from ..registry import fold
 
-        for known, file in shipped().items():
+        for known, file in (shipped() | folders()).items():
             if name == known or fold(name) == fold(known):
                 return file
     if path.is_dir():
@@ -39,7 +46,9 @@ def locate(path_or_name: str | Path) -> Path:
         beside = [str(path.parent / p.name) for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
         from .diagnostics import nearest
 
-        cure = nearest(name, [*shipped(), *beside]) or f"give the path of a YAML file or one of: {', '.join(shipped())}"
+        cure = (
+            nearest(name, [*shipped(), *folders(), *beside]) or f"give the path of a YAML file or one of: {', '.join(shipped())}"
+        )
         raise InputError("no such pipeline file or shipped pipeline", place=name, cure=cure)
     return path
 

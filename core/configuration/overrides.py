@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..registry import operators
+from ..variants import LIKE
 from . import yaml_places
 from .diagnostics import Diagnostic, nearest
 from .yaml_places import Document, Mark, Path, Source, Span
@@ -49,15 +50,18 @@ def _header_path(document: Document, parts: list[str]) -> Path:
     if parts[0] == "operators":
         raise _Refused("the list of operators cannot be set", "", "set one step's parameter: Operator.parameter=value")
     here = document.value
+    if parts[0] == "instrument" and len(parts) > 1 and isinstance(here.get("instrument"), str):
+        here["instrument"] = {LIKE: here["instrument"]}  # a variant of the one that is named
+        document.marks[("instrument", LIKE)] = document.mark(("instrument",))
     for depth, part in enumerate(parts[:-1], 1):
-        if part not in here and depth == 1:
+        if part not in here and (depth == 1 or LIKE in here):
             here[part] = {}
-            document.marks[(part,)] = document.marks[()]
+            document.marks[tuple(parts[:depth])] = document.mark(tuple(parts[: depth - 1]))
         here = here.get(part)
         if not isinstance(here, dict):
             where = ".".join(parts[:depth])
             cure = f"set '{where}' itself, or write it as a mapping in the file"
-            if where in ("site", "instrument"):
+            if where == "site":
                 cure += ": resolved.yaml of a run has it written out, under x-resolved"
             raise _Refused(f"'{where}' is {'a name' if isinstance(here, str) else 'one value'}, not a mapping", "", cure)
     return tuple(parts)

@@ -12,10 +12,12 @@ from zonda import __version__
 from .. import registry
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
+from ..output import Output
 from ..pipeline import Pipeline
 from ..run.order import check_order
 from ..scene import Scene
 from ..signal import Signal, can_be_named
+from ..variants import LIKE
 from ..weather import WeatherSource, resolve
 from . import overrides as settings
 from . import yaml_places
@@ -83,6 +85,8 @@ class _Check(Mistakes):
         self.tree: dict[Any, Any] = document.value
 
     def run(self) -> PipelineFile:
+        if self.tree.get("sweep") is not None:
+            self.found += registry.sections.get("sweep").rewrite(self.document)
         kind: type[Header] = Header if self.tree.get("campaign") is None else registry.sections.get("campaign").header
         head = {k: v for k, v in self.tree.items() if k not in (*SCENE_KEYS, "operators") and not str(k).startswith("x-")}
         header = self.validate(kind, head, (), "the pipeline", KEYS)
@@ -180,6 +184,8 @@ class _Check(Mistakes):
                 lost.add(kind)
         if isinstance(given.get("instrument"), dict):
             given["instrument"] = dict(given["instrument"])
+            if not self.named(given["instrument"], LIKE, registry.instruments, ("instrument", LIKE)):
+                lost.add("instrument")
             if not self.named(given["instrument"], "band", registry.bands, ("instrument", "band")):
                 given["instrument"]["band"] = {"name": "", "low": "1 Hz", "high": "2 Hz"}  # goes on to find the other mistakes
         if given.get("weather") is not None:
@@ -206,6 +212,7 @@ class _Check(Mistakes):
         operators = [step.operator for step in steps if step is not None]
         if len(operators) != len(steps) or check_order(operators):
             return
+        making = [operator for operator in operators if not isinstance(operator, Output)]
         components = sorted(set().union(*(operator.provides for operator in operators)))
         for name, run in header.runs.items():
             if not can_be_named(name):
@@ -213,15 +220,21 @@ class _Check(Mistakes):
             for which in ("only", "without"):
                 for i, component in enumerate(getattr(run, which) or ()):
                     try:
-                        Pipeline(operators, runs={name: Signal.model_validate({which: [component]})})
+                        Pipeline(making, runs={name: Signal.model_validate({which: [component]})})
                     except PipelineError as err:
                         span = self.document.mark(("runs", name, which, i)).value
                         near = nearest(component, components)
                         self.wrong(err.message, span, near, err.cure if err.cure != near else "")
         if self.found:
             return
-        for name in [*header.runs, ""]:  # the last: signals that outputs ask for themselves
+        for name, run in header.runs.items():
             try:
-                Pipeline(operators, runs={name: header.runs[name]} if name else {})
+                Pipeline(making, runs={name: run})
             except PipelineError as err:
-                self.wrong(err.message, self.document.mark(("runs", name) if name else ("operators",)).start, "", err.cure)
+                self.wrong(err.message, self.document.mark(("runs", name)).start, "", err.cure)
+        if self.found:
+            return
+        try:
+            Pipeline(operators, runs=header.runs)  # signals that outputs read
+        except PipelineError as err:
+            self.wrong(err.message, self.document.mark(("operators",)).start, "", err.cure)

@@ -14,6 +14,7 @@ from ..components import Registry
 from ..errors import ZondaError
 from ..operator import Operator
 from ..scene import Scene
+from ..variants import LIKE
 from .docstrings import own_doc
 from .header import KEYS
 
@@ -46,6 +47,7 @@ def json_schema() -> dict[str, Any]:
     for definition in defs.values():
         if definition.get("title") == "Instrument":
             definition["properties"]["band"] = _name_or(definition["properties"]["band"], registry.bands)
+            properties["instrument"]["anyOf"].append(_variant(definition))
     steps = _step(classes, references)
     properties["operators"] = {"type": "array", "minItems": 1, "description": "Steps, in order.", "items": steps}
     return {
@@ -67,6 +69,13 @@ def _weather() -> dict[str, type[BaseModel]]:
         with suppress(ZondaError):
             found[name] = registry.weather_sources.get(name)
     return found
+
+
+def _variant(instrument: dict[str, Any]) -> dict[str, Any]:
+    """A registered instrument with some of its fields changed; what a telescope takes is left to `zonda check`."""
+    name = {"type": "string", "examples": list(registry.instruments), "description": "Registered instrument that is varied."}
+    fields = instrument["properties"] | {"telescope": {"type": "object", "description": "What differs of the telescope."}}
+    return {"type": "object", "properties": {LIKE: name} | fields, "required": [LIKE], "additionalProperties": False}
 
 
 def _step(classes: dict[str, type[Operator]], references: Any) -> dict[str, Any]:

@@ -23,6 +23,11 @@ class Section:
         return False
 
     @staticmethod
+    def rewrite(document: Document) -> list[Diagnostic]:
+        """Replace the key, which is there, by others that mean the same; what is wrong with it."""
+        return []
+
+    @staticmethod
     def mistakes(
         document: Document, value: Any, known: list[Diagnostic], check: Callable[[Document], list[Diagnostic]]
     ) -> list[Diagnostic]:

@@ -84,6 +84,8 @@ class Target(TextValue):
     def parse(cls, value: Any) -> Target:
         """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, a pair of angles (ICRS), SkyCoord or Target.
 
+        A SkyCoord in AltAz is a horizontal target: of its time and place nothing is used.
+
         Text: two angles, sexagesimal (h for hours; colons or spaces mean hours for a right ascension and degrees elsewhere) or
         with a unit; the frame's name or the coordinates' names may stand before them; ICRS where neither does."""
         if isinstance(value, Target):
@@ -94,6 +96,8 @@ class Target(TextValue):
             return cls._from_mapping(value)
         if isinstance(value, list | tuple) and len(value) == 2:
             return cls._of("icrs", *value)
+        if getattr(getattr(value, "frame", None), "name", "") == "altaz" and getattr(value, "isscalar", False):
+            return cls("horizontal", float(value.az.rad) % (2 * math.pi), float(value.alt.rad))
         if hasattr(getattr(value, "icrs", None), "ra") and getattr(value, "isscalar", False):  # a SkyCoord
             return cls("icrs", float(value.icrs.ra.rad) % (2 * math.pi), float(value.icrs.dec.rad))
         raise mistake(f"expected a position such as '{_EXAMPLES[0]}', got {value!r}")

@@ -37,3 +37,9 @@ class Image:
         from astropy.wcs import WCS
 
         return WCS(self.header, naxis=2)
+
+    def plot(self, ax: Any = None, *, title: str = "", limit: float | None = None) -> Any:
+        """Draw it; the matplotlib Axes. ``limit``: where the colours end; default: what 99.5 % of the pixels stay below."""
+        from .picture import Shown, draw
+
+        return draw(Shown(self.values, self.wcs, self.unit, title), ax, limit)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -12,112 +11,61 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..notebook import html_table
-from ..numerics import tangent
 from ..numerics.angles import ARCMIN, FWHM_PER_SIGMA
-from ..numerics.sphere import separation
 from ..numerics.transforms import convolved, gaussian_taps
 from ..types import Floats
+from .map_arrays import MapArrays
 
 if TYPE_CHECKING:
-    from astropy.io.fits import Header
-
-    from ..numerics.tangent import TangentWcs
-    from ..storage.fits_image import Cards
-
-SMALL = 1 << 20
-"""Pixels of a map whose distances from the centre are kept."""
+    from pathlib import Path
 
 
-@dataclass
-class MapProduct:
-    """A map in the TAN projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the pixels ``pixels``.
+@dataclass(repr=False)
+class MapProduct(MapArrays):
+    """`MapArrays`, and what is done with them."""
 
-    Attributes
-    ----------
-    signal
-        Weighted mean of the samples, `unit`; NaN where hits == 0.
-    hits
-        Number of samples, int64.
-    weights
-        Sum of the samples' weights: K^-2 (inverse variance), or a plain count (uniform).
-    noise
-        Standard deviation of ``signal`` (after smoothing, where it is smoothed), `unit`; NaN where unknown.
-    half_difference
-        Noise map from the difference of the even and odd scans,
-        (m_e - m_o) sqrt(w_e w_o) / (w_e + w_o): its variance is that of ``signal`` where both have hits; NaN elsewhere.
-    header
-        Keywords of the WCS (TAN maps), else None; a dict that `astropy.io.fits.Header` takes.
-    centre
-        (lon, lat) [rad] of the map's centre in ``frame``.
-    pixel
-        Side of a pixel [rad]; for HEALPix the square root of its area.
-    nside, nest, pixels
-        HEALPix parameters and sorted pixel numbers, else 0, False, None.
-    fwhm
-        Main-beam FWHM of the instrument [rad]. ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
-    scans
-        Names of the observations in it.
-    sample_rate
-        Of all scans [Hz]; 0 where it is unknown or they differ.
-    """
+    def to(self, unit: str, *, spectral_index: float = 0.0) -> MapProduct:
+        """The map in another unit: K_RJ, K_CMB, Jy/beam, Jy/pixel, MJy/sr or y, with a prefix (``uK_CMB``, ``mJy/beam``).
 
-    signal: Floats
-    hits: NDArray[np.int64]
-    weights: Floats
-    noise: Floats
-    half_difference: Floats | None
-    header: Cards | Header | None
-    centre: tuple[float, float]
-    pixel: float
-    frame: str = "icrs"
-    unit: str = "K_RJ"
-    weighting: Literal["uniform", "inverse_variance"] = "uniform"
-    noise_from: Literal["net", "scatter"] = "net"
-    nside: int = 0
-    nest: bool = False
-    pixels: NDArray[np.int64] | None = None
-    fwhm: float = 0.0
-    smoothed_by: float = 0.0
-    scans: list[str] = field(default_factory=list)
-    sample_rate: float = 0.0
-    contents: Literal["all", "hits"] = "all"
-    """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
-
-    @property
-    def wcs(self) -> Any:
-        """The `astropy.wcs.WCS` of a TAN map."""
-        from astropy.wcs import WCS
-
-        if self.header is None:
-            raise InputError("a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy")
-        return WCS(self.header)
-
-    def distance(self) -> Floats:
-        """Angle [rad] of every pixel from the centre, shape of ``signal``."""
-        if self.header is not None:
-            find = _tangent_distance if self.signal.size <= SMALL else _tangent_distance.__wrapped__
-            world = tangent.plain(self.header) or self.header.tostring()
-            return find(world, self.signal.shape, self.centre)
-        import healpy
-
-        colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
-        return separation(phi, np.pi / 2 - colatitude, self.centre)
-
-    def seconds_per_beam(self) -> Floats | float | None:
-        """What one sample in a pixel adds to the integration time of all detectors per beam [s]: times ``hits``, that time.
-
-            1 / sample rate x beam area / pixel area,   pi FWHM^2 / (4 ln 2) / pixel^2 (cos^-3 of the distance, TAN)
-
-        The beam is the telescope's, not what smoothing made of it. One number where pixels are equal to 0.1 %, else an array,
-        shape of ``signal``; None where the rate or the beam is not known.
+        ``uK`` alone is on the map's own temperature scale. Equation (1) of `core.numerics.radiation` averages over the band of
+        the run; ``spectral_index`` is that of the flux density within the band. A beam is a Gaussian of `resolution`. Weights
+        that are an inverse variance are divided by the square of the factor. Raises InputError for a unit that is not known, and
+        where the map has no band or beam.
         """
-        if not (self.sample_rate > 0 and self.fwhm > 0):
-            return None
-        per_pixel = math.pi / math.log(16) * (self.fwhm / self.pixel) ** 2 / self.sample_rate
-        if self.header is None:
-            return per_pixel
-        larger = np.cos(self.distance()) ** -3
-        return per_pixel if larger.max() < 1.001 else per_pixel * larger
+        from .convert import converted
+
+        return converted(self, unit, spectral_index)
+
+    def smooth(self, fwhm: Any = None) -> MapProduct:
+        """`smoothed` with a Gaussian of ``fwhm``: ``"9 arcsec"``, an astropy quantity; None: the telescope's beam."""
+        from .convert import smoothing_width
+
+        return self.smoothed(smoothing_width(fwhm, self.fwhm))
+
+    def plot(self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None) -> Any:
+        """Draw a plane (``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``); the matplotlib Axes.
+
+        Raises InputError for a plane that the map has not.
+
+        Parameters
+        ----------
+        ax
+            Axes to draw into; default: a new figure with sky coordinates.
+        limit
+            Where the colours end, in the map's unit; default: what 99.5 % of the pixels stay below.
+        """
+        from .picture import draw_map
+
+        return draw_map(self, ax, plane, title, limit)
+
+    def write(self, path: str | Path, *, overwrite: bool = False) -> Path:
+        """Write it as `SaveMap` does (FITS image, or HEALPix table), without the log of the run; the path.
+
+        Raises `OutputError` where the file is there already (unless ``overwrite``), or cannot be written.
+        """
+        from .map_file import write_map
+
+        return write_map(self, path, overwrite)
 
     def rms(self, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal") -> float:
         """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre (the central arcmin).
@@ -147,8 +95,14 @@ class MapProduct:
         """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w over pixels with hits.
 
         Empty pixels neither contribute nor are filled. Noise: pixels are independent before, so its variance becomes
-        sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel itself.
+        sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel itself. Raises InputError for a map in Jy/beam,
+        whose beam it would change.
         """
+        if self.unit.endswith("/beam"):
+            message = (
+                f"a map in {self.unit} is per beam of {math.degrees(self.resolution) * 3600:.3g} arcsec, which smoothing widens"
+            )
+            raise InputError(message, place="map", cure="smooth it before: map.smooth(...).to('Jy/beam')")
         convolve = self._convolver(fwhm)
         known = self.hits > 0
         weights = np.where(known, self.weights, 0.0)
@@ -225,7 +179,7 @@ class MapProduct:
             ("pixel", f"{math.degrees(self.pixel) * 3600:.3g} arcsec"),
             ("pixels hit", int(hit.sum())),
             ("smoothed by", f"{math.degrees(self.smoothed_by) * 3600:.3g} arcsec" if self.smoothed_by else "nothing"),
-            ("resolution (FWHM)", f"{math.degrees(math.hypot(self.fwhm, self.smoothed_by)) * 3600:.3g} arcsec"),
+            ("resolution (FWHM)", f"{math.degrees(self.resolution) * 3600:.3g} arcsec"),
             ("rms in the central arcmin", f"{self.rms():.3g} {self.unit}"),
         ]
         if self.half_difference is not None:
@@ -242,18 +196,3 @@ def _rms(values: Floats, weights: Floats, where: NDArray[np.bool_]) -> float:
 def _around(places: NDArray[np.int64], reach: int) -> slice:
     """From ``reach`` before the first to ``reach`` behind the last."""
     return slice(max(0, int(places[0]) - reach), int(places[-1]) + reach + 1) if places.size else slice(0)
-
-
-@lru_cache(maxsize=1)  # the maps of all signals share it
-def _tangent_distance(world: TangentWcs | str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
-    """``world``: what the header says, or the header itself."""
-    wcs: Any = world
-    if isinstance(world, str):
-        from astropy.wcs import WCS
-
-        wcs = WCS(world)
-    y, x = np.indices(shape)
-    phi, theta = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
-    found = separation(phi, theta, centre)
-    found.flags.writeable = False
-    return found

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from .map_product import MapProduct
 
 Noise = Literal["half_difference", "source_free"]
-"""What holds noise alone: half the difference of even and odd scans, the map of the signal without the sky."""
+"""What holds noise alone: half the difference of two halves of the samples, the map of the signal without the sky."""
 
 
 def maps_of(products: Mapping[str, Any]) -> dict[str, MapProduct]:

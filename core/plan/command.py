@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import click
 
+from ..cli import complete
+
 
 @click.command()
-@click.argument("pipeline", metavar="FILE_OR_NAME")
+@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
 @click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full.")
 @click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")

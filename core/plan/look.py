@@ -14,10 +14,11 @@ from ..output import Output
 from ..pipeline import Pipeline
 from ..run.signals import note_signals
 from ..scene import Scene
+from ..signal import is_stream
 from .context import Context, Depth
 from .coverage import cover
 from .planning import planning_of
-from .structure import STREAMS, Structure, work
+from .structure import Structure, work
 
 LOOKED_AT = 4
 """Observations whose levels of noise are looked at, apart from those at the extremes of elevation."""
@@ -84,7 +85,7 @@ def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> froz
     found = set()
     if context.coverage is not None:
         found |= {"map_rms", "peak"}
-        made = set().union(*(o.provides for o in context.operators)) & STREAMS
+        made = {name for o in context.operators for name in o.provides if is_stream(name)}
         if made <= {"sky", "signal"} or any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
             found.add("transfer")
     if context.readers or context.coverage is None:

@@ -11,16 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ..block import STREAMS as NAMES
 from ..mapmaker import MapMaker, filters, forms, makes_products
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
 from ..run.signals import acting_steps, remainder
-from ..signal import MAIN, TRANSMISSION
+from ..signal import MAIN, TRANSMISSION, is_stream
 from .context import Work
-
-STREAMS = frozenset(NAMES)
 
 
 @dataclass(frozen=True)
@@ -96,10 +93,10 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
 
 
 def _wanted(pipeline: Pipeline, name: str) -> set[str]:
-    """Products of a signal that outputs read: those that ask for certain signals of these, the others of all but such signals."""
+    """Products and components of a signal that outputs read. Those that ask for certain signals read of these alone."""
     found: set[str] = set()
     for o in pipeline.operators:
-        if isinstance(o, Output) and (name in o.shown if o.signals() or name.startswith("_") else True):
+        if isinstance(o, Output) and o.reads(name):
             found |= o.requires | o.optional
     return found
 
@@ -125,7 +122,8 @@ def _takes_modes(pipeline: Pipeline, name: str) -> bool:
     """Whether a signal is treated as a part of the complete one, by a filter or by the atmosphere's transmission."""
     signal = pipeline.signals.all[name]
     return signal.model and (
-        TRANSMISSION in signal.components or any(filters(o) and o.couples == "all" for o in pipeline.operators)
+        TRANSMISSION in signal.components
+        or any(filters(o) and o.couples == "all" and o.label not in signal.own for o in pipeline.operators)
     )
 
 
@@ -133,16 +131,16 @@ def _useless(steps: Sequence[Operator], found: Mapping[str, str], wanted: set[st
     """Why a signal is not needed; empty: it is needed."""
     acting = [o for o in steps if o.label in found]
     if not any(_makes_something(o, wanted) for o in acting):
-        made = any(o.provides - STREAMS - {"boresight"} for o in steps)
+        made = any(_products(o) for o in steps)
         return "no later step reads what it makes" if made else "nothing in it makes a product"
-    if not any((o.requires | o.optional) & STREAMS for o in acting):
+    if not any(is_stream(name) for o in acting for name in o.requires | o.optional):
         return "nothing in it depends on the sky, the atmosphere or the noise"
     return ""
 
 
 def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
     """(needed, omitted) by label with reasons, going back through one signal's steps."""
-    read: dict[str, str] = {}  # stream or field -> who reads it
+    read = {name: "an output" for name in wanted if is_stream(name)}  # stream or field -> who reads it
     needed: dict[str, str] = {}
     left_out: dict[str, str] = {}
     for operator in reversed(steps):
@@ -152,7 +150,7 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
             reason = keep[operator.label]
         elif readers:
             reason = f"read by {', '.join(readers)}"
-        elif made and made <= STREAMS and (MAIN not in made or type(operator).finalize is Operator.finalize):
+        elif made and all(map(is_stream, made)) and (MAIN not in made or type(operator).finalize is Operator.finalize):
             left_out[operator.label] = f"no step that is needed reads {' or '.join(sorted(made))}"
             continue
         elif makes_products(operator) and not made & wanted:
@@ -163,7 +161,7 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
         needed[operator.label] = reason
         changes = made & operator.requires  # reads what it writes: those above still matter
         for name in made - changes:
-            if name in STREAMS:
+            if is_stream(name):
                 others = [o for o in steps[: list(steps).index(operator)] if name in o.provides]
                 if not others:
                     read.pop(name, None)
@@ -172,8 +170,13 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
     return needed, left_out
 
 
+def _products(operator: Operator) -> set[str]:
+    """What it provides besides streams and the pointing."""
+    return {name for name in operator.provides if name != "boresight" and not is_stream(name)}
+
+
 def _makes_something(operator: Operator, wanted: set[str]) -> bool:
-    made = operator.provides - STREAMS - {"boresight"}
+    made = _products(operator)
     return bool(made & wanted) or bool(made and not makes_products(operator)) or (not operator.provides)
 
 

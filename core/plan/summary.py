@@ -51,6 +51,11 @@ class PlanSummary:
     prediction: Prediction
     unpruned: Prediction
 
+    def omitted(self, file: PipelineFile) -> list[str]:
+        """The steps and signals of a pipeline file that do not act."""
+        steps = [o.label for o in file.pipeline().operators if o.label not in self.operators]
+        return steps + [f"signal {name}" for name in file.runs if name not in self.runs]
+
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators omitted."""
         labels = [o.label for o in file.pipeline().operators]

@@ -105,4 +105,7 @@ def _cure(value: Any, step: int) -> str:
     name = value if isinstance(value, str) else next(iter(value), "") if isinstance(value, Mapping) else ""
     if isinstance(name, str) and name.isidentifier():
         return f"write zonda.{name}(...) at step {step}; zonda.load(file).pipeline() makes the steps of a file"
+    if callable(value) and not isinstance(value, type):
+        own = getattr(value, "__name__", "function")
+        return f"write zonda.operator({'lambda block: ...' if own == '<lambda>' else own}) at step {step}"
     return "an operator is made of a class: zonda.Name(parameter=value); docs/plugins.md shows how to write your own"

@@ -21,12 +21,12 @@ from ..faults import PluginError, whose
 from ..mapmaker import MapMaker, filters, forms
 from ..numerics.tiles import TILE_SAMPLES
 from ..operator import Operator
-from ..signal import Formed
+from ..signal import Formed, is_stream
 from ..stream import Stream
 from ..tally import Tally
 from ..types import AnyFloats
 from .blocks import pieces, trimmed, within
-from .schedule import Schedule, unused
+from .schedule import Schedule
 from .settings import Timer
 from .streams import Ledger, Stage
 from .whole import exec_whole, knows_means, means_of, names_of
@@ -78,7 +78,7 @@ class BlockMaker:
         """By label: streams that a step must have made, for a later one requires them."""
         required = frozenset[str]()
         for step in reversed(chain.steps):
-            self._due[step.label] = frozenset(n for n in step.provides & required if unused(n))
+            self._due[step.label] = frozenset(n for n in step.provides & required if is_stream(n))
             required |= step.requires if step in acting else frozenset()
         self._measures = {o.label: (o.label, name) for o in acting if o.couples == "all" for name in o.requires - {"boresight"}}
         # an unfiltered signal may be finite where a filter has spoilt the others
@@ -144,7 +144,7 @@ class BlockMaker:
 
     def _is_read(self, step: Operator) -> bool:
         """Whether a step must act: one of its streams is read later, or it makes products."""
-        streams = [n for n in step.provides if unused(n)]
+        streams = [n for n in step.provides if is_stream(n)]
         return len(streams) < len(step.provides) or any(n in self._streams for n in streams)
 
     def _of_use(self, signals: Sequence[Formed]) -> set[int]:

@@ -17,6 +17,10 @@ BASE = 230_000_000
 """Bytes of the interpreter, libraries and compiled code."""
 
 
+KEPT = "kept streams"
+FEWER = "keep fewer streams, of fewer or shorter scans"
+
+
 def longest_of(observations: Sequence[Observation]) -> Observation:
     """The observation of most samples."""
     return max(observations, key=lambda o: o.n_detectors * o.n_samples)
@@ -46,6 +50,7 @@ def divided(chain: Chain, observation: Observation, settings: Settings, place: s
     """
     budget = settings.asked or resident_memory() + available_memory() // 2
     parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
+    parts[KEPT] = settings.kept
     parts.update((o.label, planning_of(o).memory(observation)) for o in chain.steps)
     fixed = sum(parts.values())
     left = replace(settings, memory=max(budget - fixed, 1))
@@ -68,6 +73,12 @@ def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) 
     return replace(settings, memory=settings.memory - size, ceiling=ceiling)
 
 
+def check_kept_memory(size: int, free: int, place: str) -> None:
+    """Refuse to keep streams of ``size`` bytes where less memory is ``free``. Raises PipelineError."""
+    if size > free:
+        raise PipelineError(f"the kept streams would take {_size(size)}, {_size(free)} are free", place=place, cure=FEWER)
+
+
 def least_memory(chain: Chain, observation: Observation, settings: Settings) -> int:
     """Bytes with which a process runs these steps over an observation on one thread, libraries included."""
     held = sum(planning_of(o).memory(observation) for o in chain.steps)
@@ -84,7 +95,7 @@ def _refuse(chain: Chain, parts: Mapping[str, int], blocks: int, budget: int, th
     rows = sorted([*parts.items(), (f"blocks on {threads} thread{'s' if threads > 1 else ''}", blocks)], key=lambda row: -row[1])
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
     cures = [f"use --memory {_with_margin(need) // 1_000_000}MB"] if need * 1.05 <= free else []
-    smaller = {o.label: planning_of(o).smaller for o in chain.steps}
+    smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in chain.steps}
     cures += [f"{label}: {how}" for label, how in smaller.items() if how and parts[label] > 0.1 * need]
     if blocks > 0.1 * need and parts["zonda and its libraries"] < budget:
         cures.append("split the scan into shorter ones")

@@ -28,7 +28,9 @@ from ..discovery import RAISED
 from ..errors import PipelineError
 from ..machine import resident_memory
 from ..mapmaker import filters
+from ..numerics.chunks import empty
 from ..numerics.smooth import SmoothField
+from ..numerics.tiles import TILE_DETECTORS
 from ..observation import Observation
 from ..operator import Operator
 from ..signal import MAIN, Formed, is_signal
@@ -188,11 +190,18 @@ class Execution:
                 raise PipelineError(
                     f"stream {name!r} was asked to be kept, but no operator makes it", cure="keep a stream that a step provides"
                 )
-            stream = source.streams[name]
-            whole = np.array(stream.array, np.float64)
-            if name in stream.means:
-                whole += stream.means[name].evaluate(slice(0, whole.shape[0]), slice(0, whole.shape[1]))
-            self.observation.detdata[name] = whole
+            self.observation.detdata[name] = self._whole(source.streams[name])
+
+    def _whole(self, stream: Stream) -> AnyFloats:
+        """All of a stream with its mean, float64; a few detectors at a time, so that nothing of its size is made besides."""
+        whole = empty(self.schedule.shape, np.float64)
+        for first in range(0, len(whole), TILE_DETECTORS):
+            rows = slice(first, min(first + TILE_DETECTORS, len(whole)))
+            whole[rows] = stream.array[rows]
+            if stream.name in stream.means:
+                whole[rows] += stream.means[stream.name].evaluate(rows, slice(0, whole.shape[1]))
+            forget_pages(stream.array)
+        return whole
 
     def _carry_out(self, planned: Planned, stage: Stage) -> Source:
         """Let a segment work, or put that off until its streams are read."""
@@ -275,7 +284,7 @@ class Execution:
         signals = [s for s in self.chain.signals if s.filtered and s.stream in source.names] if filters(operator) else [one]
         for signal in signals:
             lent: list[AnyFloats] = []
-            model = self.measured.get((operator.label, MAIN)) if signal.model and signal.stream != MAIN else None
+            model = self.measured.get((operator.label, MAIN)) if signal.takes_model(operator.label) else None
             stream = self._stream(operator, source, signal, lent)
             self.measured[operator.label, signal.stream] = operator.measure(stream, model)
             self._store.drop(lent)

@@ -6,10 +6,11 @@ import warnings
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ..data import STREAMS, Data
+from ..data import Data
 from ..mapmaker import makes_products
 from ..operator import Operator
 from ..pipeline import Pipeline
+from ..signal import is_stream
 
 if TYPE_CHECKING:
     from ..scene import Scene
@@ -33,5 +34,6 @@ def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[
 def writes(operators: Iterable[Operator]) -> bool:
     """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its products in memory."""
     return any(
-        not (makes_products(o) or "boresight" in o.provides or (o.provides and o.provides <= {*STREAMS})) for o in operators
+        not (makes_products(o) or "boresight" in o.provides or (o.provides and all(map(is_stream, o.provides))))
+        for o in operators
     )

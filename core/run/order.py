@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ..configuration.diagnostics import nearest
 from ..mapmaker import forms, place_of_signal
 from ..operator import Operator
 from ..output import Output
@@ -40,8 +41,12 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                     )
                 )
             else:
-                found = makers(what)
-                cure = f"{' or '.join(found)} would" if found else ""
+                found, above = makers(what), {type(o).__name__ for o in operators[:index]}
+                cure = f"{' or '.join(found)} would" if found else nearest(what, sorted(have)) or ""
+                if on_request := sorted(above & {*found}):
+                    cure = f"{on_request[0]} makes it if its parameters ask for it"
+                elif not found and not cure and have:
+                    cure = f"what there is: {', '.join(sorted(have))}"
                 message = f"{name} needs {what}, which no step provides"
                 problems.append(OrderProblem(index, message, f"add a step that provides {what} above", cure))
         adds_up = forms(operator) and (operator.requires | operator.optional) - {"boresight"}

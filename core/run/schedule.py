@@ -11,14 +11,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..block import STREAMS
 from ..errors import PipelineError
 from ..mapmaker import MapMaker, filters, forms, makes_products
 from ..numerics.tiles import TILE_DETECTORS
 from ..observation import Observation
 from ..operator import Operator
 from ..plan.planning import planning_of
-from ..signal import MAIN, Formed, is_signal
+from ..signal import MAIN, Formed
 from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, whole_span
 from .settings import Held, Settings
 from .streams import DISK_RATE, SAMPLE_COST, WORTH_MEASURING, Source, Stage, choose, disk_rate
@@ -61,10 +60,10 @@ class Chain:
 
     @property
     def read(self) -> frozenset[str]:
-        """Names of the streams that are needed: what steps read in `Operator.exec`, and what is to be kept."""
+        """Names of the streams that are needed: what `Operator.exec` or `Operator.measure` reads, and what is kept."""
         names = frozenset(self.keep)
         for step in self.steps:
-            if type(step).exec is not Operator.exec:
+            if type(step).exec is not Operator.exec or type(step).measure is not Operator.measure:
                 names |= self.of(step, self.signals) if forms(step) else step.requires | step.optional
         return self.expanded(names - {"boresight"})
 
@@ -356,8 +355,3 @@ def spares(chain: Chain, observation: Observation, settings: Settings, size: int
     except PipelineError:  # a stream would go to a disk that has no room for it
         return False
     return with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
-
-
-def unused(name: str) -> bool:
-    """Whether a stream is nothing but a component or a signal: its only use is to be read by a later step."""
-    return name in STREAMS or is_signal(name)

@@ -39,6 +39,8 @@ class Settings:
         Progress callback.
     spare
         Memory to use again.
+    kept
+        Bytes of the streams of all scans that the user wants to have at the end.
     """
 
     threads: int = 1
@@ -50,6 +52,7 @@ class Settings:
     prefer: Held | None = None
     asked: int | None = None
     least: int = 0
+    kept: int = 0
 
 
 @dataclass

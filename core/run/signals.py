@@ -54,8 +54,8 @@ class Signals:
     remainders
         By name of the others: the names of the signals that are taken from the complete one, equation (1).
     not_linear
-        Label of a filter that is not linear; empty: all are. Signals with ``modes: full`` then have modes of their own, and there
-        are no remainders.
+        Label of the first filter that is not linear; empty: all are. From there on signals with ``modes: full`` have modes of
+        their own, and there are no remainders.
     """
 
     def __init__(self, operators: Sequence[Operator], runs: Mapping[str, Signal], only: Sequence[str], place: str) -> None:
@@ -73,8 +73,11 @@ class Signals:
         if self._only:
             self._check_components(self._only, "--only names")
             self.runs = {name: s for name, s in self.runs.items() if self._is_left(s)}
-        self._add_needed()
-        self.not_linear = next((o.label for o in operators if filters(o) and not o.linear), "")
+        self._add_needed(runs)
+        changing = [o for o in operators if filters(o)]
+        self.not_linear = next((o.label for o in changing if not o.linear), "")
+        labels = [o.label for o in changing]
+        self._own = frozenset(labels[labels.index(self.not_linear) :] if self.not_linear else ())
         self.all = {name: self._formed(name, signal) for name, signal in [("", None), *self.runs.items()]}
         self.remainders = {} if self.not_linear else self._remainders()
         self.formed = tuple(f for name, f in self.all.items() if name not in self.remainders)
@@ -99,11 +102,16 @@ class Signals:
         return frozenset(named.get(name) or Component(name) for name in made)  # type: ignore[call-overload]
 
     def check_kept(self, streams: Sequence[str]) -> None:
-        """Refuse to keep a signal that has no stream."""
+        """Refuse to keep a stream that no step makes, or a signal that has none."""
         made = [formed.stream for formed in self.formed]
+        others = frozenset[str]().union(*(o.provides for o in self.operators))
         for stream in streams:
-            if not is_signal(stream) or stream in made or stream == MAIN:
+            if stream in made or stream == MAIN or stream in others:
                 continue
+            if not is_signal(stream):
+                have = sorted({*made, *self.components})
+                cure = nearest(stream, have) or f"there are: {', '.join(have)}"
+                raise PipelineError(f"the stream {stream!r} cannot be kept: no step makes it", place=self._place, cure=cure)
             parts = self.remainders.get(stream.partition("/")[2], ())
             what, cure = "there is no such signal", nearest(stream, made) or f"choose from: {', '.join(made)}"
             if parts:
@@ -124,7 +132,7 @@ class Signals:
         if signal is not None and model and TRANSMISSION not in (signal.without or ()):
             components |= {c for c in self.components if c == TRANSMISSION}
         filtered = signal is None or signal.filters == "all"
-        return Formed(stream_of(name), components, model and not self.not_linear and len(kept) < len(self._generators), filtered)
+        return Formed(stream_of(name), components, model and len(kept) < len(self._generators), filtered, self._own)
 
     def _is_left(self, signal: Signal) -> bool:
         """Whether a signal is another than the narrowed complete one, and not empty."""
@@ -138,11 +146,16 @@ class Signals:
                 cure = nearest(what, sorted(self.components)) or f"choose from: {', '.join(sorted(self.components))}"
                 raise PipelineError(f"{who} {what!r}, which no step provides", place=self._place, cure=cure)
 
-    def _add_needed(self) -> None:
-        """Find for each output the signals that it reads; add those that are not there."""
+    def _add_needed(self, given: Mapping[str, Signal]) -> None:
+        """Find for each output the signals that it reads; add those that are not there. ``given``: those of the pipeline."""
         for operator in self.operators:
             if not isinstance(operator, Output):
                 continue
+            for name in {*operator.named_signals()} - {"", *given}:
+                cure = nearest(name, sorted(given)) or f"add it to runs, e.g. `runs: {{{name}: {{without: [sky]}}}}`"
+                raise PipelineError(
+                    f"{operator.label} reads the signal {name!r}, which runs does not have", place=self._place, cure=cure
+                )
             names = []
             for wanted in operator.signals():
                 self._check_components(wanted, f"{operator.label} needs")
@@ -206,9 +219,11 @@ def acting_steps(operators: Sequence[Operator]) -> list[Operator]:
 
 def note_signals(observations: Iterable[Observation], components: Iterable[str], formed: Iterable[Formed]) -> None:
     """Note in observations which components there are and which signals are formed."""
-    names, streams = frozenset(map(str, components)), tuple(sorted(signal.stream for signal in formed))
+    formed = list(formed)
+    names, streams = frozenset(components), tuple(sorted(signal.stream for signal in formed))
+    unfiltered = frozenset(signal.stream for signal in formed if not signal.filtered)
     for observation in observations:
-        observation.components, observation.signals = names, streams
+        observation.components, observation.signals, observation.unfiltered = names, streams, unfiltered
 
 
 def _generators(operators: Sequence[Operator]) -> list[Operator]:

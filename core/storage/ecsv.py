@@ -14,7 +14,7 @@ from .files import write_text
 
 @dataclass(frozen=True)
 class Column:
-    """Name, float values (n,), FITS unit (empty: none) and description."""
+    """Name, values (n,) (numbers, or all of them texts), FITS unit (empty: none) and description."""
 
     name: str
     values: Any
@@ -27,11 +27,19 @@ def write_ecsv(path: str | Path, columns: Sequence[Column], meta: Mapping[str, A
     head = ["%ECSV 1.0", "---", "delimiter: ','", "datatype:"]
     for c in columns:
         unit = f"unit: {c.unit}, " if c.unit else ""
-        head.append(f"- {{name: {c.name}, {unit}datatype: float64, description: {json.dumps(c.description)}}}")
+        kind = "string" if any(isinstance(v, str) for v in c.values) else "float64"
+        head.append(f"- {{name: {c.name}, {unit}datatype: {kind}, description: {json.dumps(c.description)}}}")
     head.append("meta: !!omap")
     head += [f"- {{{json.dumps(key)}: {json.dumps(value)}}}" for key, value in meta.items()]
     head.append("schema: astropy-2.0")
     rows = zip(*(c.values for c in columns), strict=True)
     body = [",".join(c.name for c in columns)]
-    body += [",".join("nan" if math.isnan(v) else f"{v:.9g}" for v in map(float, row)) for row in rows]
+    body += [",".join(map(_cell, row)) for row in rows]
     return write_text(path, "\n".join([*(f"# {line}" for line in head), *body]) + "\n")
+
+
+def _cell(value: Any) -> str:
+    """Text in quotation marks, a number with nine digits."""
+    if isinstance(value, str):
+        return '"' + " ".join(value.split()).replace('"', '""') + '"'
+    return "nan" if math.isnan(value) else f"{float(value):.9g}"

@@ -28,11 +28,11 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     """The fluctuations of an observation, stated in its log."""
     parameters, observation, chosen, law = model.parameters, model.observation, model.resolution(), model.fluctuation
     law.check(model.pwv, label)
-    turbulence = _drifting(model)
+    turbulence = drifting_layers(model)
     path = turbulence.paths[chosen.step]
     shares = np.array([layer.amplitude for layer in model.layers])
     heights = np.array([layer.height for layer in model.layers])
-    vapour_height = float(shares @ heights / shares.sum())
+    vapour_height = height_of_vapour(model)
     per_vapour = delay_per_vapour(np.asarray(model.profile.at(heights).temperature), shares)
     top = model.band.pwv_max / model.pwv - 1
     response = Response(
@@ -55,16 +55,24 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     return make(chosen.nodes, turbulence, pwv, response, chosen.step, observation.n_samples)
 
 
-def _drifting(model: AtmosphereModel) -> DriftingLayers:
-    """The layers that are simulated, over the whole scan."""
+def height_of_vapour(model: AtmosphereModel) -> float:
+    """Mean height of the layers by their shares [m]."""
+    shares = np.array([layer.amplitude for layer in model.layers])
+    return float(shares @ np.array([layer.height for layer in model.layers]) / shares.sum())
+
+
+def drifting_layers(model: AtmosphereModel, points: tuple[Floats, Floats] | None = None) -> DriftingLayers:
+    """The layers that are simulated, over the whole scan, to be looked at from focal-plane ``points``, by default the nodes."""
     chosen, omit = model.resolution(), model.parameters.omit
     parts = zip(model.turbulence, model.layers, chosen.steps, strict=True)
     drifting = [Drifting(field, layer.height, layer.amplitude, layer.wind, step) for field, layer, step in parts]
     drifting = [one for number, one in enumerate(drifting) if number not in omit]
     first, count = times(slice(0, model.observation.n_samples), chosen.step)
     kind = np.float64 if chosen.nodes.shape else np.float32
-    points, span = (chosen.nodes.xi, chosen.nodes.eta), (first, first + count)
-    return DriftingLayers(model.observation, model.plane, points, drifting, chosen.step, span, kind)
+    span = first, first + count
+    return DriftingLayers(
+        model.observation, model.plane, points or (chosen.nodes.xi, chosen.nodes.eta), drifting, chosen.step, span, kind
+    )
 
 
 def state_drawn(model: AtmosphereModel, label: str, state: AtNodes | OfDetectors) -> None:

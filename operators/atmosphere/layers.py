@@ -12,7 +12,6 @@ elevation of the ray (`response`). All of it is smooth, so it is computed at nod
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,18 +23,19 @@ from zonda.core.errors import PointingError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.observation import Observation
 
+from .closed_form import closed_form
 from .drawing import draw, state_drawn
 from .fluctuations import AtNodes, OfDetectors
-from .model import AtmosphereModel, Models, expected_load
+from .model import AtmosphereModel, ExpectedLoad, Models
 from .parameters import LayerParameters
 from .weather.radiative_transfer import ELEVATION_MIN
 
 
 class _Provides:
-    """The streams of an `AtmosphereLayers`: those of every one, and its `outputs`."""
+    """The streams of an `AtmosphereLayers`: those of every one, and its `outputs`; of the class: all that there may be."""
 
     def __get__(self, operator: AtmosphereLayers | None, owner: type) -> frozenset[str]:
-        return frozenset({"atmosphere", "transmission", *(operator.outputs if operator else ())})
+        return frozenset({"atmosphere", "transmission", *(operator.outputs if operator else ("pwv", "opacity", "path_delay"))})
 
 
 class AtmosphereLayers(LayerParameters):
@@ -61,7 +61,7 @@ class AtmosphereLayers(LayerParameters):
         """Note the start of the run and its scans, which share one drifting atmosphere; announce the load to map makers."""
         self._models = self._models.of_run(data)  # one of its own: copies of this step may be at work in other threads
         for observation in data.observations:
-            observation.expected_load = partial(expected_load, self._models, self, observation)
+            observation.expected_load = ExpectedLoad(self._models, self, observation)
 
     def configure(self, observation: Observation) -> None:
         """Set the smooth means: noise levels that follow from the load need them before any step is prepared."""
@@ -75,6 +75,8 @@ class AtmosphereLayers(LayerParameters):
         if "atmosphere" not in observation.smooth:
             self.configure(observation)
         model = self.model(observation)
+        if (spectrum := closed_form(model, observation)) is not None:
+            observation.closed_forms.setdefault("atmosphere", []).append(spectrum)
         state = draw(model, self.label)
         state_drawn(model, self.label, state)
         return state

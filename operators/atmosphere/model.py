@@ -182,6 +182,22 @@ class Models:
         return self._bands[key]
 
 
+@dataclass(frozen=True)
+class ExpectedLoad:
+    """What an `AtmosphereLayers` announces to other steps of an observation: `expected_load` as a call, and its model."""
+
+    models: Models
+    parameters: LayerParameters
+    observation: Observation
+
+    def __call__(self) -> tuple[float, float]:
+        return expected_load(self.models, self.parameters, self.observation)
+
+    def model(self) -> AtmosphereModel:
+        """The model that the observation was, or will be, drawn from."""
+        return self.models.of(self.parameters, self.observation)
+
+
 def expected_load(models: Models, parameters: LayerParameters, observation: Observation) -> tuple[float, float]:
     """Mean emission [K_RJ] and transmission in the middle of a scan, before its model is built."""
     profile, band = models.weather(parameters, observation)

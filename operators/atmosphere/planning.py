@@ -29,6 +29,7 @@ from .averaging import shares
 from .drawing import in_time_order
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
+from .screens import AtmosphereScreens
 from .turbulence.geometry import ScanPlane, axes, crossing, rays
 from .turbulence.levels import FIDELITIES
 from .turbulence.nodes import Layer, differential_rms, spread_evenly
@@ -352,7 +353,7 @@ def _slope(transfer: BandTransfer, pwv: float, elevation: float) -> float:
 
 
 def _slopes(context: Context, a: Calibrated) -> list[Effect]:
-    """Emission and opacity over the elevations of the scan. The high-pass filter takes the mean emission out analytically."""
+    """Emission and opacity over the elevations of the scan. The high-pass filter takes the mean emission out."""
     low, high = max(a.elevations[0], math.radians(4.5)), a.elevations[1]
     for o in context.observations:
         low, high = min(low, float(o.elevation.min())), max(high, float(o.elevation.max()))
@@ -362,10 +363,21 @@ def _slopes(context: Context, a: Calibrated) -> list[Effect]:
     plane = context.first.focalplane
     share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max()) / float(band.transmission(pwv, low))
     size = context.bound(emission * share, context.first.duration, True)
-    gone = "removed analytically by the high-pass filter" if context.cut > 0 else "in float64 beside the stream"
+    gone = "removed by the high-pass filter" if context.cut > 0 else "in float64 beside the stream"
     noise = context.bound(opacity / 2 * math.sqrt(sum(t.loudest**2 for t in context.traits.values()))) | {"psd": opacity}
     return [
         Effect("mean emission with elevation", (full(gone),), size, "difference of the band's emission over the elevations seen"),
         Effect("opacity with elevation", (full("calibrated at the current elevation"),), noise | context.sky_error(opacity),
                "difference of the opacity over the elevations seen, x half the noise, x the sky"),
     ]  # fmt: skip
+
+
+class ScreensPlanning(Planning[AtmosphereScreens]):
+    """A cost for the whole run."""
+
+    of = AtmosphereScreens
+    cost = Cost(once=0.3, kernel="python")
+
+    def memory(self, observation: Observation) -> int:
+        """The fields and the tiles of the turbulence about them."""
+        return 100_000_000

@@ -136,10 +136,7 @@ class _Timing:
 
     def __init__(self, path: _Path, observation: Observation, plane: ScanPlane, layers: Sequence[Layer]) -> None:
         self._path, self._observation, self._plane, self._layers = path, observation, plane, layers
-        velocity = path.velocity(plane)
-        quantiles = (np.arange(64) + 0.5) / 64 * (velocity.shape[1] - 1)
-        drifts = (layer.height * velocity - (plane.drift @ layer.wind)[:, None] for layer in layers)
-        self._speeds = [np.interp(quantiles, np.arange(v.shape[1]), np.sort(np.hypot(*v))) for v in drifts]
+        self._speeds = _speeds(path, plane, layers)
         self._tried: dict[int, tuple[list[float], float]] = {}
 
     def path_errors(self, step: int) -> tuple[list[float], float]:
@@ -186,6 +183,18 @@ class _Timing:
                 return math.sqrt(spent)
             best = min(fits, key=lambda k: (max(more[k], 0.0) * steps[k], k))
             spent, steps[best] = spent + more[best], 2 * steps[best]
+
+
+def layer_speeds(observation: Observation, plane: ScanPlane, layers: Sequence[Layer]) -> list[Floats]:
+    """Speeds [m/s] of the line of sight of the boresight through each layer, 64 quantiles over the scan."""
+    return _speeds(_Path(observation, np.zeros(1), np.zeros(1)), plane, layers)
+
+
+def _speeds(path: _Path, plane: ScanPlane, layers: Sequence[Layer]) -> list[Floats]:
+    velocity = path.velocity(plane)
+    quantiles = (np.arange(64) + 0.5) / 64 * (velocity.shape[1] - 1)
+    drifts = (layer.height * velocity - (plane.drift @ layer.wind)[:, None] for layer in layers)
+    return [np.interp(quantiles, np.arange(v.shape[1]), np.sort(np.hypot(*v))) for v in drifts]
 
 
 class _Path:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from zonda.core.data import Observation
+from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
 
+from .compare_maps import CompareMaps
+from .compare_streams import LEAST_SEGMENTS, CompareStreams
+from .map_spectra import MapSpectrum
+from .measure_figures import MeasureFigures
+from .mode_spectrum import ModeSpectrum
 from .plot_operators import Plots
-from .power_spectrum import PowerSpectrum
+from .power_spectrum import CHUNK, PowerSpectrum
 from .report import Report
 from .time_streams import TimeStreams
 from .transfer_function import TransferFunction
@@ -47,6 +53,59 @@ class TransferFunctionPlanning(Planning[TransferFunction]):
         return 20_000_000
 
 
+class MeasureFiguresPlanning(Planning[MeasureFigures]):
+    """A cost for the whole run, without that of the signals that the metrics need."""
+
+    of = MeasureFigures
+    cost = Cost(once=0.1, kernel="python")
+
+    def memory(self, observation: Observation) -> int:
+        """Smoothed maps, and Fourier transforms of maps."""
+        return 20_000_000
+
+
+class ModeSpectrumPlanning(Planning[ModeSpectrum]):
+    """It reads the streams twice; its cost is that of the covariance."""
+
+    of = ModeSpectrum
+    reads_streams = True
+
+    def _rows(self, observation: Observation) -> int:
+        return min(observation.n_detectors, self.operator.detectors) * (self.operator.delays + 1)
+
+    def memory(self, observation: Observation) -> int:
+        """Covariance, eigenvectors and their work; a tile; the modes in time."""
+        rows = self._rows(observation)
+        return 8 * (6 * rows**2 + 4 * rows * TILE_SAMPLES + (2 * self.operator.modes + 2) * observation.n_samples)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        rows = self._rows(context.first)
+        return Estimate((), Cost(fixed=1e-9 * rows**3, per_sample=5e-9 + 1e-10 * rows**2 / context.first.n_detectors))
+
+
+class CompareMapsPlanning(Planning[CompareMaps]):
+    """A cost for the whole run."""
+
+    of = CompareMaps
+    cost = Cost(once=0.5, kernel="python")
+
+    def memory(self, observation: Observation) -> int:
+        """Planes and Fourier transforms of two maps."""
+        return 60_000_000
+
+
+class MapSpectrumPlanning(Planning[MapSpectrum]):
+    """A cost for the whole run."""
+
+    of = MapSpectrum
+    cost = Cost(once=0.2, kernel="python")
+
+    def memory(self, observation: Observation) -> int:
+        """Fourier transforms of the maps."""
+        return 30_000_000
+
+
 class TimeStreamsPlanning(Planning[TimeStreams]):
     """It reads the streams; its cost is small."""
 
@@ -64,3 +123,20 @@ class PowerSpectrumPlanning(Planning[PowerSpectrum]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.operator.detectors / context.first.n_detectors) * 14))
+
+
+class CompareStreamsPlanning(Planning[CompareStreams]):
+    """It reads two streams of the detectors it looks at; its cost is that of their transforms."""
+
+    of = CompareStreams
+    reads_streams = True
+
+    def memory(self, observation: Observation) -> int:
+        """Segments of a detector and their transforms, and the spectra of all."""
+        count = min(observation.n_detectors, self.operator.detectors)
+        length = min(observation.n_samples / LEAST_SEGMENTS, self.operator.segment * observation.sample_rate)
+        return round(16 * observation.n_samples + (64 * CHUNK + 16 * count) * length)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        return Estimate((), Cost(0.02, 0.0, 8e-8 * min(1.0, self.operator.detectors / context.first.n_detectors)))

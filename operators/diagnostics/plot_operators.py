@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import suppress
@@ -16,7 +17,9 @@ from pydantic import Field, PrivateAttr
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
+from zonda.core.drawable import Drawable, Sketch
 from zonda.core.early import take
+from zonda.core.maps.healpix_plane import on_plane
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import Noise, maps_of, noise_sources
@@ -24,24 +27,32 @@ from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, atomic_path, product_path
 from zonda.core.types import AnyFloats
 
-from .artist import Artist
-from .flat_map import FlatMap
-from .healpix_plane import on_plane
-from .pictures import (
+from .comparison.files import plane_of
+from .comparison.noise import with_noise
+from .comparison.statistics import Comparison
+from .drawing.artist import Artist
+from .drawing.canvas import DPI
+from .drawing.comparison_plots import draw_comparison, draw_map_spectra
+from .drawing.flat_map import FlatMap
+from .drawing.pictures import (
     Picture,
     Style,
     draw_coverage,
     draw_input,
     draw_map,
+    draw_modes,
     draw_noise,
+    draw_own,
     draw_scan,
     draw_spectra,
     draw_streams,
     draw_transfer,
+    printed,
 )
-from .plots import ScanTrack
-from .series import Spectrum, TimeStream
-from .sky_axes import SkyAxes
+from .drawing.plots import ScanTrack
+from .drawing.sky_axes import SkyAxes
+from .map_spectra import MapSpectra
+from .series import Modes, Spectrum, TimeStream
 from .transfer_function import Transfer
 
 __all__ = ["Picture", "Plots", "pictures"]
@@ -50,17 +61,22 @@ LARGEST = 1500
 """Pixels of an image's longer side in a picture; larger images are thinned out."""
 
 
+DRAWN = frozenset(
+    ["map", "spectrum", "time_streams", "transfer_function", "modes", "comparison", "map_spectra", "screens", "stream_comparison"]
+)
+"""Products with pictures."""
+
+
 class Plots(Output):
-    """Pictures of the products, as PNG files in the output folder.
+    """Pictures of the products, as PNG, PDF or SVG files in the output folder, each where there is something to show.
 
     ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``, ``power_spectra.png``, ``tod.png``,
-    ``scan.png``, ``transfer_function.png``, each where there is something to show. Acts after all maps; the report shows the same
-    pictures.
+    ``scan.png``, ``transfer_function.png``, ``modes.png``, ``comparison.png``, ``map_spectra.png``. The report shows them too.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    optional: ClassVar[frozenset[str]] = frozenset({"map", "spectrum", "time_streams", "transfer_function"})
+    optional: ClassVar[frozenset[str]] = DRAWN
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
 
     smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = "beam"
@@ -69,6 +85,12 @@ class Plots(Output):
     """Diameter of the circle that noise maps show, in which their rms is taken."""
     least_coverage: float = Field(0.1, ge=0, lt=1)
     """Map pixels with fewer samples than this share of the 99th percentile are left grey in the pictures."""
+    contours: list[float] = Field([], max_length=20)
+    """Levels of the signal-to-noise ratio, in sigma, at which maps have contours, e.g. [-8, -4, -2, 2, 4]."""
+    formats: list[Literal["png", "pdf", "svg"]] = Field(["png"], min_length=1)
+    """Files of each picture; PDF and SVG for print."""
+    dpi: float = Field(DPI, ge=50, le=600)
+    """Dots per inch of PNG files; images within PDF and SVG files have at least 300."""
 
     _artist: Artist | None = PrivateAttr(None)
     _begun: dict[str, Future[Any]] = PrivateAttr(default_factory=dict)
@@ -77,16 +99,16 @@ class Plots(Output):
         """Refuse a missing or unwritable output folder before anything is simulated; let a second process be started."""
         output_folder(data, self.label)
         self._begun = {}
-        if self._artist is None and data.threads > 1:
-            with suppress(OSError):
-                self._artist = take(Artist)
+        with suppress(OSError):
+            self._artist = take(Artist) if self._artist is None and data.threads > 1 else self._artist
 
     def watch(self, data: Data, done: Progress) -> None:
         """Begin with the pictures of what will not change any more."""
         if self._artist is not None:
-            for drawing in _drawings(data, self.style()):
+            style = self.style()
+            for drawing in _drawings(data, style):
                 if (drawing.at_once or done == "maps") and drawing.key not in self._begun:
-                    self._begun[drawing.key] = self._artist.submit(drawing.function, *drawing.arguments())
+                    self._begun[drawing.key] = self._artist.submit(printed, drawing.function, style, *drawing.arguments())
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
@@ -100,17 +122,20 @@ class Plots(Output):
 
     def style(self) -> Style:
         """Its parameters, for another process."""
-        smooth = {"beam": None, "none": 0.0}[self.smooth] if isinstance(self.smooth, str) else float(self.smooth)
-        return Style(smooth, self.central_diameter, self.least_coverage)
+        smooth: Any = {"beam": None, "none": 0.0}.get(str(self.smooth), self.smooth)
+        formats = tuple(dict.fromkeys(self.formats))
+        return Style(smooth, self.central_diameter, self.least_coverage, tuple(self.contours), formats, self.dpi)
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """Pictures to be made by ``function(*arguments())``; ``at_once``: nothing that follows changes what they show, once there is
-    anything to show."""
+    """Pictures to be made by ``printed(function, style, *arguments())``.
+
+    ``at_once``: nothing that follows changes what they show, once there is anything to show.
+    """
 
     key: str
-    function: Callable[..., list[Picture]]
+    function: Callable[..., list[Sketch]]
     arguments: Callable[[], tuple[Any, ...]]
     at_once: bool = False
 
@@ -121,7 +146,8 @@ def _write_all(folder: Path, data: Data, style: Style, begun: Mapping[str, Futur
     with ThreadPoolExecutor(MOST_AT_ONCE, "Plots") as pool:
 
         def write(picture: Picture) -> None:
-            written.append(pool.submit(_write, product_path(folder, picture.name, ".png"), picture.png))
+            for kind, content in picture.files.items():
+                written.append(pool.submit(_write, product_path(folder, picture.name, f".{kind}"), content))
 
         made = pictures(data, style, begun, artist, write)
         if artist is not None:
@@ -131,9 +157,9 @@ def _write_all(folder: Path, data: Data, style: Style, begun: Mapping[str, Futur
     return made
 
 
-def _write(path: Path, png: bytes) -> None:
+def _write(path: Path, content: bytes) -> None:
     with atomic_path(path) as temporary:
-        temporary.write_bytes(png)
+        temporary.write_bytes(content)
 
 
 def pictures(
@@ -150,7 +176,7 @@ def pictures(
     drawings, coming = list(_drawings(data, style)), dict(begun or {})
     for drawing in drawings:
         if artist is not None and drawing.key not in coming:
-            coming[drawing.key] = artist.submit(drawing.function, *drawing.arguments())
+            coming[drawing.key] = artist.submit(printed, drawing.function, style, *drawing.arguments())
     for future in as_completed(coming.values()):
         for picture in future.result() or ():
             there(picture)
@@ -158,7 +184,7 @@ def pictures(
     for drawing in drawings:
         found = coming[drawing.key].result() if drawing.key in coming else None
         if found is None:
-            found = drawing.function(*drawing.arguments())
+            found = printed(drawing.function, style, *drawing.arguments())
             for picture in found:
                 there(picture)
         made += found
@@ -191,8 +217,16 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
         elif isinstance(product, TimeStream):
             file = "tod" if name == "time_streams" else f"tod_{file}"
             yield Drawing(f"streams {name}", draw_streams, partial(_streams, file, product, before), True)
+        elif isinstance(product, Modes):
+            yield Drawing(f"modes {name}", draw_modes, partial(tuple, (file, product, before.get(product.label, ""))))
         elif isinstance(product, Transfer):
             yield Drawing(f"transfer function {name}", draw_transfer, partial(tuple, (file, product)))
+        elif isinstance(product, Drawable):
+            yield Drawing(f"own {name}", draw_own, partial(tuple, (file, product)))
+        elif isinstance(product, Comparison):
+            yield Drawing(f"comparison {name}", draw_comparison, partial(tuple, (file, product, style.contours)))
+        elif isinstance(product, MapSpectra):
+            yield Drawing(f"map spectra {name}", draw_map_spectra, partial(tuple, (file, product)))
 
 
 def _steps_before(data: Data) -> dict[str, str]:
@@ -200,7 +234,7 @@ def _steps_before(data: Data) -> dict[str, str]:
     found, last = {}, ""
     for label, kind, _ in data.provenance.get("operators", []):
         found[label] = last
-        if kind not in ("PowerSpectrum", "TimeStreams", "SaveTOD"):
+        if kind not in ("PowerSpectrum", "TimeStreams", "ModeSpectrum", "CompareStreams", "SaveTOD"):
             last = label
     return found
 
@@ -239,12 +273,23 @@ def _flat(
     return FlatMap(
         {plane: arrays[plane] for plane in planes}, arrays["hits"], np.nan_to_num(arrays["weights"]), SkyAxes.of(header),
         _plain(header), product.centre, product.pixel, product.fwhm, product.smoothed_by, rms, is_flat, per_beam,
+        product.difference.replace(" - ", " minus "),
     )  # fmt: skip
 
 
 def _map(name: str, product: MapProduct, style: Style) -> tuple[Any, ...]:
     run, _, key = name.rpartition("/")
-    return product_path("", name).name, run, key, _flat(product, "signal"), style
+    flat = _flat(product, "signal")
+    return product_path("", name).name, run, key, flat, style, None if run else _snr(product, style)
+
+
+def _snr(product: MapProduct, style: Style) -> AnyFloats | None:
+    """The SNR of a map as it is shown, where contours of it are wanted and its noise is known."""
+    if not style.contours or product.header is None:
+        return None
+    smoothing = 0.0 if product.smoothed_by else product.fwhm if style.smooth is None else style.smooth
+    plane = with_noise(plane_of(product, "map"), product, math.hypot(product.fwhm, product.smoothed_by, smoothing))
+    return None if plane.noise is None else np.asarray(plane.values / plane.noise, np.float32)
 
 
 def _noise(name: str, sources: dict[Noise, tuple[MapProduct, Any]], style: Style) -> tuple[Any, ...]:

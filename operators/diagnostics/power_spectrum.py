@@ -16,8 +16,8 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.signal import MAIN, TRANSMISSION, is_signal
-from zonda.core.stream_names import StreamName, StreamsAsked
+from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
+from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
 from zonda.core.types import Floats
 
 from .series import Spectrum, key_of
@@ -119,13 +119,14 @@ class Periodograms:
         """Those of one detector, whose whole scan is in the block."""
         assert self.welch is not None
         found: dict[str, Floats] = {}
-        gain = _gain(block, detector)
-        for name in self.streams or [s for s in in_order(block.detdata) if s == MAIN or not (is_signal(s) or s == TRANSMISSION)]:
+        gain = calibration(block, detector)
+        usual = {MAIN, *BUILT_IN, *block.observation.components} - {TRANSMISSION}
+        for name in self.streams or [s for s in in_order(block.detdata) if s in usual]:
             if name not in block.detdata:
                 have = ", ".join(sorted(block.detdata))
                 raise PipelineError(f"there is no stream {name!r} at this step", place=self.place, cure=f"choose from: {have}")
             with np.errstate(invalid="ignore", over="ignore"):  # of samples that are not finite: their spectrum is not
-                power = self.welch(_on_sky(block, detector, name, gain))
+                power = self.welch(on_sky(block, detector, name, gain))
             if np.isfinite(power).all():
                 found[name] = power
             else:
@@ -144,25 +145,33 @@ class Periodograms:
         psd = {name: np.mean(rows[name], axis=0) for name in in_order(rows)}
         net = observation.focalplane.net[every]
         white = 2 * float(np.mean(net**2)) if "white" in observation.components else 0.0
-        return Spectrum(self.welch.frequency, psd, self.welch.independent * count, white, self.place, count)
+        f = self.welch.frequency
+        forms = {
+            name: np.sum([law(f) for law in observation.closed_forms[name]], axis=0)
+            for name in psd
+            if name in observation.closed_forms
+        }
+        return Spectrum(f, psd, self.welch.independent * count, white, self.place, count, closed_forms=forms)
 
 
 class PowerSpectrum(Operator):
     """Mean one-sided power spectra of the streams at this step, in K_RJ^2/Hz on the calibrated sky.
 
-    Components are divided as the calibration divides them: `atmosphere` times epsilon, `white` and `pink`, by zeta e^-tau.
+    Components at the detector are divided as the calibration divides them: `atmosphere` times epsilon, `white`, `pink` and those
+    of plugins, by zeta e^-tau. Streams of other kinds (`pwv`, `opacity`, `path_delay`, `transmission`) keep their units.
     Each segment is freed of a straight line, which takes the slow drift of the mean emission with elevation out.
     Makes the product ``spectrum`` (a `Spectrum`), or one under this step's own name where it has one.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
     provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
     knows_means: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     streams: list[StreamName] | None = Field(None, min_length=1)
-    """Streams to measure; where absent, `signal` and every component but `transmission` that reaches this step."""
+    """Streams to measure; where absent, `signal` and zonda's own components but `transmission`, as far as they reach
+    this step."""
     detectors: int = Field(16, ge=1)
     """Number of detectors averaged, chosen evenly among those not flagged."""
     segment: Seconds = quantity("128 s", gt=0)
@@ -205,7 +214,7 @@ def in_order(streams: Iterable[str]) -> list[str]:
     return sorted(streams, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
 
 
-def _gain(block: Block, detector: int) -> Floats:
+def calibration(block: Block, detector: int) -> Floats:
     """1 / (zeta e^-tau) of one detector: (n_samp,), or (1,) where no step gave a transmission."""
     zeta = block.observation.focalplane.main_beam_efficiency[detector]
     transmission = block.observation.smooth.get("transmission")
@@ -214,17 +223,17 @@ def _gain(block: Block, detector: int) -> Floats:
     return np.asarray(1 / (zeta * transmission.evaluate(slice(detector, detector + 1), block.samples)[0]), np.float64)
 
 
-def _on_sky(block: Block, detector: int, name: str, gain: Floats) -> Floats:
+def on_sky(block: Block, detector: int, name: str, gain: Floats) -> Floats:
     """One detector's whole stream, mean included, as it enters the calibrated sum, float64 (n_samp,)."""
     row = block.detdata[name][detector - block.detectors.start]
-    if name in ("atmosphere", "white", "pink"):
-        if name == "atmosphere":
-            gain = gain * block.observation.focalplane.illumination_efficiency[detector]
-        if name not in block.means:
-            return np.asarray(row * gain, np.float64)
+    enters = {str(c): c.enters for c in (*BUILT_IN, *block.observation.components) if isinstance(c, Component)}
+    if name == "atmosphere":
+        gain = gain * block.observation.focalplane.illumination_efficiency[detector]
+    if (at_detector := enters.get(name) == "at the detector") and name not in block.means:
+        return np.asarray(row * gain, np.float64)
     values: Floats = row.astype(np.float64)
     if name in block.means:
         values += block.means[name].evaluate(slice(detector, detector + 1), block.samples)[0]
-    if name in ("atmosphere", "white", "pink"):
+    if at_detector:
         values *= gain
     return values

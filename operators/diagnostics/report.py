@@ -17,6 +17,7 @@ from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
+from zonda.core.figures import Figures
 from zonda.core.numerics.angles import angle_text
 from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import write_text
@@ -42,7 +43,21 @@ class Report(Output):
     """
 
     optional: ClassVar[frozenset[str]] = frozenset(
-        {"pictures", "map_file", "tod_file", "map", "spectrum", "time_streams", "transfer_function"}
+        {
+            "pictures",
+            "map_file",
+            "tod_file",
+            "map",
+            "spectrum",
+            "time_streams",
+            "transfer_function",
+            "figures",
+            "modes",
+            "comparison",
+            "map_spectra",
+            "screens",
+            "stream_comparison",
+        }
     )
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
 
@@ -84,6 +99,7 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float, known: M
     name = str(provenance.get("name") or "zonda run")
     parts = [
         ("results", "Results", known["results"]),
+        ("figures", "Figures", _figures(data)),
         ("pictures", "Pictures", _pictures(shown)),
         ("scene", "Scene", known["scene"]),
         ("scans", "Scans", known["scans"]),
@@ -132,6 +148,17 @@ def _pictures(shown: Sequence[Picture]) -> str:
         caption = f"<figcaption><b>{escape(picture.title)}.</b> {escape(picture.caption)}</figcaption>"
         figures.append(f'<figure{style}><img alt="{alt}" src="data:image/png;base64,{image}">{caption}</figure>')
     return f'<div class="pictures">{"".join(figures)}</div>' if figures else ""
+
+
+def _figures(data: Data) -> str:
+    """What `MeasureFigures` found."""
+    rows = [
+        (f.name, f"{f.value:.5g} {f.unit}".strip(), f"{f.error:.2g}" if np.isfinite(f.error) else "", small(f.description))
+        for product in data.products.values()
+        if isinstance(product, Figures)
+        for f in product
+    ]
+    return table(rows, ("metric", "value", "standard error", ""), numbers=(1, 2)) if rows else ""
 
 
 def _scene(data: Data) -> str:

@@ -65,7 +65,7 @@ def results(data: Data, diameter: float) -> str:
 
 def _noise(figure: NoiseFigure, product: MapProduct, diameter: float, data: Data) -> list[Card]:
     """How noisy the centre of a map is, smoothed with the beam where that can be done, and as it is."""
-    of = {"half_difference": "even − odd scans", "source_free": "all but the sky"}[figure.of]
+    of = {"half_difference": product.difference.replace(" - ", " − "), "source_free": "all but the sky"}[figure.of]
     where = f"rms, {_central(diameter)}, {of}"
     label = "" if figure.product == "map" else f", {figure.product}"
     if math.isfinite(figure.smoothed):

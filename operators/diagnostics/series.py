@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from zonda.core.notebook import html_table
 from zonda.core.product import Record
+from zonda.core.storage.ecsv import Column
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
@@ -33,6 +36,8 @@ class Spectrum(Record):
         Of the step that measured it.
     detectors, observations
         How many were averaged.
+    closed_forms
+        (n,) per component: what the law that was simulated promises; where one is known.
     of_another_length
         Scans that are not in the mean, since their frequencies or streams differ.
     """
@@ -45,6 +50,7 @@ class Spectrum(Record):
     detectors: int
     observations: int = 1
     of_another_length: int = 0
+    closed_forms: dict[str, Floats] = field(default_factory=dict)
 
     def __iadd__(self, other: Spectrum) -> Spectrum:
         """The mean of all scans, each with the same weight."""
@@ -54,10 +60,28 @@ class Spectrum(Record):
             return self
         n, m = self.observations, other.observations
         self.psd = {k: (self.psd[k] * n + other.psd[k] * m) / (n + m) for k in self.psd}
+        both = self.closed_forms.keys() & other.closed_forms.keys()
+        self.closed_forms = {k: (self.closed_forms[k] * n + other.closed_forms[k] * m) / (n + m) for k in sorted(both)}
         self.white_level = (self.white_level * n + other.white_level * m) / (n + m)
         self.averages += other.averages
         self.detectors, self.observations = other.detectors, n + m
         return self
+
+    def regimes(self) -> list[tuple[str, float, float]]:
+        """(component, lowest, highest frequency [Hz]) where one of atmosphere, 1/f and white noise dominates: closed forms.
+
+        Empty where there are not two of them.
+        """
+        laws: dict[str, Floats] = {name: self.closed_forms[name] for name in ("atmosphere", "pink") if name in self.closed_forms}
+        if self.white_level > 0 and {"white", "signal"} & set(self.psd):
+            laws["white"] = np.full(self.frequency.size, self.white_level)
+        if len(laws) < 2:
+            return []
+        names, f = list(laws), self.frequency
+        largest = np.argmax(np.array(list(laws.values())), axis=0)
+        cuts = [0, *(np.flatnonzero(np.diff(largest)) + 1).tolist(), f.size]
+        ends = [float(f[0]), *(math.sqrt(f[k - 1] * f[k]) for k in cuts[1:-1]), float(f[-1])]
+        return [(names[largest[k]], low, high) for k, low, high in zip(cuts[:-1], ends[:-1], ends[1:], strict=True)]
 
     def knee(self) -> float | None:
         """Highest frequency at which the pink part exceeds the white one [Hz]; None where it never does or one is absent."""
@@ -77,6 +101,13 @@ class Spectrum(Record):
             return None
         k = above[-1]
         return float(np.exp(np.interp(0.0, [-ratio[k], -ratio[k + 1]], [log_f[k], log_f[k + 1]])))
+
+
+def unit_of_stream(name: str) -> str:
+    """K_RJ; ``m`` or empty for streams of other kinds."""
+    from zonda.core.stream_names import UNITS
+
+    return UNITS.get(name, "K_RJ")
 
 
 def _close(a: Floats, b: Floats) -> bool:
@@ -116,3 +147,89 @@ class TimeStream(Record):
 def key_of(step: Operator, usual: str) -> str:
     """Name of a step's product: ``usual``, or the step's own where it has one."""
     return step.name or (usual if step.label == type(step).__name__ else step.label)
+
+
+@dataclass
+class Modes(Record):
+    """Principal components of the detectors' streams (`components`).
+
+    Attributes
+    ----------
+    values
+        (n_scan, n) leading singular values / (detectors x delays x samples)^1/2, `unit`; zeros behind the last.
+    energy
+        (n_scan,) sum of the squares of all.
+    seconds, streams
+        (n_samp,) and (m, n_samp): the leading modes in time, of the first scan; NaN at flagged samples.
+    vectors
+        (m, n_det (delays + 1)): the leading modes over detectors (and delays, the first detectors first), of unit length.
+    names
+        (n_det) detectors.
+    delays, delay
+        Number of delays, and each in s; 0: instantaneous.
+    unit
+        Of the values: K_RJ; empty where detectors were divided by their rms.
+    observation, label, product
+        Name of the first scan; the step at which they were taken; name among the products.
+    """
+
+    values: Floats
+    energy: Floats
+    seconds: Floats
+    streams: Floats
+    vectors: Floats
+    names: list[str]
+    delays: int
+    delay: float
+    unit: str
+    observation: str
+    label: str
+    product: str = "modes"
+
+    def __iadd__(self, other: Modes) -> Modes:
+        """Values of all scans; streams and vectors of the first."""
+        self.values, self.energy = np.concatenate([self.values, other.values]), np.concatenate([self.energy, other.energy])
+        return self
+
+    @property
+    def detectors(self) -> int:
+        """How many detectors were used."""
+        return len(self.names)
+
+    @property
+    def shares(self) -> Floats:
+        """(n,) mean over the scans of each mode's share of the variance."""
+        return np.asarray(self._shares().mean(axis=0), np.float64)
+
+    @property
+    def error(self) -> Floats:
+        """(n,) standard error of `shares` from their scatter over scans; NaN for one scan."""
+        each = self._shares()
+        n = len(each)
+        return np.asarray(each.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(each.shape[1], np.nan), np.float64)
+
+    def _shares(self) -> Floats:
+        return np.asarray(self.values**2 / self.energy[:, None], np.float64)
+
+    def columns(self) -> list[Column]:
+        """The table of the singular values, the largest first."""
+        used = self.values.any(axis=0)
+        unit, share = {"K_RJ": "K"}.get(self.unit, ""), self.shares[used]
+        rms = np.sqrt((self.values[:, used] ** 2).mean(axis=0))
+        return [
+            Column("mode", np.arange(1, share.size + 1), "", "the largest first"),
+            Column("singular_value", rms, unit, "/ sqrt(rows x samples), rms over the scans"),
+            Column("share", share, "", "of the variance, mean over the scans"),
+            Column("error", self.error[used], "", "standard error of share from its scatter over scans; nan: one scan"),
+            Column("cumulative", np.cumsum(share), "", "share of this mode and those before"),
+        ]
+
+    def stream_columns(self) -> list[Column]:
+        """The leading modes in time."""
+        text = "v(t) = sum over detectors (and delays) of u A"
+        columns = [Column(f"mode_{k + 1}", row, {"K_RJ": "K"}.get(self.unit, ""), text) for k, row in enumerate(self.streams)]
+        return [Column("seconds", self.seconds, "s", f"since the start of {self.observation}"), *columns]
+
+    def _repr_html_(self) -> str:
+        rows = [(f"mode {k + 1}", f"{100 * share:.3g} %") for k, share in enumerate(self.shares[:8]) if share > 0]
+        return html_table(f"Modes of {self.detectors} detectors", rows)

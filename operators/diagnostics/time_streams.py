@@ -10,7 +10,7 @@ from pydantic import Field
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.stream_names import StreamName, StreamsAsked
+from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
 from zonda.core.types import Floats
 
 from .series import TimeStream, key_of
@@ -19,16 +19,17 @@ from .series import TimeStream, key_of
 class TimeStreams(Operator):
     """Streams of a few detectors of one scan at this step, for a picture: product ``time_streams``.
 
-    Components (`sky`, `white` ...) are at the detector, before the calibration; `signal` is the calibrated sum.
+    Components (`sky`, `white`, those of plugins ...) are at the detector, before the calibration; `signal` is the calibrated sum.
+    Further streams are those that a step above makes, e.g. `pwv`, `opacity` and `path_delay` (`AtmosphereLayers.outputs`).
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
     knows_means: ClassVar[bool] = True
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
 
     streams: list[StreamName] = Field(["signal"], min_length=1)
-    """Streams to keep; those absent at this step are skipped and counted."""
+    """Streams to keep; components that are absent at this step are skipped and counted."""
     detectors: int = Field(3, ge=1, le=64)
     """Number of detectors, chosen evenly."""
     observation: int = Field(0, ge=0)

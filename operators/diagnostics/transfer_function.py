@@ -40,6 +40,7 @@ from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
+from .comparison.radial import tapered
 from .series import key_of
 
 NO_POWER = 1e-12
@@ -197,12 +198,12 @@ def _spectrum(values: Floats, window: Floats) -> NDArray[np.complex128]:
 
 
 def window_of(product: MapProduct, radius: float | None = None, taper: float | None = None, least: float = 0.1) -> Floats:
-    """sin^2(pi/2 min(d / taper, 1)), d the distance of a pixel to the nearest one outside the window, (ny, nx).
+    """`comparison.radial.tapered`, (ny, nx).
 
     Inside are pixels with at least ``least`` of the 99th percentile of the beam-smoothed samples, holes filled, within
-    ``radius`` [rad] of the centre. ``taper`` None: the largest d, so that a disc has cos^2(pi/2 r / R).
+    ``radius`` [rad] of the centre.
     """
-    from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter
+    from scipy.ndimage import binary_fill_holes, gaussian_filter
 
     hits = gaussian_filter(product.hits.astype(np.float64), product.fwhm / FWHM_PER_SIGMA / product.pixel, mode="constant")
     seen = hits[product.hits > 0]
@@ -210,9 +211,7 @@ def window_of(product: MapProduct, radius: float | None = None, taper: float | N
     inside = binary_fill_holes(inside)
     if radius is not None:
         inside &= product.distance() <= radius
-    depth = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * product.pixel
-    width = depth.max(initial=0.0) if taper is None else taper
-    return np.asarray(np.sin(np.pi / 2 * np.minimum(depth / max(width, product.pixel), 1)) ** 2, np.float64)
+    return tapered(np.asarray(inside, np.bool_), product.pixel, taper)
 
 
 @dataclass(frozen=True)

@@ -27,19 +27,19 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from zonda.core.compilation.jit import nb
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
-from zonda.core.operator import Operator
 from zonda.core.signal import MAIN
 from zonda.core.types import Floats
 
 from . import focal_plane_mean
 from .gram import Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
+from .parameters import CommonModeParameters
+from .source_mask import MASKED, Inside
 
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
@@ -48,7 +48,7 @@ KEPT = "modes kept because the data do not determine them (rank)"
 """A count of the log."""
 
 
-class CommonModeFilter(Operator):
+class CommonModeFilter(CommonModeParameters):
     """Filter that removes the leading singular modes of each scan, equation (1). Flagged samples and detectors are excluded.
 
     Detectors whose complete signal is not finite are flagged, and those whose complete signal is constant: they are dead. In a
@@ -61,30 +61,11 @@ class CommonModeFilter(Operator):
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
 
-    modes: int = Field(1, ge=1, le=100)
-    """How many modes to remove."""
-    method: Literal["svd", "mean"] = "svd"
-    """Singular modes, or the plain mean of all detectors at each instant (one mode), which streams of any size allow."""
-    residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
-    """Largest residual of a removed mode, equation (2)."""
-    gap: float = Field(0.9, gt=0, lt=1)
-    """A mode is determined by the data while the next singular value is at most this times its own."""
-    on_undetermined: Literal["mean", "skip", "remove"] = "mean"
-    """What to do with a mode that is not determined: remove the detectors' mean (in place of the first), skip or remove it."""
-
-    @model_validator(mode="after")
-    def _one_mean(self) -> CommonModeFilter:
-        if self.method == "mean" and self.modes != 1:
-            raise ValueError("method: mean removes one mode; leave modes at 1 or choose method: svd")
-        of_svd = {"residual", "gap", "on_undetermined"} & self.model_fields_set
-        if self.method == "mean" and of_svd:
-            raise ValueError(f"{sorted(of_svd)[0]} belongs to method: svd; the detectors' mean is exact and always determined")
-        return self
-
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
         """Find the modes; given those of the complete signal (``model``), their times in this one."""
+        inside = self.mask.of(stream.observation) if self.mask else None
         if model is not None:
-            return Modes(model.detectors, _times(stream, model.detectors, self.method))
+            return Modes(model.detectors, _times(stream, model, self.method, inside), model.scale)
         place = f"{self.label}, {stream.observation.name}"
         if stream.means.get("signal") is not None and stream.dtype != np.float64:
             raise PipelineError(
@@ -92,10 +73,12 @@ class CommonModeFilter(Operator):
                 place=place,
                 cure="put a HighpassFilter before, or set precision: float64",
             )
-        detectors, found = _mean_mode(self, stream) if self.method == "mean" else _singular_modes(self, stream)
-        _tell(self, stream, detectors, found)
+        find = _mean_mode if self.method == "mean" else _singular_modes
+        detectors, found = find(self, stream, inside)
+        _tell(self, stream, detectors, found, inside)
         _check_precision(found, detectors, stream, place)
-        return Modes(found.detectors[: found.count], found.times[: found.count])
+        scale = np.ones(detectors.use.size) if detectors.scale is None else detectors.scale
+        return Modes(found.detectors[: found.count] * scale, found.times[: found.count], detectors.scale)
 
     def exec(self, block: Block, state: Modes) -> None:
         """Equation (1) on one block."""
@@ -108,23 +91,23 @@ class CommonModeFilter(Operator):
             _remove(signal, u[block.detectors], v[block.samples])
 
 
-def _singular_modes(step: CommonModeFilter, stream: Stream) -> tuple[Usable, Ritz]:
+def _singular_modes(step: CommonModeFilter, stream: Stream, inside: Inside | None) -> tuple[Usable, Ritz]:
     """The leading singular modes, with the number of those to remove."""
     with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-        gram = Gram(stream, pool, noiseless=_sees_nothing(stream))
+        gram = Gram(stream, pool, None, _sees_nothing(stream), inside, step.scale == "rms")
         found = lanczos(gram, step.modes, step.residual, None if step.on_undetermined == "remove" else step.gap)
         found.count = _choose(step, found, gram, stream.observation)
     return gram, found
 
 
-def _mean_mode(step: CommonModeFilter, stream: Stream) -> tuple[Usable, Ritz]:
+def _mean_mode(step: CommonModeFilter, stream: Stream, inside: Inside | None) -> tuple[Usable, Ritz]:
     """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
     observation = stream.observation
     good = observation.good_samples
     detectors = Usable(observation.good_detectors, int(good.sum()))
-    reading = focal_plane_mean.read(stream, detectors.use, good)
+    reading = focal_plane_mean.read(stream, detectors.use, good, inside)
     if detectors.judge(reading.sums, reading.squares, _sees_nothing(stream)):
-        reading = focal_plane_mean.read(stream, detectors.use, good)
+        reading = focal_plane_mean.read(stream, detectors.use, good, inside)
     if detectors.n_good == 0:
         found = Ritz.nothing(detectors.use.size, stream.shape[1])
     else:
@@ -154,22 +137,28 @@ def _choose(step: CommonModeFilter, found: Ritz, gram: Gram, observation: Observ
     return determined
 
 
-def _times(stream: Stream, modes: Floats, method: str) -> Floats:
-    """Equation (3): v_i = B^T u_i."""
+def _times(stream: Stream, model: Modes, method: str, inside: Inside | None) -> Floats:
+    """Equation (3): v_i = B^T u_i, or B^T R^-1 u_i."""
+    modes = model.detectors if model.scale is None else model.detectors / model.scale
     use, good = np.asarray(modes.any(axis=0)), stream.observation.good_samples
     if method == "mean":
-        total = focal_plane_mean.read(stream, use, good).total
+        total = focal_plane_mean.read(stream, use, good, inside).total
         times = [total * u.max(initial=0.0) for u in modes]
     else:
         with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-            gram = Gram(stream, pool, use)
+            gram = Gram(stream, pool, use, inside=inside)
+            gram.scale = model.scale
             times = [gram.apply(u)[1] for u in modes]
     return np.array(times).reshape(len(modes), stream.shape[1])
 
 
-def _tell(step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz) -> None:
+def _tell(step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz, inside: Inside | None) -> None:
     """State what was found; flag the dead detectors, which the complete signal shows."""
     observation, tally, who = stream.observation, stream.observation.tally, step.label
+    if inside is not None:
+        masked, covered = inside.counts(observation.n_samples)
+        tally.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
+        tally.count(who, "instants with all detectors in the source mask: no mode removed", covered, observation.n_samples)
     if stream.signal == MAIN:
         for name, dead in (("not finite", detectors.not_finite), ("constant", detectors.constant)):
             tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
@@ -177,7 +166,8 @@ def _tell(step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz
     sizes = np.sqrt(np.maximum(found.values[: step.modes + 1], 0.0) / max(1, detectors.n_good * detectors.n_used))
     values = ", ".join(f"{s:.4g}" for s in sizes)
     worst = found.residuals[: found.count].max(initial=0.0)
-    tally.state(who, f"{observation.name}: singular values / sqrt(detectors x samples)", f"{values or 'none'} K")
+    unit = "K" if detectors.scale is None else "of the detectors' rms"
+    tally.state(who, f"{observation.name}: singular values / sqrt(detectors x samples)", f"{values or 'none'} {unit}")
     tally.state(who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps")
     tally.state(who, f"{observation.name}: modes removed", f"{found.count} ({found.what})")
 
@@ -187,7 +177,8 @@ def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str)
         return
     left = max(detectors.energy - float(found.energies[: found.count].sum()), 0.0) / detectors.energy
     if 0.01 * np.sqrt(left) < ROUNDING:
-        rms, ratio = np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)), 1 / max(np.sqrt(left), 1e-30)
+        unit = 1.0 if detectors.scale is None else float(np.median(detectors.scale[detectors.use]))
+        rms, ratio = unit * np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)), 1 / max(np.sqrt(left), 1e-30)
         raise PipelineError(
             f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than float32 can carry",
             place=place,
@@ -204,10 +195,11 @@ def _sees_nothing(stream: Stream) -> bool:
 
 @dataclass
 class Modes:
-    """Modes to remove: u (k, n_det), unit vectors, and v (k, n_samp), K_RJ."""
+    """Modes to remove: u (k, n_det), unit vectors, and v (k, n_samp), K_RJ; with a ``scale`` (n_det,), K_RJ, R u and v / K_RJ."""
 
     detectors: Floats
     times: Floats
+    scale: Floats | None = None
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})

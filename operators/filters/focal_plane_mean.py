@@ -2,6 +2,8 @@
 
     m_t = (1 / n) sum_d x_dt  over the n good detectors                                                      (1)
 
+With a source mask the sum is over the detectors outside of it at that instant, and so is n; the mean is 0 where there is none.
+
 The sum runs over the `TILE_DETECTORS` detectors of a tile, then over the tiles in order, in float64: it has the same bits
 however the stream is cut. A second reading is made only where the first finds detectors that must not take part.
 """
@@ -18,6 +20,8 @@ from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.stream import Stream
 from zonda.core.types import Floats
+
+from .source_mask import Inside
 
 Mask = NDArray[np.bool_]
 
@@ -49,30 +53,45 @@ class Reading:
         return float(0.5 * ((self.high[seen] - self.low[seen]) ** 2).sum())
 
 
-def read(stream: Stream, use: Mask, good: Mask) -> Reading:
-    """One sweep over a stream. ``use`` (n_det,), ``good`` (n_samp,): which detectors and samples take part."""
+def read(stream: Stream, use: Mask, good: Mask, inside: Inside | None = None) -> Reading:
+    """One sweep over a stream. ``use`` (n_det,), ``good`` (n_samp,): which detectors and samples take part; ``inside``: a source
+    mask, for which `Reading.total` is n times the mean of the others."""
     n_det, n_samp = stream.shape
     reading = Reading(np.zeros(n_samp), np.full(n_samp, np.inf), np.full(n_samp, -np.inf), np.zeros(n_det), np.zeros(n_det))
     field = stream.means.get(stream.name)
 
-    def look(detectors: slice, samples: slice, part: NDArray[np.floating]) -> tuple[Floats, Floats, Floats]:
+    taking = np.zeros(n_samp)  # detectors outside of the mask
+
+    def look(detectors: slice, samples: slice, part: NDArray[np.floating]) -> tuple[Floats, ...]:
         rows, n = part.shape
         sums = np.zeros((-(-rows // TILE_DETECTORS), n))
         range_of = np.empty((2, n))
         range_of[0], range_of[1] = np.inf, -np.inf
+        count = np.zeros(n)
         moments = np.zeros((-(-n // TILE_SAMPLES), 2, rows))
         for here, added in zip(chunks(n, TILE_SAMPLES), moments, strict=True):
             at = slice(samples.start + here.start, samples.start + here.stop)
             tile, begin, end = part, here.start, here.stop
-            if field is not None or not good[at].all():
+            if field is not None or inside is not None or not good[at].all():
                 tile, begin, end = part[:, here].astype(np.float64), 0, here.stop - here.start
                 if field is not None:
                     tile += field.evaluate(detectors, at)
                 tile[:, ~good[at]] = 0
-            _look(tile, begin, end, use[detectors], sums[:, here], range_of[:, here], added)
-        return sums, range_of, moments
+            if inside is None:
+                _look(tile, begin, end, use[detectors], sums[:, here], range_of[:, here], added)
+                continue
+            _look(tile, begin, end, np.zeros(rows, np.bool_), sums[:, here], range_of[:, here], added)
+            seen = use[detectors, None] & ~inside.at(detectors, at)
+            for k in range(0, rows, TILE_DETECTORS):
+                few = slice(k, k + TILE_DETECTORS)
+                sums[k // TILE_DETECTORS, here] = np.where(seen[few], tile[few], 0.0).sum(axis=0)
+            range_of[0, here] = np.where(seen, tile, np.inf).min(axis=0)
+            range_of[1, here] = np.where(seen, tile, -np.inf).max(axis=0)
+            count[here] = seen.sum(axis=0)
+        return sums, range_of, moments, count
 
-    for detectors, samples, (sums, range_of, moments) in stream.sweep(look):
+    for detectors, samples, (sums, range_of, moments, count) in stream.sweep(look):
+        taking[samples] += count
         for tile in sums:
             reading.total[samples] += tile
         np.minimum(reading.low[samples], range_of[0], out=reading.low[samples])
@@ -80,6 +99,8 @@ def read(stream: Stream, use: Mask, good: Mask) -> Reading:
         for first, second in moments:
             reading.sums[detectors] += first
             reading.squares[detectors] += second
+    if inside is not None:
+        reading.total *= int(use.sum()) / np.maximum(taking, 1)
     return reading
 
 

@@ -19,6 +19,8 @@ from zonda.core.run.streams import columns
 from zonda.core.stream import Stream
 from zonda.core.types import Floats
 
+from .source_mask import Inside
+
 MOST_COPIED = 100_000_000
 """Bytes of a tile's copy. Tiles of more detectors are shorter, down to `SHORTEST_TILE`, in memory too: the bits are the same."""
 
@@ -52,10 +54,13 @@ class Usable:
         (n_det,): detectors that `judge` excluded.
     energy
         Sum of squares of the good detectors.
+    scale
+        (n_det,): by which rows are divided before modes are sought; None: by nothing.
     """
 
     def __init__(self, use: NDArray[np.bool_], n_used: int) -> None:
         self.use, self.n_used, self.energy = use, n_used, 0.0
+        self.scale: Floats | None = None
         self.not_finite = self.constant = np.zeros(use.size, bool)
 
     @property
@@ -85,28 +90,54 @@ class Gram(Usable):
     number of threads. A spilled stream is read from its file, tile by tile, by as many threads as there is memory for copies:
     pages that are touched in a mapping count as the process's memory, and the system maps those around them too.
 
+    Samples inside a source mask are replaced, in the copy of a tile, by the mean of the other detectors at that instant (each in
+    units of its `scale`), 0 where there is none: linear in the data.
+
     The detectors' moments, which identify dead ones, come with the product that the iteration begins with; where no detector is
     dead, `apply` returns that product.
     """
 
     def __init__(
-        self, stream: Stream, pool: ThreadPoolExecutor, use: NDArray[np.bool_] | None = None, noiseless: bool = False
+        self,
+        stream: Stream,
+        pool: ThreadPoolExecutor,
+        use: NDArray[np.bool_] | None = None,
+        noiseless: bool = False,
+        inside: Inside | None = None,
+        unit_rms: bool = False,
     ) -> None:
-        """``use``: the detectors to use, where they are known; they are found otherwise. ``noiseless``: see `Usable.judge`."""
+        """``use``: the detectors to use, where they are known; they are found otherwise. ``noiseless``: see `Usable.judge`.
+        ``inside``: a source mask. ``unit_rms``: let `scale` be the detectors' rms about their means, where ``use`` is found."""
         self.good_samples = stream.observation.good_samples
         super().__init__(stream.observation.good_detectors if use is None else use, int(self.good_samples.sum()))
         self.stream, self.pool, self.n_samples = stream, pool, stream.shape[1]
         self.length = tile_length(stream.shape[0], stream.dtype.itemsize)
         self.copied = isinstance(stream.array, np.memmap)
+        self.inside, self.copied = inside, self.copied or inside is not None
         self.whole = stream.means.get("signal") is None and bool(self.good_samples.all()) and not self.copied
         copy = stream.shape[0] * min(self.length, self.n_samples) * stream.dtype.itemsize
         self._copies = Semaphore(max(1, min(stream.threads, 1 + stream.room // max(1, copy))))
         self._known: tuple[Floats, Floats, Floats] | None = None
         if use is None:
+            if inside is not None:  # what fills the mask would bring the dead to life
+                self.inside = None
+                self.judge(*self._pass(near_the_mean(self.use), np.flatnonzero(self.use), moments=True)[:2], noiseless)
+                self.inside = inside
             vector = near_the_mean(self.use)
             total, square, image, times = self._pass(vector, np.flatnonzero(self.use), moments=True)
-            if not self.judge(total, square, noiseless):
+            if inside is not None:
+                self.energy = float(np.where(self.use, square, 0.0).sum())
+            if (inside is not None or not self.judge(total, square, noiseless)) and not unit_rms:
                 self._known = vector, image, times
+            if unit_rms:
+                self._scale_to_unit_rms(total, square)
+
+    def _scale_to_unit_rms(self, total: Floats, square: Floats) -> None:
+        """Set `scale` and the energy in its units; the sums (n_det,) are of all good samples. 1 where nothing varies."""
+        with np.errstate(invalid="ignore"):
+            variance = square / max(1, self.n_used) - (total / max(1, self.n_used)) ** 2
+        self.scale = np.sqrt(np.where(self.use & (variance > 0), variance, 1.0))
+        self.energy = float(np.where(self.use, square / self.scale**2, 0.0).sum())
 
     def _on_tile(self, samples: slice, act: Callable[[NDArray[Any], int, int], Any]) -> Any:
         """``act(array, start, stop)`` on an array that has these samples, mean emission included and zero where flagged, from
@@ -119,8 +150,23 @@ class Gram(Usable):
             if mean is not None:
                 for rows in chunks(copy.shape[0], ROWS):
                     copy[rows] += mean.evaluate(rows, samples)
+            if self.inside is not None:
+                self._fill(copy, samples, self.inside)
             copy[:, ~good] = 0
             return act(copy, 0, copy.shape[1])
+
+    def _fill(self, tile: NDArray[Any], samples: slice, inside: Inside) -> None:
+        """Replace the samples of a tile (n_det, n) that are inside the mask."""
+        total, count, masks = np.zeros(tile.shape[1]), np.zeros(tile.shape[1], np.int64), []
+        unit = np.ones(len(tile)) if self.scale is None else self.scale
+        for rows in chunks(len(tile), ROWS):
+            masks.append(inside.at(rows, samples))
+            fine = self.use[rows, None] & ~masks[-1] & np.isfinite(tile[rows])
+            total += np.where(fine, tile[rows] / unit[rows, None], 0.0).sum(axis=0)
+            count += fine.sum(axis=0)
+        mean = total / np.maximum(count, 1)
+        for rows, masked in zip(chunks(len(tile), ROWS), masks, strict=True):
+            tile[rows] = np.where(masked, unit[rows, None] * mean, tile[rows])
 
     def _pass(self, q: Floats, rows: NDArray[np.intp], moments: bool = False) -> tuple[Floats, Floats, Floats, Floats]:
         """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the stream."""
@@ -147,10 +193,13 @@ class Gram(Usable):
         return total, square, image, times
 
     def apply(self, q: Floats) -> tuple[Floats, Floats]:
-        """(G q, A^T q): shapes (n_det,) and (n_samp,); A^T q is 0 at flagged samples."""
+        """(G q, A^T q): shapes (n_det,) and (n_samp,); A^T q is 0 at flagged samples. Rows of A are divided by `scale`."""
         if self._known is not None and np.array_equal(q, self._known[0]):
             return self._known[1], self._known[2]
-        return self._pass(q, np.flatnonzero(self.use))[2:]
+        if self.scale is None:
+            return self._pass(q, np.flatnonzero(self.use))[2:]
+        image, times = self._pass(q / self.scale, np.flatnonzero(self.use))[2:]
+        return image / self.scale, times
 
     def left(self, detectors: Floats, times: Floats) -> float:
         """Energy of A - sum u v^T, formed without cancellation."""
@@ -160,6 +209,8 @@ class Gram(Usable):
             for rows in chunks(array.shape[0], ROWS):
                 use = self.use[rows]
                 rest = array[rows, start:stop][use].astype(np.float64)
+                if self.scale is not None:
+                    rest /= self.scale[rows][use, None]
                 for u, v in zip(detectors, times, strict=True):
                     rest -= np.outer(u[rows][use], v[samples])
                 total += float(np.einsum("dt,dt->", rest, rest))

@@ -1,21 +1,23 @@
-"""A brick-wall high-pass filter of whole scans, without phase: equations (1) and (2) of `brick_wall`."""
+"""High-pass filters of whole scans: a brick wall without phase (`brick_wall`), or the causal Bessel filter of `bessel`."""
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from functools import partial
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from zonda.core.configuration.parameters import quantity
-from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
-from zonda.core.operator import Operator
+from zonda.core.types import AnyFloats, Floats
 
+from .baseline import Fit, in_double, polynomials
+from .bessel import BesselPlan, sections
 from .brick_wall import HighpassPlan, plan_highpass
+from .parameters import HighpassParameters
+from .source_mask import MASKED, Inside, check_mask, filter_outside
 
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
@@ -23,12 +25,24 @@ SPOILT = "samples not finite"
 ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
 
 
-class HighpassFilter(Operator):
-    """Zero-phase brick-wall high-pass filter of each detector's scan: equations (1) and (2) of `brick_wall`.
+class State(NamedTuple):
+    """What `HighpassFilter.exec` needs: the filter, flagged samples, and the source mask."""
 
-    The modelled mean emission that accompanies the signal is dropped analytically, before anything else. A scan that is shorter
-    than 1 / `frequency` loses its mean and a line alone; the log says so. A frequency so near the Nyquist frequency that
-    nothing of a scan is left is refused.
+    plan: HighpassPlan | BesselPlan
+    bad: NDArray[np.intp]
+    inside: Inside | None
+
+
+class HighpassFilter(HighpassParameters):
+    """High-pass filter of each detector's scan: a brick wall without phase, equations (1) and (2) of `brick_wall`, or the causal
+    Bessel filter of the paper's authors (`bessel`).
+
+    The brick wall drops the modelled mean emission that accompanies the signal analytically, before anything else; with a `mask`,
+    it acts on all of the signal. A scan that is shorter than 1 / `frequency` loses its mean and a line alone; the log says so. A
+    frequency so near the Nyquist frequency that nothing of a scan is left is refused.
+
+    The Bessel filter acts on all of the signal, and begins in the state zero: what does not begin with zero has a transient of
+    about 1 / `frequency`, which `degree`, `Detrend` and `Taper` lessen and `trim` flags.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -37,36 +51,64 @@ class HighpassFilter(Operator):
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
-    frequency: Hertz = quantity("0.08 Hz", gt=0)
-    """Cutoff: everything slower is removed."""
-    degree: int = Field(3, ge=0, le=3)
-    """Degree of the polynomial fitted to each detector's scan and removed before the even extension (1: a line)."""
-    trim: Seconds = quantity("0 s", ge=0)
-    """Flag this long at either end of each scan."""
-    oversampling: float = Field(24.0, ge=8, le=1000)
-    """Coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut is about oversampling^-4."""
-
     def check(self, data: Data) -> list[str]:
         """Scans that are shorter than one cycle of the cut."""
         short, every = sum(o.duration * self.frequency < 1 for o in data.observations), len(data.observations)
-        text = f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {_only(self.degree)}"
+        text = f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {_short(self)}"
         return [text] if short else []
 
-    def prepare(self, observation: Observation) -> tuple[HighpassPlan, NDArray[np.intp]]:
+    def prepare(self, observation: Observation) -> State:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
-        bad = ~good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
+        fine = good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
         _trim(self, observation)
-        observation.tally.count(self.label, "flagged samples bridged before filtering", int(bad.sum()), bad.size)
-        if observation.smooth.get("atmosphere") is not None:
+        observation.tally.count(self.label, "flagged samples bridged before filtering", int((~fine).sum()), fine.size)
+        inside = self.mask.of(observation) if self.mask else None
+        if inside is not None:
+            check_mask(inside, observation, f"{self.label}, {observation.name}")
+        if self.response == "bessel":
+            return State(_bessel(self, observation, fine), np.flatnonzero(~fine), inside)
+        if observation.smooth.get("atmosphere") is not None and inside is None:
             observation.tally.state(self.label, "smooth mean emission", "removed analytically")
-        return _planned(self, observation), np.flatnonzero(bad)
+        return State(_planned(self, observation), np.flatnonzero(~fine), inside)
 
-    def exec(self, block: Block, state: tuple[HighpassPlan, NDArray[np.intp]]) -> None:
+    def exec(self, block: Block, state: State) -> None:
         """Filter the block's rows in place."""
-        block.means.pop("signal", None)
-        plan, bad = state
-        spoilt = plan.apply(block.detdata["signal"], bad)
-        block.observation.tally.count(self.label, SPOILT, spoilt)
+        plan, bad, inside = state
+        tally, masked = block.observation.tally, None
+        if inside is not None:
+            masked = inside.at(block.detectors, block.samples)
+            tally.count(self.label, MASKED, int(masked.sum()), masked.size)
+        if masked is None and isinstance(plan, HighpassPlan):
+            block.means.pop("signal", None)
+            spoilt = plan.apply(block.detdata["signal"], bad)
+        else:
+            first, act = block.detectors.start, plan.apply if isinstance(plan, BesselPlan) else partial(_brick_wall, plan)
+            spoilt = in_double(
+                block, lambda rows, at: act(rows, bad, None if masked is None else masked[at.start - first : at.stop - first])
+            )
+        tally.count(self.label, SPOILT, spoilt)
+
+
+def _brick_wall(plan: HighpassPlan, rows: Floats, bad: NDArray[np.intp], masked: NDArray[np.bool_] | None) -> int:
+    """Equation (1) of `source_mask` on rows (n_det, N) in place; returns how many samples were not finite."""
+
+    def act(row: AnyFloats) -> None:
+        plan.apply(row[None])
+
+    return sum(filter_outside(row, bad, None if masked is None else masked[d], act) for d, row in enumerate(rows))
+
+
+def _bessel(step: HighpassFilter, observation: Observation, fine: NDArray[np.bool_]) -> BesselPlan:
+    """The causal filter of a scan. Raises PipelineError for a cutoff at the Nyquist frequency or above."""
+    rate = observation.sample_rate
+    if step.frequency >= rate / 2:
+        raise PipelineError(
+            f"a cut at {step.frequency:g} Hz removes everything: samples at {rate:g} Hz contain no higher frequency",
+            place=f"{step.label}, {observation.name}",
+            cure=f"choose a frequency below {rate / 2:.6g} Hz",
+        )
+    trend = None if step.degree is None else Fit.of(polynomials(observation.n_samples, step.degree), fine)
+    return BesselPlan(sections(step.frequency, rate), trend)
 
 
 def _trim(step: HighpassFilter, observation: Observation) -> None:
@@ -87,9 +129,10 @@ def _trim(step: HighpassFilter, observation: Observation) -> None:
 def _planned(step: HighpassFilter, observation: Observation) -> HighpassPlan:
     """The plan for a scan's length; says, or refuses, where nothing or little is left."""
     n, rate = observation.n_samples, observation.sample_rate
-    plan = plan_highpass(n, step.frequency / rate, step.degree, step.oversampling)
+    degree = step.degree or 0
+    plan = plan_highpass(n, step.frequency / rate, degree, step.oversampling)
     if plan.cut == 0:
-        text = _only(step.degree) if n > 1 + min(step.degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+        text = _short(step) if n > 1 + min(degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
         observation.tally.state(step.label, f"{observation.name} is shorter than 1/frequency", text)
     elif plan.cut >= n:
         raise PipelineError(
@@ -100,6 +143,8 @@ def _planned(step: HighpassFilter, observation: Observation) -> HighpassPlan:
     return plan
 
 
-def _only(degree: int) -> str:
-    """What is removed from a short scan."""
-    return ONLY_A_LINE if degree else ONLY_THE_MEAN
+def _short(step: HighpassFilter) -> str:
+    """What happens to a short scan."""
+    if step.response == "bessel":
+        return "all of it is within the filter's transient"
+    return ONLY_A_LINE if step.degree else ONLY_THE_MEAN

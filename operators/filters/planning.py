@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.observation import Observation
@@ -11,9 +13,14 @@ from zonda.core.plan.context import LEAKS, Context
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 
+from .baseline import ROWS
+from .bessel import amplitude
 from .common_mode import CommonModeFilter
+from .despline import Despline
+from .detrend import Detrend
 from .gram import MOST_COPIED
 from .highpass import HighpassFilter
+from .taper import Taper
 
 LANCZOS = 0.5e-9
 """Seconds per sample of one Lanczos step, which reads the stream once."""
@@ -29,8 +36,12 @@ class HighpassPlanning(Planning[HighpassFilter]):
     knobs = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
     def traits(self, observation: Observation) -> Traits:
-        """A brick wall; a scan shorter than one cycle loses only a line."""
-        frequency = self.operator.frequency
+        """A brick wall; a scan shorter than one cycle loses only a line. Of the Bessel filter, what passes a hundredth counts as
+        passed."""
+        frequency, rate = self.operator.frequency, observation.sample_rate
+        if self.operator.response == "bessel" and frequency < rate / 2:
+            lowest = next((f for f in np.geomspace(1e-3, 1, 200) * frequency if amplitude(f, frequency, rate) >= 0.01), frequency)
+            return Traits(response=lambda f: float(f >= lowest))
         cut = frequency if observation.duration * frequency >= 1 else 0.0
         return Traits(response=lambda f: float(f >= cut))
 
@@ -39,7 +50,9 @@ class HighpassPlanning(Planning[HighpassFilter]):
         return 120 * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost, and the saving and error of fewer knots."""
+        """Its cost, and the saving and error of fewer knots; the Bessel filter has none."""
+        if self.operator.response == "bessel":
+            return Estimate((), Cost(fixed=0.01, per_time=2e-7, per_sample=2e-8))
         o, cut, full_q = context.first, self.operator.frequency, self.operator.oversampling
         knots = full_q * cut * o.duration
         cost = Cost(fixed=0.01, per_time=5e-8, per_sample=2e-9 + 2e-8 * knots / o.n_samples)
@@ -59,6 +72,43 @@ class HighpassPlanning(Planning[HighpassFilter]):
         )
         left_in = {m: size[m] + context.mean_emission for m in size}
         return Estimate((effect,), cost, left_in | context.sky_error(1.0))
+
+
+class DetrendPlanning(Planning[Detrend]):
+    """Exact: it has no coarser form."""
+
+    of = Detrend
+
+    def memory(self, observation: Observation) -> int:
+        """The polynomials; the pointing of a mask; parts in float64."""
+        return 8 * (self.operator.order + 4 + ROWS) * observation.n_samples
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost."""
+        functions = self.operator.order + 1
+        return Estimate((), Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=4e-9 + 2e-9 * functions))
+
+
+class DesplinePlanning(Planning[Despline]):
+    """Exact: it has no coarser form."""
+
+    of = Despline
+    cost = Cost(fixed=0.01, per_time=1e-7, per_sample=1.4e-8)
+
+    def memory(self, observation: Observation) -> int:
+        """The splines at each sample; parts in float64."""
+        return 8 * (5 + ROWS) * observation.n_samples
+
+
+class TaperPlanning(Planning[Taper]):
+    """Exact: it has no coarser form."""
+
+    of = Taper
+    cost = Cost(fixed=0.001, per_time=2e-8, per_sample=1e-9)
+
+    def memory(self, observation: Observation) -> int:
+        """The window."""
+        return 8 * observation.n_samples
 
 
 class CommonModePlanning(Planning[CommonModeFilter]):

@@ -13,13 +13,14 @@ import numpy as np
 
 from zonda.core.flags import of_before
 from zonda.core.intervals import Intervals
+from zonda.core.maps.map_file import ascii_text
 from zonda.core.storage.files import writing
 from zonda.core.storage.fits_files import check_size, opened
+from zonda.core.stream_names import UNITS
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
-from .map_file import ascii_text
-from .time_ordered_data import UNITS, TimeOrderedData
+from .time_ordered_data import TimeOrderedData
 from .toast_hdf5 import azimuth_elevation
 
 SUFFIX = ".fits"

@@ -12,13 +12,12 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
+from zonda.core.maps.map_file import MapFile, Provenance
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures, noise_sources
 from zonda.core.output import Output, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, product_path
 from zonda.core.storage.fits_image import Cards
 from zonda.core.types import AnyFloats
-
-from .map_file import MapFile, Provenance
 
 
 class SaveMap(Output):

@@ -20,7 +20,7 @@ from zonda.core.output import output_folder
 from zonda.core.product import Record
 from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
-from zonda.core.stream_names import StreamName, StreamsAsked
+from zonda.core.stream_names import UNITS, StreamName, StreamsAsked, StreamsNeeded
 
 from . import fits_table, toast_hdf5
 from .time_ordered_data import TimeOrderedData
@@ -87,7 +87,7 @@ class SaveTOD(Operator):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     knows_means: ClassVar[bool] = True
 
@@ -114,7 +114,7 @@ class SaveTOD(Operator):
                 have = ", ".join(sorted(block.detdata))
                 raise OutputError(f"there is no stream {name!r} at this step", place=self.label, cure=f"choose from: {have}")
             values = block.total(name)
-            largest = float(np.abs(values).max(initial=0.0)) if name != "transmission" else 0.0
+            largest = float(np.abs(values).max(initial=0.0)) if name not in UNITS else 0.0
             with state.lock:
                 state.largest = max(state.largest, largest)
                 state.writer.write(name, block.detectors, block.samples, values)

@@ -15,9 +15,6 @@ from zonda.core.intervals import Intervals
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
-UNITS = {"transmission": "", "flags": ""}
-"""Units of streams that are not in K."""
-
 
 @dataclass
 class TimeOrderedData:

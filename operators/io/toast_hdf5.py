@@ -21,10 +21,11 @@ from zonda.core.flags import Flags, of_before
 from zonda.core.intervals import Intervals
 from zonda.core.storage.files import writing
 from zonda.core.storage.hdf5_files import Disk, check_size, opened
+from zonda.core.stream_names import UNITS
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
-from .time_ordered_data import UNITS, TimeOrderedData
+from .time_ordered_data import TimeOrderedData
 
 SUFFIX = ".h5"
 

@@ -2,6 +2,10 @@
 
     m_p = sum_i w_i d_i / sum_i w_i over the samples i in pixel p                                        (1)
 
+Where a `Taper` multiplied the signal by a window W, the samples weigh w W:
+
+    m_p = sum_i w_i (W d)_i / sum_i w_i W_i,   variance (sum_i w_i^2 W_i^2 sigma_i^2) / (sum_i w_i W_i)^2.  (2)
+
 The sums are kept in fixed point (`sums`), so that they are exact; each sample is rounded to 2^-36 K (1.5e-11 K).
 """
 
@@ -19,6 +23,7 @@ from zonda.core.numerics.tiles import TILE_SAMPLES
 
 from .finished import finish
 from .grid import Grid, TangentGrid
+from .halves import halves_of
 from .map_layout import grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
@@ -26,6 +31,12 @@ from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, WEIGHT, Binning, Sums
 
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""
+
+LIGHTEST = 2.0**-10
+"""Least window of a sample that is in a map: the weights of all that are, of every detector, are more than rounding (`sums`)."""
+
+LIGHT = "instants that count as flagged: a window leaves less than 1/1024 of their weight"
+"""A count of the log."""
 
 
 class _Requires:
@@ -95,15 +106,33 @@ class BinMap(MapParameters):
 
 
 def binnings(step: BinMap, observation: Observation, reference: float, spare: list[Sums]) -> list[Binning]:
-    """What `BinMap.prepare` makes. ``reference``: unit of the variance, K^2; ``spare``: see `Binning`."""
+    """What `BinMap.prepare` makes: of each half (`halves_of`), one for all signals or one for each. ``reference``: unit of the
+    variance, K^2; ``spare``: see `Binning`.
+
+    Raises PipelineError where noise is wanted from the scatter of samples that a window has changed.
+    """
     weight, noise = weights_of(step, observation, reference)
+    window = observation.window if step.contents == "all" else None
+    if window is not None and step.noise == "scatter":
+        text = f"noise: scatter needs samples that no window has changed; {' and '.join(observation.windows)} did"
+        raise PipelineError(text, place=step.label, cure="leave out noise: scatter, or the window")
+    seen = observation.good_samples
+    if window is None:
+        window = np.zeros(0)
+    else:
+        seen &= (heavy := window >= LIGHTEST)
+        observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
     if "white" not in observation.components and step.noise == "net" and step.contents == "all":
         observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
-    alike = step.noise == "net" and bool((weight == weight[0]).all() and (noise == noise[0]).all())
-    good, pointing = observation.good_samples.astype(np.uint8), step.grid.pointing(observation)
+    alike = step.noise == "net" and not window.size and bool((weight == weight[0]).all() and (noise == noise[0]).all())
+    pointing = step.grid.pointing(observation)
     signals = 1 if step.contents == "hits" else len(observation.signals)
     others, count = (0, signals) if step.noise == "scatter" else (signals - 1, 1)
-    return [Binning(step.grid, pointing, good, weight, noise, alike, others, spare) for _ in range(count)]
+    return [
+        Binning(step.grid, pointing, use, (seen & samples).astype(np.uint8), window, weight, noise, alike, others, spare)
+        for use, samples in halves_of(step.split, observation)
+        for _ in range(count)
+    ]
 
 
 def weights_of(step: BinMap, observation: Observation, reference: float) -> tuple[Any, Any]:
@@ -139,22 +168,35 @@ def add_signals(step: BinMap, block: Block, state: list[Binning], reference: flo
         nothing.fill(0)
         signals = [nothing]
     else:
-        whole = any(name in block.means for name in block.signals)
+        window, unfiltered = state[0].window[block.samples], block.observation.unfiltered
+        whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
         signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
-    for binning in state:
-        count = 1 + binning.n_others
-        add_block(step, block, tuple(signals[:count]), binning, reference)
-        signals = signals[count:]
+        if window.size:  # no filter, no window, acted on these
+            signals = [
+                signal * window if name in unfiltered else signal for name, signal in zip(block.signals, signals, strict=True)
+            ]
+    for binnings in halves(step, state):
+        left = signals
+        for binning in binnings:
+            count = 1 + binning.n_others
+            add_block(step, block, tuple(left[:count]), binning, reference)
+            left = left[count:]
+
+
+def halves(step: BinMap, state: list[Binning]) -> list[list[Binning]]:
+    """The binnings of either half; of scans, which are a half each, all together."""
+    middle = len(state) // 2
+    return [state] if step.split == "scans" else [state[:middle], state[middle:]]
 
 
 def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], binning: Binning, reference: float) -> None:
     """Add the signals of a block to this thread's sums."""
     sums, dropped, largest = binning.of_thread()
     plane, begin, end, rows = block.observation.focalplane, block.samples.start, block.samples.stop, block.detectors
-    xi, eta, use = plane.xi[rows], plane.eta[rows], block.observation.good_detectors[rows]
+    xi, eta, use = plane.xi[rows], plane.eta[rows], block.observation.good_detectors[rows] & binning.use[rows]
     how = (
-        use, binning.good[begin:end], binning.weight[rows], binning.noise[rows], step.noise == "scatter", 1 / reference,
-        sums, dropped, largest,
+        use, binning.good[begin:end], binning.window[begin:end], binning.weight[rows], binning.noise[rows],
+        step.noise == "scatter", 1 / reference, sums, dropped, largest,
     )  # fmt: skip
     if isinstance(binning.grid, TangentGrid):
         add_image(signals, binning.pointing, begin, xi, eta, *binning.grid.shape, *how)
@@ -170,9 +212,9 @@ def add_scan(step: BinMap, data: Data, observation: Observation, state: list[Bin
     """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples that are too large."""
     if step.label not in data.partial:
         signals = () if step.contents == "hits" else observation.signals
-        data.add(step.label, MapSums(step.grid.n_pixels, signals, step.noise == "scatter"))
+        data.add(step.label, MapSums(step.grid.n_pixels, signals, step.noise == "scatter", step.split == "scans"))
     sums: Any = data.partial[step.label]
-    binned, dropped = sums.add(observation, state, step.label)
+    binned, dropped = sums.add(observation, halves(step, state), step.label)
     sums.unknown_variance |= step.weights == "inverse_variance" and not (observation.focalplane.net > 0).all()
     every, tally = observation.n_detectors * observation.n_samples, observation.tally
     tally.count(step.label, "samples binned", binned, every)

@@ -18,6 +18,7 @@ from zonda.core.tally import Tally
 from zonda.core.types import Floats
 
 from .grid import Grid, TangentGrid
+from .halves import DIFFERENCES
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .sums import DATA, HITS, NOISE, VALUE, WEIGHT, WEIGHTS, Sums
@@ -34,6 +35,7 @@ def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any
             text = f"two steps make the product {step.product!r}"
             raise PipelineError(text, place=step.label, cure="give one of them another product name")
         product = map_of(step, grid, layout, sums, stream)
+        product.band = data.scene.instrument.band
         if stream == MAIN:
             state_choices(step, product, sums, data.tally)
         if step.smooth is not None:
@@ -46,7 +48,7 @@ def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: Map
     n, variance = grid.n_pixels, layout["variance"]
     unit = variance if step.weights == "inverse_variance" else 1.0
     hits, signal, weight, noise = (empty((n, 1), kind).reshape(n) for kind in (np.int64, float, float, float))
-    halves = step.half_difference and len(sums.scans) >= 2 and step.contents == "all"
+    halves = bool(step.half_difference) and (len(sums.scans) >= 2 or not sums.of_scans) and step.contents == "all"
     half = empty((n, 1), float).reshape(n) if halves else None
     for start in range(0, n, AT_ONCE):
         part = slice(start, start + AT_ONCE)
@@ -68,6 +70,7 @@ def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: Map
     common: dict[str, Any] = {
         "frame": step.frame, "weighting": step.weights, "noise_from": step.noise, "fwhm": layout["fwhm"], "scans":
         list(sums.scans), "centre": tuple(layout["middle"]), "half_difference": planes[4] if half is not None else None,
+        "difference": DIFFERENCES[step.split],
         "contents": step.contents, "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
     }  # fmt: skip
     if isinstance(grid, TangentGrid):
@@ -92,7 +95,9 @@ def state_choices(step: MapParameters, product: MapProduct, sums: MapSums, tally
     if sums.unknown_variance:
         tally.state(step.label, "weights", "uniform: every NET is 0")
     tally.state(step.label, "fixed-point step of the sums", f"{1 / VALUE:.1e} K per sample")
-    if step.half_difference and len(sums.scans) < 2:
+    if not sums.of_scans:
+        tally.state(step.label, "half-difference of", DIFFERENCES[step.split])
+    if step.half_difference and sums.of_scans and len(sums.scans) < 2:
         tally.state(step.label, "half-difference", "not made: it needs two scans")
 
 

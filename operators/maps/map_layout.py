@@ -13,6 +13,7 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.numerics.projection import pixel_matrix, share_outside
 
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
+from .mosaic import MOST_FIELDS, whole_of
 
 if TYPE_CHECKING:
     from .parameters import MapParameters
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 def layout_of(
     step: MapParameters, observations: Sequence[Observation], before: Mapping[str, Any] | None
 ) -> Mapping[str, Any] | None:
-    """Centre, extent and units of the sums: of the first observation, and wide enough for all.
+    """Centre, extent and units of the sums: about the middle of all observations, and wide enough for them.
 
     ``before``: what those before had in common. Raises PipelineError for maps that cannot be added up.
     """
@@ -37,7 +38,6 @@ def layout_of(
             "variance": 2.0 ** round(math.log2(net**2 * first.sample_rate)) if net > 0 else 2.0**-12,
             "fwhm": instrument.beam_fwhm,
             "frequency": instrument.band.centre,
-            "middle": [float(x) for x in in_frame(step.centre.icrs() if step.centre else first.centre, step.frame)],
             "fixed": step.nside is None and step.width is not None,
         }
     else:
@@ -51,12 +51,34 @@ def layout_of(
     if step.nside:
         pixels = covered_healpix(observations, step.nside, step.ordering == "nested", step.frame)
         found["pixels"] = np.union1d(found["pixels"], pixels) if "pixels" in found else pixels
-    elif not found["fixed"]:
-        longitude, latitude = found["middle"]
-        reach = covering_extent(observations, (longitude, latitude), step.frame)
-        half = found.get("half", (0.0, 0.0))
-        found["half"] = [max(half[0], reach[0]), max(half[1], reach[1])]
+    found["fields"] = fields_of(step, observations, found.get("fields", []))
+    *found["middle"], half_width, half_height = whole_of(found["fields"], step.label)
+    found["half"] = [half_width, half_height]
     return found
+
+
+def fields_of(step: MapParameters, observations: Sequence[Observation], before: Sequence[Sequence[float]]) -> list[list[float]]:
+    """Each target's field, (longitude, latitude, half its width, half its height) [rad, on its own tangent plane].
+
+    ``before``: fields so far. Of a given centre there is one field about it; extents are 0 where they are not wanted.
+    """
+    found = [list(field) for field in before]
+    together: dict[tuple[float, float], list[Observation]] = {}
+    for observation in observations:
+        together.setdefault(step.centre.icrs() if step.centre else observation.centre, []).append(observation)
+    known = {(field[0], field[1]): field for field in found}
+    for icrs, scans in together.items():
+        longitude, latitude = (float(x) for x in in_frame(icrs, step.frame))
+        reach = (0.0, 0.0)
+        if step.nside is None and step.width is None:
+            reach = covering_extent(scans, (longitude, latitude), step.frame)
+        if (field := known.get((longitude, latitude))) is None:
+            field = known[longitude, latitude] = [longitude, latitude, 0.0, 0.0]
+            found.append(field)
+        field[2:] = [max(field[2], reach[0]), max(field[3], reach[1])]
+    if len(found) > MOST_FIELDS and step.nside is None:
+        return [list(whole_of(found, step.label))]
+    return found[:1] if step.nside else found
 
 
 def grid_of(step: MapParameters, layout: Mapping[str, Any]) -> Grid:
@@ -74,15 +96,14 @@ def image_grid(step: MapParameters, middle: tuple[float, float], half: Sequence[
     height = height if height is not None else 2 * half[1] + 2 * step.pixel
     nx, ny = (max(1, math.ceil(side / step.pixel - 1e-6)) for side in (width, height))
     if nx * ny > MOST_PIXELS:
-        raise InputError(
-            f"a map of {nx} x {ny} pixels is too large", place=step.label, cure="choose larger pixels or a smaller width"
-        )
+        cure = "choose larger pixels or a smaller width, or nside for a HEALPix map"
+        raise InputError(f"a map of {nx} x {ny} pixels is too large", place=step.label, cure=cure)
     return TangentGrid(middle, step.pixel, (ny, nx), step.frame)
 
 
 def outside(step: MapParameters, observations: Sequence[Observation]) -> str:
     """The share of the samples outside an image of a given width."""
-    longitude, latitude = in_frame(step.centre.icrs() if step.centre else observations[0].centre, step.frame)
-    grid = image_grid(step, (float(longitude), float(latitude)), (0.0, 0.0))
+    longitude, latitude, *_ = whole_of(fields_of(step, observations, []), step.label)
+    grid = image_grid(step, (longitude, latitude), (0.0, 0.0))
     scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in observations)
     return f"samples outside the map: about {percent(share_outside(scans, pixel_matrix(grid.wcs), grid.shape), 2)}"

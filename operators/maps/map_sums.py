@@ -1,4 +1,4 @@
-"""`MapSums`: the partial product of a map, sums in pixels of the even and of the odd scans for every signal."""
+"""`MapSums`: the partial product of a map, sums in pixels of two halves of the samples for every signal."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from zonda.core.numerics.chunks import empty
 from zonda.core.product import Product
 from zonda.core.types import Floats
 
-from .sums import DATA, HITS, NOISE, VALUE, Binning, Sums
+from .sums import DATA, FLAGGED, HITS, NOISE, VALUE, Binning, Sums
 
 MOST = 2.0**62
 """Below what a sum must stay."""
 
 
 class MapSums(Product):
-    """Sums of the even and of the odd observations, in their order.
+    """Sums of two halves of the samples: of the even and of the odd observations, in their order, or of halves of each.
 
     Parameters
     ----------
@@ -31,6 +31,8 @@ class MapSums(Product):
         Streams of the signals, the complete one first; none where only the hits are wanted.
     scatter
         Whether each signal has noise of its own, from the scatter of its samples.
+    of_scans
+        Whether the halves are the even and the odd observations.
 
     Attributes
     ----------
@@ -44,11 +46,12 @@ class MapSums(Product):
         A scan's weights are uniform because every NET is zero.
     """
 
-    def __init__(self, n_pixels: int, signals: Sequence[str], scatter: bool = False) -> None:
+    def __init__(self, n_pixels: int, signals: Sequence[str], scatter: bool = False, of_scans: bool = True) -> None:
         self.signals = tuple(signals)
         self.sums = _zeros(n_pixels, 4)
         self.others = {name: _zeros(n_pixels, 1)[..., 0] for name in self.signals[1:]}
         self.scatters = {name: _zeros(n_pixels, 1)[..., 0] for name in self.others} if scatter else {}
+        self.of_scans = of_scans
         self.scans: list[str] = []
         self.rates: set[float] = set()
         self.unknown_variance = False
@@ -56,9 +59,25 @@ class MapSums(Product):
         self._largest_of = dict.fromkeys(self.others, 0.0)
         self._deepest = [0, 0]
 
-    def add(self, observation: Observation, binnings: Sequence[Binning], place: str) -> tuple[int, Sums]:
-        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed."""
-        k, names = len(self.scans) % 2, list(self.others)
+    def add(self, observation: Observation, halves: Sequence[Sequence[Binning]], place: str) -> tuple[int, Sums]:
+        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.
+
+        ``halves``: the binnings of either half of its samples, or one list of all of them.
+        """
+        inside, dropped = 0, np.zeros(4, np.int64)
+        for k, binnings in enumerate(halves, start=len(self.scans) % 2 if self.of_scans else 0):
+            binned, lost = self._add_half(k, binnings)
+            inside, dropped = inside + binned, dropped + lost
+        # what belongs to the other half counted as flagged
+        dropped[FLAGGED] -= (len(halves) - 1) * observation.n_detectors * observation.n_samples
+        self.scans.append(observation.name)
+        self.rates.add(float(observation.sample_rate))
+        self._check(f"{place}, {observation.name}")
+        return inside, dropped
+
+    def _add_half(self, k: int, binnings: Sequence[Binning]) -> tuple[int, Sums]:
+        """Add binnings to the half ``k``: (samples binned, dropped (4,))."""
+        names = list(self.others)
         together = binnings[0].n_others == len(names)
         others = np.stack([self.others[name][k] for name in names], axis=1) if names and together else _nothing(self.sums[k])
         inside, deepest, dropped, largest = binnings[0].fold(self.sums[k], others)
@@ -73,20 +92,16 @@ class MapSums(Product):
                 self.scatters[name][k] += own[:, NOISE]
                 high, largest[NOISE] = float(found[DATA]), max(largest[NOISE], found[NOISE])
             self._largest_of[name] = max(self._largest_of[name], high)
-        self.scans.append(observation.name)
-        self.rates.add(float(observation.sample_rate))
         self._note(k, deepest, largest[:4])
-        self._check(f"{place}, {observation.name}")
         return inside, dropped
 
     def total(self, stream: str, pixels: slice) -> Sums:
         """Both halves together of some pixels of a signal, (n, 4)."""
-        return (
-            self.half(stream, 0, pixels) + self.half(stream, 1, pixels) if len(self.scans) > 1 else self.half(stream, 0, pixels)
-        )
+        both = len(self.scans) > 1 or not self.of_scans
+        return self.half(stream, 0, pixels) + self.half(stream, 1, pixels) if both else self.half(stream, 0, pixels)
 
     def half(self, stream: str, k: int, pixels: slice) -> Sums:
-        """Sums of the even (0) or the odd (1) scans in some pixels of a signal, (n, 4)."""
+        """Sums of the first (0: even scans) or the second half (1: odd scans) in some pixels of a signal, (n, 4)."""
         found: Sums = self.sums[k, pixels]
         if stream in self.others:
             found = found.copy()
@@ -97,7 +112,7 @@ class MapSums(Product):
 
     def __iadd__(self, other: MapSums) -> MapSums:
         """Add sums whose scans follow those that are here: exact, so that their order does not matter but for which are even."""
-        shift = len(self.scans) % 2
+        shift = len(self.scans) % 2 if self.of_scans else 0
         for k in range(2):
             half, pixels = (k + shift) % 2, np.flatnonzero(other.sums[k, :, HITS])
             merged = other.sums[k].take(pixels, axis=0) + (self.sums[half].take(pixels, axis=0) if self.scans else 0)
@@ -119,7 +134,7 @@ class MapSums(Product):
         found: dict[str, Any] = {
             "signals": list(self.signals), "n_pixels": self.sums.shape[1], "scans": list(self.scans), "rates": sorted(self.rates),
             "largest": self._largest, "largest_of": dict(self._largest_of), "unknown_variance": self.unknown_variance,
-            "scatter": bool(self.scatters),
+            "scatter": bool(self.scatters), "of_scans": self.of_scans,
         }  # fmt: skip
         for k in range(2):
             pixels = np.flatnonzero(self.sums[k, :, HITS])
@@ -133,7 +148,7 @@ class MapSums(Product):
     @classmethod
     def of(cls, arrays: Mapping[str, Any]) -> MapSums:
         """See `Product.of`."""
-        made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), bool(arrays["scatter"]))
+        made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), bool(arrays["scatter"]), bool(arrays["of_scans"]))
         made.scans, made.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
         made.unknown_variance = bool(arrays["unknown_variance"])
         made._largest_of = {name: float(high) for name, high in arrays["largest_of"].items()}

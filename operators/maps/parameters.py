@@ -11,6 +11,8 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
 from zonda.core.mapmaker import MapMaker
 
+from .halves import Split
+
 WIDEST_SMOOTH = 0.1
 """FWHM of a map's smoothing, rad."""
 
@@ -25,7 +27,7 @@ class MapParameters(MapMaker):
     height: Angle | None = Field(None, gt=0)
     """Height of the map; where absent, the width if that is given, else it covers the scans."""
     centre: Target | None = None
-    """Centre of the map; where absent, the first scan's target."""
+    """Centre of the map; where absent, the scans' target; of several targets the middle of all scans."""
     projection: Literal["TAN"] = "TAN"
     """Projection of the image."""
     frame: Literal["icrs", "galactic"] = "icrs"
@@ -41,13 +43,20 @@ class MapParameters(MapMaker):
     white noise; the log then says so."""
     contents: Literal["all", "hits"] = "all"
     """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
-    half_difference: bool = True
-    """Keep even and odd scans apart and make a noise map of their difference (needs two scans)."""
+    half_difference: bool | Split = True
+    """Keep two halves of the samples apart and make a noise map of their difference: even and odd scans (`scans` or true; needs
+    two), even and odd detectors, the first and the second half of each scan, samples of rising and of falling
+    azimuth, or inner and outer detectors (`radii`)."""
     smooth: Angle | Literal["beam"] | None = None
     """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam; the resolution is then that of both, added in
     quadrature."""
     product: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
     """Name of the map among the products."""
+
+    @property
+    def split(self) -> Split:
+        """Which halves are kept apart."""
+        return "scans" if isinstance(self.half_difference, bool) or self.contents == "hits" else self.half_difference
 
     @field_validator("nside")
     @classmethod

@@ -60,8 +60,8 @@ class Binning:
     ----------
     pointing
         What `Grid.pointing` gives.
-    good
-        (n_samp,) uint8: 1 where not flagged.
+    use, good, window
+        (n_det,), (n_samp,) uint8: which detectors (of its half) and samples count; (n_samp,): `Observation.window`, or (0,).
     weight, noise
         (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
     alike
@@ -74,7 +74,9 @@ class Binning:
 
     grid: Grid
     pointing: Floats
+    use: NDArray[np.bool_]
     good: NDArray[np.uint8]
+    window: Floats
     weight: Floats
     noise: Floats
     alike: bool
@@ -121,7 +123,7 @@ class Binning:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def add_image(signals, h, start, xi, eta, ny, nx, use, good, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
+def add_image(signals, h, start, xi, eta, ny, nx, use, good, window, weight, noise, scatter, per_var, sums, dropped, largest):  # type: ignore[no-untyped-def]
     """Add a block that begins at sample ``start`` to an image of (ny, nx) pixels; the rest as in `_add`."""
     n = signals[0].shape[1]
     space = np.empty(xi.size * AT_ONCE, np.int32)
@@ -131,7 +133,7 @@ def add_image(signals, h, start, xi, eta, ny, nx, use, good, weight, noise, scat
         for d in range(xi.size):
             if use[d]:
                 _cells(h, start + low, xi[d], eta[d], ny, nx, cells[d])
-        _add(signals, low, cells, nx + 2, use, good, weight, noise, scatter, per_variance, sums, dropped, largest)
+        _add(signals, low, cells, nx + 2, use, good, window, weight, noise, scatter, per_var, sums, dropped, largest)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
@@ -158,14 +160,14 @@ def _cells(h, start, a, b, ny, nx, cells):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def add_list(signals, first, index, use, good, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
+def add_list(signals, first, index, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
     """Add samples first .. of a block to the pixels ``index`` (n_det, n) of a list, -1 outside; the rest as in `_add`."""
     index += np.int32(1)
-    _add(signals, first, index, 0, use, good, weight, noise, scatter, per_variance, sums, dropped, largest)
+    _add(signals, first, index, 0, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add(signals, first, cells, stride, use, good, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
+def _add(signals, first, cells, stride, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
     """Add samples of all ``signals`` (a tuple) to their places in ``sums`` (n, 4 and one for each further signal; or 2: all
     detectors weigh the same); count what is dropped; note the largest terms, those of the data to the next power of two.
 
@@ -211,7 +213,12 @@ def _add(signals, first, cells, stride, use, good, weight, noise, scatter, per_v
             if base == 4:
                 unit, places = units[0, k], cells[d]
                 w, term = np.int64(np.rint(weight[d] * WEIGHT)), np.int64(np.rint(noise[d] * WEIGHT))
+                largest[WEIGHTS], largest[NOISE] = max(largest[WEIGHTS], float(w)), max(largest[NOISE], float(term))
                 for t in range(n):
+                    if window.size:
+                        share = window[first + t]
+                        w = np.int64(np.rint(weight[d] * share * WEIGHT))
+                        term = np.int64(np.rint(noise[d] * share * share * WEIGHT))
                     if scatter:
                         y = np.float64(unit[t]) / factor
                         term = np.int64(np.rint(square * y * y))
@@ -219,8 +226,6 @@ def _add(signals, first, cells, stride, use, good, weight, noise, scatter, per_v
                     at = np.uintp(places[t]) * columns
                     flat[at + np.uintp(WEIGHTS)] += w
                     flat[at + np.uintp(NOISE)] += term
-                largest[WEIGHTS] = max(largest[WEIGHTS], float(w))
-                largest[NOISE] = max(largest[NOISE], float(term))
         if rows.size - begin < TOGETHER or m > 2:
             _scatter_any(flat, columns, np.uintp(base), cells, group, units)
         elif m == 2 and columns == 3:  # constants make shorter code

@@ -99,7 +99,10 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
     observation.tally.state(pink.label, "power over that of white noise", spectrum.describe(law))
     resolve(observation)
     level = level_of(pink, observation)
-    spectrum.state(observation, level.sky_net(observation))
+    net = level.sky_net(observation)
+    spectrum.state(observation, net)
+    square = float(np.mean(net[observation.good_detectors] ** 2)) if observation.good_detectors.any() else 0.0
+    observation.closed_forms.setdefault("pink", []).append(lambda f: 2 * square * spectrum.over_white(f))
     amplitude = Amplitude(pink.label, level, observation, spectrum.factor * np.sqrt(law.gain))
     streams = Streams(law, observation.detector_key(pink.label), observation.detector_key(pink.label, "start"))
     common = np.zeros((1, observation.n_samples if pink.shared else 0), np.float32)
@@ -133,6 +136,10 @@ class PinkSpectrum:
     def factor(self) -> float:
         """Root of the spectrum at its ``minimum``."""
         return float((self.knee / self.minimum) ** (self.slope / 2))
+
+    def over_white(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(f / knee)^-slope, level below the minimum."""
+        return np.asarray((np.maximum(frequency, self.minimum) / self.knee) ** -self.slope, np.float64)
 
     def filter(self, poles: int) -> PowerLawFilter:
         """The recursive filter that makes it of white noise of the rms `factor`."""

@@ -32,6 +32,7 @@ from .transform import Boresight, CelestialTransform
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
+    from zonda.core.instrument import Instrument
 
 SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
 """By `Pointing.check`: scans of a step, and instants of all of them."""
@@ -39,6 +40,7 @@ SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
 LONG = 3_000_000
 """Instants of all scans [samples] above which `Pointing.check` comes first: a second of work."""
 
+MOST_SCANS = 1_000_000
 _OFFSET_SIZE = math.radians(1 / 60)
 _BOX = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
 
@@ -73,10 +75,12 @@ class Pointing(Operator):
 
     target: Target | None = None
     """Centre of the scans; the scene's target where absent."""
+    targets: list[Target] | None = Field(None, min_length=1, max_length=10_000)
+    """Several targets instead, for a mosaic in one map: `scans` of the first, then as many of the next, and so on."""
     scan_duration: Seconds = quantity("8.6 min", gt=0, le=86400 * 31)
     """Length of one scan."""
     scans: int = Field(1, ge=1, le=1_000_000)
-    """Number of scans; each becomes an observation."""
+    """Number of scans of each target; each becomes an observation."""
     gap: Seconds = quantity("30 s", ge=0)
     """Time between the end of a scan and the start of the next (slew and settle)."""
     offsets: Offsets = "none"
@@ -94,6 +98,14 @@ class Pointing(Operator):
     """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
 
     @model_validator(mode="after")
+    def _one_or_several_targets(self) -> Pointing:
+        if self.target is not None and self.targets is not None:
+            raise ValueError("give target, or targets for a mosaic")
+        if self.number > MOST_SCANS:
+            raise ValueError(f"{self.number} scans; at most {MOST_SCANS}")
+        return self
+
+    @model_validator(mode="after")
     def _offsets_are_used(self) -> Pointing:
         if self.offsets != "box" and abs(self.offset_size - _OFFSET_SIZE) > 1e-15:
             raise ValueError("offset_size is the side of the box: set offsets: box with it, or leave it out")
@@ -108,6 +120,10 @@ class Pointing(Operator):
     """Parameters that make a scan easier for the telescope: -1 to lower, 1 to raise it; and the power of 1/s in its unit."""
 
     # -- what a subclass gives --
+
+    def of_scan(self, number: int, instrument: Instrument) -> Pointing:
+        """The step as it is in the scan ``number``, counted from 0: itself, where scans do not differ."""
+        return self
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
         """Offsets (x, y) [rad] from the scan's centre on its tangent plane, each (n,).
@@ -152,28 +168,34 @@ class Pointing(Operator):
 
     # -- the scans --
 
+    @property
+    def number(self) -> int:
+        """How many scans there are, of all targets."""
+        return self.scans * len(self.targets or [None])
+
     def observe(self, data: Data) -> None:
         rate = self.sample_rate or data.scene.instrument.sample_rate
-        if self.scans * self.scan_duration * rate > LONG:
+        if self.number * self.scan_duration * rate > LONG:
             from zonda.core.data import Data
 
             with warnings.catch_warnings():  # observing warns again, with better figures
                 warnings.simplefilter("ignore")
                 self.check(Data(scene=data.scene, observations=list(data.observations)))
-        self._observe(data, range(self.scans), rate)
+        self._observe(data, range(self.number), rate)
 
     def check(self, data: Data) -> list[str]:
         """A selection of scans and instants: elevation, speed and acceleration, samples per beam."""
         rate = self.sample_rate or data.scene.instrument.sample_rate
-        looked = sorted({round(k) for k in np.linspace(0, self.scans - 1, min(self.scans, SCANS_LOOKED_AT))})
+        looked = sorted({round(k) for k in np.linspace(0, self.number - 1, min(self.number, SCANS_LOOKED_AT))})
         coarse = min(rate, max(INSTANTS_LOOKED_AT / (len(looked) * self.scan_duration), 1 / self.scan_duration))
         self._seconds(max(min(round(self.scan_duration * rate), POINTS), 1), rate, self._jitter_key(data, 0))
         first = len(data.observations)
         self.model_copy(update={"jitter": 0.0})._observe(data, looked, coarse)
         made = data.observations[first:]
         elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
-        part = "" if len(looked) == self.scans else f" ({len(looked)} of them looked at)"
-        lines = [f"{self.scans} scan{'s' if self.scans > 1 else ''} from {made[0].start}{part}"]
+        part = "" if len(looked) == self.number else f" ({len(looked)} of them looked at)"
+        several = f" of {len(self.targets)} targets" if self.targets else ""
+        lines = [f"{self.number} scan{'s' if self.number > 1 else ''}{several} from {made[0].start}{part}"]
         lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
         motion = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
         return lines + [f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(motion)]
@@ -181,8 +203,8 @@ class Pointing(Operator):
     def _observe(self, data: Data, which: Sequence[int], rate: float) -> None:
         """Append the scans ``which``, sampled at ``rate`` [Hz]."""
         scene = data.scene
-        target = self.target or scene.target
-        if target is None:
+        targets = self.targets or [t for t in (self.target or scene.target,) if t is not None]
+        if not targets:
             raise PointingError(
                 "there is no target",
                 place=self.label,
@@ -195,7 +217,8 @@ class Pointing(Operator):
         moved, sampled = LargestMotion(scene.instrument.telescope), SamplesPerBeam()
         for k in which:
             start = begin.shifted(k * (self.scan_duration + self.gap))
-            observation = self._scan(data, target, start, before + k, self._offset(k), rate, moved)
+            target = targets[k // self.scans]
+            observation = self.of_scan(k, scene.instrument)._scan(data, target, start, before + k, self._offset(k), rate, moved)
             sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
             data.observations.append(observation)
         report(self.label, data.observations[before:], moved, sampled)
@@ -221,7 +244,7 @@ class Pointing(Operator):
         aim = Aim(transform, target, offset)
         horizontal, *boresight = self.boresight(aim, seconds)
         place = f"{self.label}, scan {index} from {start}"
-        total = self.scans * self.scan_duration + (self.scans - 1) * self.gap
+        total = self.number * self.scan_duration + (self.number - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)
         samples = Samples(seconds, rate, (boresight[0], boresight[1]), self.flag(seconds), self.intervals(seconds))
         observation = observed(self.label, scene, index, transform, centre_of(transform, target, seconds), samples)

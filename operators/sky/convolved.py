@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Hashable
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -18,7 +19,7 @@ from .geometry import placed, turned
 from .grid import Grid, own_pixels, tangent_grid
 from .inputs import HealpixMap, WcsMap
 from .parameters import SkyParameters
-from .read import read_map
+from .read import read_array, read_map
 from .resample import Progress, no_progress
 from .state import Beam
 from .stokes import STOKES
@@ -41,8 +42,7 @@ def grid_of(step: SkyParameters, observation: Observation) -> Grid:
     """Where the map will be convolved: nothing is convolved or interpolated yet."""
     widths, _ = beam_widths(step, observation)
     beam = REACH * SIGMA * float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)) / step.pixels_per_fwhm
-    stamp = step.file.stat() if step.file.exists() else None
-    identity = ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
+    identity = _identity(step)
     source: WcsMap | HealpixMap = step._cache.get(identity, lambda: read_of(step))
     band = observation.instrument.band
     key = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
@@ -65,7 +65,7 @@ def brightness_on(grid: Grid, step: SkyParameters, band: Band) -> Brightness:
         found = conversion(grid, band, step.spectral_index)
         if not grid.resampled:
             return on_own_pixels(grid, found, step.scale, step.place)
-        progress = _progress(step, f"interpolating {step.file.name}")
+        progress = _progress(step, f"interpolating {step.source}")
         return interpolated(grid, found, step.scale, step.outside, step.place, progress)
 
     return cast(Brightness, step._cache.get(grid.key, make))
@@ -79,23 +79,36 @@ def with_beam(sky: Brightness, step: SkyParameters, fwhm: float) -> Beam:
         linear = step.interpolation == "linear"
         convolved = convolve(sky.values, jacobian, fwhm, step.outside, step.pixels_per_fwhm, linear)
         if text := too_bright(float(np.abs(convolved.coefficients["float64"]).max(initial=0.0)), sky.notes["conversion"]):
-            warnings.warn(f"{step.label}: {step.file}: {text}", stacklevel=2)
+            warnings.warn(f"{step.label}: {step.file or step.source}: {text}", stacklevel=2)
         return Beam.of(sky, fwhm, convolved)
 
     return cast(Beam, step._cache.get((*sky.key, "beam", step.pixels_per_fwhm, step.interpolation, fwhm), make))
 
 
+def _identity(step: SkyParameters) -> tuple[Hashable, ...]:
+    """Tells one map from another: an array's hash, a file's size and time of change."""
+    if (array := step.array()) is not None:
+        return ("array", array.digest)
+    assert step.file is not None  # one of the two is given
+    stamp = step.file.stat() if step.file.exists() else None
+    return ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
+
+
 def read_of(step: SkyParameters) -> WcsMap | HealpixMap:
-    """The map as its file has it."""
-    large = step.file.exists() and step.file.stat().st_size > LARGE
-    progress = _progress(step, f"reading {step.file.name}") if large else no_progress
-    progress(0, 1)
-    given = {name: getattr(step, name) for name in ("unit", "pixel_size", "missing", "input_beam", "coordsys", "hdu")}
-    plane = (step.plane,) if isinstance(step.plane, int) else step.plane
-    source = read_map(step.file, centred=step.centre is not None, plane=plane, **given)
-    progress(0, 0)
+    """The map as its file, or the array, has it."""
+    given = {name: getattr(step, name) for name in ("unit", "pixel_size", "missing", "input_beam", "coordsys")}
+    given |= {"plane": (step.plane,) if isinstance(step.plane, int) else step.plane, "centred": step.centre is not None}
+    if (array := step.array()) is not None:
+        source = read_array(array, step.place, **given)
+    else:
+        assert step.file is not None
+        large = step.file.exists() and step.file.stat().st_size > LARGE
+        progress = _progress(step, f"reading {step.file.name}") if large else no_progress
+        progress(0, 1)
+        source = read_map(step.file, hdu=step.hdu, **given)
+        progress(0, 0)
     if STOKES in source.notes:
-        warnings.warn(f"{step.label}: {step.file}: {source.notes[STOKES]}", stacklevel=2)
+        warnings.warn(f"{step.label}: {step.file or step.source}: {source.notes[STOKES]}", stacklevel=2)
     return source
 
 

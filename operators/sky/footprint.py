@@ -63,15 +63,13 @@ class Footprint:
         return Target.parse(f"{ra:.9f} deg {dec:.9f} deg")
 
 
-def footprint(path: Path, pixel_size: float | None, centre: Target | None, hdu: int | str | None = None) -> Footprint | None:
-    """The footprint of an image in a FITS file; None where it has no place of its own: HEALPix, or an image without a WCS.
+def footprint(
+    header: Any, shape: tuple[int, int], pixel_size: float | None, centre: Target | None, place: str
+) -> Footprint | None:
+    """The footprint of an image (`header_of`); None where it has no place of its own: an image without a WCS.
 
-    ``pixel_size`` [rad], ``centre`` and ``hdu`` as `SkyMap` has them. Raises `InputError` as `read.read_map`.
+    ``pixel_size`` [rad] and ``centre`` as `SkyMap` has them. Raises `InputError` as `read.read_map`.
     """
-    place = f"sky map {path}"
-    header, shape = _header(path, hdu, place)
-    if header is None:
-        return None
     wcs, scale = geometry(place, header, pixel_size, centre is not None, {})
     turn = None
     if centre is not None:
@@ -110,15 +108,15 @@ def extent(wcs: Any, turn: Floats, shape: tuple[int, int]) -> tuple[Disc | None,
     return Disc(middle, min(radius, np.pi)), bool(known.all())
 
 
-def _header(path: Path, wanted: int | str | None, place: str) -> tuple[Any, tuple[int, int]]:
-    """Header and (ny, nx) of the first image, or of the extension ``wanted``; (None, (0, 0)): a HEALPix table."""
+def header_of(path: Path, wanted: int | str | None, place: str) -> tuple[Any, tuple[int, int]] | None:
+    """Header and (ny, nx) of a file's first image, or of the extension ``wanted``; None: a HEALPix table."""
     plain = read_image(path) if wanted in (None, 0) else None
     if plain is not None and plain[1].ndim == 2:
         return plain[0], (plain[1].shape[0], plain[1].shape[1])
     with opened(path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again") as hdus:
         hdu, _ = chosen(hdus, wanted, place)
         if is_healpix(hdu):
-            return None, (0, 0)
+            return None
         return hdu.header.copy(), (int(hdu.header.get("NAXIS2", 1)), int(hdu.header.get("NAXIS1", 1)))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal, Self, cast
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -15,17 +16,23 @@ from zonda.core.data import Data, percent
 from zonda.core.errors import InputError
 from zonda.core.numerics.projection import share_outside
 from zonda.core.operator import Operator
+from zonda.core.storage.files import atomic_path
 
+from .array import ArrayMap, WorldCoordinates, check_shape, checked_unit
 from .beam import PIXELS_PER_FWHM
 from .cache import Cache
-from .footprint import Footprint, footprint, off_the_map, position
+from .footprint import Footprint, footprint, header_of, off_the_map, position
 
 
 class SkyParameters(Operator):
     """Parameters of `SkyMap`. What is computed of the map is kept from observation to observation."""
 
-    file: InputPath
+    file: InputPath | None = None
     """FITS image (with or without a celestial WCS) or HEALPix table. A relative path starts at the pipeline file's folder."""
+    map: ArrayMap | None = None
+    """In Python, in place of `file`: a numpy array (ny, nx), an astropy Quantity, or an HDU. Row 0 is the southern one."""
+    wcs: WorldCoordinates | None = None
+    """World coordinates of `map`: an astropy WCS, or FITS keywords. Without: give pixel_size and centre."""
     unit: str | None = None
     """Unit of the map: Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y), with a prefix (mK_CMB). Default: its header's."""
     pixel_size: Angle | None = Field(None, gt=0)
@@ -61,6 +68,21 @@ class SkyParameters(Operator):
     _cache: Cache = PrivateAttr(default_factory=Cache)
 
     @model_validator(mode="after")
+    def _one_map(self) -> SkyParameters:
+        if (self.file is None) == (self.map is None):
+            raise ValueError("give either file, the path of a FITS map, or in Python map, an array")
+        if self.map is None:
+            if self.wcs is not None:
+                raise ValueError("wcs belongs to map, an array; a file has world coordinates of its own")
+            return self
+        if self.hdu is not None:
+            raise ValueError("hdu is for files; give that HDU as map")
+        if self.wcs is not None:
+            check_shape(self.map, self.wcs)
+        checked_unit(self.map, self.unit)
+        return self
+
+    @model_validator(mode="after")
     def _consistent(self) -> SkyParameters:
         if isinstance(self.centre, Target) and self.centre.frame == "horizontal":
             raise ValueError("centre must be fixed on the sky (ICRS or galactic), not horizontal")
@@ -71,7 +93,24 @@ class SkyParameters(Operator):
     @property
     def place(self) -> str:
         """The map in messages."""
-        return f"{self.label}, sky map {self.file}"
+        return f"{self.label}, sky map {self.map.name if self.map else self.file}"
+
+    @property
+    def source(self) -> str:
+        """The map in one word: the name of its file, or what array it is."""
+        return self.map.name if self.map else cast(Path, self.file).name
+
+    def array(self) -> ArrayMap | None:
+        """The map in memory with its world coordinates; None: it is in `file`."""
+        return self.map.with_wcs(self.wcs) if self.map and self.wcs else self.map
+
+    def in_files(self, path: Path) -> Self:
+        """The map in memory as a file at ``path`` (`core.configuration.files.InMemory`). Raises `OutputError`."""
+        if (array := self.array()) is None:
+            return self
+        with atomic_path(path) as temporary:
+            array.write(temporary)
+        return self.model_copy(update={"file": path, "map": None, "wcs": None})
 
     def map_centre(self) -> Target:
         """The middle of the input map, for ``target: map``. Raises InputError where it has none of its own."""
@@ -84,11 +123,30 @@ class SkyParameters(Operator):
             raise InputError("the map has no centre on the sky (HEALPix, or no WCS)", place=self.place, cure=cure)
         return found
 
+    def _header(self) -> tuple[Any, tuple[int, int]] | None:
+        """Header and (ny, nx) of an image; None of a HEALPix map."""
+        array = self.array()
+        if array is not None:
+            return None if array.table is not None else (array.header, (array.values.shape[-2], array.values.shape[-1]))
+        return header_of(cast(Path, self.file), self.hdu, self.place)
+
     def _footprint(self) -> Footprint | None:
-        return footprint(self.file, self.pixel_size, self.centre if isinstance(self.centre, Target) else None, self.hdu)
+        found, centre = self._header(), self.centre if isinstance(self.centre, Target) else None
+        return None if found is None else footprint(*found, self.pixel_size, centre, self.place)
+
+    def _copies(self, data: Data) -> str:
+        """What to say of a map that goes with the target, where there are several; empty where it does not."""
+        found, targets = self._header(), len({o.centre for o in data.observations})
+        placeless = self.centre is None and found is not None and "CTYPE1" not in found[0]
+        if targets < 2 or not (self.centre == "target" or placeless):
+            return ""
+        cure = "give centre a position, or remove it for a map that knows its own"
+        return f"{self.label}: the map {self.source} is put on each of {targets} targets, as a copy of its own; {cure}"
 
     def check(self, data: Data) -> list[str]:
         """Whether the scans are about a point of the map, by its header; the share of their samples that is outside."""
+        if text := self._copies(data):
+            warnings.warn(text, stacklevel=2)
         if self.centre == "target" or (found := self._footprint()) is None:
             return []
         for text in dict.fromkeys(off_the_map(found, o.centre, self.label) for o in data.observations):

@@ -19,6 +19,7 @@ from zonda.core.storage.fits_image import read_image
 from zonda.core.types import Floats
 
 from . import stokes
+from .array import ArrayMap
 from .geometry import geometry
 from .healpix import is_healpix, read_healpix
 from .inputs import HealpixMap, Wanted, WcsMap
@@ -59,6 +60,15 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
             found = _image(place, np.asarray(hdu.data), hdu.header, wanted)
         found.notes = notes | found.notes
         return found
+
+
+def read_array(array: ArrayMap, place: str, **options: Any) -> WcsMap | HealpixMap:
+    """As `read_map`, of an array or HDU in memory."""
+    wanted = Wanted(**options)
+    if array.table is not None:
+        with reading(place, "FITS", "check the table"):
+            return read_healpix(array.table, place, wanted)
+    return _image(place, array.values, array.header, wanted)
 
 
 def _image(place: str, values: Floats, header: Any, wanted: Wanted) -> WcsMap:

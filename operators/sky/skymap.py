@@ -89,7 +89,7 @@ def _count(step: SkyMap, observation: Observation, state: SkyState) -> None:
         ra, dec = np.degrees(observation.centre)
         warnings.warn(
             f"{step.label}: no sample of {observation.name} around RA {ra:.4f} deg, Dec {dec:.4f} deg falls on the input map "
-            f"{step.file.name}; `centre: target` moves the map there",
+            f"{step.source}; `centre: target` moves the map there",
             stacklevel=3,
         )
     if behind:

@@ -9,8 +9,9 @@ import pytest
 
 from zonda.core import registry
 from zonda.core.cli import main
-from zonda.core.configuration.locate import locate
+from zonda.core.configuration.locate import folders, locate
 from zonda.core.configuration.pipeline_file import load
+from zonda.core.errors import InputError
 from zonda.core.registry import RegistryError
 from zonda.core.scene import Scene
 from zonda.core.site import Site
@@ -135,3 +136,11 @@ def test_check_warns_of_a_telescope_on_another_site(tmp_path: Path, capsys: pyte
     (tmp_path / "p.yaml").write_text(PIPELINE.format(site="GreenBank", instrument="mustang2"))
     assert main(["check", str(tmp_path / "p.yaml")]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_what_is_shipped_in_folders_are_pipelines():
+    """Beside validation/mustang2 there are claims.yaml, which is none."""
+    for path in folders().values():
+        assert load(path).operators
+    with pytest.raises(InputError, match="no such pipeline"):
+        locate("validation/claims")

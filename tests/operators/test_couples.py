@@ -63,7 +63,14 @@ def outputs(bench: Any, operator: Operator, changed: str) -> dict[str, np.ndarra
     return data.observations[0].detdata
 
 
-ACTING = {"Efficiency": {}, "HighpassFilter": {"frequency": "0.5 Hz"}, "CommonModeFilter": {}}
+ACTING = {
+    "Efficiency": {},
+    "HighpassFilter": {"frequency": "0.5 Hz"},
+    "CommonModeFilter": {},
+    "Detrend": {},
+    "Despline": {},
+    "Taper": {"share": "1"},
+}
 """Operators that make streams of streams. All others make theirs of nothing (tested by the conformance kit) or none."""
 
 

@@ -17,6 +17,7 @@ import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.wcs import WCS
 
 import zonda
 from zonda.core.data import Data
@@ -151,8 +152,21 @@ def same(a: Any, b: Any) -> bool:
 
 # ---- operators: (other parameters that the case needs, the change)
 
+
+def tangent(pixel: float) -> WCS:
+    """About the scene's target, pixels in arcsec."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], [75.0, 20.0], [32.5, 32.5]
+    wcs.wcs.cdelt = [-pixel / 3600, pixel / 3600]
+    return wcs
+
+
+ARRAY: dict[str, Any] = {"file": None, "map": np.hypot(*np.indices((64, 64)) - 31.5) / 1e3, "wcs": tangent(3.0), "unit": "K_RJ"}
+"""A map that is no file."""
+
 POINTING = {
     "target": ({}, {"target": "05h00m10s +20d00m00s"}),
+    "targets": ({}, {"targets": ["05h00m00s +20d00m00s", "05h00m10s +20d00m00s"]}),
     "scan_duration": ({}, {"scan_duration": "14 s"}),
     "scans": ({}, {"scans": 3}),
     "gap": ({"scans": 2}, {"gap": "60 s"}),
@@ -179,6 +193,18 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "acceleration": ({}, {"acceleration": "30 arcsec/s2"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
     },
+    "PointingRaster": POINTING | {
+        "width": ({}, {"width": "3 arcmin"}),
+        "height": ({}, {"height": "1 arcmin"}),
+        "spacing": ({}, {"spacing": "15 arcsec"}),
+        "speed": ({}, {"speed": "40 arcsec/s"}),
+        "acceleration": ({}, {"acceleration": "60 arcsec/s2"}),
+        "smooth": ({}, {"smooth": True}),
+        "position_angle": ({}, {"position_angle": "0 deg"}),
+        "angles": ({}, {"angles": "cross_hatch"}),
+        "axes": ({}, {"axes": "horizontal"}),
+        "flag_turnarounds": ({}, {"flag_turnarounds": True}),
+    },
     "PointingRecorded": {
         "file": ({}, {"file": "other.csv"}),
         "clock": ({}, {"clock": "scene"}),
@@ -190,6 +216,8 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
     },
     "SkyMap": {
         "file": ({}, {"file": "flux.fits"}),
+        "map": (ARRAY, {"map": 2 * ARRAY["map"]}),
+        "wcs": (ARRAY, {"wcs": tangent(4.0)}),
         "unit": ({}, {"unit": "mK_CMB"}),
         "pixel_size": ({}, {"pixel_size": "4 arcsec"}),
         "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
@@ -225,6 +253,12 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "lattice": ({}, {"lattice": 0.15}),
         "tolerance": ({}, {"tolerance": "0.01 %"}),
     },
+    "AtmosphereScreens": {
+        "observation": ({}, {"observation": 1}),
+        "moment": ({}, {"moment": "2 s"}),
+        "moments": ({}, {"moments": 2}),
+        "pixels": ({}, {"pixels": 8}),
+    },
     "WhiteNoise": {
         "net": ({}, {"net": "1 mK s(1/2)"}),
         "reference": ({"net": "1 mK s(1/2)"}, {"reference": "detector"}),
@@ -252,13 +286,20 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "degree": ({}, {"degree": 1}),
         "trim": ({}, {"trim": "1 s"}),
         "oversampling": ({}, {"oversampling": 8.0}),
+        "response": ({}, {"response": "bessel"}),
+        "mask": ({}, {"mask": {"radius": "20 arcsec"}}),
     },
+    "Detrend": {"order": ({}, {"order": 2}), "mask": ({}, {"mask": {"radius": "20 arcsec"}})},
+    "Despline": {"knots": ({}, {"knots": "5 s"})},
+    "Taper": {"share": ({}, {"share": "20 %"})},
     "CommonModeFilter": {
         "modes": ({}, {"modes": 2}),
         "method": ({}, {"method": "mean"}),
         "residual": ({}, {"residual": 1e-2}),
         "gap": ({"gap": 0.99}, {"gap": 1e-3}),
         "on_undetermined": ({"gap": 1e-3}, {"on_undetermined": "skip"}),
+        "scale": ({}, {"scale": "rms"}),
+        "mask": ({}, {"mask": {"radius": "20 arcsec"}}),
     },
     "BinMap": {
         "pixel": ({}, {"pixel": "3 arcsec"}),
@@ -291,6 +332,21 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "streams": ({}, {"streams": ["signal", "white"]}),
         "dtype": ({}, {"dtype": "float32"}),
     },
+    "ModeSpectrum": {
+        "modes": ({}, {"modes": 2}),
+        "delays": ({}, {"delays": 1}),
+        "delay": ({"delays": 1}, {"delay": "0.5 s"}),
+        "detectors": ({}, {"detectors": 5}),
+        "center": ({}, {"center": False}),
+        "normalize": ({}, {"normalize": True}),
+    },
+    "CompareStreams": {
+        "stream": ({}, {"stream": "pink"}),
+        "reference": ({}, {"reference": "pink"}),
+        "detectors": ({}, {"detectors": 3}),
+        "segment": ({}, {"segment": "0.5 s"}),
+    },
+    "MeasureFigures": {"metrics": ({}, {"metrics": ["central_rms"]})},
     "TransferFunction": {
         "modes": ({}, {"modes": "full"}),
         "bins": ({}, {"bins": 4}),
@@ -301,6 +357,22 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "least_coverage": ({}, {"least_coverage": 0.6}),
         "map": ({}, {"map": "chart"}),
     },
+    "CompareMaps": {
+        "map": ({}, {"map": "chart"}),
+        "reference": ({}, {"reference": "map"}),
+        "file": ({}, {"file": "map.fits"}),
+        "beam": ({}, {"beam": "20 arcsec"}),
+        "least_coverage": ({}, {"least_coverage": 0.6}),
+        "threshold": ({}, {"threshold": 3.0}),
+        "noise": ({}, {"noise": "map"}),
+        "bins": ({}, {"bins": 5}),
+    },
+    "MapSpectrum": {
+        "maps": ({}, {"maps": ["chart"]}),
+        "bins": ({}, {"bins": 5}),
+        "least_coverage": ({}, {"least_coverage": 0.6}),
+        "taper": ({}, {"taper": "20 arcsec"}),
+    },
     "SaveMap": {
         "central_diameter": ({}, {"central_diameter": "30 arcsec"}),
         "overwrite": ({}, {"overwrite": False}),
@@ -309,6 +381,9 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "smooth": ({}, {"smooth": "none"}),
         "central_diameter": ({}, {"central_diameter": "30 arcsec"}),
         "least_coverage": ({}, {"least_coverage": 0.5}),
+        "contours": ({}, {"contours": [-1.0, 1.0]}),
+        "formats": ({}, {"formats": ["svg"]}),
+        "dpi": ({}, {"dpi": 60.0}),
     },
     "Report": {"central_diameter": ({}, {"central_diameter": "30 arcsec"})},
 }  # fmt: skip
@@ -317,14 +392,21 @@ CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
     "AtmosphereLayers": ["AtmosphereLayers"],
+    "AtmosphereScreens": ["AtmosphereLayers", "AtmosphereScreens"],
     "WhiteNoise": ["WhiteNoise"],
     "PinkNoise": ["PinkNoise"],
     "Efficiency": ["SkyMap", "AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency"],
     "HighpassFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "HighpassFilter"],
     "CommonModeFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "CommonModeFilter"],
+    "Detrend": ["WhiteNoise", "PinkNoise", "Efficiency", "Detrend"],
+    "Despline": ["WhiteNoise", "PinkNoise", "Efficiency", "Despline"],
+    "Taper": ["WhiteNoise", "PinkNoise", "Efficiency", "Taper"],
     "BinMap": ["SkyMap", "WhiteNoise", "Efficiency", "BinMap"],
     "PowerSpectrum": ["WhiteNoise", "PinkNoise", "Efficiency", "PowerSpectrum"],
     "TimeStreams": ["WhiteNoise", "Efficiency", "TimeStreams"],
+    "ModeSpectrum": ["WhiteNoise", "PinkNoise", "Efficiency", "ModeSpectrum"],
+    "CompareStreams": ["WhiteNoise", "PinkNoise", "Efficiency", "CompareStreams"],
+    "MeasureFigures": ["WhiteNoise", "Efficiency", "BinMap", "MeasureFigures"],
     "SaveTOD": ["WhiteNoise", "Efficiency", "SaveTOD"],
     "SaveMap": ["WhiteNoise", "Efficiency", "BinMap", "SaveMap"],
     "TransferFunction": [
@@ -337,6 +419,8 @@ CHAINS = {
         "BinMap",
         "TransferFunction",
     ],
+    "CompareMaps": ["SkyMap", "WhiteNoise", "Efficiency", "BinMap", "CompareMaps"],
+    "MapSpectrum": ["WhiteNoise", "Efficiency", "BinMap", "MapSpectrum"],
     "Plots": ["WhiteNoise", "Efficiency", "BinMap", "Plots"],
     "Report": ["WhiteNoise", "Efficiency", "BinMap", "Report"],
 }
@@ -349,6 +433,9 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "PointingDaisy": SCAN,
     "PointingStare": {"scan_duration": "12 s"},
     "PointingBackAndForth": TURN,
+    "PointingRaster": {"scan_duration": "32 s", "scans": 2, "width": "2 arcmin", "speed": "30 arcsec/s"},
+    "CompareStreams": {"reference": "white"},
+    "MeasureFigures": {"metrics": ["coverage", "central_rms"]},
     "PointingRecorded": {"file": "scan.csv"},
 }
 
@@ -358,7 +445,7 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 
     def step(other: str) -> Any:
         values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
-        if "file" in values:
+        if values.get("file") is not None:
             values = values | {"file": maps / values["file"]}
         if which == "BinMap" == other and "nside" in values:
             values.pop("pixel", None)
@@ -372,12 +459,15 @@ REFUSALS = {
     ("BinMap", "projection"): "'TAN'",
     ("SkyMap", "missing"): "NaN",
     ("TransferFunction", "map"): "there is no map 'chart'",
+    ("CompareMaps", "map"): "there is no map 'chart'",
+    ("MapSpectrum", "maps"): "no TAN map 'chart'",
     ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
     ("SaveMap", "overwrite"): "is there already",
     ("PointingRecorded", "clock"): "is too large",
     ("PointingRecorded", "celestial"): "no boresight_radec",
     ("PointingDaisy", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingStare", "check_limits"): "dish's largest speed of the azimuth axis",
+    ("PointingRaster", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingBackAndForth", "check_limits"): "dish's largest speed of the azimuth axis",
 }
 """What a changed parameter is answered with, where it is not another result."""
@@ -434,6 +524,9 @@ def test_the_name_of_a_step_is_its_label(name: str, maps: Path) -> None:
         ("BinMap", {"nside": 1024, "pixel": "3 arcsec"}),
         ("BinMap", {"nside": 1024, "width": "3 arcmin"}),
         ("BinMap", {"ordering": "nested"}),
+        ("HighpassFilter", {"response": "bessel", "oversampling": 12}),
+        ("HighpassFilter", {"degree": None}),
+        ("CommonModeFilter", {"method": "mean", "scale": "rms"}),
         ("CommonModeFilter", {"method": "mean", "modes": 3}),
         ("CommonModeFilter", {"method": "mean", "residual": 1e-3}),
         ("CommonModeFilter", {"method": "mean", "gap": 0.5}),

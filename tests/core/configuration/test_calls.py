@@ -44,7 +44,8 @@ def scene(**changes: Any) -> zonda.Scene:
         (lambda: zonda.PointingDaisy(radius="1 furlong"), "unknown unit 'furlong'", "furlong", "e.g. '4 arcmin'"),
         (lambda: zonda.PointingDaisy(offsets=[("1 arcmin", "2 K")]), "offsets.0.1: expected an angle", "K", "not an angle"),
         (lambda: zonda.PointingDaisy(target="M31"), "target: cannot read 'M31' as a position", "'M31'", "e.g. 05h00m00s"),
-        (lambda: zonda.SkyMap(), "SkyMap needs 'file'", "SkyMap()", "add file=..."),
+        (lambda: zonda.PointingRecorded(), "PointingRecorded needs 'file'", "PointingRecorded()", "add file=..."),
+        (lambda: zonda.SkyMap(), "give either file, the path of a FITS map, or in Python map, an array", "SkyMap()", ""),
         (lambda: zonda.WhiteNoise(model="foo"), "model: unknown noise model 'foo'", "'foo'", "fixed_net"),
         (
             lambda: zonda.WhiteNoise(model={"name": "background_limited", "mods": 1}),
@@ -151,7 +152,7 @@ STEPS = [zonda.PointingDaisy(scan_duration="2 s"), zonda.WhiteNoise(), zonda.Eff
         (lambda: zonda.Pipeline(STEPS).run(scene(), output=3), ["output is the path of a folder, not 3"]),
         (lambda: zonda.Pipeline(STEPS).run(scene(), output=__file__), ["there is a file of that name"]),
         (lambda: zonda.Pipeline(STEPS).run(scene(), keep="signal"), ["keep is a list of streams", "keep=['signal']"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), keep=["sgnal"]), ["stream 'sgnal' was asked to be kept"]),
+        (lambda: zonda.Pipeline(STEPS).run(scene(), keep=["sgnal"]), ["the stream 'sgnal' cannot be kept: no step makes it"]),
         (lambda: zonda.load(3), ["3: is not a path"]),
         (lambda: zonda.load("mustang2_clustr"), ["did you mean 'mustang2_cluster'?"]),
         (lambda: zonda.load("mustang2_cluster", "seed=a"), ["seed: expected a whole number, got 'a'", "1 mistake"]),

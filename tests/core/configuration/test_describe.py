@@ -20,8 +20,10 @@ from zonda.core.registry import operators
         ("BinMap", "pixel", "an angle such as '4 arcmin'"),
         ("BinMap", "frame", "'icrs' or 'galactic'"),
         ("BinMap", "projection", "'TAN'"),
-        ("BinMap", "half_difference", "True or False"),
+        ("BinMap", "half_difference", "'scans', 'detectors', 'halves', 'directions' or 'radii', or True or False"),
         ("SkyMap", "file", "the path of a file"),
+        ("SkyMap", "map", "an array"),
+        ("SkyMap", "wcs", "an astropy WCS"),
         ("SkyMap", "beam", "'gaussian' or 'none'"),
         ("SkyMap", "centre", "'target', or a position such as '05h00m00s +20d00m00s'"),
         ("PointingDaisy", "offsets", "'none' or 'box', or a list"),
@@ -57,7 +59,7 @@ def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
 def test_the_signature_is_what_a_user_writes() -> None:
     signature = inspect.signature(zonda.PointingDaisy)
     assert signature.parameters["radius"].default == "4 arcmin"
-    assert inspect.signature(zonda.SkyMap).parameters["file"].default is inspect.Parameter.empty
+    assert inspect.signature(zonda.PointingRecorded).parameters["file"].default is inspect.Parameter.empty
     assert "Annotated" not in str(signature)
 
 

@@ -149,7 +149,7 @@ LINE = 7  # of the step in the tests below, after the head and 'operators:'
             "- ToyPoynting: {duration: 1 s}",
             5,
             11,
-            ["unknown operator 'ToyPoynting'", "did you mean 'ToyPointing'?", "installed: "],
+            ["unknown operator 'ToyPoynting'", "did you mean 'ToyPointing'?", "`zonda plugins` lists all"],
         ),
         ("- ToyPointing {duration: 1 s}", 5, 21, ["a colon is missing"]),
         ("- ToyPointing:\n    duration: 1 s", 5, 8, ["'duration' may be indented too little", "indent this under the operator"]),

@@ -119,3 +119,26 @@ def test_free_memory_may_fluctuate_about_a_limit(file, no_planning, monkeypatch)
         monkeypatch.setattr(remembered, "available_memory", lambda power=power: int(2**power))
         with pytest.raises(RuntimeError, match="planned again"):
             summary(file)
+
+
+def test_what_a_run_does_not_do(file, tmp_path):
+    """The structure leaves out white noise for a map of hits, and the run says so."""
+    from zonda.core.configuration.pipeline_file import parse
+
+    text = """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+runs: {quiet: {without: [white]}}
+operators:
+  - PointingDaisy: {scan_duration: 20 s}
+  - SkyMap: {file: data/merging_cluster.fits}
+  - WhiteNoise
+  - Efficiency
+  - BinMap: {pixel: 2 arcsec, contents: hits}
+  - SaveMap
+"""
+    hits = parse(text, name="hits", folder=tmp_path)
+    assert summary(hits).omitted(hits) == ["SkyMap", "WhiteNoise", "Efficiency", "signal quiet"]
+    assert summary(file).omitted(file) == []

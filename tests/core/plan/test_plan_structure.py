@@ -52,14 +52,14 @@ def test_everything_is_needed_where_a_map_is_written():
 def test_a_hit_map_draws_nothing():
     found, runs, structure = acting(POINT, SKY, AIR, NOISE, SUM, FILTER, HITS, SAVE, runs=RUNS)
     assert found == {"Point", "Hits", "Save"}
-    assert not runs, "a companion would count the same hits"
+    assert not runs, "their maps would have the same hits"
     assert all(row.reason for row in structure.rows)
 
 
 def test_a_run_without_a_map_bins_nothing():
     found, runs, _ = acting(POINT, SKY, AIR, NOISE, SUM, TOD, FILTER, MAP, runs=RUNS)
     assert found == {"Point", "Sky", "Air", "Noise", "Sum", "Tod"}
-    assert not runs, "files of time streams are written in the main run only"
+    assert not runs, "files of time streams are of the complete signal only"
 
 
 def test_each_further_signal_is_formed_filtered_and_mapped():
@@ -88,6 +88,12 @@ def test_a_spectrum_that_nobody_draws():
     found, _, structure = acting(POINT, SKY, SUM, SPECTRUM, MAP, SAVE)
     assert "Spectrum" not in found
     assert [r.reason for r in structure.rows] == ["no step writes or draws its spectrum"]
+
+
+def test_an_output_that_shows_a_component():
+    """It reads the model that the component was made with."""
+    shows = kind("Shows", {"boresight"}, {"screens"}, {"atmosphere"}, base=Output)
+    assert acting(POINT, AIR, NOISE, shows)[0] == {"Point", "Air", "Shows"}
 
 
 def test_products_are_the_output_where_nothing_is_written():

@@ -312,11 +312,21 @@ def test_a_step_that_is_not_linear_acts_on_each_signal_and_they_share_its_mask()
     pipeline, data = observed(steps(HIGHPASS, Holes()), BOTH)
     assert pipeline.signals.remainders == {}
     said = {(who, what): text for who, what, text in data.tally}
-    assert said["sky", "modes"] == "its own, not those of the complete signal: Holes is not linear"
+    assert said["sky", "modes"] == "its own from Holes on, which is not linear, instead of those of the complete signal"
     whole, sky, rest = (data.products[n] for n in ("map", "sky/map", "rest/map"))
     assert 0 < whole.hits.sum() < 0.99 * 2 * 19 * 6000
     assert same(whole, sky, "hits")
     assert same(whole, rest, "hits")
+
+
+def test_modes_of_the_complete_signal_are_taken_up_to_the_first_step_that_is_not_linear():
+    """`Unsaid` changes nothing, so that before it the map keeps its bits; behind it the modes are those of the sky."""
+    highpass, common = FILTERS["modes"]
+    _, full = observed(steps(highpass, common), {"sky": SKY})
+    _, before = observed(steps(highpass, common, Unsaid()), {"sky": SKY})
+    _, behind = observed(steps(highpass, Unsaid(), common), {"sky": SKY})
+    assert same(full.products["sky/map"], before.products["sky/map"], "signal")
+    assert np.nanstd(behind.products["sky/map"].signal) < 0.9 * np.nanstd(full.products["sky/map"].signal)
 
 
 def test_unfiltered_signals_share_the_mask_of_the_filters_in_maps_with_noise_of_their_own():

@@ -659,7 +659,8 @@ def test_outputs_are_the_fluctuations_along_each_line_of_sight() -> None:
 
 
 def test_outputs_are_made_only_where_asked_for() -> None:
-    assert operator().provides == AtmosphereLayers.provides == {"atmosphere", "transmission"}
+    assert operator().provides == {"atmosphere", "transmission"}
+    assert AtmosphereLayers.provides == {"atmosphere", "transmission", "pwv", "opacity", "path_delay"}, "what may be asked for"
     o = observe(5.0)
     assert set(operator().prepare(o).fields) == {"emission", "transmission"}
     with pytest.raises(ZondaError, match="outputs"):

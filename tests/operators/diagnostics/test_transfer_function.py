@@ -11,8 +11,8 @@ import zonda
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
+from zonda.operators.diagnostics.drawing.plots import plot_transfer
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
-from zonda.operators.diagnostics.plots import plot_transfer
 from zonda.operators.diagnostics.transfer_function import Transfer, TransferFunction, compare, window_of
 
 SIDE, PIXEL = 64, 4 * ARCSEC

@@ -12,8 +12,8 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import OutputError, PipelineError
+from zonda.core.maps import map_file
 from zonda.core.maps.map_product import MapProduct
-from zonda.operators.io import map_file
 from zonda.operators.io.save_map import SaveMap
 
 ARCSEC = np.pi / 648000

@@ -6,11 +6,11 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
+from zonda.core.maps.units import parse_unit
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.operators.sky.geometry import placed
 from zonda.operators.sky.inputs import HealpixMap, WcsMap
 from zonda.operators.sky.read import read_map
-from zonda.operators.sky.units import parse_unit
 
 ARCSEC = np.pi / 648000
 

@@ -1,0 +1,50 @@
+"""What the shell offers when Tab is pressed: names, found without importing what they stand for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import click
+
+
+def pipelines(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[Any]:
+    """Shipped pipelines, and YAML files and folders on disk."""
+    from click.shell_completion import CompletionItem
+
+    from ..configuration.locate import shipped
+
+    folder, _, begin = incomplete.rpartition("/")
+    names = [name for name in shipped() if name.startswith(incomplete)]
+    try:
+        beside = sorted(
+            p for p in Path(folder or ("/" if incomplete.startswith("/") else ".")).iterdir() if p.name.startswith(begin)
+        )
+    except OSError:
+        beside = []
+    before = incomplete[: len(incomplete) - len(begin)]
+    for path in beside:
+        if path.name.startswith(".") and not begin.startswith("."):
+            continue
+        if path.is_dir() or path.suffix in (".yaml", ".yml"):
+            names.append(before + path.name + ("/" if path.is_dir() else ""))
+    return [CompletionItem(name) for name in names]
+
+
+def instruments(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[Any]:
+    """Registered instruments."""
+    return _names("zonda.instruments", incomplete)
+
+
+def sites(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[Any]:
+    """Registered sites."""
+    return _names("zonda.sites", incomplete)
+
+
+def _names(group: str, incomplete: str) -> list[Any]:
+    from click.shell_completion import CompletionItem
+
+    from ..discovery import discover
+
+    return [CompletionItem(name) for name in sorted({found.name for found in discover(group)}) if name.startswith(incomplete)]

@@ -1,0 +1,141 @@
+"""The arrays of a map, and where its pixels are on the sky."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..numerics import tangent
+from ..numerics.sphere import separation
+from ..types import Floats
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+    from ..instrument import Band
+    from ..numerics.tangent import TangentWcs
+    from ..storage.fits_image import Cards
+
+SMALL = 1 << 20
+"""Pixels of a map whose distances from the centre are kept."""
+
+
+@dataclass
+class MapArrays:
+    """A map in the TAN projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the pixels ``pixels``.
+
+    Attributes
+    ----------
+    signal
+        Weighted mean of the samples, `unit`; NaN where hits == 0.
+    hits
+        Number of samples, int64.
+    weights
+        Sum of the samples' weights: K^-2 (inverse variance), or a plain count (uniform).
+    noise
+        Standard deviation of ``signal`` (after smoothing, where it is smoothed), `unit`; NaN where unknown.
+    half_difference
+        Noise map from the difference of two halves of the samples (``difference``: which, ``even - odd scans``),
+        (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2): its variance is that of ``signal`` where both have hits; NaN elsewhere.
+    header
+        Keywords of the WCS (TAN maps), else None; a dict that `astropy.io.fits.Header` takes.
+    centre
+        (lon, lat) [rad] of the map's centre in ``frame``.
+    pixel
+        Side of a pixel [rad]; for HEALPix the square root of its area.
+    nside, nest, pixels
+        HEALPix parameters and sorted pixel numbers, else 0, False, None.
+    fwhm
+        Main-beam FWHM of the instrument [rad]. ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
+    scans
+        Names of the observations in it.
+    sample_rate
+        Of all scans [Hz]; 0 where it is unknown or they differ.
+    """
+
+    signal: Floats
+    hits: NDArray[np.int64]
+    weights: Floats
+    noise: Floats
+    half_difference: Floats | None
+    header: Cards | Header | None
+    centre: tuple[float, float]
+    pixel: float
+    frame: str = "icrs"
+    unit: str = "K_RJ"
+    weighting: Literal["uniform", "inverse_variance"] = "uniform"
+    noise_from: Literal["net", "scatter"] = "net"
+    nside: int = 0
+    nest: bool = False
+    pixels: NDArray[np.int64] | None = None
+    fwhm: float = 0.0
+    smoothed_by: float = 0.0
+    scans: list[str] = field(default_factory=list)
+    sample_rate: float = 0.0
+    contents: Literal["all", "hits"] = "all"
+    """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
+    difference: str = "even - odd scans"
+    band: Band | None = None
+    """Of the run: what `to` converts with; None: not known."""
+
+    @property
+    def wcs(self) -> Any:
+        """The `astropy.wcs.WCS` of a TAN map."""
+        from astropy.wcs import WCS
+
+        if self.header is None:
+            raise InputError("a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy")
+        return WCS(self.header)
+
+    @property
+    def resolution(self) -> float:
+        """FWHM [rad] of the beam and of what smoothed the map."""
+        return math.hypot(self.fwhm, self.smoothed_by)
+
+    def distance(self) -> Floats:
+        """Angle [rad] of every pixel from the centre, shape of ``signal``."""
+        if self.header is not None:
+            find = _tangent_distance if self.signal.size <= SMALL else _tangent_distance.__wrapped__
+            world = tangent.plain(self.header) or self.header.tostring()
+            return find(world, self.signal.shape, self.centre)
+        import healpy
+
+        colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
+        return separation(phi, np.pi / 2 - colatitude, self.centre)
+
+    def seconds_per_beam(self) -> Floats | float | None:
+        """What one sample in a pixel adds to the integration time of all detectors per beam [s]: times ``hits``, that time.
+
+            1 / sample rate x beam area / pixel area,   pi FWHM^2 / (4 ln 2) / pixel^2 (cos^-3 of the distance, TAN)
+
+        The beam is the telescope's, not what smoothing made of it. One number where pixels are equal to 0.1 %, else an array,
+        shape of ``signal``; None where the rate or the beam is not known.
+        """
+        if not (self.sample_rate > 0 and self.fwhm > 0):
+            return None
+        per_pixel = math.pi / math.log(16) * (self.fwhm / self.pixel) ** 2 / self.sample_rate
+        if self.header is None:
+            return per_pixel
+        larger = np.cos(self.distance()) ** -3
+        return per_pixel if larger.max() < 1.001 else per_pixel * larger
+
+
+@lru_cache(maxsize=1)  # the maps of all signals share it
+def _tangent_distance(world: TangentWcs | str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
+    """``world``: what the header says, or the header itself."""
+    wcs: Any = world
+    if isinstance(world, str):
+        from astropy.wcs import WCS
+
+        wcs = WCS(world)
+    y, x = np.indices(shape)
+    phi, theta = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
+    found = separation(phi, theta, centre)
+    found.flags.writeable = False
+    return found

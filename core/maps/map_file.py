@@ -1,0 +1,253 @@
+"""Map files: FITS images with world coordinates or partial HEALPix tables, and where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data import Data
+from ..errors import OutputError
+from ..numerics import tangent
+from ..storage.files import atomic_path
+from ..storage.fits_image import BLOCK, Cards, image_pieces
+from ..types import AnyFloats
+from .map_arrays import MapArrays
+from .units import scale_of
+
+PLANES = ("signal", "hits", "weights", "noise", "half_difference")
+"""Planes a map product may have; `signal` always, but for a map of hits alone."""
+_MEANING = {
+    "signal": "brightness",
+    "hits": "samples per pixel",
+    "weights": "sum of weights",
+    "noise": "standard error per pixel",
+    "half_difference": "noise from the difference of two halves",
+    "source_free": "map of all but the sky",
+}
+_SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
+_COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What all map files of a run say alike.
+
+    Attributes
+    ----------
+    cards
+        For the first header: who made it, with what; the resolved YAML as HISTORY.
+    tables
+        The resolved YAML (a row per line), the plan and the tally: binary tables of text, as they stand at a file's end.
+    """
+
+    cards: Cards
+    tables: bytes
+
+    @classmethod
+    def of_a_map(cls, product: MapArrays) -> Provenance:
+        """What is known of a map apart from its run."""
+        from zonda import __version__
+
+        cards = Cards([("ORIGIN", "zonda", "simulated, not observed"), ("CREATOR", f"zonda {__version__}", "software")])
+        if product.band is not None:
+            cards["RESTFRQ"] = product.band.centre, "[Hz] centre of the band"
+        return cls(cards.add(Cards([("NSCANS", len(product.scans), "scans")])), b"")
+
+    @classmethod
+    def of(cls, data: Data) -> Provenance:
+        """Provenance of a run that has ended."""
+        return cls(_origin(data), b"".join(_tables(data)))
+
+
+@dataclass(frozen=True)
+class MapFile:
+    """What a file shows of a product.
+
+    Attributes
+    ----------
+    name
+        Of what is shown, e.g. ``noiseless/map``.
+    product
+        Whose pixels, frame and beam these are.
+    planes
+        ``signal``, ``hits`` ...: (ny, nx) each on a WCS grid, (n_pix,) on HEALPix; NaN where nothing is known.
+    cards
+        More of the header of the first image, or of the table.
+    """
+
+    name: str
+    product: MapArrays
+    planes: dict[str, AnyFloats]
+    cards: Cards = field(default_factory=Cards)
+
+    @classmethod
+    def of(cls, name: str, product: MapArrays) -> MapFile:
+        """With the planes that a product has."""
+        wanted = PLANES if product.contents == "all" else ("hits",)
+        found = {plane: getattr(product, plane) for plane in wanted}
+        return cls(name, product, {plane: values for plane, values in found.items() if values is not None})
+
+    def unit(self, plane: str) -> str:
+        """FITS unit; none for counts."""
+        unit = scale_of(self.product.unit)[0]
+        if plane == "weights":
+            inverse = f"{unit}-2" if unit.isalpha() else f"({unit})-2"
+            return inverse if self.product.weighting == "inverse_variance" else ""
+        return "" if plane == "hits" else unit
+
+    @property
+    def beam(self) -> Cards:
+        """The resolution of the map."""
+        product = self.product
+        degrees = float(np.degrees(product.resolution))
+        what = "[deg] FWHM: beam, smoothing in quadrature" if product.smoothed_by else "[deg] FWHM of the beam"
+        return Cards([("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")] if degrees else ())
+
+    @property
+    def halves(self) -> Cards:
+        """What `half_difference` is the difference of."""
+        return Cards([("JACKKNIF", ascii_text(self.product.difference), "halves that were subtracted")])
+
+    def first(self, about: Provenance) -> Cards:
+        """Cards of the first header: the name, where it comes from, and its own cards."""
+        return Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(about.cards)
+
+    def write(self, path: Path, about: Provenance) -> Path:
+        """Write it atomically; its path. Raises `OutputError` where it cannot be written."""
+        with atomic_path(path) as temporary:
+            if self.product.header is None:
+                self._write_table(temporary, about)
+            with open(temporary, "ab") as file:
+                for piece in self._images(about) if self.product.header is not None else ():
+                    file.write(piece)
+                file.write(about.tables)
+        return path
+
+    def _images(self, about: Provenance) -> Iterator[bytes]:
+        world = (tangent.plain(self.product.header) or self.product.wcs).to_header(relax=True)
+        for k, (name, plane) in enumerate(self.planes.items()):
+            header = Cards((key, world[key], world.comments[key]) for key in world if key not in ("", "COMMENT", "HISTORY"))
+            header["EXTNAME"] = name.upper(), "extension name"
+            if unit := self.unit(name):
+                header["BUNIT"] = unit, _MEANING[name]
+            if (scale := scale_of(self.product.unit)[1]) and name not in ("hits", "weights"):
+                header["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
+            if name not in ("hits", "weights"):
+                header.add(self.beam)
+            if name == "half_difference":
+                header.add(self.halves)
+            if k == 0:
+                header.add(self.first(about)).add(self.cards)
+            yield from image_pieces(header, plane, extension=k > 0, dtype=_type(name, plane))
+
+    def _write_table(self, path: Path, about: Provenance) -> None:
+        """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that healpy reads."""
+        from astropy.io import fits
+
+        product = self.product
+        columns = [fits.Column("PIXEL", "K", array=product.pixels)]
+        for name, plane in self.planes.items():
+            values: NDArray[Any] = np.asarray(plane, _type(name, plane))
+            code = "D" if values.dtype.kind == "f" else "K" if values.dtype.itemsize == 8 else "J"
+            columns.append(fits.Column(name.upper(), code, unit=self.unit(name) or None, array=values))
+        table = fits.BinTableHDU.from_columns(columns, name="MAP")
+        made = Cards(
+            [
+                ("PIXTYPE", "HEALPIX", "HEALPix pixelization"),
+                ("ORDERING", "NESTED" if product.nest else "RING", "pixel ordering"),
+                ("COORDSYS", _COORDSYS[product.frame], f"{product.frame}"),
+                ("NSIDE", product.nside, "resolution"),
+                ("INDXSCHM", "EXPLICIT", "pixel numbers are in the column PIXEL"),
+                ("OBJECT", "PARTIAL", "not all of the sky"),
+            ]
+        )
+        if scale := scale_of(product.unit)[1]:
+            made["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
+        made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards())
+        made.add(self.first(about)).add(self.cards)
+        hdus = [fits.PrimaryHDU(), table]
+        for hdu, more in zip(hdus, (self.first(about), made), strict=True):
+            for key, value in more.items():
+                hdu.header[key] = value, more.comments.get(key, "")
+            for line in more.history:
+                hdu.header.add_history(line or " ")
+        fits.HDUList(hdus).writeto(path, output_verify="exception")
+
+
+def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
+    """`MapProduct.write`."""
+    path = Path(path).expanduser()
+    if path.exists() and not overwrite:
+        raise OutputError("is there already", place=str(path), cure="choose another name, or write overwrite=True")
+    return MapFile.of("map", product).write(path, Provenance.of_a_map(product))
+
+
+def _type(name: str, plane: Any) -> np.dtype[Any]:
+    """Type of numbers as they are written: hits as integers, everything else as float64."""
+    if name == "hits" and (plane.dtype.kind in "iu" or np.array_equal(plane, np.rint(plane))):
+        return np.dtype(np.int64 if np.max(plane, initial=0) > 2**31 - 1 else np.int32)
+    return np.dtype(np.float64)
+
+
+def _origin(data: Data) -> Cards:
+    """Where the data come from; the command and the resolved YAML as history."""
+    import zonda
+
+    scene, provenance = data.scene, data.provenance
+    cards = Cards(
+        [
+            ("ORIGIN", "zonda", "simulated, not observed"),
+            ("CREATOR", f"zonda {provenance.get('versions', {}).get('zonda', zonda.__version__)}", "software"),
+            ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
+            ("SEED", int(scene.seed), "root of all random numbers"),
+            ("TELESCOP", ascii_text(scene.instrument.telescope.name)),
+            ("INSTRUME", ascii_text(scene.instrument.name)),
+            ("SITE", ascii_text(scene.site.name)),
+            ("DATE-OBS", str(scene.time), "start of the first scan, UTC"),
+            ("RESTFRQ", scene.instrument.band.centre, "[Hz] centre of the band"),
+            ("NSCANS", len(data.observations), "scans"),
+        ]
+    )
+    if command := str(provenance.get("command", "")):
+        cards.history.append(ascii_text(command))
+    cards.history += map(ascii_text, str(provenance.get("resolved_yaml", "")).splitlines())
+    return cards
+
+
+def ascii_text(text: str) -> str:
+    """FITS holds printable ASCII only: anything else becomes a Python escape (``\\xe9``)."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in text)
+
+
+def _tables(data: Data) -> Iterable[bytes]:
+    if text := str(data.provenance.get("resolved_yaml", "")):
+        yield _text_table("RESOLVED_YAML", {"LINE": text.splitlines()})
+    if plan := data.provenance.get("plan"):
+        names = ("EFFECT", "DECISION", "BOUND", "FORMULA")
+        yield _text_table("PLAN", {n: [str(r[k]) for r in plan] for k, n in enumerate(names)})
+    if rows := list(data.tally):
+        who, what, value = ([str(r[k]) for r in rows] for k in range(3))
+        yield _text_table("TALLY", {"STEP": who, "WHAT": what, "VALUE": value})
+
+
+def _text_table(name: str, columns: dict[str, list[str]]) -> bytes:
+    """FITS 4.0, section 7.3; see `core.storage.fits_image` for why not astropy."""
+    plain = {title: [ascii_text(t) for t in texts] for title, texts in columns.items()}
+    widths = {title: max([1, *map(len, texts)]) for title, texts in plain.items()}
+    rows = list(zip(*([t.ljust(widths[title], "\0") for t in texts] for title, texts in plain.items()), strict=True))
+    cards = Cards([("XTENSION", "BINTABLE", "binary table extension"), ("BITPIX", 8), ("NAXIS", 2)])
+    sizes = {"NAXIS1": sum(widths.values()), "NAXIS2": len(rows), "PCOUNT": 0, "GCOUNT": 1, "TFIELDS": len(plain)}
+    for key, size in sizes.items():
+        cards[key] = size
+    for k, (title, width) in enumerate(widths.items(), 1):
+        cards[f"TTYPE{k}"], cards[f"TFORM{k}"] = title, f"{width}A"
+    cards["EXTNAME"] = name
+    body = "".join("".join(row) for row in rows).encode("ascii")
+    return cards.tostring().encode("ascii") + body + bytes(-len(body) % BLOCK)

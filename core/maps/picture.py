@@ -1,0 +1,100 @@
+"""Quick pictures of maps for notebooks; those of reports are made by operators."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..configuration.diagnostics import nearest
+from ..errors import InputError
+from ..types import AnyFloats
+from .map_arrays import MapArrays
+
+PLANES = ("signal", "noise", "hits", "weights", "half_difference")
+SHOWN = 99.5
+"""Per cent of the pixels that the colours cover by default."""
+FAR = 0.1
+"""A map whose lowest brightness is more than this share of its highest is far from zero (one with the mean emission in it)."""
+PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))
+
+
+@dataclass
+class Shown:
+    """What a picture shows: ``values`` (ny, nx), NaN grey, in ``unit``; ``fwhm`` [rad] of a beam, 0: none."""
+
+    values: AnyFloats
+    wcs: Any
+    unit: str
+    title: str = ""
+    around_zero: bool = True
+    fwhm: float = 0.0
+
+
+def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float | None) -> Any:
+    """`MapProduct.plot`."""
+    values: AnyFloats | None = getattr(product, plane, None) if plane in PLANES else None
+    if values is None:
+        have = [name for name in PLANES if getattr(product, name) is not None]
+        cure = nearest(plane, have) or f"choose from: {', '.join(have)}"
+        raise InputError(f"the map has no plane {plane!r}", place="map.plot", cure=cure)
+    values = np.where(product.hits > 0, values, np.nan)
+    if product.header is None:
+        from .healpix_plane import on_plane
+
+        flat, wcs = on_plane(product, {plane: values})
+        values = flat[plane]
+    else:
+        wcs = product.wcs
+    unit = {"hits": "samples per pixel", "weights": "weight"}.get(plane, product.unit)
+    around_zero = plane in ("signal", "half_difference")
+    fwhm = product.resolution if plane == "signal" else 0.0
+    shown = Shown(values, wcs, unit, title or plane.replace("_", " "), around_zero, fwhm)
+    return draw(shown, ax, limit)
+
+
+def draw(shown: Shown, ax: Any, limit: float | None) -> Any:
+    """A picture with a colour bar, in ``ax`` or a new figure; its Axes. ``limit``: where the colours end."""
+    import matplotlib as mpl
+    from matplotlib import pyplot as plt
+
+    if ax is None:
+        ax = plt.figure(figsize=(6.4, 5.2), layout="constrained").add_subplot(projection=shown.wcs)
+    values, wcs, unit = shown.values, shown.wcs, shown.unit
+    low, top, around_zero = _range(values[np.isfinite(values)], limit, shown.around_zero)
+    size, letter = 1.0, ""
+    if unit in ("K_RJ", "K_CMB"):
+        size, letter = next(((s, p) for s, p in PREFIXES if max(abs(low), abs(top)) >= s), PREFIXES[-1])
+    colours = mpl.colormaps["RdBu_r" if around_zero else "viridis"].with_extremes(bad="0.85")
+    picture = ax.imshow(values / size, origin="lower", cmap=colours, vmin=low / size, vmax=top / size, interpolation="nearest")
+    ax.figure.colorbar(picture, ax=ax, label=letter + unit)
+    if hasattr(ax, "coords"):
+        for axis, name in zip(ax.coords, wcs.wcs.ctype, strict=True):
+            axis.set_axislabel({"RA--": "right ascension", "DEC-": "declination", "GLON": "l", "GLAT": "b"}.get(name[:4], name))
+    if shown.fwhm > 0:
+        _beam(ax, math.degrees(shown.fwhm) / abs(float(np.linalg.det(wcs.pixel_scale_matrix))) ** 0.5)
+    ax.set_title(shown.title)
+    return ax
+
+
+def _range(known: AnyFloats, limit: float | None, around_zero: bool) -> tuple[float, float, bool]:
+    """(lowest, highest) brightness of the colours; whether they lie about zero: not those of a map that is far from it."""
+    if not known.size:
+        return -(limit or 1.0), limit or 1.0, around_zero
+    low, top = (float(v) for v in np.percentile(known, [(100 - SHOWN) / 2, (100 + SHOWN) / 2]))
+    if around_zero and low <= FAR * top and top >= FAR * low:
+        top = limit or max(abs(low), abs(top)) or 1.0
+        return -top, top, True
+    top = top if limit is None else limit
+    return (low, top, False) if low < top else (low, low + (abs(low) or 1.0), False)
+
+
+def _beam(ax: Any, across: float) -> None:
+    """A circle ``across`` pixels wide in the lower left corner."""
+    from matplotlib.patches import Circle
+
+    left, bottom = ax.get_xlim()[0], ax.get_ylim()[0]
+    circle = Circle((left + 1.2 * across, bottom + 1.2 * across), across / 2, facecolor="white", edgecolor="black")
+    ax.add_patch(circle)

@@ -1,0 +1,94 @@
+"""The power spectrum of the atmosphere's fluctuation in closed form: frozen layers that drift through the beams.
+
+A layer of covariance C(r) = sum_i w_i exp(-r^2 / 4 e_i) behind a Gaussian beam (`turbulence.covariance`, equation 4) that passes
+a line of sight at the speed V has the one-sided spectrum
+
+    S(f) = 2 int C(V t) cos(2 pi f t) dt = (2 / V) sum_i w_i (4 pi e_i)^(1/2) exp(-e_i (2 pi f / V)^2)                  (1)
+
+and behind an aperture with a rim, of transform B (`turbulence.beams`), with the two-dimensional spectrum P,
+
+    S(f) = (2 / V) (1 / pi) int_0^inf P(k) B(k)^2 dq,      k^2 = (2 pi f / V)^2 + q^2.                                   (2)
+
+The relative fluctuation of the PWV has p^2 sum_l a_l^2 <S_l>, the mean over the speeds of the scan: this holds above the
+frequencies of the scan itself. The emission on the calibrated sky has that times (epsilon dT / dy / (zeta e^-tau))^2, y small.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from zonda.core.observation import Observation
+from zonda.core.types import Floats
+
+from .model import AtmosphereModel
+from .resolution import layer_speeds
+from .turbulence.covariance import NU, mixture
+from .turbulence.nodes import Layer
+
+SLOWEST = 1e-4
+"""m/s: what is slower does not fluctuate."""
+NODES = 1500
+"""Of the integral over q in equation (2)."""
+
+
+KNOTS = 48
+"""Frequencies at which a long spectrum is evaluated."""
+
+
+def layer_spectrum(layer: Layer, frequency: Floats, speeds: Floats) -> Floats:
+    """Mean of equation (1) or (2) over ``speeds`` [m/s], of a layer of unit variance before the beam: (n,) 1/Hz."""
+    total = np.zeros(frequency.size)
+    for speed in np.maximum(speeds, SLOWEST):
+        total += 2 / speed * _along(layer, 2 * np.pi * frequency / speed)
+    return np.asarray(total / len(speeds), np.float64)
+
+
+def _along(layer: Layer, k: Floats) -> Floats:
+    """The layer's spectrum along a line, int C(r) cos(k r) dr: (n,) m, k in rad/m."""
+    if layer.aperture is None:
+        e, w = mixture(layer.outer_scale, layer.sigma)
+        return np.asarray(np.exp(-np.multiply.outer(k * k, e)) @ (w * np.sqrt(4 * np.pi * e)), np.float64)
+    known = np.geomspace(1e-3 / layer.outer_scale, 400 / layer.aperture.diameter, 200)
+    q = np.concatenate([[0.0], np.geomspace(1e-4 / layer.outer_scale, 400 / layer.aperture.diameter, NODES)])
+    table = np.empty(known.size)
+    for n, own in enumerate(known):
+        square = own**2 + q * q
+        power = 4 * np.pi * NU * layer.outer_scale ** (-2 * NU) * (square + layer.outer_scale**-2) ** (-NU - 1)
+        table[n] = np.trapezoid(power * layer.aperture.transform(np.sqrt(square)) ** 2, q) / np.pi
+    found = np.exp(np.interp(np.log(np.maximum(k, known[0])), np.log(known), np.log(table)))
+    return np.where(k <= known[-1], found, 0.0)
+
+
+def closed_form(model: AtmosphereModel, observation: Observation) -> Callable[[Floats], Floats] | None:
+    """The spectrum of ``atmosphere`` on the calibrated sky, K_RJ^2/Hz, as a function of the frequency [Hz].
+
+    None where the PWV is log-normal, for which there is no closed form.
+    """
+    if model.fluctuation.log_normal:
+        return None
+    simulated = [k for k in range(len(model.layers)) if k not in model.parameters.omit]
+
+    def spectrum(frequency: Floats) -> Floats:
+        if frequency.size > 2 * KNOTS:  # smooth in log-log: evaluated at knots, interpolated
+            nodes = np.geomspace(frequency[0], frequency[-1], KNOTS)
+            law = np.log(np.maximum(spectrum(nodes), np.finfo(np.float64).tiny))
+            return np.asarray(np.exp(np.interp(np.log(frequency), np.log(nodes), law)))
+        speeds = layer_speeds(observation, model.plane, model.layers)
+        parts = (model.layers[k].amplitude ** 2 * layer_spectrum(model.layers[k], frequency, speeds[k]) for k in simulated)
+        return np.asarray(_emission_per_fluctuation(model, observation) ** 2 * model.fluctuation.scale**2 * sum(parts))
+
+    return spectrum
+
+
+def _emission_per_fluctuation(model: AtmosphereModel, observation: Observation) -> float:
+    """epsilon dT/dy / (zeta e^-tau) at the scan's mean elevation, rms over detectors that are not flagged, K_RJ."""
+    elevation = np.array([float(np.mean(observation.elevation))])
+    y = 1e-3
+    rise = float(model.band.emission_difference(model.pwv, np.array([model.pwv * y]), elevation)[0]) / y
+    transmission = float(model.band.transmission(model.pwv, elevation[0]))
+    plane, good = observation.focalplane, observation.good_detectors
+    ratio = plane.illumination_efficiency[good] / plane.main_beam_efficiency[good]
+    return rise / transmission * math.sqrt(float(np.mean(ratio**2)))

@@ -1,0 +1,254 @@
+"""`AtmosphereScreens`: the turbulence that the detectors saw, as fields: each layer at a moment, and their sum over the field.
+
+The realization is that of `AtmosphereLayers` (the same random streams), evaluated at other places: layer l on its lattice, in the
+frame that drifts with its wind, and the fluctuation of the PWV along lines of sight over the field of view,
+
+    dPWV = airmass PWV y,   y as in equation (1) of `layers`.                                                (1)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from zonda.core.configuration.units import Seconds
+from zonda.core.data import Data
+from zonda.core.drawable import Sketch
+from zonda.core.errors import PipelineError
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.output import Output
+from zonda.core.storage.ecsv import Column, write_ecsv
+from zonda.core.storage.files import atomic_path, product_path
+from zonda.core.storage.fits_image import Cards, image_pieces
+from zonda.core.types import Floats
+
+from .drawing import drifting_layers, height_of_vapour
+from .model import AtmosphereModel, ExpectedLoad
+from .response import airmass
+from .turbulence.lines_of_sight import LinesOfSight
+
+MOST_CELLS = 400
+"""Lattice points along each side of a layer's picture."""
+LEAST_BEAMS = 4.0
+"""Width of a layer's picture in beams, at least."""
+
+
+@dataclass(frozen=True)
+class LayerScreen:
+    """One layer about the point that the boresight looks through at a moment.
+
+    Attributes
+    ----------
+    height, distance
+        Of the layer, and along the line of sight, m.
+    wind
+        (east, north), m/s.
+    values
+        (n_along, n_across) fluctuation of the PWV at zenith in this layer, m: p a_l g_l PWV.
+    spacing
+        Between the values, m.
+    track
+        (n, 2) across and along the wind, m, where the boresight passes through the layer during the scan; 0 at the moment.
+    fwhm, field
+        Width of the beam there, and diameter of the field of view, m.
+    """
+
+    height: float
+    distance: float
+    wind: tuple[float, float]
+    values: Floats
+    spacing: float
+    track: Floats
+    fwhm: float
+    field: float
+
+
+@dataclass(frozen=True)
+class Screens:
+    """The layers at a moment, and the PWV over the field of view at several.
+
+    Attributes
+    ----------
+    layers
+        From the lowest up.
+    moment
+        Of ``layers``, s since the scan's start.
+    seconds
+        (k,) of ``pwv``, s since the scan's start.
+    pwv
+        (k, n, n) fluctuation of the PWV along the line of sight, m; rows eta, columns xi; NaN beyond the field.
+    side
+        Of the field, rad.
+    mean_pwv
+        At zenith, m.
+    observation
+        Name of the scan.
+    """
+
+    layers: list[LayerScreen]
+    moment: float
+    seconds: Floats
+    pwv: Floats
+    side: float
+    mean_pwv: float
+    observation: str
+
+    def sketches(self, name: str) -> list[Sketch]:
+        """See `core.drawable.Drawable`."""
+        from .screen_plots import sketches
+
+        return sketches(name, self)
+
+
+class AtmosphereScreens(Output):
+    """Pictures and files of the simulated turbulence: each layer at a moment, and the PWV over the field as time goes on.
+
+    They show the realization that the detectors saw. Each layer is shown in the frame that drifts with its wind, with the wind,
+    the beam, the field of view and the boresight's track through it. Makes the product ``screens`` (a `Screens`); where there is
+    an output folder, it is written there as ``screens.fits`` and ``screens.ecsv``. `Plots` and `Report` show it.
+
+    Raises `PipelineError` where there is no `AtmosphereLayers`, or no scan of that number.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    optional: ClassVar[frozenset[str]] = frozenset({"atmosphere"})
+    provides: ClassVar[frozenset[str]] = frozenset({"screens"})
+
+    observation: int = Field(0, ge=0)
+    """Number of the scan, counted from 0."""
+    moment: Seconds | None = Field(None, ge=0)
+    """When the layers are shown, since the start of the scan. Default: the middle."""
+    moments: int = Field(6, ge=1, le=100)
+    """How many pictures of the PWV over the field, evenly over the scan."""
+    pixels: int = Field(48, ge=4, le=512)
+    """Points along each side of the field."""
+
+    def finalize(self, data: Data) -> None:
+        """Evaluate the layers and write them."""
+        if self.observation >= len(data.observations):
+            cure = f"choose observation from 0 to {len(data.observations) - 1}"
+            raise PipelineError(f"there is no scan {self.observation}", place=self.label, cure=cure)
+        load = data.observations[self.observation].expected_load
+        if not isinstance(load, ExpectedLoad):
+            raise PipelineError("there is no atmosphere to show", place=self.label, cure="add AtmosphereLayers")
+        found = screens(load.model(), self.moment, self.moments, self.pixels)
+        key = self.name or "screens"
+        data.products[key] = found
+        if data.output is not None:
+            write(found, product_path(data.output, key))
+
+
+def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: int) -> Screens:
+    """The layers of an observation at a ``moment`` [s] after its start, and the PWV over the field at ``moments``."""
+    o = model.observation
+    seconds = np.asarray(o.seconds_at(np.arange(o.n_samples, dtype=np.int64)), np.float64)
+    seconds = seconds - seconds[0]
+    at = o.n_samples // 2 if moment is None else int(np.searchsorted(seconds, min(moment, float(seconds[-1]))))
+    step = model.resolution().step
+    samples = np.linspace(0, o.n_samples - 1, moments + 2)[1:-1].astype(np.int64) // step * step
+    radius = float(np.hypot(o.focalplane.xi, o.focalplane.eta).max())
+    line = np.linspace(-1, 1, pixels) * (radius or 1e-6)
+    xi, eta = (grid.ravel() for grid in np.meshgrid(line, line))
+    inside = np.hypot(xi, eta) <= radius * (1 + 1e-9)
+    pwv = np.full((moments, pixels * pixels), np.nan)
+    pwv[:, inside] = pwv_at(model, xi[inside], eta[inside], samples).T
+    layers = _layers(model, at)
+    cube = pwv.reshape(moments, pixels, pixels)
+    return Screens(layers, float(seconds[at]), seconds[samples], cube, 2 * radius, model.pwv, o.name)
+
+
+def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: NDArray[np.int64]) -> Floats:
+    """(n, k) fluctuation of the PWV [m] along lines of sight at focal-plane offsets (n,) and samples (k,), equation (1).
+
+    Samples are rounded down to the times that `AtmosphereLayers` evaluates.
+    """
+    step, law = model.resolution().step, model.fluctuation
+    layers, height = drifting_layers(model, (xi, eta)), height_of_vapour(model)
+    found = []
+    for sample in samples:
+        g, sine = layers(xi, eta, int(sample) // step, 1)
+        y = np.clip(law(g), -1.0, model.band.pwv_max / model.pwv - 1)
+        found.append((model.pwv * y * airmass(np.arcsin(sine), height))[:, 0])
+    return np.stack(found, axis=1)
+
+
+def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
+    """Every layer that is simulated about the boresight's place at sample ``at``."""
+    o, plane, omit = model.observation, model.plane, model.parameters.omit
+    step = max(1, o.n_samples // 2000)
+    samples = np.append(np.arange(0, o.n_samples, step), at)
+    path = LinesOfSight(o, plane, 1, 0, o.n_samples)
+    zero = np.zeros(1)
+    x, y, _ = path(zero, zero, 0, o.n_samples)
+    crossing = np.stack([x[0], y[0]])[:, samples]
+    angle = 2 * float(np.hypot(o.focalplane.xi, o.focalplane.eta).max())
+    found = []
+    for number, (layer, field) in enumerate(zip(model.layers, model.turbulence, strict=True)):
+        if number in omit:
+            continue
+        matrix, start, velocity = plane.affine(layer.height, layer.wind)
+        place = (matrix @ crossing + start[:, None] + velocity[:, None] * path.seconds[samples]).T  # across, along
+        here, track = place[-1], place[:-1] - place[-1]
+        fwhm, d = field.sigma * FWHM_PER_SIGMA, field.spacing
+        half = max(LEAST_BEAMS / 2 * fwhm, layer.distance * angle, float(np.abs(track).max()) * 1.05)
+        cells = min(MOST_CELLS // 2, math.ceil(half / d))
+        i, j = (round(float(v) / d) for v in here)
+        values = field.region(i - cells, i + cells + 1, j - cells, j + cells + 1).astype(np.float64)
+        offset = here - np.array([i, j]) * d  # of the moment from the middle of the picture
+        east, north = (float(v) for v in layer.wind)
+        found.append(
+            LayerScreen(
+                layer.height,
+                layer.distance,
+                (east, north),
+                model.pwv * model.fluctuation.scale * layer.amplitude * values.T,
+                d,
+                track + offset,
+                fwhm,
+                layer.distance * angle,
+            )
+        )
+    return found
+
+
+def write(found: Screens, stem: Path) -> list[Path]:
+    """``STEM.fits`` (PWV over the field, then each layer) and ``STEM.ecsv`` (the layers); their paths. Raises OutputError."""
+    images, table = stem.with_name(f"{stem.name}.fits"), stem.with_name(f"{stem.name}.ecsv")
+    with atomic_path(images) as temporary, open(temporary, "wb") as file:
+        step = math.degrees(found.side) / (found.pwv.shape[1] - 1)
+        middle = (found.pwv.shape[1] + 1) / 2
+        cards = Cards(
+            [("EXTNAME", "PWV", "fluctuation along the line of sight"), ("BUNIT", "m"), ("CTYPE1", "XI"), ("CTYPE2", "ETA")]
+        )
+        cards = cards.add(Cards((f"CRPIX{k}", middle) for k in (1, 2))).add(Cards((f"CDELT{k}", step) for k in (1, 2)))
+        for k, second in enumerate(found.seconds):
+            cards[f"TIME{k + 1}"] = float(second), "[s] since the start of the scan"
+        for piece in image_pieces(cards, found.pwv, dtype=np.float64):
+            file.write(piece)
+        for k, layer in enumerate(found.layers):
+            cards = Cards(
+                [("EXTNAME", f"LAYER{k}"), ("BUNIT", "m"), ("HEIGHT", layer.height, "[m]"), ("TIME", found.moment, "[s]")]
+            )
+            for axis, (name, n) in enumerate(zip(("ACROSS", "ALONG"), layer.values.shape[::-1], strict=True), 1):
+                cards[f"CTYPE{axis}"], cards[f"CDELT{axis}"] = (name, "the wind"), (layer.spacing, "[m]")
+                cards[f"CRPIX{axis}"] = (n + 1) / 2
+            for piece in image_pieces(cards, layer.values, extension=True, dtype=np.float64):
+                file.write(piece)
+    rows = found.layers
+    columns = [
+        Column("height", [r.height for r in rows], "m", "above the telescope"),
+        Column("distance", [r.distance for r in rows], "m", "along the line of sight"),
+        Column("wind_east", [r.wind[0] for r in rows], "m / s", "towards the east"),
+        Column("wind_north", [r.wind[1] for r in rows], "m / s", "towards the north"),
+        Column("beam", [r.fwhm for r in rows], "m", "FWHM of the beam in the layer"),
+        Column("field", [r.field for r in rows], "m", "diameter of the field of view in the layer"),
+        Column("pwv_rms", [float(r.values.std()) for r in rows], "m", "of the fluctuation within the picture"),
+    ]
+    write_ecsv(table, columns, {"OBSERVATION": found.observation, "MOMENT": found.moment, "PWV": found.mean_pwv})
+    return [images, table]

@@ -1,0 +1,116 @@
+"""`CompareMaps`: a map of a run beside another one, or beside a FITS file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.units import Angle
+from zonda.core.data import Data
+from zonda.core.errors import PipelineError
+from zonda.core.maps.image import Image
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.output import Output
+from zonda.core.storage.files import product_path
+
+from .comparison.files import plane_of, read_plane, write_comparison
+from .comparison.noise import with_noise
+from .comparison.planes import Plane
+from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
+from .series import key_of
+from .transfer_function import window_of
+
+
+class CompareMaps(Output):
+    """How a map differs from a reference: difference, fidelity, signal-to-noise ratio, radial spectra and profiles.
+
+    Both are brought to one beam (the wider one) and one grid (that of the map with the smaller pixels), see
+    `comparison.planes`. Fidelity is \\|reference\\| / max(\\|difference\\|, `threshold` x rms of the difference), as for ALMA.
+    Makes the product ``comparison`` (a `Comparison`), or one under this step's own name where it has one; where there is an
+    output folder, it is written there as ``comparison.fits`` and as tables of spectra and profiles (ECSV). `Plots` and `Report`
+    show it.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"map"})
+    provides: ClassVar[frozenset[str]] = frozenset({"comparison"})
+
+    map: str = "map"
+    """Which map, by its name among the products, e.g. noiseless/map."""
+    reference: str = "input"
+    """What it is compared with, by its name among the products: the input of `SkyMap`, or another map."""
+    file: InputPath | None = None
+    """FITS image or HEALPix map to compare with, instead of a product. A relative path starts at the pipeline file's folder."""
+    beam: Angle | None = Field(None, gt=0)
+    """Common resolution (FWHM). Default: that of the map with the wider beam, once more smoothed with it if it was not yet."""
+    least_coverage: float = Field(0.1, ge=0, lt=1)
+    """Map pixels with fewer (beam-smoothed) samples than this share of their 99th percentile are left out."""
+    threshold: float = Field(THRESHOLD, gt=0, le=100)
+    """Least difference that the fidelity divides by, in units of the rms of the difference."""
+    noise: Literal["half_difference", "map"] = "half_difference"
+    """Noise of the SNR: that of the map, brought to the rms of half the difference of the scans, or as it is."""
+    bins: int = Field(24, ge=2, le=500)
+    """Number of rings of the spectra, of equal width in the logarithm of the scale."""
+
+    def finalize(self, data: Data) -> None:
+        """Raises PipelineError where a map is missing, InputError where the two cannot be compared."""
+        reference = self._reference(data)
+        product = _product(data, self.map, self.label)
+        plane = covered(plane_of(product, self.map), product, self.least_coverage)
+        fwhm = self.beam or resolution(plane, reference, product)
+        if self.noise == "half_difference":
+            noisy = data.products.get(self.map.rpartition("/")[2], product)  # of a signal without noise: that of the complete map
+            plane = with_noise(plane, noisy, fwhm) if isinstance(noisy, MapProduct) else plane
+        found = compare(reference, plane, Settings(fwhm or None, self.threshold, self.bins), self.label)
+        for note in found.notes:
+            data.tally.state(self.label, *note.split(": ", 1) if ": " in note else ("grid", note))
+        _tell(self.label, data, found)
+        key = key_of(self, "comparison")
+        data.products[key] = found
+        if data.output is not None:
+            meta = {"SEED": data.scene.seed, "PIPELINE": str(data.provenance.get("name", ""))}
+            write_comparison(found, product_path(data.output, key), meta)
+
+    def _reference(self, data: Data) -> Plane:
+        if self.file is None:
+            return plane_of(_product(data, self.reference, self.label), self.reference)
+        plane, _ = read_plane(self.file)
+        if plane.unit in ("K_RJ", ""):
+            return replace(plane, unit="K_RJ")
+        pixel, beam = plane.pixel**2, math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2
+        return plane.scaled(to_kelvin_rj(plane.unit, data.scene.instrument.band, pixel, 0.0, beam), "K_RJ")
+
+
+def resolution(plane: Plane, reference: Plane, product: Any) -> float:
+    """FWHM [rad] of the map with the wider beam; sqrt(2) times that of a map which is not smoothed yet. 0: not known."""
+    own = plane.fwhm or 0.0
+    if isinstance(product, MapProduct) and product.header is not None and not product.smoothed_by:
+        own *= math.sqrt(2)
+    return max(own, reference.fwhm or 0.0)
+
+
+def covered(plane: Plane, product: Any, least: float) -> Plane:
+    """The plane without the pixels that `window_of` leaves out."""
+    if not isinstance(product, MapProduct) or product.header is None:
+        return plane
+    return replace(plane, values=np.where(window_of(product, least=least) > 0, plane.values, np.nan))
+
+
+def _product(data: Data, name: str, place: str) -> Any:
+    found = data.products.get(name)
+    if isinstance(found, Image) or (isinstance(found, MapProduct) and found.contents == "all"):
+        return found
+    known = [key for key, value in data.products.items() if isinstance(value, Image | MapProduct) and not key.startswith("_")]
+    raise PipelineError(f"there is no map {name!r}", place=place, cure=f"name one of these: {', '.join(known)}")
+
+
+def _tell(label: str, data: Data, found: Comparison) -> None:
+    f = found.figures
+    data.tally.state(label, "gain of the map", f"{f['gain']:.4g} +- {f['gain error']:.2g}")
+    data.tally.state(label, "correlation", f"{f['correlation']:.4f}")
+    data.tally.state(label, "rms of the difference", f"{f['rms difference']:.3e} {found.unit}")

@@ -1,0 +1,150 @@
+"""`CompareStreams`: a stream of a run beside another one."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Seconds
+from zonda.core.data import Block, Data, Observation
+from zonda.core.errors import PipelineError
+from zonda.core.operator import Operator
+from zonda.core.storage.ecsv import write_ecsv
+from zonda.core.storage.files import product_path
+from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
+
+from .power_spectrum import Welch, calibration, on_sky
+from .series import key_of
+from .stream_statistics import Pair, StreamComparison, pair
+
+LEAST_SEGMENTS = 8
+"""A segment is at most this part of the scan: with a single one the coherence is 1 whatever the streams."""
+
+
+@dataclass
+class Pairs:
+    """Spectra of one scan by detector, and the segment's length in samples (0: the scan is too short)."""
+
+    detectors: NDArray[np.int64]
+    length: int
+    found: dict[int, Pair] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+class CompareStreams(Operator):
+    """How a stream differs from another at this step: rms, correlation, gain, ratio of spectra and coherence.
+
+    Both are referred to the calibrated sky as in `PowerSpectrum`, their means included, and freed of a straight line in each
+    segment: what is slower than a segment is not compared. Makes the product ``stream_comparison`` (a `StreamComparison`), or
+    one under this step's own name where it has one; where there is an output folder, it is written there as tables (ECSV), by
+    frequency and by detector. `Plots` and `Report` show it.
+
+    Raises `PipelineError` where a stream is absent at this step.
+    """
+
+    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
+    provides: ClassVar[frozenset[str]] = frozenset({"stream_comparison"})
+    knows_means: ClassVar[bool] = True
+    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
+
+    stream: StreamName = "signal"
+    """Which stream: `signal`, a component, or another that a step above makes (`pwv`)."""
+    reference: StreamName = "atmosphere"
+    """What it is compared with."""
+    detectors: int = Field(16, ge=1)
+    """Number of detectors, chosen evenly among those not flagged."""
+    segment: Seconds = quantity("16 s", gt=0)
+    """Length of Welch's segments, at most an eighth of the scan. Shortened to a number of samples that transforms quickly."""
+
+    @model_validator(mode="after")
+    def _two(self) -> Self:
+        if self.stream == self.reference:
+            raise ValueError("stream and reference are the same")
+        return self
+
+    @property
+    def streams(self) -> tuple[str, str]:
+        """Both."""
+        return self.stream, self.reference
+
+    def prepare(self, observation: Observation) -> Pairs:
+        return begin(self, observation)
+
+    def exec(self, block: Block, state: Pairs) -> None:
+        here = (state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)
+        for detector in state.detectors[here] if state.length else ():
+            add(self, block, state, int(detector))
+
+    def collect(self, data: Data, observation: Observation, state: Pairs) -> None:
+        if (found := finished(self, observation, state)) is not None:
+            data.add(self.label, found)
+
+    def finalize(self, data: Data) -> None:
+        found: StreamComparison | None = data.take(self.label)
+        if found is not None:
+            tell(self, data, found)
+
+
+def begin(step: CompareStreams, observation: Observation) -> Pairs:
+    """The detectors and the length of the segments."""
+    from scipy.fft import next_fast_len
+
+    usable = np.flatnonzero(observation.good_detectors)
+    count = min(usable.size, step.detectors)
+    chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
+    length = min(observation.n_samples // LEAST_SEGMENTS, round(step.segment * observation.sample_rate))
+    if flagged := int(np.count_nonzero(~observation.good_samples)):
+        observation.tally.count(step.label, "flagged samples that the comparison includes", flagged, observation.n_samples)
+    if length < 4:
+        return Pairs(usable[chosen], 0)
+    return Pairs(usable[chosen], next(n for n in range(length, 0, -1) if next_fast_len(n, real=True) == n))
+
+
+def add(step: CompareStreams, block: Block, state: Pairs, detector: int) -> None:
+    """The spectra of one detector, whose whole scan is in the block."""
+    for name in step.streams:
+        if name not in block.detdata:
+            have = ", ".join(sorted(block.detdata))
+            raise PipelineError(f"there is no stream {name!r} at this step", place=step.label, cure=f"choose from: {have}")
+    factor = calibration(block, detector)
+    with np.errstate(invalid="ignore", over="ignore"):
+        x, y = (on_sky(block, detector, name, factor) for name in step.streams)
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        block.observation.tally.count(step.label, "detectors left out for samples that are not finite", 1)
+        return
+    found = pair(x, y, block.observation.sample_rate, state.length)
+    with state.lock:
+        state.found[detector] = found
+
+
+def finished(step: CompareStreams, observation: Observation, state: Pairs) -> StreamComparison | None:
+    """The comparison of one scan, in the order of the detectors; None where there is none, which is counted."""
+    if not state.found:
+        why = "without a detector to compare" if state.length else "too short to compare streams"
+        observation.tally.count(step.label, f"scans {why}", 1)
+        return None
+    every = sorted(state.found)
+    welch = Welch(observation.n_samples, observation.sample_rate, state.length)
+    names = [observation.focalplane.names[d] for d in every]
+    what = (*step.streams, step.label, key_of(step, "stream_comparison"))
+    return StreamComparison.of_pairs([state.found[d] for d in every], welch.frequency, welch.independent, names, what)
+
+
+def tell(step: CompareStreams, data: Data, found: StreamComparison) -> None:
+    """State the figures in the log, keep the product and write its tables."""
+    data.tally.count(step.label, "scans left out: other detectors or length", found.of_another_length)
+    for figure, text in found.lines():
+        data.tally.state(step.label, figure, text)
+    data.products[found.product] = found
+    if data.output is not None:
+        made = {"PIPELINE": str(data.provenance.get("name", "")), "SEED": data.provenance.get("seed")}
+        made |= {"STREAM": found.stream, "REFERENCE": found.reference, "SCANS": found.observations, "SEGMENTS": found.segments}
+        write_ecsv(product_path(data.output, found.product, ".ecsv"), found.columns(), made)
+        write_ecsv(product_path(data.output, f"{found.product}_detectors", ".ecsv"), found.detector_columns(), made)

@@ -1,0 +1,171 @@
+"""Radial power spectra and profiles of maps.
+
+With a window w and the Fourier transform m_k of w (m - <m>_w), and pixels of area A,
+
+    P_i = A / sum w^2  mean_i |m_k|^2,                                                                       (1)
+
+the mean over the modes of ring i: the power spectral density, so that white noise of standard error n per pixel has
+P = n^2 A whatever the window. Its relative standard error is N_i^(-1/2), N_i = n_i / (2 c) independent modes as in
+`transfer_function`, equation (3). The coherence of two maps is Re sum a b* / (sum |a|^2 sum |b|^2)^(1/2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.types import Floats
+
+
+def tapered(inside: NDArray[np.bool_], pixel: float, taper: float | None = None) -> Floats:
+    """sin^2(pi/2 min(d / taper, 1)), d [rad] the distance of a pixel to the nearest one that is not ``inside``, (ny, nx).
+
+    ``taper`` None: the largest d, so that a disc has cos^2(pi/2 r / R).
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    depth = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * pixel
+    width = depth.max(initial=0.0) if taper is None else taper
+    return np.asarray(np.sin(np.pi / 2 * np.minimum(depth / max(width, pixel), 1)) ** 2, np.float64)
+
+
+@dataclass(frozen=True)
+class RadialSpectra:
+    """Power spectra of maps on one grid, equation (1).
+
+    Attributes
+    ----------
+    edges
+        (n + 1,) wavenumbers between the rings, rad^-1 (1 / wavelength), ascending.
+    wavenumber
+        (n,) mean over each ring's modes; NaN without any.
+    power
+        (n,) of each map, unit^2 sr.
+    modes
+        (n,) independent modes.
+    white
+        (n,) of maps whose noise is known: what independent pixels of that noise have, behind the smoothing.
+    coherence
+        (n,) of the first two maps; NaN of one map alone.
+    """
+
+    edges: Floats
+    wavenumber: Floats
+    power: dict[str, Floats]
+    modes: Floats
+    white: dict[str, Floats]
+    coherence: Floats
+
+    @property
+    def scale(self) -> Floats:
+        """(n,) wavelengths, rad; of a ring without modes its middle."""
+        middle = np.sqrt(self.edges[1:] * self.edges[:-1])
+        return np.asarray(1 / np.where(np.isfinite(self.wavenumber), self.wavenumber, middle), np.float64)
+
+
+def ring_edges(shape: tuple[int, int], pixel: float, bins: int) -> Floats:
+    """At most (bins + 1,) wavenumbers, from one wave across the map to two pixels per wave, rad^-1.
+
+    Their ratio is constant, but rings are at least as wide as the modes of the longer side are apart.
+    """
+    step, highest = 1 / (max(shape) * pixel), 0.5 / pixel
+    edges = [0.75 * step]
+    ratio = (highest / edges[0]) ** (1 / bins)
+    while edges[-1] < highest * (1 - 1e-9) and len(edges) <= bins:
+        edges.append(min(max(edges[-1] * ratio, edges[-1] + step), max(highest, edges[0] + step)))
+    return np.array(edges)
+
+
+def radial_spectra(
+    maps: Mapping[str, Floats],
+    window: Floats,
+    pixel: float,
+    edges: Floats,
+    noise: Mapping[str, Floats] | None = None,
+    smoothing: Floats | float = 1.0,
+) -> RadialSpectra:
+    """Equation (1) of maps (ny, nx); pixels that are NaN in one of them count in none.
+
+    Parameters
+    ----------
+    window
+        (ny, nx).
+    pixel
+        Side, rad.
+    edges
+        Between the rings, rad^-1.
+    noise
+        (ny, nx) standard errors of some of the maps, of independent pixels before the smoothing.
+    smoothing
+        (n,) squared transfer of the smoothing in each ring.
+    """
+    known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
+    window = np.where(known, window, 0.0)
+    square = float((window**2).sum())
+    area = pixel**2 / square if square else math.nan
+    transforms = {}
+    for name, values in maps.items():
+        kept = np.where(known, values, 0.0)
+        mean = float((kept * window).sum() / window.sum()) if square else 0.0
+        transforms[name] = np.fft.fft2((kept - mean) * window)
+    k = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n, pixel) for n in window.shape), indexing="ij"))
+    count, n = len(edges) - 1, np.searchsorted(edges, k, "right") - 1
+    ring = np.where((n >= 0) & (n < count), n, count).ravel()
+
+    def summed(values: Floats) -> Floats:
+        return np.asarray(np.bincount(ring, values.ravel(), count + 1)[:count], np.float64)
+
+    number = np.bincount(ring, minlength=count + 1)[:count]
+    correlated = window.size * float((window**4).sum()) / square**2 if square else math.inf
+    with np.errstate(invalid="ignore", divide="ignore"):
+        power = {name: area * summed(np.abs(values) ** 2) / number for name, values in transforms.items()}
+        first, second = (list(transforms.values()) * 2)[:2]
+        cross = summed((first * second.conj()).real) / np.sqrt(summed(np.abs(first) ** 2) * summed(np.abs(second) ** 2))
+        wavenumber = summed(k) / number
+    white = {name: area * float((np.where(known, window * n, 0.0) ** 2).sum()) for name, n in (noise or {}).items()}
+    levels = {name: np.broadcast_to(level * np.asarray(smoothing), (count,)) for name, level in white.items()}
+    if len(maps) < 2:
+        cross = np.full(count, math.nan)
+    return RadialSpectra(edges, wavenumber, power, number / 2 / correlated, levels, cross)
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Means in rings about a pixel.
+
+    Attributes
+    ----------
+    radius
+        (n,) middle of each ring, rad.
+    mean, error
+        (n,) of each map, its unit; standard errors from the scatter in the ring, of one value per beam; NaN where there is no
+        pixel, or no scatter.
+    """
+
+    radius: Floats
+    mean: dict[str, Floats]
+    error: dict[str, Floats]
+
+
+def profiles(maps: Mapping[str, Floats], centre: tuple[float, float], pixel: float, width: float, beam_area: float) -> Profiles:
+    """Mean of each map (ny, nx) in rings of ``width`` [rad] about the pixel ``centre`` (x, y).
+
+    ``beam_area`` [sr]: area in which pixels are not independent.
+    """
+    known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
+    y, x = np.indices(known.shape)
+    ring = (np.hypot(x - centre[0], y - centre[1]) * pixel / width).astype(np.int64)[known]
+    number = np.bincount(ring)
+    independent = np.maximum(number * min(1.0, pixel**2 / beam_area if beam_area else 1.0), 1.0)
+    mean, error = {}, {}
+    for name, values in maps.items():
+        with np.errstate(invalid="ignore", divide="ignore"):
+            first = np.bincount(ring, values[known]) / number
+            second = np.bincount(ring, (values[known] - first[ring]) ** 2) / number
+            error[name] = np.where(independent > 1, np.sqrt(second / np.maximum(independent - 1, 1e-9)), np.nan)
+        mean[name] = first
+    return Profiles(np.asarray((np.arange(len(number)) + 0.5) * width, np.float64), mean, error)

@@ -1,0 +1,175 @@
+"""Pictures of two maps that are compared, and of radial spectra of maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zonda.core.drawable import Sketch
+from zonda.core.numerics.angles import ARCSEC, angle_text
+from zonda.core.types import Floats
+
+from .canvas import SEQUENCE, log_labels, new_figure, unit_of, write_title
+from .map_layout import map_axes
+from .map_plots import contour_text, plot_contours, plot_map, plot_plain
+from .sky_axes import SkyAxes
+
+if TYPE_CHECKING:
+    from ..comparison.radial import RadialSpectra
+    from ..comparison.statistics import Comparison
+    from ..map_spectra import MapSpectra
+
+CONTOURS = (-8.0, -4.0, -2.0, 2.0, 4.0)
+"""Of SNR maps where no others are wanted."""
+DEPTH = 1e-5
+"""Least power spectral density that is shown, as a share of the largest."""
+MOST_FIDELITY = 100.0
+"""End of the scale of fidelity maps."""
+
+
+def draw_comparison(file: str, found: Comparison, contours: Sequence[float] = ()) -> list[Sketch]:
+    """The two maps and their difference; fidelity and SNR; spectra and profiles."""
+    levels = contours or CONTOURS
+    sketches = [_maps(file, found), _quality(file, found, levels)]
+    return [*sketches, _curves(file, found)]
+
+
+def _maps(file: str, found: Comparison) -> Sketch:
+    planes, header = found.planes, found.header
+    where = SkyAxes.of(header) or header
+    shape = planes["map"].shape
+    axes = map_axes(shape, where, 3)
+    both = np.abs(np.concatenate([planes[name][np.isfinite(planes[name])] for name in ("reference", "map")]))
+    limit = float(np.percentile(both, 99.7))
+    reference, other = found.names
+    style: dict[str, Any] = {"fwhm": found.fwhm or None, "unit": found.unit}
+    plot_map(planes["reference"], where, ax=axes[0], title=_short(f"Reference: {reference}"), limit=limit, **style)
+    plot_map(planes["map"], where, ax=axes[1], title=_short(f"Map: {other}"), limit=limit, **style)
+    plot_map(planes["difference"], where, ax=axes[2], title="Map − reference", **style)
+    f = found.figures
+    caption = (
+        f"{other} against {reference}: {'; '.join(found.notes)}. Gain {f['gain']:.4g} ± {f['gain error']:.2g}, correlation "
+        f"{f['correlation']:.4g}. The difference has a scale of its own."
+    )
+    return Sketch(file, "Comparison", caption, axes[0])
+
+
+def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
+    planes, header = found.planes, found.header
+    where = SkyAxes.of(header) or header
+    snr = planes.get("snr")
+    axes = map_axes(planes["map"].shape, where, 1 if snr is None else 2)
+    finite = planes["fidelity"][np.isfinite(planes["fidelity"])]  # infinite where maps are equal
+    most = (min(MOST_FIDELITY, float(np.percentile(finite, 99.9))) if finite.size else 0.0) or 1.0
+    plot_plain(planes["fidelity"], where, (0.0, most), "viridis", "fidelity", ax=axes[0], title="Fidelity")
+    caption = "Fidelity: |reference| / max(|difference|, threshold times its rms)."
+    if snr is not None:
+        top = float(np.nanpercentile(np.abs(snr), 99.9)) or 1.0
+        plot_plain(
+            snr, where, (-top, top), "RdBu_r", "signal-to-noise ratio", ax=axes[1], title="Signal-to-noise ratio of the map"
+        )
+        plot_contours(axes[1], snr, levels)
+        caption += f" Contours of the SNR: {contour_text(levels)} (negative ones dashed)."
+    return Sketch(f"{file}_quality", "Fidelity and SNR", caption, axes[0])
+
+
+def _curves(file: str, found: Comparison) -> Sketch:
+    size = (10.6, 4.6)
+    left, right = new_figure(size, [(0.085, 0.135, 0.395, 0.7), (0.585, 0.135, 0.395, 0.7)])
+    plot_radial_spectra(left, found.spectra, found.unit, found.fwhm)
+    p, names = found.profiles, {"reference": found.names[0], "map": found.names[1], "difference": "difference"}
+    used = np.isfinite(p.mean["map"])
+    factor, unit = 1.0, found.unit
+    if unit == "K_RJ":
+        factor, unit = unit_of(max(float(np.abs(mean[used]).max(initial=0.0)) for mean in p.mean.values()))
+    for k, (name, mean) in enumerate(p.mean.items()):
+        error = np.where(np.isfinite(p.error[name]), p.error[name], 0.0)
+        style: dict[str, Any] = {"color": SEQUENCE[k], "linewidth": 1.3, "markersize": 3, "elinewidth": 0.8}
+        right.errorbar(
+            p.radius[used] / ARCSEC,
+            factor * mean[used],
+            yerr=factor * error[used],
+            fmt="o-",
+            label=_short(names[name], 28),
+            **style,
+        )
+    right.axhline(0.0, color="0.6", linewidth=0.8, zorder=1)
+    right.set_xlim(0, float(p.radius[used].max()) / ARCSEC)
+    right.set_xlabel("distance from the centre [arcsec]")
+    right.set_ylabel(f"mean brightness [{unit}]" if unit else "mean brightness")
+    right.grid(which="major", color="0.9", linewidth=0.7)
+    right.legend(frameon=False, fontsize=8)
+    write_title(left, "Radial power spectra", pad=42)
+    write_title(right, "Radial profiles")
+    caption = (
+        "Power spectral densities in rings of angular scale under a cosine window, and means in rings about the map's centre."
+    )
+    if found.fwhm:
+        caption += f" Resolution {angle_text(found.fwhm)} FWHM (dotted)."
+    return Sketch(f"{file}_spectra", "Spectra and profiles", caption, left)
+
+
+def plot_radial_spectra(
+    ax: Any, found: RadialSpectra, unit: str, fwhm: float = 0.0, names: Mapping[str, str] | None = None
+) -> Any:
+    """Power spectral densities against the angular scale, log-log; shaded: standard errors; dashed: the white level."""
+    scale = found.scale / ARCSEC
+    values: list[Floats] = []
+    for k, (name, power) in enumerate(found.power.items()):
+        good = np.isfinite(power) & (power > 0)
+        error = 1 / np.sqrt(np.maximum(found.modes, 1.0))
+        colour, y = SEQUENCE[k % len(SEQUENCE)], power / ARCSEC**2
+        ax.plot(scale[good], y[good], "o-", color=colour, linewidth=1.4, markersize=3, label=(names or {}).get(name, name))
+        low, high = (y * np.maximum(1 - error, 0.05))[good], (y * (1 + error))[good]
+        ax.fill_between(scale[good], low, high, color=colour, alpha=0.15, linewidth=0)
+        values.append(y[good])
+        if name in found.white:
+            ax.plot(scale, found.white[name] / ARCSEC**2, "--", color=colour, linewidth=1.0, label=f"white level of {name}")
+            values.append(found.white[name] / ARCSEC**2)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    every = np.concatenate(values) if values else np.ones(1)
+    top = float(every.max(initial=1e-300))
+    ax.set_ylim(max(float(every.min(initial=top)) / 2, DEPTH * top), 3 * top)
+    ends = (1 / found.edges[0] / ARCSEC, 1 / found.edges[-1] / ARCSEC)
+    ax.set_xlim(*ends)
+    if ends[1] < fwhm / ARCSEC < ends[0]:
+        ax.axvline(fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
+    log_labels(ax.xaxis, ends[1], ends[0])
+    log_labels(ax.yaxis, *ax.get_ylim())
+    upper = ax.secondary_xaxis("top", functions=(_inverse, _inverse))
+    upper.set_xlabel("wavenumber 1/scale [1/arcmin]")
+    log_labels(upper.xaxis, _inverse(ends[0]), _inverse(ends[1]))
+    ax.set_xlabel("angular scale [arcsec]")
+    ax.set_ylabel(f"power spectral density [{unit}² arcsec²]" if unit else "power spectral density [arcsec²]")
+    ax.grid(which="major", color="0.9", linewidth=0.7)
+    ax.legend(frameon=False, fontsize=8)
+    return ax
+
+
+def _inverse(arcsec: Any) -> Any:
+    """1/arcmin of a scale in arcsec, and back: the function is its own inverse."""
+    with np.errstate(divide="ignore"):
+        return 60.0 / np.asarray(arcsec, np.float64)
+
+
+def draw_map_spectra(file: str, found: MapSpectra) -> list[Sketch]:
+    """Radial spectra of maps, each with the white level that its noise promises."""
+    (ax,) = new_figure((7.2, 5.2), [(0.13, 0.12, 0.85, 0.74)])
+    plot_radial_spectra(ax, found.spectra, "K_RJ", found.fwhm, found.names)
+    write_title(ax, "Radial power spectra of the maps", pad=42)
+    caption = "Power spectral densities of the maps in rings of angular scale under a cosine window over the well covered field."
+    if found.spectra.white:
+        caption += " Dashed: the level of white noise by NET and samples."
+    if found.fwhm:
+        caption += f" Dotted: the beam, {angle_text(found.fwhm)} FWHM."
+    return [Sketch(file, "Radial power spectra of maps", caption, ax)]
+
+
+def _short(text: str, most: int = 46) -> str:
+    """The text, its middle left out where it is long."""
+    half = math.floor((most - 1) / 2)
+    return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"

@@ -1,0 +1,93 @@
+"""Figures of a run as a table."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Self, cast
+
+from pydantic import Field, model_validator
+
+from zonda.core.data import Data
+from zonda.core.errors import InputError
+from zonda.core.figures import Choice, Figure, FigureMetric, Figures
+from zonda.core.output import Output
+from zonda.core.signal import Signal
+from zonda.core.storage.files import product_path
+
+from .series import key_of
+
+
+class ProductsRead:
+    """The ``requires`` of `MeasureFigures`: none for the class, what its metrics read in an object."""
+
+    def __get__(self, operator: Any, owner: type) -> frozenset[str]:
+        return frozenset[str]().union(*(m.reads for m in _metrics(operator)))
+
+
+class MeasureFigures(Output):
+    """Figures of a run: the numbers that it is judged by, with units and, where they are known, standard errors.
+
+    Metrics are those of the group ``zonda.metrics`` that are one number, e.g. ``central_rms`` or
+    ``{transfer_at: {scale: 60 arcsec}}``. The signals that they need are made for this step, unless `runs` has them. Makes the
+    product ``figures`` (a `Figures`), or one under this step's own name where it has one; where there is an output folder, it is
+    written there as a table, ``figures.ecsv``. `Report` shows it.
+
+    Raises `PipelineError` or `InputError` where a metric cannot be measured on what the run made.
+    """
+
+    requires: ClassVar[frozenset[str]] = cast(Any, ProductsRead())
+    provides: ClassVar[frozenset[str]] = frozenset({"figures"})
+
+    metrics: list[Choice] = Field(min_length=1)
+    """What to measure: names, or mappings of a name to its parameters."""
+
+    @model_validator(mode="after")
+    def _once(self) -> Self:
+        names = [choice.name for choice in self.metrics]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"{twice} is listed twice")
+        return self
+
+    def signals(self) -> tuple[Signal, ...]:
+        """Those that the metrics need."""
+        return tuple(signal for metric in _metrics(self) for signal in metric.needs())
+
+    def named_signals(self) -> tuple[str, ...]:
+        """Those that parameters of the metrics name."""
+        return tuple(name for metric in _metrics(self) for name in metric.named_signals())
+
+    def reads(self, signal: str) -> bool:
+        """Whether a metric reads products of that signal."""
+        plain = len(_metrics(self)) < len(self.metrics) and not signal.startswith("_")
+        return plain or signal in self.shown or signal in self.named_signals()
+
+    def finalize(self, data: Data) -> None:
+        """Measure, in the order of the list."""
+        names, found = list(self.shown), []
+        for choice in self.metrics:
+            count = len(choice.metric.needs()) if isinstance(choice.metric, FigureMetric) else 0
+            found.append(_figure(choice, data, names[:count]))
+            del names[:count]
+        key = key_of(self, "figures")
+        figures = data.products[key] = Figures.from_figures(found)
+        for figure in figures:
+            data.tally.state(self.label, figure.name, str(figure).partition(" = ")[2])
+        if data.output is not None:
+            made = {"PIPELINE": str(data.provenance.get("name", "")), "SEED": data.provenance.get("seed")}
+            made |= {"ZONDA": str(data.provenance.get("versions", {}).get("zonda", ""))}
+            figures.write(product_path(data.output, key, ".ecsv"), made)
+
+
+def _figure(choice: Choice, data: Data, names: list[str]) -> Figure:
+    """As `Choice.figure`; NaN, with the reason, for what cannot be measured on the sum of a campaign's scans."""
+    try:
+        return choice.figure(data, names)
+    except InputError as err:
+        if not data.laid_out:
+            raise
+        return Figure(choice.name, math.nan, getattr(choice.metric, "unit", ""), description=f"not known: {err.message}")
+
+
+def _metrics(operator: Any) -> list[FigureMetric]:
+    chosen = [] if operator is None else getattr(operator, "metrics", [])
+    return [choice.metric for choice in chosen if isinstance(choice.metric, FigureMetric)]

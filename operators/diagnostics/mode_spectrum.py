@@ -1,0 +1,124 @@
+"""Singular values and time streams of what detectors have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Seconds
+from zonda.core.data import Data, Observation, Stream
+from zonda.core.errors import PipelineError
+from zonda.core.operator import Operator
+from zonda.core.storage.ecsv import write_ecsv
+from zonda.core.storage.files import product_path
+
+from .components import Lagged, components
+from .series import Modes, key_of
+
+MOST_ROWS = 4096
+"""Detectors times delays: the covariance of more takes minutes and gigabytes."""
+KEPT = 64
+"""Singular values that are kept of each scan."""
+
+
+@dataclass
+class Found:
+    """What `ModeSpectrum.measure` puts down for `ModeSpectrum.collect`."""
+
+    modes: Modes | None = field(default=None)
+
+
+class ModeSpectrum(Operator):
+    """Singular values of the matrix detectors x time of `signal` at this step, their shares, and the leading modes.
+
+    They are the principal components of the detectors' streams: of the values at one instant, or, with ``delays``, of the values
+    at several delays (time-lagged components), which see what moves across the field. Flagged samples and detectors are left out.
+    Makes the product ``modes`` (a `Modes`), or one under this step's own name where it has one: shares are means over the scans,
+    streams those of the first. Where there is an output folder, both are written there as tables (ECSV). `Plots` and `Report`
+    show them.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"modes"})
+    knows_means: ClassVar[bool] = True
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+
+    modes: int = Field(4, ge=1, le=KEPT)
+    """How many leading modes to keep the streams of."""
+    delays: int = Field(0, ge=0, le=1000)
+    """Number of delays; 0: instantaneous components."""
+    delay: Seconds = quantity("0.1 s", gt=0)
+    """Length of each delay, rounded to samples."""
+    detectors: int = Field(512, ge=2)
+    """Number of detectors at most, chosen evenly among those not flagged."""
+    center: bool = True
+    """Subtract each detector's mean over the scan first."""
+    normalize: bool = False
+    """Divide each detector's stream by its rms first, so that all count alike."""
+
+    def prepare(self, observation: Observation) -> Found:
+        count = min(self.detectors, observation.n_detectors)
+        if count * (self.delays + 1) > MOST_ROWS:
+            raise PipelineError(
+                f"{count} detectors with {self.delays} delays are more than {MOST_ROWS} rows",
+                place=self.label,
+                cure=f"set detectors to {max(2, MOST_ROWS // (self.delays + 1))}, or fewer delays",
+            )
+        return Found()
+
+    def measure(self, stream: Stream, model: Any = None) -> Any:
+        """Read the stream twice: for the covariance, and for the streams of the modes."""
+        stream.state.modes = _find(self, stream)
+        return stream.state
+
+    def collect(self, data: Data, observation: Observation, state: Found) -> None:
+        if state.modes is not None:
+            data.add(self.label, state.modes)
+
+    def finalize(self, data: Data) -> None:
+        found: Modes | None = data.take(self.label)
+        if found is None:
+            return
+        data.products[found.product] = found
+        if data.output is not None:
+            _write(found, data)
+
+
+def _find(step: ModeSpectrum, stream: Stream) -> Modes | None:
+    """The modes of one scan; None where there are none, which is counted."""
+    observation = stream.observation
+    usable = np.flatnonzero(observation.good_detectors)
+    count = min(usable.size, step.detectors)
+    chosen = usable[np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))]
+    lag = max(1, round(step.delay * observation.sample_rate))
+    lagged = Lagged(stream, chosen, step.delays, lag)
+    if chosen.size < 2 or np.count_nonzero(lagged.good) < 2:
+        observation.tally.count(step.label, "scans without two detectors and two samples: no modes", 1)
+        return None
+    found = components(lagged, step.modes, center=step.center, normalize=step.normalize)
+    observation.tally.count(step.label, "detectors left out: signal not finite", int(np.count_nonzero(~found.used)))
+    if not found.energy > 0:
+        observation.tally.count(step.label, "scans whose signal is constant: no modes", 1)
+        return None
+    values, n = np.zeros((1, KEPT)), min(KEPT, found.values.size)
+    values[0, :n] = found.values[:n]
+    return Modes(
+        values, np.array([found.energy]), observation.seconds, found.times, found.vectors,
+        [observation.focalplane.names[d] for d in chosen], step.delays, lag / observation.sample_rate if step.delays else 0.0,
+        "" if step.normalize else "K_RJ", observation.name, step.label, key_of(step, "modes"),
+    )  # fmt: skip
+
+
+def _write(found: Modes, data: Data) -> None:
+    """Both tables."""
+    made = {
+        "PIPELINE": str(data.provenance.get("name", "")),
+        "SEED": data.provenance.get("seed"),
+        "SCAN": found.observation,
+    }
+    write_ecsv(product_path(data.output, found.product, ".ecsv"), found.columns(), {**made, "SCANS": len(found.values)})
+    write_ecsv(product_path(data.output, f"{found.product}_streams", ".ecsv"), found.stream_columns(), made)

@@ -1,0 +1,171 @@
+"""Smooth functions of time that are fitted to each detector's scan and removed.
+
+With B (K, N) the functions, and B_g, x_g their values and the data at the samples that are used,
+
+    y = x - B^T (B_g B_g^T)^-1 B_g x_g,                                                                    (1)
+
+a linear least-squares fit, in float64. Samples that are flagged, not finite or in a source mask are not used, but the fit is
+subtracted there too. Functions that no used sample determines get the coefficient 0 (pseudoinverse).
+
+A mask leaves a detector that looks into it most of the time too little to go by: the fit would be an extrapolation. The mask of a
+detector is not used where fewer functions are determined without its samples, or where at these the variance of the fit,
+
+    mean over the masked samples of b_t^T (B_g B_g^T)^-1 b_t,                                              (2)
+
+is larger than that of a sample.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.block import Block
+from zonda.core.compilation.jit import nb
+from zonda.core.numerics.chunks import chunks
+from zonda.core.numerics.smooth import spline_basis
+from zonda.core.types import Floats
+
+ROWS = 32
+"""Detectors that are worked on in float64 at a time."""
+
+DETERMINED = 1e-14
+"""Eigenvalues of B_g B_g^T below this share of the largest count as zero."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Functions of time of which few reach a sample.
+
+    Attributes
+    ----------
+    first
+        (N,) number of the first function that reaches each sample.
+    weights
+        (N, taps): the values of the functions first .. first + taps - 1.
+    size
+        K, the number of functions.
+    """
+
+    first: NDArray[np.int64]
+    weights: Floats
+    size: int
+
+    def inverse(self, use: Mask) -> Floats:
+        """(K, K): the pseudoinverse of B_g B_g^T for the samples ``use`` (N,)."""
+        return np.asarray(np.linalg.pinv(self.normal(use), rcond=DETERMINED, hermitian=True))
+
+    def normal(self, use: Mask) -> Floats:
+        """(K, K): B_g B_g^T for the samples ``use`` (N,)."""
+        normal = np.zeros((self.size, self.size))
+        _normal(use, self.first, self.weights, normal)
+        return normal
+
+
+def polynomials(n: int, order: int) -> Basis:
+    """Legendre polynomials up to ``order`` over a scan of ``n`` samples."""
+    time = (2 * np.arange(n) + 1) / n - 1
+    return Basis(np.zeros(n, np.int64), np.asarray(np.polynomial.legendre.legvander(time, order), np.float64), order + 1)
+
+
+def splines(n: int, spacing: float) -> Basis:
+    """Cubic B-splines with knots every ``spacing`` samples, a whole number of intervals centred on a scan of ``n`` samples."""
+    inner = max(1, math.ceil((n - 1) / spacing))  # knots inside the scan, half of an interval or less from either end
+    position = (np.arange(n) - (n - 1) / 2) / spacing + (inner - 1) / 2 + 1
+    first = np.clip(np.floor(position).astype(np.int64), 0, inner)
+    return Basis(first, np.ascontiguousarray(spline_basis(position - first).T), inner + 4)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Equation (1) for scans whose samples ``use`` (N,) are used; ``inverse`` (K, K): `Basis.inverse` of these."""
+
+    basis: Basis
+    use: Mask
+    inverse: Floats
+
+    @classmethod
+    def of(cls, basis: Basis, use: Mask) -> Fit:
+        """A fit of these functions to the samples ``use`` (N,)."""
+        return cls(basis, use, basis.inverse(use))
+
+    def remove(self, rows: Floats, masked: Mask | None = None) -> int:
+        """Equation (1) on ``rows`` (n_det, N) in place. ``masked`` (n_det, N): samples that are not used, of each detector, where
+        equation (2) allows it.
+
+        Returns how many samples were not finite; they stay as they were.
+        """
+        spoilt = 0
+        for d, row in enumerate(rows):
+            use, inverse = self.use, self.inverse
+            if not (finite := np.isfinite(row)).all():
+                use = use & finite
+                inverse = self.basis.inverse(use)
+                spoilt += int(np.count_nonzero(~finite))
+            if masked is not None and masked[d].any():
+                use, inverse = self._outside(use, inverse, masked[d])
+            sums = np.zeros(self.basis.size)
+            _sums(row, use, self.basis.first, self.basis.weights, sums)
+            _subtract(row, self.basis.first, self.basis.weights, inverse @ sums)
+        return spoilt
+
+    def _outside(self, use: Mask, inverse: Floats, masked: Mask) -> tuple[Mask, Floats]:
+        """Samples to use outside of a mask (N,), and their inverse; those that are given where equation (2) forbids it."""
+        left, basis = use & ~masked, self.basis
+        found, inside = basis.inverse(left), basis.normal(use & masked)
+        lost = np.trace(inverse @ basis.normal(use)) - np.trace(found @ basis.normal(left))
+        if lost > 0.5 or np.trace(found @ inside) > np.count_nonzero(use & masked):
+            return use, inverse
+        return left, found
+
+
+def in_double(block: Block, work: Callable[[Floats, slice], int]) -> int:
+    """Let ``work`` change the signal of a block in float64, its mean included; no mean is left beside it.
+
+    ``work(rows, detectors)`` changes samples (n_det, n_samp) of up to `ROWS` detectors in place. The sum of the numbers that it
+    returns is returned.
+    """
+    signal, mean, found = block.detdata["signal"], block.means.pop("signal", None), 0
+    for part in chunks(len(signal), ROWS):
+        detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
+        rows = signal[part].astype(np.float64)
+        if mean is not None:
+            rows += mean.evaluate(detectors, block.samples)
+        found += work(rows, detectors)
+        signal[part] = rows
+    return found
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _normal(use, first, weights, normal):  # type: ignore[no-untyped-def]
+    """normal += B_g B_g^T."""
+    taps = weights.shape[1]
+    for t in range(use.size):
+        if use[t]:
+            k = first[t]
+            for i in range(taps):
+                for j in range(taps):
+                    normal[k + i, k + j] += weights[t, i] * weights[t, j]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _sums(row, use, first, weights, sums):  # type: ignore[no-untyped-def]
+    """sums += B_g x_g."""
+    for t in range(use.size):
+        if use[t]:
+            for i in range(weights.shape[1]):
+                sums[first[t] + i] += weights[t, i] * row[t]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _subtract(row, first, weights, coefficients):  # type: ignore[no-untyped-def]
+    """row -= B^T coefficients."""
+    for t in range(row.size):
+        for i in range(weights.shape[1]):
+            row[t] -= weights[t, i] * coefficients[first[t] + i]

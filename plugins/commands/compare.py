@@ -1,0 +1,191 @@
+"""``zonda compare``: two maps, or the maps of two runs, side by side in figures and pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from zonda.operators.diagnostics.comparison.planes import Plane
+    from zonda.operators.diagnostics.comparison.statistics import Comparison, Settings
+
+ROWS = (
+    ("rms of the reference", "rms reference", "", 1.0),
+    ("rms of the map", "rms map", "", 1.0),
+    ("rms of the difference", "rms difference", "", 1.0),
+    ("mean of the difference", "mean difference", "", 1.0),
+    ("gain: map = gain x reference + offset", "gain", "gain error", 0.0),
+    ("offset", "offset", "offset error", 1.0),
+    ("correlation", "correlation", "", 0.0),
+    ("peak of the reference", "peak reference", "", 1.0),
+    ("map / reference at that pixel", "peak ratio", "", 0.0),
+    ("median fidelity above 10 % of the peak", "median fidelity where the reference is above 10 % of its peak", "", 0.0),
+)
+"""What is printed: text, figure, its error, whether it has the map's unit."""
+
+
+@click.command()
+@click.argument("first", metavar="REFERENCE", type=click.Path(path_type=Path))
+@click.argument("second", metavar="MAP", type=click.Path(path_type=Path))
+@click.option("--output", type=click.Path(path_type=Path), default=Path("out/compare"), show_default=True, metavar="DIR")
+@click.option("--unit", metavar="UNIT", help="Of the figures: mK_RJ, K_CMB, MJy/sr, Jy/beam ...  [default: that of REFERENCE]")
+@click.option("--frequency", metavar="FREQUENCY", help="For conversions, e.g. '93 GHz'.  [default: RESTFRQ of the files]")
+@click.option("--beam", metavar="ANGLE", help="Common resolution (FWHM), e.g. '20 arcsec'.  [default: the wider of the two]")
+@click.option("--sky", is_flag=True, help="REFERENCE is a sky before any beam: it gets the whole common beam.")
+@click.option("--threshold", type=click.FloatRange(0, 100, min_open=True), default=0.7, show_default=True,
+              help="Least difference that the fidelity divides by, in units of the rms of the difference.")  # fmt: skip
+@click.option("--contours", default="-8,-4,-2,2,4", show_default=True, metavar="LEVELS", help="Of the signal-to-noise ratio.")
+@click.option("--format", "formats", multiple=True, type=click.Choice(["png", "pdf", "svg"]), default=("png",), show_default=True)
+def compare(
+    first: Path,
+    second: Path,
+    output: Path,
+    unit: str | None,
+    frequency: str | None,
+    beam: str | None,
+    sky: bool,
+    threshold: float,
+    contours: str,
+    formats: tuple[str, ...],
+) -> None:
+    """Compare a map with a reference: print figures, write pictures, FITS images and tables.
+
+    REFERENCE and MAP are FITS files (images in any projection, or HEALPix tables), or two folders with the maps of runs, of which
+    those of the same name are compared. The reference is taken to be without error: put the truth first. Both maps are smoothed
+    to one beam; the one with the larger pixels is interpolated (cubic splines) onto the pixels of the other.
+    """
+    from zonda.core.configuration.units import Unit
+    from zonda.operators.diagnostics.comparison.statistics import Settings
+    from zonda.plugins.commands.arguments import checked
+
+    fwhm = None if beam is None else checked("--beam", lambda: Unit("rad").parse(beam))
+    hertz = None if frequency is None else checked("--frequency", lambda: Unit("Hz").parse(frequency))
+    levels = _levels(contours)
+    for name, one, other in pairs(first, second):
+        folder = output / name if name else output
+        _compare((one, other), folder, Settings(fwhm, threshold), (unit, hertz, sky), (levels, formats))
+
+
+def pairs(first: Path, second: Path) -> list[tuple[str, Path, Path]]:
+    """(subfolder, reference, map) of each comparison. Raises InputError where folders have no map in common."""
+    from zonda.core.errors import InputError
+
+    folders = [path.is_dir() for path in (first, second)]
+    if folders == [False, False]:
+        return [("", first, second)]
+    if not all(folders):
+        folder, file = (first, second) if folders[0] else (second, first)
+        return [("", *((folder / "map.fits", file) if folders[0] else (file, folder / "map.fits")))]
+    names = [{p.name for p in folder.glob("*.fits") if not _is_comparison(p)} for folder in (first, second)]
+    both = sorted(names[0] & names[1])
+    if not both:
+        found = [", ".join(sorted(n)) or "none" for n in names]
+        cure = "give the folders of two runs that saved their maps (SaveMap), or two files"
+        raise InputError(
+            f"no map has the same name in both (*.fits: {found[0]}; {found[1]})", place=f"{first}, {second}", cure=cure
+        )
+    single = len(both) == 1
+    return [("" if single else Path(name).stem, first / name, second / name) for name in both]
+
+
+def _is_comparison(path: Path) -> bool:
+    """Whether a FITS file is what `write_comparison` wrote."""
+    with open(path, "rb") as file:
+        return b"REFERENC=" in file.read(10 * 2880)
+
+
+def _levels(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(level) for level in text.split(",") if level.strip())
+    except ValueError:
+        raise click.BadParameter(f"'{text}' is not a list of numbers, e.g. -4,-2,2,4", param_hint="'--contours'") from None
+
+
+def _compare(
+    paths: tuple[Path, Path],
+    folder: Path,
+    settings: Settings,
+    given: tuple[str | None, float | None, bool],
+    look: tuple[tuple[float, ...], tuple[str, ...]],
+) -> None:
+    """One comparison, printed and written to ``folder``. ``given``: unit, frequency [Hz], whether the reference is a sky."""
+    from zonda.core.storage.files import atomic_path
+    from zonda.operators.diagnostics.comparison import statistics
+    from zonda.operators.diagnostics.comparison.files import read_plane, write_comparison
+    from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
+    from zonda.operators.diagnostics.drawing.pictures import Style, printed
+
+    (reference, nu), (other, second_nu) = (read_plane(path, _name(path, paths)) for path in paths)
+    reference = replace(reference, fwhm=0.0) if given[2] else reference
+    reference, other = _in_one_unit(reference, other, given[0], given[1] or nu or second_nu)
+    found = statistics.compare(reference, other, settings)
+    click.echo("\n".join(lines(found)))
+    levels, formats = look
+    style = Style(0.0, 0.0, 0.0, levels, formats)
+    written = write_comparison(found, folder / "comparison", {})
+    for picture in printed(draw_comparison, style, "comparison", found, levels):
+        for kind, content in picture.files.items():
+            path = folder / f"{picture.name}.{kind}"
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(content)
+            written.append(path)
+    click.echo("\n" + "\n".join(map(str, written)))
+
+
+def _name(path: Path, paths: tuple[Path, Path]) -> str:
+    """Short enough for a picture, and different for the two."""
+    return path.name if paths[0].name != paths[1].name else f"{path.parent.name or '.'}/{path.name}"
+
+
+def _in_one_unit(reference: Plane, other: Plane, unit: str | None, frequency: float | None) -> tuple[Plane, Plane]:
+    from zonda.core.errors import InputError
+    from zonda.operators.diagnostics.comparison.files import in_unit
+
+    if unit is not None:
+        return in_unit(reference, unit, frequency), in_unit(other, unit, frequency)
+    if reference.unit == other.unit:
+        return reference, other
+    if not (reference.unit and other.unit):
+        bare = other if reference.unit else reference
+        known = reference.unit or other.unit
+        raise InputError(
+            f"has no unit, and the other map is in {known}", place=bare.name, cure="set its header key BUNIT to what it is in"
+        )
+    return reference, in_unit(other, reference.unit, frequency)
+
+
+def lines(found: Comparison) -> list[str]:
+    """The table as text."""
+    from zonda.core.numerics.angles import angle_text
+
+    f, (first, second) = found.figures, found.names
+    factor, unit = _readable(f["rms reference"], found.unit)
+    rows: list[tuple[str, str]] = [("reference", first), ("map", second)]
+    rows.append(("pixels with both", f"{f['pixels']:.0f} of {angle_text(found.pixel)}"))
+    rows.append(("resolution (FWHM)", angle_text(found.fwhm) if found.fwhm else "not known"))
+    for text, key, error, has_unit in ROWS:
+        scale = factor if has_unit else 1.0
+        value = f"{f[key] * scale:.5g}" + (f" +- {f[error] * scale:.2g}" if error and math.isfinite(f[error]) else "")
+        rows.append((text, value + (f" {unit}" if has_unit and unit else "")))
+    if "chi2" in f:
+        rows.append(("chi2 of the difference / pixels", f"{f['chi2']:.5g} / {f['chi2 pixels']:.0f} = {_ratio(f):.4g}"))
+    width = max(len(text) for text, _ in rows)
+    made = [f"{text:<{width}}  {value}" for text, value in rows]
+    return [*made, "", *found.notes]
+
+
+def _ratio(figures: dict[str, Any]) -> float:
+    return float(figures["chi2"] / figures["chi2 pixels"]) if figures["chi2 pixels"] else math.nan
+
+
+def _readable(size: float, unit: str) -> tuple[float, str]:
+    """Factor and name of the unit in which an rms of ``size`` reads well; kelvins only."""
+    if unit in ("K_RJ", "K_CMB"):
+        for factor, prefix in ((1e6, "u"), (1e3, "m")):
+            if abs(size) * factor < 1e3:
+                return factor, prefix + unit
+    return 1.0, unit

@@ -1,0 +1,121 @@
+"""``zonda weather``: the atmosphere above a site, printed and drawn; ``zonda weather fetch``: ERA5 from the Climate Data Store.
+
+Only click is imported with this module; each command imports what it needs.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import click
+
+from .arguments import checked, instant_of, place_of
+
+
+class WithDefault(click.Group):
+    """A group whose first command is meant where none is named: ``zonda weather green_bank``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put ``show`` before what names no command."""
+        if args and args[0] not in self.commands and not (len(args) == 1 and args[0] in ctx.help_option_names):
+            args = ["show", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(cls=WithDefault, subcommand_metavar="SITE [OPTIONS] | fetch SITE [OPTIONS]")
+def weather() -> None:
+    """Show the atmosphere above a site: profile, PWV, and what instruments see; `fetch` gets ERA5.
+
+    SITE is a registered name (`zonda plugins`), or 'latitude, longitude, altitude', e.g. '46.5 deg, 8 deg, 3500 m'.
+    """
+
+
+SIGNS = {"ignore_unknown_options": True}
+"""A southern latitude begins with a minus."""
+
+_site = click.argument("site", metavar="SITE")
+_time = click.option("--time", metavar="TIME", help="UTC unless it carries an offset, e.g. 2024-11-25T07:00.  [default: now]")
+
+
+@weather.command(context_settings=SIGNS)
+@_site
+@_time
+@click.option("--instrument", "instruments", multiple=True, metavar="NAME", help="Whose bands to show; may be repeated.")
+@click.option("--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]")
+@click.option("--file", metavar="FILE.nc", help="ERA5 file to take the weather from, instead of the climatology.")
+@click.option("--table", metavar="FILE.csv", help="Table to take the weather from, instead of the climatology.")
+@click.option("--elevation", default="90 deg", show_default=True, metavar="ANGLE", help="Of the line of sight.")
+@click.option("--seed", default=0, show_default=True, help="Of a random PWV.")
+@click.option(
+    "--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The figure.  [default: out/weather/SITE.png]"
+)
+def show(
+    site: str,
+    time: str | None,
+    instruments: tuple[str, ...],
+    pwv: str | None,
+    file: str | None,
+    table: str | None,
+    elevation: str,
+    seed: int,
+    output: Path | None,
+) -> None:
+    """Print the profile, the PWV by month and hour, and what bands see; draw them (also as PDF or SVG)."""
+    from zonda.core import registry, weather
+    from zonda.core.configuration.units import Unit
+    from zonda.core.storage.files import atomic_path, product_path
+    from zonda.operators.atmosphere.weather import summary
+    from zonda.operators.atmosphere.weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
+    from zonda.operators.atmosphere.weather.sources import profile_of
+
+    place, when = place_of(site), instant_of(time)
+    given = {key: value for key, value in (("pwv", pwv), ("file", file), ("table", table)) if value is not None}
+    cls, values = weather.resolve(given)
+    source = checked("weather", lambda: cls.model_validate(values))
+    angle = checked("--elevation", lambda: Unit("rad").parse(elevation))
+    if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
+        limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
+        raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")
+    bands = list(dict.fromkeys(registry.instruments.create(name).band for name in instruments))
+    air = profile_of(source, place, when, seed)
+    water = summary.pwv_by_month(place, when.datetime.year) if place.climatology is not None else None
+
+    parts = [summary.place_lines(place, when, air), summary.profile_lines(air)]
+    if water is not None:
+        parts.append(summary.pwv_lines(water))
+    if bands:
+        parts.append(summary.band_lines(air, bands, angle))
+    click.echo("\n\n".join("\n".join(lines) for lines in parts))
+
+    from zonda.plugins.commands.weather_plots import weather_figure
+
+    path = product_path("out/weather", place.name, ".png") if output is None else output
+    _check_suffix(path)
+    with atomic_path(path) as temporary:
+        weather_figure(f"{place.name}, {when}, PWV {air.pwv * 1e3:.3g} mm", air, water, angle, bands).savefig(temporary)
+    click.echo(f"\n{path}")
+
+
+@weather.command(context_settings=SIGNS)
+@_site
+@_time
+@click.option("--hours", default=6, show_default=True, type=click.IntRange(1, 240), help="How many hours from TIME on.")
+@click.option("--output", type=click.Path(path_type=Path), default=Path("era5.nc"), show_default=True, metavar="FILE.nc")
+def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
+    """Get ERA5 for a site and time from the Climate Data Store, for `weather: {file: era5.nc}`.
+
+    Needs a (free) key and the package cdsapi: pip install 'zonda[weather]', then https://cds.climate.copernicus.eu/how-to-api.
+    """
+    from zonda.core.storage.files import atomic_path
+    from zonda.operators.atmosphere.weather.era5 import retrieve
+
+    place, when = place_of(site), instant_of(time)
+    with atomic_path(output) as temporary:
+        retrieve(place, when, hours, temporary)
+    click.echo(f"{output}")
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise click.BadParameter(f"'{path}' does not end in .png, .pdf or .svg", param_hint="'--output'")

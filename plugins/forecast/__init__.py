@@ -1,0 +1,1 @@
+"""The noise of a map, forecast without a run: `zonda sensitivity`."""

@@ -1,0 +1,193 @@
+"""What the filters leave of the atmosphere in a map: an indicative figure, without drawing any turbulence.
+
+Layer l of the frozen atmosphere is a sum of plane waves q with the spectrum P_l (behind the telescope's beam in that layer). The
+boresight crosses it along the path X(t), a detector at focal-plane offset d beside it, at X(t) + J d. With K the beam on the map
+about a point x, delta(t) the offset in the focal plane at which x is at time t, g(t) = sum_d K(x - x_dt) ~ the density of
+detectors at delta(t), and A(q) = <exp(i q J d)>_d what the common mode removes,
+
+    variance = sum_l K_l^2 int d2q/(2 pi)^2 P_l(q) |sum_t g (exp(i q J delta) - A) (1 - P) exp(i q X)|^2 / (sum_t g)^2     (1)
+
+with K_l the kelvin of calibrated signal per unit of the layer's field. Waves are drawn from what (1) leads to expect of them, so
+that few are needed; their scatter is part of the error that is stated. It holds for weak fluctuations and equal gains. Scans see
+different parts of the atmosphere, so their contributions add up in quadrature: the wind carries it farther between them than the
+size of what the filters leave.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from zonda.core.types import Floats
+from zonda.operators.atmosphere.planning import Calibrated, calibrated
+from zonda.operators.atmosphere.turbulence.geometry import ScanPlane, axes, crossing, rays, scan_planes
+
+from .survey import Survey, Track
+
+WAVES = 320
+"""Waves: 96 left the rms wrong by half where the atmosphere is a small part of the noise (AtLAST), 1280 change it by 8 %."""
+POINTS, DETECTORS = 8, 64
+"""Probes; detectors whose mean is A."""
+MOST = 12
+"""Scans that are followed: the first ones. Later ones are taken to average down as 1 / time."""
+PER_CUT, LEAST, LARGEST = 4.0, 3.0, 30.0
+"""Instants per cycle of the cut, and per second, at least and at most."""
+WAVE_NUMBERS = np.linspace(math.log(2e-4), math.log(3.0), 240)
+"""ln of the wave numbers [rad/m] that waves are drawn from."""
+ENDS = 0.01
+"""Share of the power below the cut that the ends of a scan let pass, for the choice of waves."""
+GOLDEN = 0.618034
+NEGLIGIBLE = 1e-4
+"""Share of the expected variance below which a layer is left out."""
+
+
+@dataclass(frozen=True)
+class Left:
+    """Variance [K^2] after each scan, (n_scan,), and the relative standard error of its last value from the scatter of the
+    waves."""
+
+    variance: Floats
+    error: float
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """A scan as equation (1) needs it: instants at which some probe is seen, g (n_probe, n), delta (n_probe, n, 2)."""
+
+    track: Track
+    plane: ScanPlane
+    crossings: Floats
+    jacobian: Floats
+    density: Floats
+    offsets: Floats
+    weight: float
+
+
+def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
+    """Equation (1) from about so many waves, averaged over probes in a circle of ``radius`` [rad] about the map's centre."""
+    step, number = survey.atmosphere, len(survey.observations)
+    if step is None or step.pwv_rms == 0:
+        return Left(np.zeros(number), 0.0)
+    found = calibrated(step.model(survey.observations[survey.configured[0]]))
+    scans = _scans(survey, radius)
+    shares = _expected(survey, found)
+    total, spread = np.zeros(len(scans)), 0.0
+    share = np.array([s.sum() for s in shares]) * [k not in step.omit for k in range(len(shares))]
+    rng = np.random.default_rng(3)
+    for k in np.flatnonzero(share > NEGLIGIBLE * share.sum()).tolist():
+        drawn, weights = _drawn(found, k, shares[k], max(8, round(waves * share[k] / share.sum())), rng)
+        each = _of_waves(survey, scans, found, k, drawn) * weights * (found.kelvin * found.layers[k].amplitude) ** 2
+        total += each.sum(axis=1)
+        spread += float(each[-1].size * each[-1].var())
+    last = np.arange(len(scans), number)
+    total = np.r_[total, total[-1] * survey.seconds[len(scans) - 1] / survey.seconds[last]]
+    return Left(total, math.sqrt(spread) / total[-1] if total[-1] > 0 else 0.0)
+
+
+def _scans(survey: Survey, radius: float) -> list[_Scan]:
+    """The first scans, at instants that resolve the beam's passages over the probes where there is time for that."""
+    needed = min(survey.rate, LARGEST)
+    rate = min(max(PER_CUT * survey.cut, needed, LEAST), survey.observations[0].sample_rate)
+    width = max(survey.sigma, 1.5 * survey.speed / rate / survey.fwhm * survey.sigma)
+    density, reach, cell = _footprint(survey.offsets, width)
+    angle = 2 * np.pi * (GOLDEN * np.arange(POINTS) % 1)
+    probes = radius * np.sqrt((np.arange(POINTS) + 0.5) / POINTS)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    planes = scan_planes(survey.observations[:MOST])
+    found = []
+    for k, plane in enumerate(planes):
+        track = survey.track(k, rate)
+        offsets = np.einsum("tij,ptj->pti", np.linalg.inv(track.turn), probes[:, None] - track.centre[None])
+        seen = _interpolated(density, (offsets + reach) / cell - 0.5)
+        frame = axes(track.observation.boresight_azel[track.index])
+        own = plane.unroll(crossing(rays(frame, np.zeros(1), np.zeros(1))))[:, 0]
+        middle, little = frame[len(frame) // 2 : len(frame) // 2 + 1], 1e-4
+        corners = plane.unroll(crossing(rays(middle, np.array([0.0, little, 0.0]), np.array([0.0, 0.0, little]))))[:, :, 0]
+        jacobian = (corners[:, 1:] - corners[:, :1]) / little
+        found.append(_Scan(track, plane, own, jacobian, seen * track.step, offsets, float(survey.weights[k])))
+    return found
+
+
+def _footprint(offsets: Floats, sigma: float) -> tuple[Floats, float, float]:
+    """(grid, reach, cell): detectors per solid angle of the focal plane, smoothed with a Gaussian of ``sigma`` [rad]."""
+    from scipy.ndimage import gaussian_filter
+
+    reach = float(np.abs(offsets).max()) + 4 * sigma
+    cell = max(sigma / 1.5, reach / 250)
+    number = int(2 * reach / cell) + 2
+    half = number * cell / 2
+    counts, _, _ = np.histogram2d(offsets[:, 0], offsets[:, 1], bins=number, range=[[-half, half]] * 2)
+    return np.asarray(gaussian_filter(counts, sigma / cell)), half, cell
+
+
+def _interpolated(grid: Floats, where: Floats) -> Floats:
+    from scipy.ndimage import map_coordinates
+
+    found = map_coordinates(grid, where.reshape(-1, 2).T, order=1, mode="constant")
+    return np.asarray(found.reshape(where.shape[:-1]))
+
+
+def _spectrum(found: Calibrated, layer: int, number: Floats) -> Floats:
+    """P_l at wave numbers [rad/m], m2, of unit variance before the beam."""
+    e, w = found.components[layer]
+    return np.asarray((4 * np.pi * e * w) @ np.exp(-np.multiply.outer(e, number**2)), np.float64)
+
+
+def _expected(survey: Survey, found: Calibrated) -> list[Floats]:
+    """For each layer what each of `WAVE_NUMBERS` is expected to add: spectrum x the array's response x share of time above the
+    cut, where fast waves average down over a passage."""
+    number = np.exp(WAVE_NUMBERS)
+    field = max(float(np.hypot(*survey.offsets.T).max()), survey.sigma)
+    shares = []
+    for k, layer in enumerate(found.layers):
+        speed = np.hypot(*found.velocities[k])
+        across = np.clip(number[:, None] * speed / (2 * np.pi * max(survey.cut, 1e-6)), 1e-9, None)
+        above = np.where(across > 1, 1 - 2 / np.pi * np.arcsin(1 / np.maximum(across, 1)), 0).mean(axis=1)
+        above += ENDS * np.minimum(1, across.max(axis=1)) ** 2
+        phase = number * field * layer.distance
+        form = phase**2 / (phase**2 + 4) if survey.common else np.ones_like(number)
+        each = (found.kelvin * layer.amplitude) ** 2 * number**2 * _spectrum(found, k, number) / (2 * np.pi) * above * form
+        slow, fast = each / (1 + phase**2), each / (1 + phase)
+        shares.append(slow / max(slow.sum(), 1e-300) * fast.sum() + fast)
+    return shares
+
+
+def _drawn(found: Calibrated, layer: int, share: Floats, number: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Waves (n, 2) [rad/m], and the weight of each in the integral of equation (1)."""
+    chance = share / share.sum()
+    at = (rng.permutation(number) + 0.5) / number
+    drawn = np.interp(at, np.cumsum(chance) - 0.5 * chance, WAVE_NUMBERS)
+    density = np.interp(drawn, WAVE_NUMBERS, chance) / (WAVE_NUMBERS[1] - WAVE_NUMBERS[0])
+    angle = 2 * np.pi * ((GOLDEN * np.arange(number) + rng.random()) % 1)
+    k = np.exp(drawn)
+    waves = k[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return waves, k**2 * _spectrum(found, layer, k) / (2 * np.pi) / density / number
+
+
+def _of_waves(survey: Survey, scans: list[_Scan], found: Calibrated, layer: int, waves: Floats) -> Floats:
+    """(n_scan, n_wave) the square in equation (1) over (sum g)^2, after each scan, averaged over probes."""
+    model = found.layers[layer]
+    squares, amount = np.zeros((POINTS, len(waves))), np.zeros(POINTS)
+    some = survey.offsets[:: max(1, len(survey.offsets) // DETECTORS)]
+    rows = []
+    for scan in scans:
+        matrix, start, velocity = scan.plane.affine(model.height, model.wind)
+        seconds = scan.track.observation.seconds[scan.track.index]
+        path = matrix @ scan.crossings + start[:, None] + velocity[:, None] * seconds
+        phase = waves @ path
+        series = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
+        survey.filter(scan.track, series)
+        series = series[: len(waves)] + 1j * series[len(waves) :]
+        across = waves @ (matrix @ scan.jacobian)
+        mean = np.exp(1j * (across @ some.T)).mean(axis=1) if survey.common else np.zeros(len(waves))
+        for i, seen in enumerate(scan.density):
+            near = np.flatnonzero(seen > 1e-2 * seen.max(initial=0.0))
+            if near.size:
+                angle = (across @ scan.offsets[i, near].T).astype(np.float32)
+                value = ((np.exp(1j * angle) - mean[:, None]) * series[:, near]) @ seen[near]
+                squares[i] += scan.weight**2 * abs(value) ** 2
+            amount[i] += scan.weight * seen.sum()
+        weighted = np.where(amount > 0, amount, np.inf)
+        rows.append((squares / weighted[:, None]).sum(axis=0) / max(amount.sum(), 1e-300))
+    return np.array(rows)

@@ -1,0 +1,118 @@
+"""Simulated depths beside the forecast: `zonda sensitivity --audit N`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zonda.core.errors import InputError
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.pipeline import Pipeline
+from zonda.core.signal import product_name, stream_of
+from zonda.core.types import Floats
+from zonda.operators.maps.bin_map import BinMap
+
+from .covered import steps_of
+from .depth import PARTS, Depth, scatter
+from .lines import prefixed
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.loaded import PipelineFile
+
+COMPONENTS = {"white": "white", "1/f": "pink", "atmosphere": "atmosphere"}
+"""By part of the noise, the component that makes it."""
+TOGETHER = "together"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One part of the noise, K_RJ.
+
+    Attributes
+    ----------
+    forecast
+        Rms of the forecast.
+    mean, error
+        Root of the mean square over ``seeds`` simulated maps, and its standard error: that from their scatter, or from the
+        scatter that white noise would have (`depth.scatter`) if that is more, since few seeds do not tell their own.
+    """
+
+    part: str
+    forecast: float
+    mean: float
+    error: float
+    seeds: int
+
+    @property
+    def difference(self) -> float:
+        """Of the forecast, relative to what was simulated."""
+        return self.forecast / self.mean - 1 if self.mean > 0 else math.nan
+
+    @property
+    def z(self) -> float:
+        """The difference in standard errors of what was simulated."""
+        return (self.forecast - self.mean) / self.error if self.error > 0 else math.nan
+
+
+@dataclass(frozen=True)
+class Audited:
+    """All parts, and all noise together."""
+
+    rows: tuple[Row, ...]
+
+    @property
+    def together(self) -> Row:
+        """All noise."""
+        return next(r for r in self.rows if r.part == TOGETHER)
+
+    def as_dict(self) -> list[dict[str, Any]]:
+        """The rows, for JSON."""
+        return [{**asdict(r), "difference": r.difference, "z": r.z} for r in self.rows]
+
+    def __str__(self) -> str:
+        factor, unit = prefixed(self.together.mean, "K_RJ")
+        table: list[tuple[str, ...]] = [("", f"forecast [{unit}]", "simulated", "standard error", "difference", "z")]
+        for r in self.rows:
+            figures = (f"{v * factor:.4g}" for v in (r.forecast, r.mean, r.error))
+            table.append((r.part, *figures, f"{100 * r.difference:+.1f} %", f"{r.z:+.1f}"))
+        widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
+        lines = [f"audit: {self.rows[0].seeds} simulations of the whole pipeline"]
+        for first, *others in table:
+            lines.append("  ".join([first.ljust(widths[0]), *(c.rjust(w) for c, w in zip(others, widths[1:], strict=True))]))
+        return "\n".join(lines)
+
+
+def audit(file: PipelineFile, depth: Depth, radius: float, seeds: int, threads: int | None = None) -> Audited:
+    """Simulate a pipeline with ``seeds`` seeds, from its own on, and compare the noise of the map with the forecast.
+
+    The parts are signals of one run, behind the modes of the complete one, so that their maps add up to its map.
+    """
+    if seeds < 2:
+        raise InputError(f"{seeds} simulation has no standard error", place="--audit", cure="ask for 2 or more")
+    parts = [p for p in PARTS if depth.variance[p][-1] > 0]
+    found = np.array([_squares(file, parts, radius, file.scene().seed + k, threads) for k in range(seeds)])
+    rows, sigma = [], file.scene().instrument.beam_fwhm / FWHM_PER_SIGMA
+    for name, squares in zip([*parts, TOGETHER], found.T, strict=True):
+        forecast = sum(float(depth.variance[p][-1]) for p in (parts if name == TOGETHER else [name]))
+        mean = math.sqrt(squares.mean())
+        error = max(float(squares.std(ddof=1)) / (2 * mean), scatter(sigma, radius) * mean) / math.sqrt(seeds)
+        rows.append(Row(name, math.sqrt(forecast), mean, error, seeds))
+    return Audited(tuple(rows))
+
+
+def _squares(file: PipelineFile, parts: list[str], radius: float, seed: int, threads: int | None) -> Floats:
+    """(n_part + 1,) squared rms [K^2] behind the beam in the circle: of each part, and of all noise."""
+    operators = [
+        o.model_copy(update={"smooth": None, "half_difference": False}) if isinstance(o, BinMap) else o
+        for o in steps_of(file).operators
+    ]
+    runs = {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in parts} if len(parts) > 1 else {}
+    pipeline = Pipeline(operators, runs=runs, name=file.header.name, precision=file.header.precision)
+    scene = file.scene().model_copy(update={"seed": seed})
+    products = pipeline.run(scene, threads=threads).products
+    name = next(o.product for o in operators if isinstance(o, BinMap))
+    maps = [products[product_name(stream_of(run), name)] for run in runs] or [products[name]]
+    return np.array([m.smoothed_rms(m.fwhm, radius) ** 2 for m in [*maps, products[name]]])

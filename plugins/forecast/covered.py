@@ -1,0 +1,143 @@
+"""Which pipelines a forecast covers, and the steps of them that matter for the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from zonda.core.errors import PipelineError
+from zonda.core.mapmaker import makes_products
+from zonda.core.operator import Operator
+from zonda.core.output import Output
+from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.filters.common_mode import CommonModeFilter
+from zonda.operators.filters.highpass import HighpassFilter
+from zonda.operators.maps.bin_map import BinMap
+from zonda.operators.noise.pink import PinkNoise
+from zonda.operators.noise.white import WhiteNoise
+from zonda.operators.optics.efficiency import Efficiency
+from zonda.operators.sky.skymap import SkyMap
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.loaded import PipelineFile
+
+ANY = frozenset(("name",))
+COVERED: dict[type[Operator], frozenset[str] | None] = {
+    AtmosphereLayers: frozenset(AtmosphereLayers.model_fields) - {"beam", "edge_taper"},
+    WhiteNoise: frozenset({"net", "reference", "model"}),
+    PinkNoise: None,
+    Efficiency: frozenset({"main_beam", "illumination"}),
+    HighpassFilter: frozenset({"frequency", "degree", "oversampling"}),
+    CommonModeFilter: frozenset({"method", "residual", "gap", "on_undetermined"}),
+    BinMap: frozenset({
+        "pixel", "width", "height", "centre", "projection", "frame", "weights", "noise", "half_difference", "smooth", "product",
+    }),
+    SkyMap: None,
+}  # fmt: skip
+"""Parameters that may have any value; the others must have their defaults. None: all may."""
+
+CURE = "remove it, or find the noise with `zonda run` and several seeds"
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps that make, filter and map the noise.
+
+    Attributes
+    ----------
+    operators
+        In order; neither sky nor outputs.
+    binning
+        The map.
+    highpass, common
+        The filters; None: there is none.
+    """
+
+    operators: tuple[Operator, ...]
+    binning: BinMap
+    highpass: HighpassFilter | None
+    common: CommonModeFilter | None
+
+    @classmethod
+    def among(cls, operators: Sequence[Operator]) -> Steps:
+        """Those steps, which have one map and at most one of each filter."""
+        binning = next(o for o in operators if isinstance(o, BinMap))
+        highpass = next((o for o in operators if isinstance(o, HighpassFilter)), None)
+        common = next((o for o in operators if isinstance(o, CommonModeFilter)), None)
+        return cls(tuple(operators), binning, highpass, common)
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        """Those of one class."""
+        return [o for o in self.operators if isinstance(o, kind)]
+
+
+def steps_of(file: PipelineFile) -> Steps:
+    """The steps of a pipeline file that matter for the noise of its map.
+
+    Raises PipelineError for what the forecast does not cover, with the step's name.
+    """
+    kept: list[Operator] = []
+    for step in file.steps:
+        operator = step.operator
+        if isinstance(operator, Output) or (makes_products(operator) and not isinstance(operator, BinMap)):
+            continue
+        if _only_writes(operator) or type(operator) is SkyMap:
+            continue
+        if "boresight" not in operator.provides:
+            _check(operator, step.key)
+        kept.append(operator)
+    maps, highpass, common = ([o for o in kept if isinstance(o, kind)] for kind in (BinMap, HighpassFilter, CommonModeFilter))
+    _check_numbers(file.header.name, maps, highpass, common)
+    found = Steps.among(kept)
+    _check_together(found, file.header.name)
+    return found
+
+
+def _only_writes(operator: Operator) -> bool:
+    return not operator.provides
+
+
+def _check(operator: Operator, name: str) -> None:
+    """Refuse an operator, or a parameter of it, that is not covered."""
+    if type(operator) not in COVERED:
+        raise PipelineError("the forecast does not cover this step", place=name, cure=CURE)
+    free = COVERED[type(operator)]
+    if free is None:
+        return
+    usual = type(operator)()
+    for parameter in type(operator).model_fields:
+        value = getattr(operator, parameter)
+        if parameter not in free | ANY and value != getattr(usual, parameter):
+            text = f"the forecast does not cover {parameter}: {value}"
+            raise PipelineError(
+                text, place=name, cure=f"leave {parameter} out, or find the noise with `zonda run` and several seeds"
+            )
+
+
+def _check_numbers(name: str, maps: Sequence[Operator], *filters: Sequence[Operator]) -> None:
+    if len(maps) != 1:
+        text = "there is no map" if not maps else f"there are {len(maps)} maps, the forecast is of one"
+        raise PipelineError(text, place=name, cure="have one BinMap")
+    for each in filters:
+        if len(each) > 1:
+            raise PipelineError(f"there are {len(each)} of them, the forecast covers one", place=each[0].label, cure=CURE)
+
+
+def _check_together(steps: Steps, name: str) -> None:
+    if not any(steps.of(kind) for kind in (WhiteNoise, PinkNoise, AtmosphereLayers)):
+        raise PipelineError("nothing in this pipeline makes noise", place=name, cure="add WhiteNoise")
+    order = [o for o in steps.operators if isinstance(o, HighpassFilter | CommonModeFilter)]
+    if len(order) == 2 and isinstance(order[0], CommonModeFilter):
+        raise PipelineError(
+            "the forecast covers a CommonModeFilter behind the HighpassFilter only", place=name, cure="exchange them"
+        )
+    if steps.of(AtmosphereLayers) and steps.highpass is None:
+        text = "without a HighpassFilter the mean emission of the atmosphere, tens of kelvin, is in the map"
+        raise PipelineError(text, place=name, cure="add HighpassFilter, or leave AtmosphereLayers out")
+    if len(steps.of(AtmosphereLayers)) > 1:
+        raise PipelineError("the forecast covers one AtmosphereLayers", place=name, cure=CURE)
+    shared = any(o.shared > 0 for o in steps.of(PinkNoise))
+    if shared and steps.common is None:
+        text = "noise that detectors share adds up coherently without a CommonModeFilter, which the forecast does not cover"
+        raise PipelineError(text, place=name, cure="add CommonModeFilter, or set PinkNoise.shared to 0")

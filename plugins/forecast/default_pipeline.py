@@ -1,0 +1,256 @@
+"""A pipeline for an observer who names an instrument and a site: daisy scans, high-pass filter, common mode, one map.
+
+    radius r       half the area's diameter, of what the boresight covers
+    speed          the least of: 0.35 sqrt(a r), a the telescope's largest acceleration; half of its largest speed; r per second;
+                   a fifth of a beam per sample                                                                       (1)
+    cut            speed / (2.5 r)                                                                                    (2)
+
+For MUSTANG-2 on the GBT and r = 4 arcmin these are about 50 arcsec/s and 0.08 Hz, as its observers choose them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from zonda.core import registry
+from zonda.core.configuration.target import Target
+from zonda.core.configuration.time import Instant
+from zonda.core.configuration.units import Unit
+from zonda.core.errors import InputError, PointingError
+from zonda.core.instrument import Instrument, Telescope
+from zonda.core.numerics.sphere import unit_vectors
+from zonda.core.site import Site
+from zonda.core.weather import Pwv
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from zonda.core.configuration.loaded import PipelineFile
+    from zonda.core.types import Floats
+
+ELEVATION = math.radians(60)
+LONGEST, MOST = 600.0, 6
+"""Seconds of a scan, and number of scans that are followed, at most: a longer observation averages down as time^-1/2."""
+ACCELERATION, SPEED, PERIOD, SAMPLED, CUT = 0.35, 0.5, 1.0, 0.2, 2.5
+"""Of equations (1) and (2)."""
+TURN, CYCLES = 20.0, 5.0
+"""A scan lasts at least this many radius / speed, one turn of the petals, and this many cycles of the cut."""
+WIDEST = math.radians(20)
+"""Largest area where none is given."""
+YEAR = 2024
+"""Of the date: the climatology is that of any year, and the Earth's orientation is known."""
+DAY, GRID = 86400.0, 300.0
+"""Seconds in which a target's culmination is looked for, and steps."""
+PLACE = "zonda sensitivity"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an observer says, as text with units; None: not said.
+
+    Attributes
+    ----------
+    instrument, site
+        Registered names.
+    pwv, month, quantile
+        PWV, or the month (1 to 12) and quantile (0 to 1) of the climatology; the median of the present month where nothing is
+        said.
+    elevation, target
+        Elevation of a target that culminates in the middle of the night, or a target, observed when it culminates.
+    area
+        Diameter of the field that the boresight covers; twice the field of view where it is not said.
+    time
+        Integration time.
+    """
+
+    instrument: str
+    site: str
+    pwv: str | None = None
+    month: int | None = None
+    quantile: float | None = None
+    elevation: str | None = None
+    target: str | None = None
+    area: str | None = None
+    time: str | None = None
+
+    def check(self) -> None:
+        """Raise InputError for what contradicts itself or is beyond limits."""
+        if self.pwv is not None and self.quantile is not None:
+            raise InputError("the PWV is given twice, as a value and as a quantile", place=PLACE, cure="give --pwv or --quantile")
+        if self.elevation is not None and self.target is not None:
+            raise InputError("a target has an elevation of its own", place=PLACE, cure="give --target or --elevation")
+        if self.month is not None and not 1 <= self.month <= 12:
+            raise InputError(f"there is no month {self.month}", place="--month", cure="give 1 to 12")
+        if self.quantile is not None and not 0 < self.quantile < 1:
+            raise InputError(f"a quantile of {self.quantile:g} is outside the limits, above 0 and below 1", place="--quantile")
+
+
+@dataclass(frozen=True)
+class Daisy:
+    """Equations (1) and (2): rad, rad/s, Hz, s."""
+
+    radius: float
+    speed: float
+    cut: float
+    duration: float
+    scans: int
+
+
+def make(asked: Asked, settings: Sequence[str] = ()) -> PipelineFile:
+    """The pipeline, with changes as `zonda run --set` takes them.
+
+    Raises ZondaError for names that are not registered, contradictions, and targets that are not up.
+    """
+    from zonda.core.configuration.pipeline_file import parse
+
+    return parse(text(asked), name="the pipeline of zonda sensitivity", overrides=settings)
+
+
+def text(asked: Asked) -> str:
+    """The pipeline as YAML. Raises as `make`."""
+    asked.check()
+    instrument, site = registry.instruments.create(asked.instrument), registry.sites.create(asked.site)
+    elevation = positive("--elevation", "rad", asked.elevation, ELEVATION)
+    if elevation > math.pi / 2:
+        raise InputError(f"an elevation of {asked.elevation} is outside the limits, 0 to 90 deg", place="--elevation")
+    wanted = positive("--time", "s", asked.time, 3600.0)
+    usual = min(2 * max(instrument.field_of_view, 10 * instrument.beam_fwhm), WIDEST)
+    scan = daisy(instrument, elevation, positive("--area", "rad", asked.area, usual), wanted)
+    span = scan.scans * (scan.duration + 30) - 30
+    middle = _midnight(site, asked.month)
+    if asked.target is None:
+        start, target = middle.shifted(-span / 2), _culminating(site, middle, elevation)
+    else:
+        target = parsed("--target", Target.parse, asked.target)
+        start = _culmination(site, middle, target).shifted(-span / 2)
+    pwv = asked.pwv if asked.pwv is not None else None if asked.quantile is None else f"{100 * asked.quantile:.12g} %"
+    water = None if pwv is None else str(parsed("--pwv", Pwv.parse, pwv))
+    return _yaml(asked, instrument, scan, (str(start), str(target), water))
+
+
+def daisy(instrument: Instrument, elevation: float, area: float, seconds: float) -> Daisy:
+    """Equations (1) and (2) for an area of diameter ``area`` [rad] at an ``elevation`` [rad], and the scans that fill
+    ``seconds``."""
+    radius, telescope = area / 2, instrument.telescope
+    acceleration, fastest = _limits(telescope, elevation)
+    speed = min(
+        ACCELERATION * math.sqrt(acceleration * radius),
+        SPEED * fastest,
+        radius / PERIOD,
+        SAMPLED * instrument.beam_fwhm * instrument.sample_rate,
+    )
+    cut = speed / (CUT * radius)
+    scans = max(1, min(MOST, math.ceil(seconds / LONGEST - 1e-9)))
+    least = max(TURN * radius / speed, CYCLES / cut)
+    return Daisy(radius, speed, cut, max(min(seconds / scans, LONGEST), least), scans)
+
+
+def _limits(telescope: Telescope, elevation: float) -> tuple[float, float]:
+    """Largest acceleration and speed on the sky in any direction, rad/s2 and rad/s; infinite where none is known."""
+    across = math.cos(elevation)
+
+    def least(*values: float | None) -> float:
+        return min((v for v in values if v is not None), default=math.inf)
+
+    t = telescope
+    turned = [None if v is None else v * across for v in (t.azimuth_acceleration_max, t.azimuth_speed_max)]
+    return (
+        least(t.acceleration_max, turned[0], t.elevation_acceleration_max),
+        least(t.speed_max, turned[1], t.elevation_speed_max),
+    )
+
+
+def _midnight(site: Site, month: int | None) -> Instant:
+    """Local mean midnight on the 15th of a month of `YEAR`; of the present month where none is given."""
+    day = datetime(YEAR, month or datetime.now(UTC).month, 15, tzinfo=UTC)
+    hours = (-site.longitude / (2 * math.pi) * 24) % 24
+    return Instant.parse(day).shifted(round(hours * 3600))
+
+
+def _culminating(site: Site, middle: Instant, elevation: float) -> Target:
+    """The ICRS position that is highest at ``middle``, at an elevation: south of a northern site, north of a southern one."""
+    from zonda.operators.pointing.transform import CelestialTransform
+
+    azimuth = math.pi if site.latitude >= 0 else 0.0
+    transform = CelestialTransform(site, middle, 1.0)
+    x, y, z = transform.icrs(unit_vectors(-azimuth, elevation), np.zeros(1))[0]
+    right_ascension, declination = math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(z, math.hypot(x, y)))
+    return Target.parse(f"{right_ascension:.4f} deg {declination:.4f} deg")
+
+
+def _culmination(site: Site, middle: Instant, target: Target) -> Instant:
+    """When a target is highest within half a day of ``middle``. Raises PointingError where it never rises."""
+    from zonda.operators.pointing.transform import CelestialTransform
+
+    if target.frame == "horizontal":
+        cure = "give --elevation, or a position on the sky"
+        raise InputError("a target in azimuth and elevation moves over the sky", place="--target", cure=cure)
+    start = middle.shifted(-DAY / 2)
+    transform = CelestialTransform(site, start, DAY, 1e-6)
+    right_ascension, declination = target.icrs()
+    seconds: Floats = np.arange(0.0, DAY + 1, GRID)
+    height = transform.horizontal(unit_vectors(right_ascension, declination), seconds)[:, 2]
+    best = int(np.argmax(height))
+    if height[best] <= 0:
+        raise PointingError(f"{target} never rises at {site.name}", place="--target", cure="choose another site")
+    return start.shifted(float(seconds[best]))
+
+
+def _yaml(asked: Asked, instrument: Instrument, scan: Daisy, scene: tuple[str, str, str | None]) -> str:
+    angle, rate = Unit("rad"), Unit("rad / s")
+    start, target, pwv = scene
+    lines = [
+        f"name: sensitivity_{asked.instrument}",
+        f"site: {asked.site}",
+        f"instrument: {asked.instrument}",
+        f"time: {start}",
+        f"target: {target}",
+        *([f"weather: {{pwv: {pwv}}}"] if pwv is not None else []),
+        "operators:",
+        "  - PointingDaisy:",
+        f"      radius: {_in(angle, scan.radius, 'arcmin', 'deg')}",
+        f"      speed: {_in(rate, scan.speed, 'arcsec/s', 'arcmin/s', 'deg/s')}",
+        f"      scan_duration: {scan.duration:.6g} s",
+        f"      scans: {scan.scans}",
+        "  - AtmosphereLayers",
+        "  - WhiteNoise",
+        "  - PinkNoise",
+        "  - Efficiency",
+        f"  - HighpassFilter: {{frequency: {scan.cut:.3g} Hz}}",
+        *(["  - CommonModeFilter"] if instrument.detectors > 1 else []),
+        f"  - BinMap: {{pixel: {_in(angle, instrument.beam_fwhm / 4, 'arcsec', 'arcmin')}}}",
+        "  - SaveMap",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _in(unit: Unit, value: float, *names: str) -> str:
+    """A quantity [SI] with three digits, in the first of some units of rising size in which it is below 100."""
+    texts = [(value / unit.parse(f"1 {name}"), name) for name in names]
+    number, name = next((t for t in texts if t[0] < 100), texts[-1])
+    return f"{number:.3g} {name}"
+
+
+def positive(place: str, unit: str, given: str | None, usual: float) -> float:
+    """A quantity above 0 in SI; ``usual`` where none is given. Raises InputError about ``place``."""
+    value = usual if given is None else parsed(place, Unit(unit).parse, given)
+    if not value > 0:
+        raise InputError(f"{given} is not positive", place=place, cure=f"write e.g. {Unit(unit).example}")
+    return value
+
+
+def parsed(place: str, parse: Callable[[Any], T], given: str) -> T:
+    """What ``parse`` makes of a text; its refusal as an InputError about ``place``."""
+    from pydantic_core import PydanticCustomError
+
+    try:
+        return parse(given)
+    except PydanticCustomError as err:
+        raise InputError(err.message(), place=place) from None

@@ -1,0 +1,126 @@
+"""The depth of a map against time: variances of its noise, their errors, and the units that observers use."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from zonda.core.errors import InputError
+from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.types import Floats
+
+from . import atmosphere_noise, detector_noise
+
+if TYPE_CHECKING:
+    from zonda.core.instrument import Band
+
+    from .survey import Survey
+
+PARTS = ("white", "1/f", "atmosphere")
+"""What the noise is split into."""
+WITHIN = {"white": 0.05, "1/f": 0.05, "atmosphere": 0.25}
+"""Relative error of each part's rms that audits found at most (docs/sensitivity.md); the atmosphere is indicative."""
+UNITS = ("K_RJ", "K_CMB", "Jy/beam", "MJy/sr", "Jy")
+"""Units of a depth: ``Jy`` is the flux density of a point source, see `factors`."""
+PER_DECADE = (1.0, 2.0, 5.0)
+
+
+def factors(band: Band, fwhm: float) -> dict[str, float]:
+    """By unit what a depth in K_RJ behind the beam is multiplied by.
+
+    The spectrum of the source is flat over the band in S_nu, and that of CMB anisotropy for K_CMB (`core.numerics.radiation`).
+    ``Jy/beam`` and ``MJy/sr`` are surface brightness, for the solid angle Omega = pi FWHM^2 / (4 ln 2) of the beam. ``Jy`` is the
+    standard deviation of the flux density of a point source: the map behind the beam K is the matched filter, whose peak for a
+    source of flux density S is S / (2 Omega) in surface brightness, because int K^2 / int K = 1/2. Hence Jy = 2 Jy/beam.
+    """
+    omega = math.pi * fwhm**2 / math.log(16)
+    found = {unit: 1 / to_kelvin_rj(unit, band, beam_solid_angle=omega) for unit in UNITS[:-1]}
+    return found | {"Jy": 2 * found["Jy/beam"]}
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Rms of the noise behind the beam in a circle, K_RJ.
+
+    Attributes
+    ----------
+    seconds
+        (n_scan,) integration time after each scan.
+    variance
+        By part (`PARTS`), (n_scan,) K^2.
+    error
+        By part, relative error of its rms that is stated.
+    """
+
+    seconds: Floats
+    variance: Mapping[str, Floats]
+    error: Mapping[str, float]
+
+    def part(self, name: str, seconds: Floats | float) -> Floats:
+        """The rms of a part of the noise, K_RJ, after ``seconds``: as forecast up to the end of the scans, then as time^-1/2;
+        before the end of the first scan likewise."""
+        wanted = np.asarray(seconds, np.float64)
+        inside = np.clip(wanted, self.seconds[0], self.seconds[-1])
+        variance = np.interp(inside, self.seconds, self.seconds * self.variance[name])
+        return np.asarray(np.sqrt(variance / wanted))
+
+    def total(self, seconds: Floats | float) -> Floats:
+        """All parts in quadrature, K_RJ."""
+        return np.asarray(np.sqrt(sum(self.part(name, seconds) ** 2 for name in PARTS)))
+
+    def total_error(self, seconds: float) -> float:
+        """Relative error of `total`, the parts' errors in quadrature."""
+        parts = [float(self.part(name, seconds)) ** 2 * self.error[name] for name in PARTS]
+        return math.hypot(*parts) / max(float(self.total(seconds)) ** 2, 1e-300)
+
+    def reach(self, rms: float) -> float:
+        """Integration time [s] after which all parts together are ``rms`` [K_RJ]; all of them fall as time^-1/2 after the scans.
+
+        Raises InputError for what is not positive.
+        """
+        if not rms > 0:
+            raise InputError(f"a depth of {rms:g} K is reached by no observation", place="--reach", cure="give a positive depth")
+        end = float(self.seconds[-1])
+        if float(self.total(end)) >= rms:
+            return end * (float(self.total(end)) / rms) ** 2
+        start = float(self.seconds[0])
+        if float(self.total(start)) <= rms:
+            return start * (float(self.total(start)) / rms) ** 2
+        fine = np.geomspace(start, end, 2000)
+        return float(fine[np.argmax(self.total(fine) <= rms)])
+
+
+def depth_of(survey: Survey, radius: float) -> Depth:
+    """Forecast the noise behind the beam, averaged over a circle of ``radius`` [rad] about the map's centre.
+
+    Raises PipelineError where the circle is not on the map, or not observed.
+    """
+    survey.check_radius(radius)
+    variance = detector_noise.variances(survey, radius)
+    if not np.isfinite(variance["white"]).all():
+        raise InputError("nothing is observed in the circle", place="zonda sensitivity", cure="choose a larger --radius")
+    left = atmosphere_noise.variance(survey, radius)
+    # an error of a variance is half as large of its root
+    error = WITHIN | {"atmosphere": math.hypot(WITHIN["atmosphere"], left.error / 2)}
+    return Depth(survey.seconds, variance | {"atmosphere": left.variance}, error)
+
+
+def scatter(sigma: float, radius: float) -> float:
+    """Relative standard deviation of the rms of one map of white noise behind a beam of standard deviation ``sigma`` in a circle
+    of ``radius``: sigma / radius, because pi radius^2 / (2 pi sigma^2) areas in it are independent."""
+    return sigma / max(radius, math.sqrt(2) * sigma)
+
+
+def times(depth: Depth, wanted: float | None) -> Floats:
+    """Round times [s] about the length of the scans (or ``wanted``) for a table: 1, 2 and 5 of each decade of hours, and the
+    length."""
+    end = float(depth.seconds[-1])
+    chosen = {end, wanted or end}
+    low, high = min(chosen) / 5, max(chosen) * 20
+    decades = range(math.floor(math.log10(low / 3600)), math.ceil(math.log10(high / 3600)) + 1)
+    chosen |= {3600 * step * 10.0**d for d in decades for step in PER_DECADE if low <= 3600 * step * 10.0**d <= high}
+    return np.array(sorted(chosen))

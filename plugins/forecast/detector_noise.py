@@ -1,0 +1,147 @@
+"""White and 1/f noise of a filtered, binned map behind the beam, without its time streams.
+
+Samples i = (detector d, time t) at x_i have weights a_i in the map and noise of rms sigma_i; K is the beam. At a point x of the
+map that is smoothed with K, the sample i has the weight
+
+    w_i = a_i K(x - x_i) / sum_j a_j K(x - x_j)                                                                   (1)
+
+The filters are F = (1 - u u^T) (1 - P), P the low part that the high-pass filter removes and u = n_det^(-1/2) what the common
+mode takes. With W_d(f) the spectrum of the series (1 - P) w_d, and R(f) the power of the noise over that of white noise,
+
+    variance = (1 - 1 / n_det) (1 - shared) sum_i sigma_i^2 w_i^2  <sum_df sigma^2 |W_d|^2 R> / <sum_dt sigma^2 w_d^2>     (2)
+
+R = 1 of white noise. What detectors share is gone behind the common mode. The factor <> / <> needs few detectors, which stand for
+all; w and the sum before it need all of them (few would bias it). The variance is averaged over probes in a circle about the
+map's centre, weighted like the samples of the map; in the factor all probes of a comb are in one series, with random signs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.fft import next_fast_len, rfft
+
+from zonda.core.types import AnyFloats, Floats
+
+from .beams import Comb, combs, kernel_series, kernel_sums
+from .survey import Noise, Survey
+
+PROBES, DETECTORS = 16, 24
+"""Probes in the circle, and detectors whose series stand for all."""
+SIGNS = 16
+"""How often the signs are drawn, all combs together: probes that a detector passes one after the other have noise in common."""
+SAMPLES, INSTANTS = 3e7, 4000
+"""Samples (of all scans and combs) of which kernels are summed up: where there are more, instants are left out, and of so few
+instants detectors."""
+STEEP = 8
+"""Lowest frequencies whose bins are integrated over."""
+FILTERED = 12
+"""Scans whose series are filtered: evenly chosen of all."""
+
+
+def variances(survey: Survey, radius: float) -> dict[str, Floats]:
+    """``white`` and ``1/f``: (n_scan,) variance [K^2] after each scan, averaged over a circle of ``radius`` [rad]."""
+    chosen = combs(survey, radius, PROBES)
+    sums, some = _sums(survey, chosen)
+    weighted = sums[..., 0] * survey.weights[:, None]
+    total = np.cumsum(weighted, axis=0)
+    found = {"white": np.zeros(len(total)), "1/f": np.zeros(len(total))}
+    seen = total[-1] > 0
+    if not seen.any():
+        return {name: np.full(len(total), np.nan) for name in found}
+    filtered = _Filtered(survey, chosen, total[-1])
+    for k, noise in enumerate(survey.levels[0]):
+        sigma2 = np.array([each[k].sample ** 2 for each in survey.levels])
+        squares = np.cumsum(sums[..., 1] * (survey.weights**2 * sigma2)[:, None], axis=0)
+        unfiltered = _averaged(squares, total, some)
+        left = 1 - 1 / len(survey.focalplane) if survey.common else 1.0
+        own = 1 - noise.shared if survey.common else 1.0
+        found["white" if noise.spectrum is None else "1/f"] += left * own * filtered.share(k) * unfiltered
+    return found
+
+
+def _averaged(squares: Floats, total: Floats, some: bool) -> Floats:
+    """(n_scan,) sum a^2 sigma^2 K^2 / (sum a K)^2, averaged over probes with the weights sum a K. Of ``some`` detectors only, the
+    sums of the numerator and of one factor of the denominator are averaged first: the ratio of few samples is biased."""
+    if some:
+        seen = np.count_nonzero(total, axis=1)
+        return np.asarray(seen * squares.sum(axis=1) / total.sum(axis=1) ** 2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(total > 0, squares / total, 0.0).sum(axis=1) / total.sum(axis=1))
+
+
+def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
+    """(n_scan, n_probe, 2) sums of K and K^2 at the probes of all combs; whether they are from some of the detectors."""
+    rate, offsets = survey.rate, survey.offsets
+    tracks = [survey.track(k, rate) for k in range(len(survey.observations))]
+    instants = sum(len(t.index) for t in tracks)
+    number = instants * len(offsets) * len(chosen)
+    thin = min(max(1, round(number / SAMPLES)), max(1, instants // INSTANTS))
+    fewer = min(len(offsets), max(1, round(thin * SAMPLES / number * len(offsets))))
+    if fewer < len(offsets):
+        offsets = np.ascontiguousarray(offsets[np.sort(np.random.default_rng(4).permutation(len(offsets))[:fewer])])
+    far = float(np.hypot(*survey.offsets.T).max())
+    rows = [np.concatenate([kernel_sums(t, c, offsets, (survey.sigma, far), thin)[c.inside] for c in chosen]) for t in tracks]
+    return np.array(rows) * (len(survey.offsets) / fewer), fewer < len(survey.offsets)
+
+
+class _Filtered:
+    """What the filters leave of each noise, <> / <> of equation (2)."""
+
+    def __init__(self, survey: Survey, chosen: list[Comb], total: Floats) -> None:
+        number = len(survey.levels[0])
+        self._left, self._all = np.zeros(number), np.zeros(number)
+        rng = np.random.default_rng(2)
+        every = survey.offsets
+        few = every[np.sort(np.random.default_rng(1).permutation(len(every))[:DETECTORS])]
+        scans = sorted({round(k) for k in np.linspace(0, len(survey.observations) - 1, FILTERED)})
+        begin = 0
+        for comb in chosen:
+            factors = np.zeros(comb.inside.shape)
+            stop = begin + int(comb.inside.sum())
+            there = total[begin:stop]
+            for _ in range(max(1, SIGNS // len(chosen))):
+                signs = rng.choice([-1.0, 1.0], len(there))
+                factors[comb.inside] = np.where(there > 0, signs / np.sqrt(np.where(there > 0, there, 1.0)), 0.0)
+                for scan in scans:
+                    self._add(survey, scan, kernel_series(survey, survey.track(scan, survey.rate), comb, factors, few))
+            begin = stop
+
+    def _add(self, survey: Survey, scan: int, rows: AnyFloats) -> None:
+        track = survey.track(scan, survey.rate)
+        rows = rows[rows.any(axis=1)]
+        if not len(rows):
+            return
+        weight = survey.weights[scan] ** 2 * track.step
+        before = weight * float(np.einsum("dt,dt->", rows, rows, dtype=np.float64))
+        survey.filter(track, rows)
+        frequency, energy = _power(rows, track.rate)
+        for k, noise in enumerate(survey.levels[scan]):
+            self._left[k] += weight * noise.sample**2 * float(energy @ _spectrum(noise, frequency))
+            self._all[k] += before * noise.sample**2
+
+    def share(self, noise: int) -> float:
+        """Of one of the noises."""
+        return float(self._left[noise] / self._all[noise]) if self._all[noise] > 0 else 0.0
+
+
+def _spectrum(noise: Noise, frequency: Floats) -> Floats:
+    """R at the frequencies of `_power`; of the lowest, where it is steep, its mean over the bin."""
+    if noise.spectrum is None:
+        return np.ones_like(frequency)
+    found, step = noise.spectrum(frequency), frequency[1]
+    for k in range(min(STEEP, len(found))):
+        fine = np.geomspace(max(k - 0.5, 1e-5), k + 0.5, 200) * step
+        below = fine[0] * noise.spectrum(fine[:1])[0] if k == 0 else 0.0
+        found[k] = (float(np.trapezoid(noise.spectrum(fine), fine)) + below) / (step * (0.5 if k == 0 else 1.0))
+    return found
+
+
+def _power(rows: AnyFloats, rate: float) -> tuple[Floats, Floats]:
+    """(f, sum over rows of |W(f)|^2), one-sided, by transforms of twice the length: their sum over f is that of the squares."""
+    n = next_fast_len(2 * rows.shape[-1], real=True)
+    spectrum = rfft(rows, n, axis=-1)
+    energy = (spectrum.real**2 + spectrum.imag**2).sum(axis=0, dtype=np.float64) / n
+    energy[1:] *= 2
+    if n % 2 == 0:
+        energy[-1] /= 2
+    return np.arange(energy.size) * rate / n, energy

@@ -1,0 +1,305 @@
+"""The scans of a pipeline as the forecast needs them: where detectors look on the map, how noisy they are, what the filters cut.
+
+The telescope is pointed and levels of noise are resolved by the pipeline's own steps (`Operator.observe`, `Operator.configure`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.fft import dct, idct
+
+from zonda.core.errors import PipelineError
+from zonda.core.focalplane import Focalplane
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.projection import boresights, homographies
+from zonda.core.observation import Observation
+from zonda.core.pipeline import Pipeline
+from zonda.core.run.signals import note_signals
+from zonda.core.types import AnyFloats, Floats
+from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.filters.brick_wall import plan_highpass
+from zonda.operators.maps.grid import TangentGrid, tangent_wcs
+from zonda.operators.noise.pink import PinkNoise, PinkSpectrum, level_of
+from zonda.operators.noise.planning import calibrated as calibrated_level
+from zonda.operators.noise.white import WhiteNoise
+
+from .covered import Steps, steps_of
+
+if TYPE_CHECKING:
+    from zonda.core.configuration.loaded import PipelineFile
+    from zonda.core.scene import Scene
+
+CONFIGURED = 9
+"""Scans whose atmosphere and levels of noise are looked at; the others have those of the nearest."""
+
+PER_BEAM, PER_CUT = 2.5, 8.0
+"""Instants per beam that is crossed, and per cycle of the high-pass filter's cut, at which scans are followed."""
+
+UNEVEN = 0.05
+"""Largest relative scatter of NET between detectors that is taken as none."""
+
+FLAGGED = 0.01
+"""Largest share of flagged samples that is taken as none."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One kind of noise of one scan's calibrated samples: white, or 1/f.
+
+    Attributes
+    ----------
+    sample
+        Rms of one sample of the white noise that it refers to, K.
+    spectrum
+        Its power over that of that white noise at frequencies [Hz]; None: white.
+    shared
+        Share of the variance that all detectors have in common.
+    """
+
+    sample: float
+    spectrum: Callable[[Floats], Floats] | None = None
+    shared: float = 0.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """A scan followed at some instants.
+
+    Attributes
+    ----------
+    observation
+        The scan.
+    index
+        (n,) sample numbers of the instants, each in the middle of the ``step`` samples that it stands for.
+    rate
+        Of the instants, Hz.
+    matrices
+        (n, 9): from (xi, eta, 1) to the map's tangent plane, rad from its centre towards west and north (`projection`, equation
+        1).
+    """
+
+    observation: Observation
+    index: Any
+    step: int
+    rate: float
+    matrices: Floats
+
+    @cached_property
+    def centre(self) -> Floats:
+        """(n, 2) where the boresight is, rad."""
+        h = self.matrices
+        return np.asarray(h[:, (2, 5)] / h[:, 8:])
+
+    @cached_property
+    def turn(self) -> Floats:
+        """(n, 2, 2) derivative of the position by (xi, eta) at the boresight."""
+        h = self.matrices
+        rows = [h[:, 3 * k : 3 * k + 2] - self.centre[:, k : k + 1] * h[:, 6:8] for k in (0, 1)]
+        return np.asarray(np.stack(rows, axis=1) / h[:, 8, None, None])
+
+
+@dataclass
+class Survey:
+    """What a pipeline does to noise, see `survey_of`.
+
+    Attributes
+    ----------
+    scene, steps, observations
+        The scans have their pointing; those of ``levels`` their levels of noise.
+    levels
+        For each scan the noises of its samples.
+    weights
+        (n_scan,) relative weight of a sample in the map.
+    configured
+        (n_scan,) index of the scan whose atmosphere a scan is taken to have.
+    """
+
+    scene: Scene
+    steps: Steps
+    observations: list[Observation]
+    levels: list[tuple[Noise, ...]]
+    weights: Floats
+    configured: list[int]
+    _tracks: dict[tuple[int, int], Track] = field(default_factory=dict)
+
+    @property
+    def focalplane(self) -> Focalplane:
+        """The detectors, those of the first scan."""
+        return self.observations[0].focalplane
+
+    @cached_property
+    def offsets(self) -> Floats:
+        """(n_det, 2) xi and eta."""
+        return np.ascontiguousarray(np.stack([self.focalplane.xi, self.focalplane.eta], axis=1))
+
+    @property
+    def fwhm(self) -> float:
+        """The beam's, rad."""
+        return self.scene.instrument.beam_fwhm
+
+    @property
+    def sigma(self) -> float:
+        """Its standard deviation, rad."""
+        return self.fwhm / FWHM_PER_SIGMA
+
+    @property
+    def cut(self) -> float:
+        """Frequency of the high-pass filter, Hz; 0: there is none."""
+        return self.steps.highpass.frequency if self.steps.highpass else 0.0
+
+    @property
+    def common(self) -> bool:
+        """Whether what detectors have in common is removed: of one detector it is not."""
+        return self.steps.common is not None and len(self.focalplane) > 1
+
+    @property
+    def atmosphere(self) -> AtmosphereLayers | None:
+        """The step that makes the atmosphere."""
+        found: list[AtmosphereLayers] = self.steps.of(AtmosphereLayers)
+        return found[0] if found else None
+
+    @cached_property
+    def seconds(self) -> Floats:
+        """(n_scan,) integration time after each scan, gaps between them not counted."""
+        return np.cumsum([o.duration for o in self.observations])
+
+    @cached_property
+    def speed(self) -> float:
+        """Median speed of the boresight on the sky, rad/s."""
+        speeds = []
+        for o in self.observations[:3]:
+            at = np.unique(np.linspace(0, o.n_samples - 2, min(2000, max(o.n_samples - 1, 1))).astype(int))
+            if o.n_samples > 1:
+                ends = boresights(o.boresight_radec[np.stack([at, at + 1], 1).ravel()]).reshape(3, -1, 2)
+                speeds.append(np.linalg.norm(ends[..., 1] - ends[..., 0], axis=0) * o.sample_rate)
+        return float(np.median(np.concatenate(speeds))) if speeds else 0.0
+
+    @property
+    def rate(self) -> float:
+        """Instants per second at which beams and filters are resolved, Hz."""
+        return max(PER_BEAM * self.speed / self.fwhm, PER_CUT * self.cut, 1.0)
+
+    def track(self, scan: int, rate: float) -> Track:
+        """A scan followed at about ``rate`` [Hz], or at every sample."""
+        o = self.observations[scan]
+        step = min(max(1, int(o.sample_rate / rate)), max(1, o.n_samples // 16))
+        if (scan, step) not in self._tracks:
+            index = np.arange(step // 2, o.n_samples // step * step, step)
+            grid = self._grid
+            plane = tangent_wcs(grid.centre, 1.0, (1, 1), grid.frame)
+            matrices = np.ascontiguousarray(homographies(o.boresight_radec[index], plane))
+            self._tracks[scan, step] = Track(o, index, step, o.sample_rate / step, matrices)
+        return self._tracks[scan, step]
+
+    def filter(self, track: Track, rows: AnyFloats) -> None:
+        """The pipeline's high-pass filter on series (n_row, n) at the instants of a track, in place."""
+        step = self.steps.highpass
+        if step is None:
+            return
+        plan = plan_highpass(len(track.index), step.frequency / track.rate, step.degree, step.oversampling)
+        if plan.knots:
+            plan.apply(rows)
+            return
+        low = (rows @ plan.polynomials.T) @ plan.polynomials
+        if plan.cut:
+            spectrum = dct(rows - low, type=2, axis=1)
+            spectrum[:, plan.cut :] = 0
+            low += idct(spectrum, type=2, axis=1)
+        rows -= low.astype(rows.dtype)
+
+    @property
+    def _grid(self) -> TangentGrid:
+        grid = self.steps.binning.grid
+        assert isinstance(grid, TangentGrid)
+        return grid
+
+    def check_radius(self, radius: float) -> None:
+        """Raise PipelineError where a circle [rad] about the map's centre is not on the map."""
+        grid = self._grid
+        half = min(grid.shape) * grid.pixel / 2
+        if radius > half:
+            wide, reach = (math.degrees(angle) * 60 for angle in (radius, half))
+            text = f"a circle of radius {wide:.3g} arcmin is not on the map, which reaches {reach:.3g} arcmin from its centre"
+            raise PipelineError(text, place="zonda sensitivity", cure="choose a smaller --radius")
+
+
+def survey_of(file: PipelineFile) -> Survey:
+    """Point the telescope and resolve the noise, as the pipeline's steps do it; nothing is drawn.
+
+    Raises PipelineError for what the forecast does not cover, and what the steps raise.
+    """
+    chosen, scene = steps_of(file), file.scene()
+    header = file.header
+    pipeline = Pipeline(chosen.operators, name=header.name, precision=header.precision)
+    steps = Steps.among(pipeline.operators)  # copies, which know the scans
+    data = pipeline.point(scene, {}, Path())
+    observations = data.observations
+    note_signals(observations, pipeline.signals.components, pipeline.signals.formed)
+    chosen_scans = sorted({round(k) for k in np.linspace(0, len(observations) - 1, min(CONFIGURED, len(observations)))})
+    for k in chosen_scans:
+        for operator in pipeline.operators:
+            operator.configure(observations[k])
+    levels = {k: _noises(steps, observations[k]) for k in chosen_scans}
+    distance = np.abs(np.subtract.outer(np.arange(len(observations)), chosen_scans))
+    nearest = [chosen_scans[k] for k in distance.argmin(axis=1)]
+    _check_scans(observations, header.name)
+    weights = np.ones(len(observations))
+    if steps.binning.weights == "inverse_variance":
+        nets = np.array([_rms(observations[k].expected_net()) for k in nearest])
+        weights = np.where(nets > 0, (nets[0] / np.where(nets > 0, nets, 1.0)) ** 2, 1.0)
+    return Survey(scene, steps, observations, [levels[k] for k in nearest], weights, nearest)
+
+
+def _check_scans(observations: Sequence[Observation], name: str) -> None:
+    if not observations:
+        raise PipelineError("the pointing steps made no observation", place=name, cure="ask for at least one scan")
+    first = observations[0].focalplane.names
+    for o in observations:
+        if o.focalplane.names != first:
+            raise PipelineError("scans with other detectors", place=o.name, cure="forecast them one by one")
+        unused = 1 - o.good_samples.mean() * o.good_detectors.mean()
+        if unused > FLAGGED:
+            text = f"{100 * unused:.3g} % of the samples are flagged, which the forecast does not cover"
+            raise PipelineError(text, place=o.name, cure="find the noise with `zonda run` and several seeds")
+
+
+def _noises(steps: Steps, observation: Observation) -> tuple[Noise, ...]:
+    """The noises of a configured scan's calibrated samples."""
+    found = []
+    for white in steps.of(WhiteNoise):
+        found.append(Noise(_even(calibrated_level(observation.noise_levels[white.label], observation), white.label)))
+    for pink in steps.of(PinkNoise):
+        spectrum = PinkSpectrum.of(pink, observation)
+        if spectrum is not None:
+            level = _even(calibrated_level(level_of(pink, observation), observation), pink.label)
+            found.append(Noise(level, _response(spectrum, pink.poles), pink.shared))
+    return tuple(found)
+
+
+def _response(spectrum: PinkSpectrum, poles: int) -> Callable[[Floats], Floats]:
+    """Power of pink noise over that of white noise: of the recursive filter that a run uses."""
+    law = spectrum.filter(poles)
+    frequency = np.geomspace(1e-3 * spectrum.minimum, spectrum.rate / 2, 500)
+    table = np.log(spectrum.factor**2 * law.response(frequency / spectrum.rate))
+    at = np.log(frequency)
+    return lambda f: np.exp(np.interp(np.log(np.maximum(f, frequency[0])), at, table))
+
+
+def _even(samples: Floats, place: str) -> float:
+    """The rms of what all detectors have alike."""
+    level = _rms(samples)
+    if level > 0 and float(np.std(samples)) > UNEVEN * level:
+        text = "the detectors' NETs differ, which the forecast does not cover"
+        raise PipelineError(text, place=place, cure="leave the scatter out, or find the noise with `zonda run` and several seeds")
+    return level
+
+
+def _rms(values: Floats) -> float:
+    return math.sqrt(float(np.mean(np.asarray(values) ** 2)))

@@ -1,0 +1,281 @@
+"""The built-in metrics of `zonda accuracy`: equations (1) to (5).
+
+m is a run's, m0 that of the tightest setting with the same random numbers.
+
+``map_rms``, the rms of the difference map in units of the map's own noise (pixels with hits in both; weights w and instrument
+noise n of the reference; the rms of m0 itself where the noise is not known):
+
+    E = sqrt( sum w (m - m0)^2 / sum w n^2 )                                                              (1)
+
+It bounds the change of the map's rms, because | |m| - |m0| | <= |m - m0| for every norm.
+
+``peak``, the extreme value p of the beam-smoothed map, of the sky alone where a signal keeps only that, among pixels with at
+least `COVERED` of the usual coverage:
+
+    E = |p - p0| / |p0|                                                                                   (2)
+
+``transfer``, the share T of each angular scale of the input map a (convolved with the beam, under the window of the coverage)
+that is left in the map b of the sky alone, as `TransferFunction` measures it; rings i of equal width in log k, from the map's
+extent to the beam, that hold power:
+
+    T_i = Re sum_ring b a* / sum_ring |a|^2,    E = sqrt( mean_i (T_i - T0_i)^2 )                         (3)
+
+``psd``, the mean power spectrum P of the signal as `PowerSpectrum` measures it, in `BINS` bins j of equal width in log f:
+
+    E = sqrt( mean_j (P_j / P0_j - 1)^2 )                                                                 (4)
+
+``structure``, the structure functions of the atmosphere's fluctuation s at `TRACED` detectors of the first scan, in time (lags)
+and between detectors (bins of separation), all in one list of values D:
+
+    D = < (s(t + lag) - s(t))^2 >  and  < (s_i(t) - s_j(t))^2 >,    E = sqrt( mean (D / D0 - 1)^2 )       (5)
+
+Each of N differences d measured through white noise of rms n per sample has the square (d + sqrt(2) n g)^2, g a standard normal,
+of variance 8 n^4 + 8 n^2 D where d is given, so that D, its 2 n^2 taken off, is known to within
+
+    sqrt( (8 n^4 + 8 n^2 D) / N )                                                                        (6)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.accuracy.metrics import Metric
+from zonda.core.data import Data
+from zonda.core.errors import InputError, PipelineError
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.operator import Operator
+from zonda.core.signal import Signal
+from zonda.core.types import Floats
+from zonda.operators.diagnostics.series import Spectrum
+from zonda.operators.diagnostics.time_streams import TimeStreams
+from zonda.operators.diagnostics.transfer_function import compare
+
+from .common import COVERED, as_seen, at_beam, covered, extreme, input_of
+
+RINGS, BINS, LAGS, SEPARATIONS = 8, 24, 12, 6
+TRACED = 64
+"""Detectors whose atmosphere is kept for the structure functions."""
+INSTANTS = 4096
+"""Instants at which pairs of detectors are compared."""
+TRACE = "accuracy-structure"
+
+
+class MapRms(Metric):
+    """Equation (1)."""
+
+    says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
+
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
+        _needs_map("map_rms", operators)
+
+    def measure(self, data: Data) -> dict[str, Floats]:
+        product = _map(data)
+        return {"signal": product.signal, "weights": product.weights, "noise": product.noise}
+
+    def error(self, found: dict[str, Floats], reference: dict[str, Floats]) -> float:
+        if found["signal"].shape != reference["signal"].shape:
+            cure = "fix the map: set BinMap.width and BinMap.centre"
+            raise InputError("the map's size depends on the knobs", place="map_rms", cure=cure)
+        known = np.isfinite(found["signal"]) & np.isfinite(reference["signal"])
+        difference = _mean_square(found["signal"] - reference["signal"], reference["weights"], known)
+        return math.sqrt(difference / self._unit(reference)) if difference else 0.0
+
+    def summary(self, found: dict[str, Floats]) -> Floats:
+        """The map's rms in units of its noise."""
+        known = np.isfinite(found["signal"])
+        return np.array([math.sqrt(_mean_square(found["signal"], found["weights"], known) / self._unit(found))])
+
+    def floor(self, reference: dict[str, Floats]) -> float | None:
+        """1, where the map knows its noise."""
+        return 1.0 if np.isfinite(reference["noise"]).any() else None
+
+    def _unit(self, of: dict[str, Floats]) -> float:
+        known = np.isfinite(of["noise"]) & np.isfinite(of["signal"])
+        values = of["noise"] if known.any() else of["signal"]
+        return _mean_square(values, of["weights"], np.isfinite(values)) or 1.0
+
+
+class Peak(Metric):
+    """Equation (2)."""
+
+    says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
+
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
+        _needs_map("peak", operators)
+
+    def measure(self, data: Data) -> Floats:
+        main, sky = _map(data), _map(data, _sky_alone(data.provenance.get("runs", {})))
+        smooth, noise = at_beam(sky), at_beam(main).noise
+        where, peak = extreme(smooth.signal, covered(smooth), "peak")
+        return np.array([peak, noise.flat[where]])
+
+    def summary(self, found: Floats) -> Floats:
+        return np.asarray(found[:1], np.float64)
+
+    def floor(self, reference: Floats) -> float | None:
+        """The smoothed map's instrument noise at the peak."""
+        value = abs(reference[1] / reference[0]) if reference[0] else math.nan
+        return float(value) if math.isfinite(value) else None
+
+
+class Transfer(Metric):
+    """Equation (3)."""
+
+    says: ClassVar[str] = "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is lost)"
+
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
+        _needs_map("transfer", operators)
+        if not any("sky" in o.provides for o in operators):
+            raise PipelineError("the metric transfer needs a sky, and no step makes one", place="--metric", cure="add a SkyMap")
+
+    def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
+        """The sky alone, where no signal of the pipeline is."""
+        return {} if any(run.only == ["sky"] for run in runs.values()) else {"sky_alone": Signal(only=["sky"])}
+
+    def measure(self, data: Data) -> Floats:
+        """(2, n): T_i, and its standard deviation from the instrument's noise in the main map."""
+        sky, main = _map(data, _sky_alone(data.provenance.get("runs", {}))), _map(data)
+        if sky.header is None:
+            raise InputError("the metric transfer needs a TAN map", place="transfer", cure="leave BinMap.nside out")
+        image = input_of(data, "transfer")
+        window = sky.hits / np.percentile(sky.hits[sky.hits > 0], 99)
+        window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
+        side = np.array(window.shape) * sky.pixel
+        edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
+        noise = float((window**2 * np.nan_to_num(main.noise) ** 2).sum())  # variance of each mode
+        rings = compare(as_seen(image, sky), sky.signal, window, sky.pixel, edges)
+        use = rings.power > 1e-6 * rings.power.max()
+        return np.array([rings.transfer[use], np.sqrt(noise / 2 / rings.power[use])])
+
+    def error(self, found: Floats, reference: Floats) -> float:
+        return float(np.sqrt(np.mean((found[0] - reference[0]) ** 2)))
+
+    def summary(self, found: Floats) -> Floats:
+        return np.asarray(found[0], np.float64)
+
+    def floor(self, reference: Floats) -> float | None:
+        return float(np.sqrt(np.mean(reference[1] ** 2)))
+
+
+class _Binned(Metric):
+    """What is measured in bins: (2, n) values and their relative standard errors."""
+
+    def error(self, found: Floats, reference: Floats) -> float:
+        return float(np.sqrt(np.mean((found[0] / reference[0] - 1) ** 2)))
+
+    def summary(self, found: Floats) -> Floats:
+        """The logarithm of the values: differences of it are relative."""
+        return np.asarray(np.log(np.maximum(found[0], 1e-300)), np.float64)
+
+    def floor(self, reference: Floats) -> float | None:
+        """The standard errors, from periodograms averaged or from white noise; None where they are not known."""
+        value = float(np.sqrt(np.mean(reference[1] ** 2)))
+        return value if math.isfinite(value) else None
+
+
+class Psd(_Binned):
+    """Equation (4)."""
+
+    says: ClassVar[str] = "rms over log-frequency bins of the relative error of the signal's power spectrum"
+
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
+        if not any("spectrum" in o.provides for o in operators):
+            cure = "add a PowerSpectrum where the spectrum matters, e.g. after Efficiency"
+            raise PipelineError("the metric psd needs a spectrum, and no step measures one", place="--metric", cure=cure)
+
+    def measure(self, data: Data) -> Floats:
+        """(2, n): P_j, and its relative standard error."""
+        spectrum = next((p for p in data.products.values() if isinstance(p, Spectrum) and "signal" in p.psd), None)
+        if spectrum is None:
+            raise InputError(
+                "no spectrum of the signal was measured", place="psd", cure="let PowerSpectrum.streams include signal"
+            )
+        f = spectrum.frequency
+        number = np.clip((BINS * np.log(f / f[0]) / np.log(f[-1] / f[0])).astype(int), 0, BINS - 1)
+        count = np.bincount(number, minlength=BINS)
+        mean = np.bincount(number, spectrum.psd["signal"], BINS)[count > 0] / count[count > 0]
+        return np.array([mean, 1 / np.sqrt(spectrum.averages * count[count > 0])])
+
+
+class Structure(_Binned):
+    """Equation (5). It keeps the atmosphere's stream, and the white noise, at some detectors by a step of its own."""
+
+    says: ClassVar[str] = "rms relative error of the atmosphere's structure functions in time and across the field"
+
+    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
+        if not any("atmosphere" in o.provides for o in operators) or not any("signal" in o.provides for o in operators):
+            cure = "add AtmosphereLayers and Efficiency"
+            raise PipelineError("the metric structure needs an atmosphere, and no step makes one", place="--metric", cure=cure)
+
+    def steps(self, operators: list[Operator]) -> list[Operator]:
+        """With a `TimeStreams` of the atmosphere, and of the noise, behind the step that forms the signal."""
+        at = next(k for k, o in enumerate(operators) if "signal" in o.provides) + 1
+        noisy = any("white" in o.provides for o in operators[:at])
+        trace = TimeStreams(name=TRACE, streams=["atmosphere", "white"] if noisy else ["atmosphere"], detectors=TRACED)
+        return [*operators[:at], trace, *operators[at:]]
+
+    def measure(self, data: Data) -> Floats:
+        """(2, n): D, and its relative standard error from the white noise of those detectors (NaN where there is none)."""
+        trace, observation = data.products[TRACE], data.observations[0]
+        s: Floats = trace.streams["atmosphere"]
+        n = s.shape[1]
+        lags = np.unique(np.geomspace(1, max(1, n // 4), LAGS).astype(int))
+        lags = lags[lags < n]
+        in_time = np.array([float(np.mean((s[:, lag:] - s[:, :-lag]) ** 2)) for lag in lags])
+        index = [observation.focalplane.names.index(name) for name in trace.names]
+        plane = observation.focalplane
+        noise = math.nan  # of one sample, in kelvins of the atmosphere
+        if "white" in trace.streams:
+            noise = float(trace.streams["white"].std() / plane.illumination_efficiency[index].mean())
+        pairs = len(index) * (n - lags) / 2  # increments that overlap share a sample
+        xi, eta = plane.xi[index], plane.eta[index]
+        i, j = np.triu_indices(len(index), 1)
+        if not i.size:
+            return np.array([in_time, _uncertain(in_time, noise, pairs)])
+        distance = np.hypot(xi[i] - xi[j], eta[i] - eta[j])
+        seen = s[:, :: max(1, n // INSTANTS)]
+        squares = np.array([np.mean((seen[a] - seen[b]) ** 2) for a, b in zip(i, j, strict=True)])
+        edges = np.quantile(distance, np.linspace(0, 1, SEPARATIONS + 1))
+        number = np.clip(np.searchsorted(edges, distance, "right") - 1, 0, SEPARATIONS - 1)
+        count = np.bincount(number, minlength=SEPARATIONS)
+        across = np.bincount(number, squares, SEPARATIONS)[count > 0] / count[count > 0]
+        # a bin's pairs share detectors: no more of them are independent than there are detectors
+        pairs = np.concatenate([pairs, np.minimum(count[count > 0], len(index) / 2) * seen.shape[1]])
+        d = np.concatenate([in_time, across])
+        return np.array([d, _uncertain(d, noise, pairs)])
+
+
+def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
+    """Relative standard error of D from N differences that carry white noise of the given rms, equation (6)."""
+    return np.asarray(np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs) / np.maximum(d, 1e-300), np.float64)
+
+
+def _mean_square(values: Floats, weights: Floats, use: NDArray[np.bool_]) -> float:
+    total = float(weights[use].sum())
+    return float((weights[use] * values[use] ** 2).sum() / total) if total > 0 else 0.0
+
+
+def _needs_map(metric: str, operators: Sequence[Operator]) -> None:
+    if not any("map" in o.provides for o in operators):
+        cure = "add `- BinMap` to the operators, or choose another metric: psd, structure"
+        raise PipelineError(
+            f"the metric {metric} needs a map, and no step of this pipeline makes one", place="--metric", cure=cure
+        )
+
+
+def _map(data: Data, run: str = "") -> MapProduct:
+    """The first map of a signal; ``run`` empty: the complete one."""
+    for name, product in data.products.items():
+        if isinstance(product, MapProduct) and name.rpartition("/")[0] == run:
+            return product
+    raise InputError(f"the run {run or 'itself'} made no map", place="--metric", cure="add `- BinMap` to the operators")
+
+
+def _sky_alone(runs: Mapping[str, Any]) -> str:
+    """Name of the signal that keeps the sky alone; empty (the complete one) where there is none."""
+    return next((name for name, run in runs.items() if run.get("only") == ["sky"]), "")

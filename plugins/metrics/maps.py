@@ -1,0 +1,241 @@
+"""Figures of maps: equations (1) to (5).
+
+With the map m, its weights w and the angle r of a pixel from the map's centre, after smoothing with the beam:
+
+    central_rms      sqrt( sum w m^2 / sum w ),   r <= radius                                             (1)
+    peak_ratio       p(b) / p(a)                                                                          (2)
+    peak_snr         max |m| / s,   s = n f,   f = rms(noise map) / rms(n) within the radius              (3)
+    coverage         median of hits x (seconds per sample and beam),   r <= radius                        (4)
+                     or the solid angle of the pixels with at least a share of it                         (5)
+
+p is the extreme value over pixels with at least `COVERED` of the usual samples: of a, the sky alone without filters, the one of
+largest absolute value; of b, the sky alone behind the filters, the one of the same sign. n is the standard deviation by NET and
+samples; a noise map with the factor f takes what 1/f noise and the atmosphere add into account.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Angle, Fraction
+from zonda.core.data import Data
+from zonda.core.errors import InputError
+from zonda.core.figures import FigureMetric
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.angles import ARCMIN, angle_text
+from zonda.core.signal import Signal
+from zonda.core.types import Floats
+
+from .common import SKY_ALONE, UNFILTERED, as_seen, at_beam, covered, extreme, flat, input_of, map_of, relative_error_of_rms
+
+Smoothing = Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"]
+NAME = r"^[A-Za-z0-9_]+$"
+
+
+class _OfMap(FigureMetric):
+    """A figure of one map."""
+
+    map: str = Field("map", pattern=NAME)
+    """Which map, by its name among the products."""
+
+
+class _OfSmoothMap(_OfMap):
+    """A figure of one smoothed map."""
+
+    smooth: Smoothing = "beam"
+    """Smooth a map that is not smoothed yet: with the beam, with a Gaussian of this FWHM, or not."""
+
+    def smoothed(self, product: MapProduct) -> MapProduct:
+        """The map as it is judged."""
+        return at_beam(product, {"beam": None, "none": 0.0}[self.smooth] if isinstance(self.smooth, str) else self.smooth)
+
+    def how(self) -> str:
+        """The smoothing in words."""
+        given = self.smooth if isinstance(self.smooth, str) else f"a Gaussian of FWHM {angle_text(self.smooth)}"
+        return {"beam": "smoothed with the beam", "none": "not smoothed"}.get(given, f"smoothed with {given}")
+
+
+class CentralRms(_OfSmoothMap):
+    """Weighted rms of the smoothed map about zero, near the map's centre, equation (1).
+
+    The standard error is that of white noise in the pixels, which the smoothing correlates.
+    """
+
+    radius: Angle = quantity("1 arcmin", gt=0)
+    """Pixels whose centres are this near to the map's centre count. (`Report` and `Plots` state a diameter.)"""
+    signal: str = Field("", pattern=r"^[A-Za-z0-9_]*$")
+    """Of which signal of the pipeline, e.g. source_free; empty: the complete one."""
+    of: Literal["signal", "half_difference"] = "signal"
+    """The map itself, or half the difference of two halves of its samples (`BinMap.half_difference`)."""
+
+    @property
+    def unit(self) -> str:
+        """Of a brightness."""
+        return "K_RJ"
+
+    def named_signals(self) -> tuple[str, ...]:
+        """The one that is chosen."""
+        return (self.signal,)
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (1)."""
+        return central_rms(self.smoothed(map_of(data, "central_rms", self.signal, self.map)), self.radius, self.of)
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        what = self.signal or "the map"
+        if self.of == "half_difference":
+            what = f"half the difference, {map_of(data, 'central_rms', self.signal, self.map).difference},"
+        return f"rms of {what} within {angle_text(self.radius)} of the centre, {self.how()}"
+
+
+def central_rms(product: MapProduct, radius: float, of: Literal["signal", "half_difference"] = "signal") -> tuple[float, float]:
+    """Equation (1) of a map as it is, within ``radius`` [rad], and its standard error. InputError where no pixel is there."""
+    value, near = product.rms(radius, of), product.distance() <= radius
+    if not math.isfinite(value):
+        cure = "choose a larger radius"
+        raise InputError(f"no pixel has a value within {angle_text(radius)} of the centre", place="central_rms", cure=cure)
+    return value, value * relative_error_of_rms(product, near)
+
+
+class PeakRatio(_OfSmoothMap):
+    """Extreme value of the sky alone behind the filters, divided by that without filters, equation (2).
+
+    Without filters is the map of the same samples (beam, pixels and coverage are in both), or the input map convolved with the
+    beam. It depends on the size of the source: a larger one loses more.
+    """
+
+    against: Literal["unfiltered", "input"] = "unfiltered"
+    """Divide by the map without filters, or by the input map convolved with the beam."""
+    modes: Literal["sky", "full"] = "sky"
+    """Singular modes of the sky alone (the paper's noiseless map), or of the complete data."""
+
+    def needs(self) -> tuple[Signal, ...]:
+        """The sky alone, with filters and without."""
+        kept = SKY_ALONE if self.modes == "sky" else Signal(only=["sky"], modes="full")
+        bare = UNFILTERED if self.modes == "sky" else Signal(only=["sky"], modes="full", filters="none")
+        return (kept, bare) if self.against == "unfiltered" else (kept,)
+
+    def named_signals(self) -> tuple[str, ...]:
+        """None but those of `needs`."""
+        return ()
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (2)."""
+        after = map_of(data, "peak_ratio", names[0], self.map)
+        seen = self.smoothed(after)
+        if self.against == "unfiltered":
+            before = self.smoothed(map_of(data, "peak_ratio", names[1], self.map)).signal
+        else:
+            extra = seen.smoothed_by
+            before = as_seen(input_of(data, "peak_ratio"), flat(after, "peak_ratio"), math.hypot(after.fwhm, extra))
+        return peak_ratio(before, seen), math.nan
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        other = "the map without filters" if self.against == "unfiltered" else "the input convolved with the beam"
+        return f"extreme value of the filtered sky / that of {other}, both {self.how()}, modes: {self.modes}"
+
+
+def peak_ratio(before: Floats, after: MapProduct) -> float:
+    """Equation (2) of a brightness without filters, in the pixels of the map behind them."""
+    good = covered(after) & np.isfinite(before)
+    _, peak = extreme(before, good, "peak_ratio")
+    if peak == 0:
+        raise InputError("the sky is empty", place="peak_ratio", cure="use a sky with a source")
+    same_sign = np.sign(peak) * after.signal
+    return float(np.max(same_sign[good])) / abs(peak)
+
+
+class PeakSnr(_OfSmoothMap):
+    """Largest ratio of the smoothed map to its noise, over pixels with enough samples, equation (3)."""
+
+    noise: Literal["source_free", "half_difference", "white"] = "source_free"
+    """What scales the noise: the map of everything but the sky (with the modes of the complete data), half the difference of even
+    and odd scans, or nothing: white noise by NET and samples."""
+    radius: Angle = quantity("1 arcmin", gt=0)
+    """Where the noise map is compared with the white noise."""
+    within: Angle | None = Field(None, gt=0)
+    """Look for the peak only this near to the map's centre."""
+
+    def needs(self) -> tuple[Signal, ...]:
+        """All but the sky, where that is the noise."""
+        return (Signal(without=["sky"], modes="full"),) if self.noise == "source_free" else ()
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (3); the noise itself scatters the ratio by 1."""
+        product = self.smoothed(map_of(data, "peak_snr", "", self.map))
+        factor, error = 1.0, 0.0
+        if self.noise != "white":
+            of: Any = "half_difference" if self.noise == "half_difference" else "signal"
+            free = self.smoothed(map_of(data, "peak_snr", names[0], self.map)) if names else product
+            found, error = central_rms(free, self.radius, of)
+            near = (product.distance() <= self.radius) & np.isfinite(product.noise)
+            if not near.any():
+                cure = "add a WhiteNoise and leave BinMap.noise at its default"
+                raise InputError("the map does not know its white noise", place="peak_snr", cure=cure)
+            w = product.weights[near]
+            factor = found / math.sqrt(float((w * product.noise[near] ** 2).sum() / w.sum()))
+            error /= found
+        good = covered(product) & np.isfinite(product.noise) & (product.noise > 0)
+        if self.within is not None:
+            good &= product.distance() <= self.within
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.where(good, product.signal / (factor * product.noise), 0.0)
+        value = abs(extreme(ratio, good, "peak_snr")[1])
+        return value, math.hypot(1.0, value * error)
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        return f"largest |map| / noise ({self.noise}), {self.how()}"
+
+
+class Coverage(_OfMap):
+    """How long the centre of the map was observed, per beam, equation (4), or how large the field is, equation (5)."""
+
+    of: Literal["time", "area"] = "time"
+    """Seconds of all detectors per beam near the centre, or the solid angle in arcmin2 with at least `least` of that."""
+    radius: Angle = quantity("1 arcmin", gt=0)
+    """What the centre is."""
+    least: Fraction = quantity("50 %", gt=0, le=1)
+    """Share of the centre's time from which a pixel counts to the area."""
+
+    @property
+    def unit(self) -> str:
+        """Of a time, or of a solid angle."""
+        return "s" if self.of == "time" else "arcmin2"
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (4) or (5)."""
+        product = data.products.get(self.map)
+        if not isinstance(product, MapProduct):
+            product = map_of(data, "coverage", "", self.map)  # raises
+        return coverage(product, self.radius, None if self.of == "time" else self.least), math.nan
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        centre = f"within {angle_text(self.radius)} of the centre"
+        if self.of == "time":
+            return f"seconds of all detectors per beam, median {centre}"
+        return f"solid angle with at least {100 * self.least:g} % of the time {centre}"
+
+
+def coverage(product: MapProduct, radius: float, least: float | None = None) -> float:
+    """Equation (4), s; with ``least`` equation (5), arcmin2."""
+    factor, near = product.seconds_per_beam(), product.distance() <= radius
+    if factor is None or not near.any():
+        cure = "set the instrument's fwhm and one sample rate, or choose a larger radius"
+        raise InputError("the time per beam is not known there", place="coverage", cure=cure)
+    time = product.hits * np.asarray(factor)
+    centre = float(np.median(time[near]))
+    if least is None:
+        return centre
+    solid = product.pixel**2
+    sizes = solid * np.cos(product.distance()) ** 3 if product.header is not None else np.full(time.shape, solid)
+    return float(sizes[(time >= least * centre) & (product.hits > 0)].sum()) / ARCMIN**2

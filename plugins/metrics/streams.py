@@ -1,0 +1,236 @@
+"""Figures of time streams: equations (1) to (4).
+
+``psd_slope``, the least-squares slope of ln P over ln f between two frequencies, x = ln f:
+
+    b = sum (x - <x>) (ln P - <ln P>) / sum (x - <x>)^2,     sigma_b^2 = c s^2 / sum (x - <x>)^2             (1)
+
+s^2 is the variance of the residuals, c = 1 + 2 (4/9 + 1/36) = 35/18 for the correlation of neighbouring frequencies through
+Welch's Hann window. ``crossing``, the highest frequency f_x at which one spectrum exceeds another, or a level 2 NET^2, between
+neighbouring bins of `BINS` equal ones in ln f, with the residuals s and the slope d of ln(P_1 / P_2) within a factor `NEAR`:
+
+    ln f_x: zero of the line through both bins,     sigma_ln f = (c / n)^(1/2) s / |d|                        (2)
+
+``first_component``, the largest share of the variance that `ModeSpectrum` found,
+
+    sigma_1^2 / sum sigma_i^2,                                                                               (3)
+
+``mean_t_scan``, from the levels that the run resolved, mean over detectors, instants and scans,
+
+    T_scan = < epsilon T_atm / (zeta e^-tau) >.                                                              (4)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Hertz, KelvinRootSecond
+from zonda.core.data import Data, Observation
+from zonda.core.errors import InputError
+from zonda.core.figures import FigureMetric
+from zonda.core.types import Floats
+from zonda.operators.diagnostics.series import Modes, Spectrum
+
+BINS, NEAR = 30, 1.5
+CORRELATED = 35 / 18
+"""c of equation (1)."""
+INSTANTS = 64
+"""At which the levels of a scan are evaluated."""
+
+
+class _OfSpectrum(FigureMetric):
+    """A figure of a power spectrum."""
+
+    reads: ClassVar[frozenset[str]] = frozenset({"spectrum"})
+
+    spectrum: str = Field("spectrum", pattern=r"^[A-Za-z0-9_.]+$")
+    """Which one, by its name among the products: that of a `PowerSpectrum` with a name of its own."""
+
+    def spectrum_of(self, data: Data, metric: str) -> Spectrum:
+        """The product. Raises InputError where there is none."""
+        found = data.products.get(self.spectrum)
+        if not isinstance(found, Spectrum):
+            there = ", ".join(k for k, p in data.products.items() if isinstance(p, Spectrum)) or "none; add a PowerSpectrum"
+            raise InputError(f"there is no spectrum {self.spectrum!r}", place=metric, cure=f"the spectra of this run: {there}")
+        return found
+
+
+def stream_in(spectrum: Spectrum, stream: str, metric: str) -> Floats:
+    """The spectrum of one stream. Raises InputError where it was not measured."""
+    if stream not in spectrum.psd:
+        cure = f"choose from: {', '.join(spectrum.psd)}; or add it to PowerSpectrum.streams"
+        raise InputError(f"the spectrum has no stream {stream!r}", place=metric, cure=cure)
+    return spectrum.psd[stream]
+
+
+class PsdSlope(_OfSpectrum):
+    """Logarithmic slope of a stream's power spectrum between two frequencies, equation (1)."""
+
+    stream: str = "signal"
+    """Which stream."""
+    low: Hertz = quantity("16 mHz", gt=0)
+    """Lowest frequency."""
+    high: Hertz = quantity("50 mHz", gt=0)
+    """Highest frequency."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.high <= self.low:
+            raise ValueError("high must be larger than low")
+        return self
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (1)."""
+        spectrum = self.spectrum_of(data, "psd_slope")
+        psd = stream_in(spectrum, self.stream, "psd_slope")
+        use = (spectrum.frequency >= self.low) & (spectrum.frequency <= self.high) & (psd > 0)
+        if np.count_nonzero(use) < 3:
+            cure = "widen low and high, or lengthen PowerSpectrum.segment: its inverse is the distance of frequencies"
+            raise InputError(f"fewer than 3 frequencies lie from {self.low:g} to {self.high:g} Hz", place="psd_slope", cure=cure)
+        return slope(np.log(spectrum.frequency[use]), np.log(psd[use]))
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        return f"d ln P / d ln f of {self.stream} from {self.low:g} to {self.high:g} Hz"
+
+
+def slope(x: Floats, y: Floats) -> tuple[float, float]:
+    """Equation (1): slope of y (n,) over x and its standard error, n > 2."""
+    spread = x - x.mean()
+    squares = float(spread @ spread)
+    b = float(spread @ y) / squares
+    rest = y - y.mean() - b * spread
+    return b, math.sqrt(CORRELATED * float(rest @ rest) / (x.size - 2) / squares)
+
+
+class Crossing(_OfSpectrum):
+    """Highest frequency at which a stream's spectrum exceeds another's, or a level, equation (2), Hz."""
+
+    @property
+    def unit(self) -> str:
+        """Of a frequency."""
+        return "Hz"
+
+    stream: str = "atmosphere"
+    """The stream that dominates at low frequencies."""
+    other: str = "white"
+    """The stream that dominates at high frequencies."""
+    net: KelvinRootSecond | None = Field(None, gt=0)
+    """In place of `other`: the level 2 NET^2."""
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (2)."""
+        spectrum = self.spectrum_of(data, "crossing")
+        psd = stream_in(spectrum, self.stream, "crossing")
+        level = np.full(psd.shape, 2 * self.net**2) if self.net else stream_in(spectrum, self.other, "crossing")
+        return crossing(spectrum.frequency, psd, level)
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        other = f"2 NET^2 with {self.net:.4g} K s(1/2)" if self.net else self.other
+        return f"highest frequency at which {self.stream} exceeds {other}"
+
+
+def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, float]:
+    """Equation (2): f_x and its standard error, Hz. Raises InputError where the two do not cross."""
+    good = (upper > 0) & (lower > 0)
+    f, ratio = np.log(frequency[good]), np.log(upper[good] / lower[good])
+    number = np.clip((BINS * (f - f[0]) / (f[-1] - f[0])).astype(int), 0, BINS - 1) if f.size > 1 else np.zeros(f.size, int)
+    count = np.bincount(number, minlength=BINS)
+    used = count > 0
+    middle = np.bincount(number, f, BINS)[used] / count[used]
+    sums = [np.bincount(number, part[good], BINS)[used] for part in (upper, lower)]
+    mean = np.log(sums[0] / sums[1])
+    above = np.flatnonzero(mean > 0)
+    if not above.size or above[-1] + 1 == mean.size:
+        which = "nowhere exceeds" if not above.size else "exceeds everywhere"
+        raise InputError(f"the first spectrum {which} the second", place="crossing", cure="choose other streams or another level")
+    k = int(above[-1])
+    at = float(np.interp(0.0, [-mean[k], -mean[k + 1]], middle[[k, k + 1]]))
+    near = abs(f - at) <= math.log(NEAR)
+    if np.count_nonzero(near) < 4:
+        return math.exp(at), math.nan
+    b, error = slope(f[near], ratio[near])
+    scatter = error * float(np.std(f[near]))  # (c / n)^(1/2) s
+    return math.exp(at), math.exp(at) * scatter / abs(b) if b else math.nan
+
+
+class FirstComponent(FigureMetric):
+    """Share of the variance in the first principal component of the detectors' streams, equation (3).
+
+    It is measured by a `ModeSpectrum`; with delays there, it is the time-lagged one.
+    """
+
+    reads: ClassVar[frozenset[str]] = frozenset({"modes"})
+
+    modes: str = Field("modes", pattern=r"^[A-Za-z0-9_.]+$")
+    """Which product: that of a `ModeSpectrum` with a name of its own."""
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (3); the standard error is that from the scatter over scans."""
+        found = self._product(data)
+        return float(found.shares[0]), float(found.error[0])
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        found = self._product(data)
+        if found.delays == 0:
+            return f"share of the variance of {found.detectors} detectors in the first component, instantaneous"
+        lags = f"with {found.delays} delays of {found.delay:g} s"
+        return f"share of the variance of {found.detectors} detectors in the first component, {lags}"
+
+    def _product(self, data: Data) -> Modes:
+        found = data.products.get(self.modes)
+        if not isinstance(found, Modes):
+            cure = "add a ModeSpectrum, or name the one that there is"
+            raise InputError(f"there is no mode spectrum {self.modes!r}", place="first_component", cure=cure)
+        return found
+
+
+class MeanTScan(FigureMetric):
+    """Mean emission of the atmosphere on the calibrated scale, T_scan, equation (4), or as it is, T_atm."""
+
+    @property
+    def unit(self) -> str:
+        """Of a brightness."""
+        return "K_RJ"
+
+    reads: ClassVar[frozenset[str]] = frozenset()
+
+    of: Literal["scan", "atmosphere"] = "scan"
+    """T_scan: the atmosphere's share of the calibrated stream; or T_atm: its brightness, before any efficiency."""
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (4), every scan weighted by its duration."""
+        scans = [o for o in data.observations if "atmosphere" in o.smooth]
+        if not scans or len(scans) < len(data.observations):
+            cure = "add AtmosphereLayers and Efficiency; in a campaign, measure it in one scan's run"
+            raise InputError("the levels of the atmosphere are not known here", place="mean_t_scan", cure=cure)
+        means = [mean_t_scan(o, calibrated=self.of == "scan") for o in scans]
+        return float(np.average(means, weights=[o.duration for o in scans])), math.nan
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """What was measured."""
+        what = "epsilon T_atm / (zeta e^-tau)" if self.of == "scan" else "T_atm"
+        return f"mean of {what} over detectors and time"
+
+
+def mean_t_scan(observation: Observation, *, calibrated: bool = True) -> float:
+    """Equation (4) of one scan, K_RJ; not ``calibrated``: <T_atm>. Mean over detectors that are not flagged."""
+    plane, good, n = observation.focalplane, observation.good_detectors, observation.n_samples
+    every = slice(0, observation.n_detectors)
+    total = 0.0
+    instants = np.unique(((np.arange(INSTANTS) + 0.5) * n / INSTANTS).astype(int))
+    for t in instants:
+        at = slice(int(t), int(t) + 1)
+        level = observation.smooth["atmosphere"].evaluate(every, at)[:, 0].astype(np.float64)
+        if calibrated:
+            transmission = observation.smooth["transmission"].evaluate(every, at)[:, 0]
+            level *= plane.illumination_efficiency / (plane.main_beam_efficiency * transmission)
+        total += float(level[good].mean())
+    return total / len(instants)

@@ -1,0 +1,121 @@
+"""A function of a block as a step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zonda
+import zonda.testing
+from zonda.core.errors import PipelineError
+from zonda.plugins.checks.scenes import camera, scene
+
+STEPS = (
+    zonda.PointingDaisy(scan_duration="4 s"),
+    zonda.AtmosphereLayers(pwv="5 mm"),
+    zonda.WhiteNoise(),
+    zonda.Efficiency(),
+)
+
+
+def double(block):
+    """Twice the signal."""
+    return 2 * block.detdata["signal"]
+
+
+def signal(*steps, threads=1):
+    return zonda.Pipeline([*STEPS, *steps]).run(scene(camera(19)), keep=["signal"], threads=threads)
+
+
+def test_what_it_returns_is_the_stream_with_its_mean():
+    plain, doubled = signal().tod(), signal(zonda.operator(double)).tod()
+    assert plain.mean() > 10
+    # the mean stands beside the stream: what is rounded to 2^-24 is below 100 K
+    np.testing.assert_allclose(doubled, 2 * plain, atol=100 * 2.0**-24)
+
+
+def test_in_place_and_as_a_lambda_and_as_a_decorator():
+    @zonda.operator(linear=True)
+    def in_place(block):
+        block.detdata["signal"] *= 2
+
+    returned = zonda.operator(lambda block: 2 * block.detdata["signal"])
+    expected = signal(zonda.operator(double)).tod()
+    for step in (in_place, returned):
+        np.testing.assert_array_equal(signal(step).tod(), expected)
+    assert (in_place.label, returned.label, in_place.linear, returned.linear) == ("in_place", "function", True, False)
+
+
+def test_it_keeps_the_contract():
+    zonda.testing.check_operator(zonda.operator(double, linear=True))
+
+
+def test_the_conformance_kit_finds_a_function_that_is_not_linear():
+    with pytest.raises(AssertionError, match="linear"):
+        zonda.testing.check_operator(zonda.operator(lambda block: block.detdata["signal"] + 1.0, linear=True))
+
+
+def test_a_component_of_its_own():
+    offset = zonda.operator(
+        lambda block: np.full(block.shape, 0.5), name="offset", requires=(), provides=[zonda.Component("offset", "calibrated")]
+    )
+    steps = [STEPS[0], STEPS[2], offset, STEPS[3]]
+    data = zonda.Pipeline(steps, runs={"alone": {"only": ["offset"]}}).run(
+        scene(camera(3)), keep=["signal", "signal/alone", "offset"], threads=1
+    )
+    np.testing.assert_array_equal(data.tod("signal/alone"), 0.5)
+    np.testing.assert_array_equal(data.tod("offset"), 0.5)
+
+
+def test_a_whole_scan_of_each_detector():
+    seen = []
+
+    @zonda.operator(couples="time", linear=True)
+    def demean(block):
+        seen.append(block.shape[1])
+        return block.detdata["signal"] - block.detdata["signal"].mean(axis=1, keepdims=True)
+
+    found = signal(demean).tod()
+    assert set(seen) == {400}
+    # rounded to 2^-24 of fluctuations below 10 K, once for each sample
+    assert np.abs(found.mean(axis=1)).max() < 10 * 2.0**-24
+
+
+def test_provenance_names_the_source():
+    (label, kind, said), *_ = [row for row in signal(zonda.operator(double)).provenance["operators"] if row[0] == "double"]
+    assert (label, kind) == ("double", "double")
+    assert said["function"].endswith("test_function_operator.double")
+    assert said["source"] == f"{__file__}, line {double.__code__.co_firstlineno}"
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: zonda.operator(3), "expected a function of a block, got 3"),
+        (lambda: zonda.operator(zonda.BinMap), "expected a function"),
+        (lambda: zonda.operator(double, requires="signal"), r"requires is a list of names(.|\n)*requires=\['signal'\]"),
+        (lambda: zonda.operator(double, couples="all"), "cannot couple 'all'"),
+        (lambda: zonda.Pipeline([*STEPS, double]), r"step 5 is the function double(.|\n)*zonda.operator\(double\) at step 5"),
+        (lambda: signal(zonda.operator(lambda block: 3)), r"returned an array of shape \(\)(.|\n)*the stream signal"),
+        (lambda: signal(zonda.operator(lambda block: "no")), "returned 'no'"),
+        (lambda: zonda.Pipeline([STEPS[0], zonda.operator(double)]), "double needs signal, which no step provides"),
+    ],
+)
+def test_mistakes(make, said):
+    with pytest.raises(PipelineError, match=said):
+        make()
+
+
+def test_a_pipeline_file_does_not_know_it():
+    from zonda.core.configuration.pipeline_file import parse
+
+    zonda.operator(double)
+    text = """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+operators: [PointingDaisy, double]
+"""
+    with pytest.raises(zonda.ZondaError, match="unknown operator 'double'"):
+        parse(text)

@@ -1,0 +1,122 @@
+"""`AtmosphereScreens` shows the turbulence that the detectors saw."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+import zonda
+import zonda.testing
+from zonda.core.drawable import Drawable
+from zonda.core.errors import PipelineError
+from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.atmosphere.model import ExpectedLoad
+from zonda.operators.atmosphere.screens import AtmosphereScreens, pwv_at
+from zonda.operators.diagnostics.plot_operators import Plots
+from zonda.plugins.checks import scenes
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A field of 12 arcmin, 15 s."""
+    folder = tmp_path_factory.mktemp("screens")
+    observation = scenes.scan(instrument=scenes.camera(19, field="12 arcmin"), samples=1500)
+    steps = [AtmosphereLayers(pwv="5 mm", layers=3, outputs=["pwv"]), AtmosphereScreens(moments=3, pixels=12), Plots()]
+    return scenes.run(steps, observation, keep=("pwv",), output=folder), folder
+
+
+def test_contract():
+    zonda.testing.check_operator(AtmosphereScreens())
+
+
+def test_it_is_what_the_detectors_saw(run):
+    """The PWV along each detector's line of sight is its stream's within the errors that are allowed for nodes and step."""
+    data, _ = run
+    (o,) = data.observations
+    assert isinstance(o.expected_load, ExpectedLoad)
+    model = o.expected_load.model()
+    step = model.resolution().step
+    samples = np.arange(5, 1400, 200) // step * step
+    direct = pwv_at(model, o.focalplane.xi, o.focalplane.eta, samples)
+    stream = o.detdata["pwv"][:, samples]
+    rms = model.fluctuation.before_and_after()[1] * model.pwv
+    error = np.sqrt(np.mean((direct - stream) ** 2))
+    assert error < 3 * model.resolution().tolerance * rms + 1e-9
+    assert error < 0.2 * stream.std()  # it tells detectors and times apart
+
+
+def test_the_field_has_the_streams_value_in_the_middle(run):
+    data, _ = run
+    found = data.products["screens"]
+    (o,) = data.observations
+    centre = int(np.hypot(o.focalplane.xi, o.focalplane.eta).argmin())
+    seconds = np.asarray(o.seconds)
+    for second, pwv in zip(found.seconds, found.pwv, strict=True):
+        sample = int(np.abs(seconds - seconds[0] - second).argmin())
+        middle = pwv[5:7, 5:7].mean()  # four points about the middle, half a point away from it
+        slope = np.nanmax(np.abs(np.diff(pwv, axis=1)))
+        assert middle == pytest.approx(o.detdata["pwv"][centre, sample], abs=slope)
+    assert np.isnan(found.pwv[:, 0, 0]).all()
+
+
+def test_layers_have_their_variance_and_wind(run):
+    data, _ = run
+    found, model = data.products["screens"], data.observations[0].expected_load.model()
+    assert [layer.height for layer in found.layers] == [layer.height for layer in model.layers]
+    for screen, layer in zip(found.layers, model.layers, strict=True):
+        assert screen.wind == tuple(layer.wind)
+        assert screen.values.shape[0] == screen.values.shape[1]
+        ensemble = model.pwv * model.fluctuation.scale * layer.amplitude
+        assert 0 < np.abs(screen.values).max() < 5 * ensemble  # g has unit variance before the beam
+        moment = np.abs(screen.track).sum(axis=1).min()
+        assert moment < 2 * screen.spacing  # the track passes through the middle
+
+
+def test_the_boresight_sees_the_sum_of_the_layers(run):
+    """What the layers' pictures show where the boresight is adds up to the stream there, but for the airmass.
+
+    A value between lattice points is taken from the nearest: it differs by at most the largest step between neighbours.
+    """
+    data, _ = run
+    found, (o,) = data.products["screens"], data.observations
+    model = o.expected_load.model()
+    total = allowed = 0.0
+    for screen in found.layers:
+        here = screen.track[np.abs(screen.track).sum(axis=1).argmin()]
+        middle = screen.values.shape[0] // 2
+        row, column = (round(middle + v / screen.spacing) for v in (here[1], here[0]))
+        total += screen.values[row, column]
+        allowed += max(np.abs(np.diff(screen.values, axis=axis)).max() for axis in (0, 1))
+    seconds = np.asarray(o.seconds)
+    sample = int(np.abs(seconds - seconds[0] - found.moment).argmin())
+    step = model.resolution().step
+    sample = sample // step * step
+    direct = pwv_at(model, np.zeros(1), np.zeros(1), np.array([sample]))[0, 0]
+    airmass = 1 / np.sin(o.elevation[sample])
+    assert model.fluctuation.log_normal is False or abs(total) < 0.2 * model.pwv
+    assert total * airmass == pytest.approx(direct, abs=2 * allowed * airmass + 0.1 * abs(direct))
+
+
+def test_files_and_pictures(run):
+    data, folder = run
+    found = data.products["screens"]
+    assert isinstance(found, Drawable)
+    with fits.open(folder / "screens.fits") as hdus:
+        np.testing.assert_array_equal(hdus[0].data, found.pwv)
+        assert [hdu.name for hdu in hdus] == ["PWV", "LAYER0", "LAYER1", "LAYER2"]
+        assert hdus[0].header["TIME2"] == found.seconds[1]
+    table = Table.read(folder / "screens.ecsv")
+    np.testing.assert_allclose(table["height"], [layer.height for layer in found.layers])
+    assert (folder / "screens_layers.png").is_file()
+    assert (folder / "screens_field.png").is_file()
+
+
+def test_refusals():
+    data = zonda.Data(scenes.scene())
+    with pytest.raises(PipelineError, match="there is no scan 0"):
+        AtmosphereScreens().finalize(data)
+    data.observations.append(scenes.scan(samples=100))
+    with pytest.raises(PipelineError, match="no atmosphere to show"):
+        AtmosphereScreens().finalize(data)

@@ -1,0 +1,152 @@
+"""Source masks: where they are, and that what is removed is found outside of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zonda.testing
+from zonda.core.errors import PipelineError
+from zonda.core.numerics.projection import directions
+from zonda.operators.filters.common_mode import CommonModeFilter
+from zonda.operators.filters.detrend import Detrend
+from zonda.operators.filters.highpass import HighpassFilter
+from zonda.operators.filters.source_mask import SourceMask
+
+N_DET, N = 37, 6000
+MASK = {"radius": "25 arcsec"}
+WHITE = 0.017
+FILTERS = [
+    HighpassFilter(frequency="0.5 Hz", mask=MASK),
+    HighpassFilter(frequency="0.5 Hz", response="bessel", mask=MASK),
+    Detrend(order=4, mask=MASK),
+    CommonModeFilter(mask=MASK),
+    CommonModeFilter(mask=MASK, scale="rms"),
+    CommonModeFilter(mask=MASK, method="mean"),
+]
+
+
+def distance(bench, observation):
+    """(n_det, n_samp) from the target, rad, by the arc cosine."""
+    plane, (ra, dec) = observation.focalplane, bench.CENTRE
+    centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    looked = directions(observation.boresight_radec, plane.xi, plane.eta)
+    return np.arctan2(np.linalg.norm(np.cross(looked, centre), axis=-1), looked @ centre)
+
+
+def test_it_is_a_disc_on_the_sky(bench):
+    observation = bench.observation(N_DET, N)
+    inside = SourceMask(**MASK).of(observation)
+    found, radius = inside.at(slice(0, N_DET), slice(0, N)), 25 * bench.ARCSEC
+    near = np.abs(distance(bench, observation) - radius) < 1e-9 * radius
+    np.testing.assert_array_equal(found[~near], (distance(bench, observation) <= radius)[~near])
+    np.testing.assert_array_equal(inside.at(slice(3, 9), slice(100, 333)), found[3:9, 100:333])
+    assert inside.counts(N) == (int(found.sum()), int(found.all(axis=0).sum()))
+    elsewhere = SourceMask(radius="25 arcsec", centre="05h +21d").of(observation)
+    assert not elsewhere.at(slice(0, N_DET), slice(0, N)).any()
+
+
+def source(bench, observation):
+    """A Gaussian of 8.5 arcsec on the target, peak 1."""
+    return np.exp(-4 * np.log(2) * (distance(bench, observation) / (8.5 * bench.ARCSEC)) ** 2)
+
+
+@pytest.mark.parametrize("step", FILTERS, ids=repr)
+def test_a_source_in_the_mask_keeps_its_flux(bench, step):
+    """Nothing of it is outside (3 sigma of the beam and more: 1e-10): what a filter finds is zero, and it stays as it was."""
+    x = source(bench, bench.observation(N_DET, N))
+    x[x < 1e-9] = 0
+    noise = WHITE * np.random.default_rng(1).standard_normal(x.shape)  # the modes are of something
+    alone = type(step)(**{**step.model_dump(mode="json", exclude_unset=True), "mask": None})
+
+    def left(filter):
+        both, rest = (
+            bench.run([filter], bench.observation(N_DET, N), {"signal": y}, precision="float64").signal
+            for y in (x + noise, noise)
+        )
+        return both - rest
+
+    peak = x > 0.5
+    masked, plain = left(step), left(alone)
+    scale = 1e-6 if not isinstance(step, CommonModeFilter) or step.method == "mean" else 0.02
+    # scaled modes: the rms of a filled stream; singular modes: found to 1e-6, of streams filled alike
+    np.testing.assert_allclose(masked[peak], x[peak], rtol=0, atol=scale)
+    assert np.abs(plain[peak] - x[peak]).max() > 3 * np.abs(masked[peak] - x[peak]).max()
+
+
+@pytest.mark.parametrize("step", FILTERS, ids=repr)
+def test_without_a_source_it_changes_little(bench, step):
+    """White noise and a common drift: the rms outside is what it is without a mask, within 4 standard errors of independent
+    samples; a bridge leaves more inside, by no more than a fifth, and before a causal filter by no more than a half."""
+    rng = np.random.default_rng(2)
+    x = WHITE * rng.standard_normal((N_DET, N)) + np.cumsum(rng.standard_normal(N)) * 1e-3
+    x -= x.mean(axis=1, keepdims=True)
+    observation = bench.observation(N_DET, N)
+    alone = type(step)(**{**step.model_dump(mode="json", exclude_unset=True), "mask": None})
+    one, other = (bench.run([s], bench.observation(N_DET, N), {"signal": x}, precision="float64").signal for s in (step, alone))
+    inside = distance(bench, observation) <= 25 * bench.ARCSEC
+    ratio = {where: one[m].std() / other[m].std() for where, m in (("out", ~inside), ("in", inside))}
+    assert abs(ratio["out"] - 1) < 4 / np.sqrt(2 * (~inside).sum()) + 0.02
+    assert 0.9 < ratio["in"] < (1.5 if "bessel" in repr(step) else 1.2)
+
+
+def test_common_mode_fills_with_the_mean_of_the_others(bench):
+    """u and v of the filled matrix, subtracted from the matrix itself: by numpy."""
+    rng = np.random.default_rng(3)
+    observation = bench.observation(N_DET, N)
+    x = np.outer(1 + 0.1 * rng.standard_normal(N_DET), rng.standard_normal(N)) + 0.1 * rng.standard_normal((N_DET, N))
+    inside = distance(bench, observation) <= 25 * bench.ARCSEC
+    assert not inside.all(axis=0).any()
+    filled = np.where(inside, np.nanmean(np.where(inside, np.nan, x), axis=0), x)
+    u = np.linalg.svd(filled, full_matrices=False)[0][:, 0]
+    found = bench.run([CommonModeFilter(mask=MASK, residual=1e-10)], observation, {"signal": x}, precision="float64")
+    np.testing.assert_allclose(found.signal, x - np.outer(u, u @ filled), rtol=0, atol=1e-8)
+    assert found.tally["CommonModeFilter", "instants with all detectors in the source mask: no mode removed"] == "0"
+    mean = bench.run(
+        [CommonModeFilter(mask=MASK, method="mean")], bench.observation(N_DET, N), {"signal": x}, precision="float64"
+    )
+    np.testing.assert_allclose(mean.signal, x - np.nanmean(np.where(inside, np.nan, x), axis=0), rtol=0, atol=1e-12)
+
+
+def test_a_mask_larger_than_the_scan_is_refused(bench):
+    with pytest.raises(PipelineError, match="covers the whole scan"):
+        bench.run([HighpassFilter(mask={"radius": "1 deg"})], bench.observation(3, 900), {"signal": np.ones((3, 900))})
+    with pytest.raises(PipelineError, match="covers the whole scan"):
+        bench.run([Detrend(mask={"radius": "1 deg"})], bench.observation(3, 900), {"signal": np.ones((3, 900))})
+    with pytest.raises(ValueError, match="fixed on the sky"):
+        SourceMask(centre="az 10 deg el 40 deg")
+
+
+@pytest.mark.parametrize("more", [{}, {"scale": "rms"}, {"method": "mean"}])
+def test_dead_detectors_are_found_in_spite_of_a_mask(bench, more):
+    """What a mask is filled with varies; the detector does not. The others get what they get without the dead."""
+    x = np.random.default_rng(1).standard_normal((N_DET, 3000))
+    x[5], x[7], x[9, 100] = 0.0, 3.0, np.nan
+    found = {}
+    for flagged in (False, True):
+        observation = bench.observation(N_DET, 3000)
+        observation.detector_flags[[5, 7, 9]] = flagged
+        found[flagged] = bench.run([CommonModeFilter(mask=MASK, **more)], observation, {"signal": x}, precision="float64").signal
+        assert np.flatnonzero(observation.detector_flags).tolist() == [5, 7, 9]
+    alive = np.setdiff1d(np.arange(N_DET), [5, 7, 9])
+    np.testing.assert_allclose(found[False][alive], found[True][alive], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [Detrend(order=3), HighpassFilter(frequency="0.5 Hz", response="bessel")], ids=repr)
+def test_a_fit_is_no_extrapolation(bench, step):
+    """A mask in which some detectors are all but a moment: unit noise about 30 K stays noise (a detector whose mask is not used
+    loses its 30 K too; 12 is twice the largest of 1e5 normals and more). Without the rule: 7000."""
+    radius = "60 arcsec"
+    x = 30 + np.random.default_rng(1).standard_normal((N_DET, 3000))
+    inside = SourceMask(radius=radius).of(bench.observation(N_DET, 3000)).at(slice(0, N_DET), slice(0, 3000))
+    assert 0 < (~inside).sum(axis=1).min() < 300
+    masked = type(step)(**{**step.model_dump(mode="json", exclude_unset=True), "mask": {"radius": radius}})
+    found = bench.run([masked], bench.observation(N_DET, 3000), {"signal": x}, precision="float64").signal
+    assert np.abs(found).max() < 12
+
+
+@pytest.mark.parametrize("step", [FILTERS[0], FILTERS[1], FILTERS[4], FILTERS[5]], ids=repr)
+def test_they_keep_the_contract(step):
+    zonda.testing.check_operator(
+        type(step)(**{**step.model_dump(mode="json", exclude_unset=True), "mask": {"radius": "1 arcmin"}})
+    )

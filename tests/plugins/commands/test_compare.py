@@ -1,0 +1,171 @@
+"""`zonda compare`: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from zonda.core import cli
+
+SIDE = 48
+
+
+def compare(*arguments):
+    return cli.main(["compare", *map(str, arguments)])
+
+
+def write(path, values, unit="K", beam=0.0, axes="TAN", centre=75.0, **cards):
+    hdu = fits.PrimaryHDU(values)
+    ny, nx = values.shape[-2:]
+    hdu.header.update(
+        {
+            "CTYPE1": f"RA---{axes}",
+            "CTYPE2": f"DEC--{axes}",
+            "CUNIT1": "deg",
+            "CUNIT2": "deg",
+            "CRVAL1": centre,
+            "CRVAL2": 20.0,
+            "CRPIX1": (nx + 1) / 2,
+            "CRPIX2": (ny + 1) / 2,
+            "CDELT1": -2 / 3600,
+            "CDELT2": 2 / 3600,
+        }
+    )
+    if unit:
+        hdu.header.update({"BUNIT": unit} | ({"TEMPSCAL": "K_RJ"} if unit.endswith("K") else {}))
+    if beam:
+        hdu.header.update({"BMAJ": beam / 3600, "BMIN": beam / 3600})
+    hdu.header.update(cards)
+    hdu.writeto(path, overwrite=True)
+    return path
+
+
+@pytest.fixture
+def values():
+    y, x = (np.indices((SIDE, SIDE)) - 23.5) * 2.0
+    return 1e-3 * np.exp(-4 * np.log(2) * (x**2 + y**2) / 30.0**2)
+
+
+def rows(text):
+    """The printed table."""
+    pairs = (line.split("  ", 1) for line in text.splitlines() if "  " in line)
+    return {name.strip(): value.strip() for name, value in pairs}
+
+
+def test_two_files(tmp_path, values, capsys):
+    a = write(tmp_path / "a.fits", values)
+    b = write(tmp_path / "b.fits", 900 * values + 0.02, unit="mK", axes="SIN")
+    assert compare(a, b, "--output", tmp_path / "out", "--format", "png", "--format", "svg") == 0
+    found = rows(capsys.readouterr().out)
+    assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(0.9, abs=1e-4)
+    assert found["offset"].startswith("20 ")
+    assert found["offset"].endswith("uK_RJ")
+    names = {p.name for p in (tmp_path / "out").iterdir()}
+    assert {"comparison.fits", "comparison_spectra.ecsv", "comparison_profiles.ecsv", "comparison.png", "comparison.svg"} <= names
+    assert not list((tmp_path / "out").glob("*.pdf"))
+
+
+def test_units_are_converted_at_a_frequency(tmp_path, values, capsys):
+    a = write(tmp_path / "a.fits", values)
+    factor = 2 * 1.380649e-23 * (93e9 / 299792458) ** 2 * 1e20  # MJy/sr per K_RJ
+    b = write(tmp_path / "b.fits", values * factor, unit="MJy/sr")
+    assert compare(a, b, "--output", tmp_path) == 2
+    error = capsys.readouterr().err
+    assert "units differ" in error
+    assert "--frequency" in error
+    assert compare(a, b, "--output", tmp_path, "--frequency", "93 GHz") == 0
+    assert rows(capsys.readouterr().out)["gain: map = gain x reference + offset"].split()[0] == "1"
+    assert compare(a, b, "--output", tmp_path, "--frequency", "93 GHz", "--unit", "kJy/sr") == 0
+    assert rows(capsys.readouterr().out)["peak of the reference"].endswith("kJy/sr")
+
+
+def test_a_sky_gets_the_beam(tmp_path, values, capsys):
+    y, x = (np.indices((SIDE, SIDE)) - 23.5) * 2.0
+    wide = np.hypot(30.0, 12.0)
+    smooth = 1e-3 * (30.0 / wide) ** 2 * np.exp(-4 * np.log(2) * (x**2 + y**2) / wide**2)
+    a, b = write(tmp_path / "a.fits", values), write(tmp_path / "b.fits", smooth, beam=12.0)
+    assert compare(a, b, "--output", tmp_path / "o", "--sky") == 0
+    assert float(rows(capsys.readouterr().out)["map / reference at that pixel"]) == pytest.approx(1.0, abs=2e-3)
+    assert compare(a, b, "--output", tmp_path / "o") == 0
+    text = capsys.readouterr().out
+    assert "a.fits: its beam is not known" in text
+    assert float(rows(text)["map / reference at that pixel"]) == pytest.approx((30.0 / wide) ** 2, abs=2e-3)
+
+
+def test_two_runs(tmp_path, values, capsys):
+    for run, gain in (("one", 1.0), ("two", 0.5)):
+        (tmp_path / run).mkdir()
+        write(tmp_path / run / "map.fits", gain * values)
+        write(tmp_path / run / "noiseless_map.fits", gain * values)
+    assert compare(tmp_path / "one", tmp_path / "two", "--output", tmp_path / "out") == 0
+    text = capsys.readouterr().out
+    assert text.count("correlation") == 2
+    assert "one/map.fits" in text
+    assert (tmp_path / "out" / "noiseless_map" / "comparison.fits").is_file()
+
+
+def test_healpix(tmp_path, values, capsys):
+    """A HEALPix map of a smooth source against the image of it: the nearest pixel of 6.4 arcsec is what is compared."""
+    a = write(tmp_path / "a.fits", values)
+    nside = 32768
+    world = WCS(fits.getheader(a))
+    pixels = healpy.query_disc(nside, healpy.ang2vec(75.0, 20.0, lonlat=True), np.radians(60 / 3600))
+    x, y = world.wcs_world2pix(*healpy.pix2ang(nside, pixels, lonlat=True), 0)
+    signal = 1e-3 * np.exp(-4 * np.log(2) * ((x - 23.5) ** 2 + (y - 23.5) ** 2) * 4 / 60.0**2)
+    wide = write(
+        tmp_path / "b.fits", 1e-3 * np.exp(-4 * np.log(2) * ((np.indices((SIDE, SIDE)) - 23.5) ** 2).sum(0) * 4 / 60.0**2)
+    )
+    columns = [fits.Column("PIXEL", "K", array=pixels), fits.Column("SIGNAL", "D", unit="K", array=signal)]
+    table = fits.BinTableHDU.from_columns(columns)
+    table.header.update({"PIXTYPE": "HEALPIX", "NSIDE": nside, "ORDERING": "RING", "COORDSYS": "C", "TEMPSCAL": "K_RJ"})
+    table.writeto(tmp_path / "h.fits")
+    assert compare(wide, tmp_path / "h.fits", "--output", tmp_path) == 0
+    found = rows(capsys.readouterr().out)
+    # the nearest pixel is 2.4 arcsec (rms) away from a point, where a source of 60 arcsec changes by up to 2.4 % of its peak per
+    # arcsec: an rms of at most 6 % of the peak, beside a scatter of 20 % of it
+    assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(1.0, abs=0.05)
+    assert float(found["correlation"]) > 0.97
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda p, v: write(p, v, centre=80.0), "no pixel in common"),
+        (lambda p, v: write(p, np.full_like(v, np.nan)), "no pixel has a value"),
+        (lambda p, v: write(p, v, unit=""), "has no unit"),
+        (lambda p, v: write(p, v, unit="furlong"), "unknown unit 'furlong'"),
+        (lambda p, v: write(p, np.stack([v, v])), "cube of 48 x 48 x 2"),
+        (lambda p, v: write(p, v, beam=20.0), "smaller than the map's"),
+        (lambda p, v: fits.PrimaryHDU(v).writeto(p), "no celestial coordinates"),
+        (lambda p, v: fits.PrimaryHDU().writeto(p), "is not a map"),
+        (lambda p, v: p.write_text("text"), "cannot be read as FITS"),
+        (lambda p, v: None, "no such file"),
+    ],
+)
+def test_refusals(tmp_path, values, capsys, make, words):
+    a, b = write(tmp_path / "a.fits", values), tmp_path / "b.fits"
+    make(b, values)
+    assert compare(a, b, "--output", tmp_path / "out", "--beam", "15 arcsec") == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert "  = " in error  # what to do about it
+    assert "Traceback" not in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_without_common_maps(tmp_path, capsys):
+    for run in ("one", "two"):
+        (tmp_path / run).mkdir()
+    assert compare(tmp_path / "one", tmp_path / "two") == 2
+    assert "no map has the same name in both" in capsys.readouterr().err
+
+
+def test_bad_options(tmp_path, values, capsys):
+    a = write(tmp_path / "a.fits", values)
+    assert compare(a, a, "--contours", "a,b") == 2
+    assert "not a list of numbers" in capsys.readouterr().err
+    assert compare(a, a, "--beam", "5 km") == 2
+    assert "--beam" in capsys.readouterr().err

@@ -1,0 +1,125 @@
+"""`zonda sensitivity`: what it prints, writes and refuses."""
+
+import json
+
+import pytest
+
+import zonda
+from zonda.core import cli
+from zonda.core.errors import InputError
+from zonda.plugins.forecast.lines import duration, in_unit, read_depth
+
+SHORT = "--set", "PointingDaisy.scans=1", "--set", "PointingDaisy.scan_duration=30 s"
+M2 = "--instrument", "mustang2", "--site", "green_bank", "--month", "11"
+
+
+def sensitivity(*arguments):
+    return cli.main(["sensitivity", *map(str, arguments)])
+
+
+def test_of_a_pipeline(capsys):
+    assert sensitivity("mustang2_cluster", *SHORT, "--reach", "20 uK") == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "mustang2 at green_bank, 1 scan, 30 s in all",
+        "PWV 7.7 mm with 0.5 % rms",
+        "filters: high-pass 0.08 Hz, common mode",
+        "beam of 8.5 arcsec, averaged over a circle of radius 0.5 arcmin",
+        "time uK_RJ white 1/f atmosphere uK_CMB uJy/beam MJy/sr point source uJy",
+        "stated errors of the rms: white 5 %, 1/f 5 %, atmosphere",
+        "at the band's centre",
+        "20 uK after ",
+    ):
+        assert words in text
+    assert "# the pipeline" not in text
+
+
+def test_of_an_instrument_with_files(tmp_path, capsys):
+    out = tmp_path / "depth"
+    assert (
+        sensitivity(
+            *M2,
+            "--pwv",
+            "7.7 mm",
+            "--time",
+            "1 min",
+            "--set",
+            "PointingDaisy.scan_duration=60 s",
+            "--set",
+            "PinkNoise.shared=0.8",
+            "--output",
+            out,
+        )
+        == 0
+    )
+    text = capsys.readouterr().out
+    assert "# the pipeline:" in text
+    assert "weather: {pwv: 7.7 mm}" in text
+    assert "# --set PinkNoise.shared=0.8" in text
+    assert (out / "sensitivity.png").read_bytes()[:4] == b"\x89PNG"
+    from astropy.table import Table
+
+    table = Table.read(out / "sensitivity.ecsv")
+    assert str(table["time"].unit) == "s"
+    parts = table["white"] ** 2 + table["one_over_f"] ** 2 + table["atmosphere"] ** 2
+    assert (table["depth_K_RJ"] ** 2 / parts).tolist() == pytest.approx([1] * len(table))
+    again = zonda.load(out / "pipeline.yaml")
+    assert next(o for o in again.operators if type(o).__name__ == "PinkNoise").shared == 0.8
+
+
+def test_json(capsys):
+    assert sensitivity("mustang2_cluster", *SHORT, "--json", "--time", "2 h", "--radius", "1 arcmin") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["radius_arcmin"] == pytest.approx(1)
+    row = next(r for r in found["table"] if r["seconds"] == 7200)
+    assert not row["followed"]
+    assert row["depth"]["K_RJ"] ** 2 == pytest.approx(sum(v**2 for v in row["K_RJ"].values()))
+    assert row["depth"]["Jy"] == pytest.approx(2 * row["depth"]["Jy/beam"])
+
+
+def test_in_python():
+    file = zonda.load("mustang2_cluster", ["PointingDaisy.scans=1", "PointingDaisy.scan_duration=30 s"])
+    found = zonda.sensitivity(file)
+    assert found.rms(3600, "K_CMB") > found.rms(3600) > found.rms(3600, part="white")
+    assert "uK_RJ" in found._repr_html_()
+    assert found.plot().axes[0].get_xlabel() == "integration time [h]"
+    with pytest.raises(InputError, match="no depth in 'Kelvin'"):
+        found.rms(unit="Kelvin")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'insturment'"):
+        zonda.sensitivity(insturment="mustang2")
+    with pytest.raises(InputError, match="when it is loaded"):
+        zonda.sensitivity(file, settings=["seed=1"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "neither a pipeline nor --instrument"),
+        (("--instrument", "mustang2"), "--site"),
+        (("mustang2_cluster", "--pwv", "3 mm"), "a pipeline says itself what --pwv is"),
+        (("no_such_pipeline",), "no_such_pipeline"),
+        ((*M2, "--target", "nowhere"), "--target"),
+        ((*M2, "--quantile", "2"), "--quantile"),
+        (("mustang2_cluster", *SHORT, "--set", "CommonModeFilter.modes=3"), "the forecast does not cover modes: 3"),
+        (("mustang2_cluster", *SHORT, "--reach", "10 apples"), "'apples' is no unit of a depth"),
+        (("mustang2_cluster", *SHORT, "--reach", "deep"), "cannot read 'deep' as a depth"),
+        (("mustang2_cluster", *SHORT, "--reach", "0 uK"), "reached by no observation"),
+        (("mustang2_cluster", *SHORT, "--radius", "1 deg"), "is not on the map"),
+        (("mustang2_cluster", *SHORT, "--audit", "1"), "--audit"),
+    ],
+)
+def test_refusals(arguments, words, capsys):
+    assert sensitivity(*arguments) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert "Traceback" not in told
+
+
+def test_depths_with_units():
+    factors = {"K_RJ": 1.0, "K_CMB": 2.0, "Jy/beam": 4.0, "MJy/sr": 5.0, "Jy": 8.0}
+    given = {"10 uK": 1e-5, "10uK_RJ": 1e-5, "10 µK_CMB": 5e-6, "8 mJy/beam": 2e-3, "5 kJy/sr": 1e-3, "8 uJy": 1e-6, "1 K": 1.0}
+    for text, kelvin in given.items():
+        assert read_depth(text, factors) == pytest.approx(kelvin)
+    assert in_unit(158e-6, "K_RJ") == "158 uK_RJ"
+    assert in_unit(2e-3, "MJy/sr") == "2 kJy/sr"
+    assert (duration(30), duration(516), duration(7200)) == ("30 s", "8.6 min", "2 h")

@@ -1,0 +1,295 @@
+"""Figures against known answers: analytic maps and spectra, and where a default would be wrong."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from astropy.wcs import WCS
+
+import zonda
+from zonda.core import registry
+from zonda.core.accuracy import metrics
+from zonda.core.errors import ZondaError
+from zonda.core.figures import Choice, Figures, measure
+from zonda.core.maps.image import Image
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.smooth import SmoothField
+from zonda.operators.diagnostics.power_spectrum import Spectrum, Welch
+from zonda.plugins.checks import scenes
+from zonda.plugins.metrics.maps import central_rms
+from zonda.plugins.metrics.streams import slope
+
+ARCSEC = np.pi / 648000
+PIXEL, FWHM, SIDE = 4.0, 12.0, 128
+SIGMA = FWHM / FWHM_PER_SIGMA / PIXEL
+NAMES = ("central_rms", "peak_ratio", "peak_snr", "coverage", "transfer_at", "psd_slope", "crossing", "first_component",
+         "mean_t_scan")  # fmt: skip
+
+
+CENTRE = float(np.radians(75)), float(np.radians(20))
+
+
+def header(side, pixel):
+    made = WCS(naxis=2)
+    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = ["RA---TAN", "DEC--TAN"], [75, 20], [side / 2 + 0.5] * 2
+    made.wcs.cdelt, made.wcs.cunit = [-pixel / 3600, pixel / 3600], ["deg", "deg"]
+    return made.to_header()
+
+
+def product(signal, noise=0.1, pixel=PIXEL, fwhm=FWHM, hits=50, **other):
+    values = np.asarray(signal, float)
+    return MapProduct(
+        values, np.broadcast_to(hits, values.shape).copy(), np.ones(values.shape), np.full(values.shape, noise), None,
+        header(len(values), pixel), CENTRE, pixel * ARCSEC, fwhm=fwhm * ARCSEC, sample_rate=100.0, **other,
+    )  # fmt: skip
+
+
+def data(runs=None, observations=(), **products):
+    named = {name.replace("__", "/"): p for name, p in products.items()}
+    return SimpleNamespace(products=named, provenance={"runs": runs or {}}, observations=list(observations))
+
+
+def radius(pixel=PIXEL, side=SIDE):
+    y, x = (np.indices((side, side)) - (side - 1) / 2) * pixel
+    return np.hypot(x, y)
+
+
+def blob(fwhm, amplitude=1.0):
+    return amplitude * np.exp(-(radius() ** 2) / 2 / (fwhm / FWHM_PER_SIGMA) ** 2)
+
+
+def white(seed, amplitude=1.0):
+    return amplitude * np.random.default_rng(seed).standard_normal((SIDE, SIDE))
+
+
+SKY = {"sky": {"only": ["sky"]}, "bare": {"only": ["sky"], "filters": "none"}}
+
+
+def test_all_are_registered_and_described():
+    assert set(registry.metrics) >= set(NAMES)
+    for name in NAMES:
+        assert isinstance(metrics.get(name), zonda.FigureMetric)
+        assert Choice.parse(name).name == name == metrics.get(name).own_name()
+
+
+# ---- central_rms
+
+
+def test_central_rms_counts_what_is_within_the_radius():
+    """1 K within 40 arcsec, 3 K beyond: sqrt((40^2 + 9 (60^2 - 40^2)) / 60^2) within an arcminute."""
+    steps = data(map=product(np.where(radius() < 40, 1.0, 3.0)))
+    assert measure(steps, "central_rms", smooth="none", radius="36 arcsec").value == pytest.approx(1)
+    expected = np.sqrt((1600 + 9 * 2000) / 3600)
+    # pixels of 4 arcsec: the rim of either circle is known to 1 % of its area
+    assert measure(steps, "central_rms", smooth="none").value == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("fwhm", [12.0, 24.0])
+def test_central_rms_of_white_noise_behind_the_beam(fwhm):
+    """White noise of 1 K per pixel behind a Gaussian of s pixels: 1 / (2 sqrt(pi) s), within its standard error."""
+    found = measure(data(map=product(white(1), fwhm=fwhm)), "central_rms", radius="3 arcmin")
+    expected = 1 / (2 * np.sqrt(np.pi) * fwhm / FWHM_PER_SIGMA / PIXEL)
+    assert found.unit == "K_RJ"
+    assert 0 < found.error < 0.1 * expected
+    assert abs(found.value - expected) < 3 * found.error
+    other = measure(data(map=product(white(1), fwhm=fwhm)), "central_rms", radius="3 arcmin", smooth="18 arcsec").value
+    assert other == pytest.approx(1 / (2 * np.sqrt(np.pi) * 18 / FWHM_PER_SIGMA / PIXEL), rel=0.1)
+
+
+def test_standard_error_of_the_central_rms():
+    """Its square is the variance over realizations: 200 of them know that to 10 %; three sigma."""
+    found = np.array([central_rms(product(white(seed)).smoothed(FWHM * ARCSEC), 60 * ARCSEC) for seed in range(200)])
+    assert found[:, 0].std() == pytest.approx(found[:, 1].mean(), rel=3 * 0.05)
+
+
+def test_central_rms_of_another_signal():
+    two = data(map=product(white(1)), source_free__map=product(white(1, 0.5)))
+    assert measure(two, "central_rms", signal="source_free").value == pytest.approx(measure(two, "central_rms").value / 2)
+    with pytest.raises(ZondaError, match="there is no map 'noiseless/map'"):
+        measure(two, "central_rms", signal="noiseless")
+
+
+# ---- peaks
+
+
+def test_peak_ratio_is_that_of_the_smoothed_maps():
+    """Filters that leave 0.6 of a source and make it narrower, 30 to 20 arcsec, behind 12 arcsec: 0.6 x 400/544 / (900/1044)."""
+    found = data(SKY, sky__map=product(blob(20, -0.6)), bare__map=product(blob(30, -1)))
+    middle = measure(found, "peak_ratio")
+    expected = 0.6 * (400 / 544) / (900 / 1044)
+    # no pixel's centre is on the peak: 8 arcsec2 off it, a factor exp(-8 / 2 s^2) in either map
+    off = np.exp(-4 * FWHM_PER_SIGMA**2 * (1 / 544 - 1 / 1044))
+    assert middle.value == pytest.approx(expected * off, rel=2e-3)
+    off = np.exp(-4 * FWHM_PER_SIGMA**2 * (1 / 400 - 1 / 900))
+    assert measure(found, "peak_ratio", smooth="none").value == pytest.approx(0.6 * off)
+
+
+def test_peak_ratio_takes_the_same_sign():
+    """What filters leave of a decrement is not the larger hump beside it."""
+    after = blob(20, -0.3) + 2 * np.roll(blob(20), 40, axis=0)
+    assert measure(data(SKY, sky__map=product(after), bare__map=product(blob(20, -1))), "peak_ratio").value == pytest.approx(
+        0.3, rel=1e-3
+    )
+
+
+def test_peak_ratio_against_the_input_behind_the_beam():
+    """A map of the beam-convolved input has the ratio 1, though the input's own peak is 544 / 400 higher."""
+    seen = product(blob(np.sqrt(544), 400 / 544))
+    image = Image(blob(20), header(SIDE, PIXEL))
+    found = measure(data({"sky": {"only": ["sky"]}}, sky__map=seen, input=image), "peak_ratio", against="input")
+    assert found.value == pytest.approx(1, abs=0.01)
+
+
+def test_peak_snr():
+    """A peak of 2 K behind the beam, white noise of 0.1 K per pixel; noise maps twice as loud halve the ratio."""
+    both = blob(np.sqrt(2) * FWHM, 4)  # what smoothing leaves of a source of FWHM 12: half its peak
+    peak = both.max() / 2
+    maps = data({"free": {"without": ["sky"], "modes": "full"}}, map=product(blob(FWHM, 4)), free__map=product(white(3, 0.2)))
+    alone = measure(maps, "peak_snr", noise="white").value
+    assert alone == pytest.approx(peak / (0.1 / (2 * np.sqrt(np.pi) * SIGMA)), rel=0.02)
+    real = measure(maps, "peak_snr", radius="3 arcmin")
+    assert real.value == pytest.approx(alone / 2, abs=3 * real.error)
+    assert real.error >= 1
+    with pytest.raises(ZondaError, match="no signal"):
+        measure(data(map=product(blob(12))), "peak_snr")
+
+
+# ---- coverage
+
+
+@pytest.mark.parametrize(("pixel", "fwhm"), [(4.0, 12.0), (2.0, 9.0)])
+def test_coverage(pixel, fwhm):
+    """50 samples at 100 Hz in each pixel; half as many to the west, where an area of more than half the time ends."""
+    hits = np.full((SIDE, SIDE), 50)
+    hits[:, : SIDE // 4] = 20
+    found = data(map=product(white(1), pixel=pixel, fwhm=fwhm, hits=hits))
+    per_beam = 0.5 * np.pi * fwhm**2 / (4 * np.log(2)) / pixel**2
+    time = measure(found, "coverage")
+    assert time.value == pytest.approx(per_beam)
+    assert time.unit == "s"
+    area = measure(found, "coverage", of="area")
+    assert area.value == pytest.approx(0.75 * (SIDE * pixel / 60) ** 2, rel=1e-4)
+    assert area.unit == "arcmin2"
+    assert measure(found, "coverage", of="area", least="30 %").value == pytest.approx(area.value * 4 / 3, rel=1e-4)
+
+
+# ---- scales
+
+
+@pytest.mark.parametrize("scale", [40, 120])
+def test_transfer_at_a_scale(scale):
+    """A filter H(k) = 1 / (1 + (k L)^-2) with L = 60 arcsec: T at 40 and at 120 arcsec; the ring is narrow."""
+    before = white(5)
+    k = np.hypot(*np.meshgrid(*[np.fft.fftfreq(SIDE, PIXEL)] * 2, indexing="ij"))
+    k[0, 0] = 1e-9
+    after = np.fft.ifft2(np.fft.fft2(before) / (1 + (k * 60) ** -2)).real
+    found = measure(
+        data(SKY, sky__map=product(after), bare__map=product(before)), "transfer_at", scale=f"{scale} arcsec", width=0.3
+    )
+    # the ring and the window's width blur H by a few per cent of its change over a factor 1.35 in k
+    assert found.value == pytest.approx(1 / (1 + (scale / 60) ** 2), abs=0.02 + 3 * found.error)
+    kept = measure(data(SKY, sky__map=product(0.4 * before), bare__map=product(before)), "transfer_at", kind="amplitude")
+    assert kept.value == pytest.approx(0.4)
+    narrow = f"{scale} arcsec"
+    inside = measure(
+        data(SKY, sky__map=product(np.where(radius() < 150, before, 0)), bare__map=product(before)), "transfer_at",
+        scale=narrow, radius="140 arcsec",
+    )  # fmt: skip
+    assert inside.value == pytest.approx(1)  # the window excludes what was cut off
+    assert "window within 2.33′" in inside.description
+
+
+# ---- spectra
+
+
+def spectrum(psd, f):
+    return data(spectrum=Spectrum(f, psd, 50.0, 1.0, "PowerSpectrum", 16))
+
+
+def test_slope_and_crossing_of_power_laws():
+    f = np.arange(1, 4001) * 0.005
+    laws = spectrum({"atmosphere": 3e-6 * f**-3.0, "white": np.full(f.size, 2e-6), "signal": 3e-6 * f**-3.0 + 2e-6}, f)
+    assert measure(laws, "psd_slope", stream="atmosphere", low="0.1 Hz", high="1 Hz").value == pytest.approx(-3)
+    assert measure(laws, "psd_slope", low="10 Hz", high="20 Hz").value == pytest.approx(0, abs=2e-3)
+    assert measure(laws, "crossing").value == pytest.approx(1.5 ** (1 / 3), rel=0.02)
+    level = measure(laws, "crossing", net="2 mK s(1/2)")  # 2 NET^2 = 8e-6
+    assert level.value == pytest.approx((3 / 8) ** (1 / 3), rel=0.02)
+    assert level.unit == "Hz"
+    with pytest.raises(ZondaError, match="exceeds everywhere"):
+        measure(laws, "crossing", net="1 nK s(1/2)")
+    with pytest.raises(ZondaError, match=r"no stream .dust.\n.*choose from: atmosphere"):
+        measure(laws, "crossing", stream="dust")
+
+
+def test_standard_error_of_the_slope():
+    """White noise through Welch's method: slopes scatter about 0 as they say; 150 series know that to 6 %, three sigma."""
+    welch, random = Welch(4096, 100.0, 512), np.random.default_rng(8)
+    use = (welch.frequency > 2) & (welch.frequency < 40)
+    rows = [slope(np.log(welch.frequency[use]), np.log(welch(random.standard_normal(4096))[use])) for _ in range(150)]
+    values, errors = np.array(rows).T
+    assert abs(values.mean()) < 3 * values.std() / np.sqrt(150)
+    assert values.std() / errors.mean() == pytest.approx(1, abs=3 * 0.06)
+
+
+# ---- levels
+
+
+def test_mean_t_scan_of_the_levels_that_were_resolved():
+    """epsilon T / (zeta t), with another efficiency for each detector; a flagged one does not count."""
+    scan = scenes.scan(4, 500)
+    scan.focalplane.main_beam_efficiency = np.array([0.3, 0.2, 0.3, 0.3])
+    scan.focalplane.illumination_efficiency = np.array([0.8, 0.8, 0.7, 0.8])
+    scan.smooth["atmosphere"] = SmoothField.constant([20.0, 20.0, 20.0, 99.0], 500)
+    scan.smooth["transmission"] = SmoothField.constant([0.9, 0.9, 0.8, 0.9], 500)
+    scan.detector_flags[3] = 1
+    one = data(observations=[scan])
+    expected = np.mean([0.8 * 20 / 0.27, 0.8 * 20 / 0.18, 0.7 * 20 / 0.24])
+    assert measure(one, "mean_t_scan").value == pytest.approx(expected)
+    assert measure(one, "mean_t_scan", of="atmosphere").value == pytest.approx(20)
+    with pytest.raises(ZondaError, match="levels of the atmosphere are not known"):
+        measure(data(observations=[scenes.scan(4, 500)]), "mean_t_scan")
+
+
+# ---- how they are named
+
+
+def test_names_and_parameters():
+    asked = Choice.parse({"central_rms": {"radius": "30 arcsec", "signal": "source_free"}})
+    assert asked.name == "central_rms(radius=30 arcsec, signal=source_free)"
+    assert Choice.parse(asked.name) == asked
+    assert asked.metric.radius == pytest.approx(30 * ARCSEC)
+    assert metrics.get("peak_snr(noise=white, within=2 arcmin)").within == pytest.approx(120 * ARCSEC)
+    maps = data(map=product(white(1)))
+    rms = metrics.get("central_rms(radius=2 arcmin)")
+    one, two = rms.measure(maps), rms.measure(data(map=product(white(1, 1.02))))
+    assert rms.error(two, one) == pytest.approx(0.02)
+    assert rms.floor(one) == pytest.approx(one[1] / one[0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ("central_rmss", "did you mean 'central_rms'"),
+        ({"central_rms": {"radius": "30 Hz"}}, "angle"),
+        ({"central_rms": {"radios": "30 arcsec"}}, "radios"),
+        ("central_rms(radius)", "parameter=value"),
+        ("central_rms(radius=1 arcmin", "name\\(parameter=value"),
+        ("map_rms(radius=1 arcmin)", "no parameters"),
+        (["central_rms"], "as a metric"),
+    ],
+)
+def test_mistakes_in_names(wrong, says):
+    with pytest.raises(ZondaError, match=says):
+        zonda.MeasureFigures(metrics=[wrong])
+
+
+def test_figures_of_parts_are_refused():
+    one = Figures.from_figures([zonda.Figure("a", 1.0, "s", 0.1, "text"), zonda.Figure("b", 2.0)])
+    again = Figures.of(one.arrays())
+    assert [str(f) for f in again] == ["a = 1 +- 0.1 s", "b = 2"]
+    assert again["a"].error == 0.1
+    with pytest.raises(KeyError, match="there are a, b"):
+        again["c"]
+    with pytest.raises(ZondaError, match="cannot be added up"):
+        one += again
