@@ -210,7 +210,7 @@ def check_output_folder(path: str | os.PathLike[str]) -> Path:
         Not creatable, not writable, a file in its place, or no space for even a small file.
     """
     folder = Path(path)
-    probe = folder / f".zonda-probe-{os.getpid()}-{secrets.token_hex(4)}"
+    probe = temporary_sibling(folder / "probe")  # where a kill leaves one, a campaign finds it by this name
     try:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)

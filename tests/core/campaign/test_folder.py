@@ -4,6 +4,7 @@ import pytest
 
 from zonda.core.campaign.folder import clean
 from zonda.core.campaign.job import FILE, digest_of_text
+from zonda.core.storage import files
 from zonda.core.storage.files import temporary_sibling
 
 
@@ -45,3 +46,11 @@ def test_the_folder_of_an_older_version_is_refused(bench, undisturbed, capsys, c
     assert f"error: {out}: holds a campaign of zonda" in (said := capsys.readouterr().err)
     assert "choose another output folder" in said
     assert [p.name for p in out.iterdir() if not p.name.startswith(".")] == [FILE]
+
+
+def test_the_file_that_proves_a_folder_writable_is_removed_after_a_kill(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "discard", lambda path: None)  # SIGKILL: it never comes to that
+    files.check_output_folder(tmp_path / "entries")
+    assert len(list((tmp_path / "entries").iterdir())) == 1
+    clean(tmp_path)
+    assert list((tmp_path / "entries").iterdir()) == []
