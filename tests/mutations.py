@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from zonda.core.data import Block, Observation
+from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.run import block_maker
 from zonda.operators.atmosphere.turbulence import covariance, lattice
 from zonda.operators.atmosphere.weather import bands
@@ -22,7 +23,6 @@ from zonda.operators.maps.sums import DATA
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing import recording
-from zonda.operators.pointing.transform import CelestialTransform
 from zonda.operators.sky import read
 
 Patch = pytest.MonkeyPatch

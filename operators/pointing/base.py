@@ -16,6 +16,7 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
 from zonda.core.errors import PointingError
 from zonda.core.intervals import Intervals
+from zonda.core.numerics.celestial import Boresight, CelestialTransform
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.random import normals, stream_key
@@ -27,7 +28,6 @@ from .limits import LargestMotion, check_elevation, excess, what_fits
 from .motion import POINTS, LargestDerivative, Quantity, motion
 from .observed import Samples, centre_of, observed, report, state_times
 from .samples_per_beam import SamplesPerBeam
-from .transform import Boresight, CelestialTransform
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant

@@ -14,11 +14,11 @@ import numpy as np
 
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.errors import PointingError
+from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.types import Floats
 
 from .motion import LargestDerivative, Quantity, rate_text
-from .transform import CelestialTransform
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target

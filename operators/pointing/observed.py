@@ -18,11 +18,11 @@ from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
+    from zonda.core.numerics.celestial import CelestialTransform
     from zonda.core.scene import Scene
 
     from .limits import LargestMotion
     from .samples_per_beam import SamplesPerBeam
-    from .transform import CelestialTransform
 
 
 @dataclass(frozen=True)

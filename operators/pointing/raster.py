@@ -14,6 +14,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
 from zonda.core.flags import TURNAROUND
 from zonda.core.intervals import Intervals, runs
+from zonda.core.numerics.celestial import Boresight
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.sphere import unit_vectors
@@ -22,7 +23,6 @@ from zonda.core.types import Floats
 from .base import Aim, Pointing
 from .motion import rate_text
 from .rows import Rows, acceleration_of, side_of, spacing_of, speed_of
-from .transform import Boresight
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Observation

@@ -17,6 +17,7 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
 from zonda.core.errors import InputError, PointingError
 from zonda.core.intervals import part
+from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
@@ -25,7 +26,6 @@ from .observed import Samples, centre_of, observed, report, state_times
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
 from .recording_files import Clock, read_recording
 from .samples_per_beam import SamplesPerBeam
-from .transform import CelestialTransform
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -139,7 +139,7 @@ def memory() -> Measured:
 @checks.add(MACHINE, reference="today", limit=0, unit="days short")
 def earth_orientation() -> Measured:
     """how far the bundled IERS tables, predictions included, fall short of today; pip install -U astropy-iers-data renews them"""
-    from zonda.operators.pointing.earth_orientation import orientation
+    from zonda.core.numerics.earth_orientation import orientation
 
     today = (datetime.datetime.now(datetime.UTC) - datetime.datetime(1858, 11, 17, tzinfo=datetime.UTC)).days
     known = [day for day in range(0, 400, 10) if orientation(np.array([today + day + 0.5])).known]

@@ -9,6 +9,8 @@ import numpy as np
 
 from zonda.core.checks import Family, Measured
 from zonda.core.configuration.time import Instant
+from zonda.core.numerics.celestial import CelestialTransform
+from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.site import Site
@@ -18,8 +20,6 @@ from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.operators.noise.streams import Streams
-from zonda.operators.pointing.earth_orientation import orientation
-from zonda.operators.pointing.transform import CelestialTransform
 
 from .cases import DECADES, PINK, TIME
 from .scenes import largest, run, scan

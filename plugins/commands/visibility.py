@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.configuration.time import Instant
+from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
-from zonda.operators.pointing.earth_orientation import orientation
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target

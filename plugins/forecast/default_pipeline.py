@@ -176,7 +176,7 @@ def _midnight(site: Site, month: int | None) -> Instant:
 
 def _culminating(site: Site, middle: Instant, elevation: float) -> Target:
     """The ICRS position that is highest at ``middle``, at an elevation: south of a northern site, north of a southern one."""
-    from zonda.operators.pointing.transform import CelestialTransform
+    from zonda.core.numerics.celestial import CelestialTransform
 
     azimuth = math.pi if site.latitude >= 0 else 0.0
     transform = CelestialTransform(site, middle, 1.0)
@@ -187,7 +187,7 @@ def _culminating(site: Site, middle: Instant, elevation: float) -> Target:
 
 def _culmination(site: Site, middle: Instant, target: Target) -> Instant:
     """When a target is highest within half a day of ``middle``. Raises PointingError where it never rises."""
-    from zonda.operators.pointing.transform import CelestialTransform
+    from zonda.core.numerics.celestial import CelestialTransform
 
     if target.frame == "horizontal":
         cure = "give --elevation, or a position on the sky"

@@ -12,13 +12,13 @@ import numpy as np
 from zonda.core.checks import Family
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
+from zonda.core.numerics.celestial import CelestialTransform
+from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.daisy import PointingDaisy
-from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.stare import PointingStare
-from zonda.operators.pointing.transform import CelestialTransform
 from zonda.plugins.checks.numerics import ERROR, SITES, angle, erfa_horizontal
 from zonda.plugins.checks.scenes import camera, differing, largest, scene
 

@@ -10,9 +10,9 @@ from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.flags import TURNAROUND
 from zonda.core.intervals import samples_in
+from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
-from zonda.operators.pointing.transform import CelestialTransform
 
 speeds = st.floats(1e-5, 1.0)
 SCAN = {"throw": "2 deg", "speed": "0.5 deg/s", "acceleration": "1 deg/s2"}

@@ -11,12 +11,12 @@ from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.flags import TURNAROUND
 from zonda.core.instrument import hexagonal_packing
+from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.registry import instruments
 from zonda.core.scene import Scene
 from zonda.operators.pointing.raster import PointingRaster
 from zonda.operators.pointing.rows import Rows
-from zonda.operators.pointing.transform import CelestialTransform
 from zonda.plugins.instruments import CAMERAS
 
 ARCMIN = math.radians(1 / 60)

@@ -15,13 +15,13 @@ from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PointingError, ZondaError
 from zonda.core.flags import INVALID, NOT_RECORDED
+from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.recorded import PointingRecorded
 from zonda.operators.pointing.recording import Recording, comb, longest_rising
 from zonda.operators.pointing.recording_files import read_recording
-from zonda.operators.pointing.transform import CelestialTransform
 
 UNIX = 1732518000.0  # 2024-11-25T07:00:00Z
 NAN = np.nan

@@ -28,17 +28,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from zonda.core.errors import PointingError
-from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import rotation_matrices
-from zonda.core.numerics.quaternions import Upright, conjugate, multiply, rotate, series, shortest_rotation
-from zonda.core.types import Floats
-
+from ..errors import PointingError
+from ..types import Floats
+from .chunks import chunks
 from .earth_orientation import orientation
+from .projection import rotation_matrices
+from .quaternions import Upright, conjugate, multiply, rotate, series, shortest_rotation
 
 if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
-    from zonda.core.site import Site
+    from ..configuration.time import Instant
+    from ..site import Site
 
 SIDEREAL_RATE = 2 * np.pi * 1.00273781191135448 / 86400
 """Rate of the Earth rotation angle, rad/s of UT1."""

@@ -15,6 +15,8 @@ from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics import chunks
+from zonda.core.numerics.celestial import CelestialTransform
+from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.numerics.quaternions import from_angles
 from zonda.core.numerics.sphere import unit_vectors
@@ -22,9 +24,7 @@ from zonda.core.site import Site
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 from zonda.operators.pointing.base import Aim
 from zonda.operators.pointing.daisy import PointingDaisy
-from zonda.operators.pointing.earth_orientation import orientation
 from zonda.operators.pointing.stare import PointingStare
-from zonda.operators.pointing.transform import CelestialTransform
 
 GREEN_BANK = Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m")
 POLE = Site(name="South Pole", latitude="-90 deg", longitude="0 deg", altitude="2835 m")
@@ -257,7 +257,7 @@ def test_a_leap_second_is_a_second(reference: Any) -> None:
 
 
 def test_tables_agree_where_they_overlap() -> None:
-    from zonda.operators.pointing import earth_orientation
+    from zonda.core.numerics import earth_orientation
 
     final, latest = earth_orientation._c04(58000, 60000), earth_orientation._finals(58000, 60000)
     assert final is not None
@@ -270,7 +270,7 @@ def test_tables_agree_where_they_overlap() -> None:
 
 
 def test_a_table_whose_lines_differ_in_length_is_read_whole(tmp_path: Path) -> None:
-    from zonda.operators.pointing.earth_orientation import _rows
+    from zonda.core.numerics.earth_orientation import _rows
 
     def rows(lines: list[str], first: int, last: int) -> Any:
         (tmp_path / "table").write_text("# a table\n" + "".join(f"{line}\n" for line in lines))
@@ -317,7 +317,7 @@ socket.socket.connect = socket.getaddrinfo = socket.create_connection = refuse
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.site import Site
-from zonda.operators.pointing.transform import CelestialTransform
+from zonda.core.numerics.celestial import CelestialTransform
 import numpy as np
 site = Site(name="s", latitude="38 deg", longitude="-79 deg")
 for when in ("2024-11-25", "2027-06-01", "2050-01-01"):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zonda.core.types import Floats
+from ..types import Floats
 
 MEAN_POLE = (0.035, 0.29)
 """Polar motion where no table reaches [arcsec]: astropy's 50-year mean."""
