@@ -11,6 +11,9 @@ from .errors import InputError
 from .notebook import html_table
 from .types import Floats
 
+DEFAULTS = {"polarization_angle": 0.0, "polarization_efficiency": 0.0, "knee": 0.0, "slope": 1.0, "minimum_frequency": 1e-3}
+"""Of columns that are not given."""
+
 
 @dataclass(repr=False)
 class Focalplane:
@@ -26,6 +29,8 @@ class Focalplane:
         Tangents: sotodlib's xi and eta are sines.
     polarization_angle
         rad, COSMO convention, from the focal plane's +X (TOAST) axis.
+    polarization_efficiency
+        0 (not polarized) to 1 (a perfect polarizer): TOAST's (1 - epsilon) / (1 + epsilon) with the cross-polar leakage epsilon.
     fwhm
         Main-beam full width at half maximum on the sky, rad.
     main_beam_efficiency
@@ -49,6 +54,7 @@ class Focalplane:
     illumination_efficiency: Floats
     net: Floats
     polarization_angle: Floats = field(default_factory=lambda: np.zeros(0))
+    polarization_efficiency: Floats = field(default_factory=lambda: np.zeros(0))
     band: list[str] = field(default_factory=list)
     knee: Floats = field(default_factory=lambda: np.zeros(0))
     slope: Floats = field(default_factory=lambda: np.zeros(0))
@@ -56,11 +62,9 @@ class Focalplane:
 
     def __post_init__(self) -> None:
         n = len(self.names)
-        if not self.polarization_angle.size:
-            self.polarization_angle = np.zeros(n)
         if not self.band:
             self.band = [""] * n
-        for name, default in (("knee", 0.0), ("slope", 1.0), ("minimum_frequency", 1e-3)):
+        for name, default in DEFAULTS.items():
             if not getattr(self, name).size:
                 setattr(self, name, np.full(n, default))
         if len(set(self.names)) != n:
@@ -75,6 +79,10 @@ class Focalplane:
                 if not np.isfinite(value).all():
                     bad = self.names[int(np.flatnonzero(~np.isfinite(value))[0])]
                     raise InputError(f"{f.name} of detector {bad} is not finite", place="focal plane")
+        outside = (self.polarization_efficiency < 0) | (self.polarization_efficiency > 1)
+        if outside.any():
+            bad = self.names[int(np.flatnonzero(outside)[0])]
+            raise InputError(f"polarization_efficiency of detector {bad} is not between 0 and 1", place="focal plane")
 
     def __repr__(self) -> str:
         reach = np.degrees(np.arctan(self.radius)) * 60
@@ -95,11 +103,17 @@ class Focalplane:
             ("NET on the sky", span(self.net, 1e3, "mK_RJ sqrt(s)")),
             ("main-beam efficiency zeta", span(self.main_beam_efficiency, 1, "")),
             ("illumination efficiency epsilon", span(self.illumination_efficiency, 1, "")),
+            ("polarized detectors", int((self.polarization_efficiency > 0).sum())),
         ]
         return html_table("Focalplane", rows)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def polarized(self) -> bool:
+        """Whether a detector is polarized."""
+        return bool((self.polarization_efficiency > 0).any())
 
     @property
     def radius(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,6 +164,8 @@ class Instrument(Parameters):
     """Number of detectors."""
     field_of_view: Angle = Field(ge=0, le=1.0)
     """Diameter of the circle that holds all detectors."""
+    polarization: Literal["none", "pairs"] = "none"
+    """`pairs`: a pixel has two polarized detectors at right angles, A and B; A lies at 0 and 45 deg in turn from pixel to pixel."""
     fwhm: Angle | None = Field(None, gt=0)
     """Main-beam FWHM; where absent, the diffraction limit 1.22 lambda / D at the band centre."""
     main_beam_efficiency: Fraction = Field(gt=0, le=1)
@@ -185,6 +187,14 @@ class Instrument(Parameters):
 
     def _as_argument(self) -> str:
         return named_or_written(self, instruments)
+
+    @model_validator(mode="after")
+    def _in_pairs(self) -> Instrument:
+        if self.polarization == "pairs" and self.detectors % 2:
+            raise ValueError(
+                f"polarization: pairs needs an even number of detectors, two in each pixel; detectors is {self.detectors}"
+            )
+        return self
 
     @field_validator("band", mode="before")
     @classmethod
@@ -210,21 +220,29 @@ class Instrument(Parameters):
         return 1.22 * SPEED_OF_LIGHT / self.band.centre / self.telescope.diameter
 
     def focalplane(self) -> Focalplane:
-        """The detector table: `detectors` points of a hexagonal lattice that just fill `field_of_view`."""
-        x, y = hexagonal_packing(self.detectors)
+        """The detector table: pixels at points of a hexagonal lattice that just fill `field_of_view`, nearest its centre first.
+
+        A pixel has one detector, or two with ``polarization: pairs``: A and B, at right angles, next to each other in the table.
+        A of every second pixel lies at 0, of the others at 45 deg.
+        """
+        pair = 2 if self.polarization == "pairs" else 1
+        pixels, n = self.detectors // pair, self.detectors
+        x, y = hexagonal_packing(pixels)
         reach = float(np.hypot(x, y).max())
         scale = math.tan(self.field_of_view / 2) / reach if reach > 0 else 0.0
-        n = self.detectors
-        width = len(str(n - 1))
+        width = len(str(pixels - 1))
         full = np.full
+        angle = np.add.outer(np.pi / 4 * (np.arange(pixels) % 2), [0.0, np.pi / 2]).ravel() if pair == 2 else np.zeros(n)
         return Focalplane(
-            names=[f"d{k:0{width}d}" for k in range(n)],
-            xi=x * scale,
-            eta=y * scale,
+            names=[f"d{k:0{width}d}{side}" for k in range(pixels) for side in ("AB" if pair == 2 else ("",))],
+            xi=np.repeat(x * scale, pair),
+            eta=np.repeat(y * scale, pair),
             fwhm=full(n, self.beam_fwhm),
             main_beam_efficiency=full(n, self.main_beam_efficiency),
             illumination_efficiency=full(n, self.illumination_efficiency),
             net=full(n, self.net),
+            polarization_angle=angle,
+            polarization_efficiency=full(n, float(pair == 2)),
             band=[self.band.name] * n,
             knee=full(n, self.knee),
             slope=full(n, self.slope),

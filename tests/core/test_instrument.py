@@ -10,6 +10,13 @@ from zonda.core.registry import instruments, sites
 
 ARCMIN = np.radians(1 / 60)
 
+CAMERA = {
+    "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"},
+    "band": {"name": "b150", "low": "140 GHz", "high": "160 GHz"},
+    "detectors": 7, "field_of_view": "10 arcmin", "main_beam_efficiency": 0.6, "illumination_efficiency": 0.9,
+    "net": "500 uK s(1/2)", "sample_rate": "50 Hz",
+}  # fmt: skip
+
 
 def test_mustang2_is_the_papers():
     m2 = instruments.create("mustang2")
@@ -108,3 +115,29 @@ def test_focalplane_shows_itself():
     page = plane._repr_html_()
     assert "8.5 arcsec" in page
     assert "1.7 mK_RJ sqrt(s)" in page
+
+
+def test_pairs_of_polarized_detectors():
+    whole = zonda.Instrument(**dict(CAMERA, detectors=14, polarization="pairs")).focalplane()
+    half = zonda.Instrument(**dict(CAMERA, detectors=7)).focalplane()
+    assert whole.names[:4] == ["d0A", "d0B", "d1A", "d1B"]
+    for a, b in ((whole.xi, half.xi), (whole.eta, half.eta)):  # both look where the one does
+        np.testing.assert_array_equal(a.reshape(-1, 2), np.stack([b, b], 1))
+    angles = np.degrees(whole.polarization_angle).reshape(-1, 2)
+    np.testing.assert_allclose(angles[:, 1] - angles[:, 0], 90)
+    np.testing.assert_allclose(angles[:4, 0], [0, 45, 0, 45])
+    assert whole.polarized
+    assert (whole.polarization_efficiency == 1).all()
+    assert not half.polarized
+
+
+def test_pairs_need_an_even_number():
+    with pytest.raises(ZondaError, match="even number of detectors, two in each pixel; detectors is 7"):
+        zonda.Instrument(**dict(CAMERA, detectors=7, polarization="pairs"))
+
+
+def test_a_polarization_efficiency_beyond_one_is_refused():
+    plane = zonda.Instrument(**CAMERA).focalplane()
+    plane.polarization_efficiency[2] = 1.2
+    with pytest.raises(InputError, match="polarization_efficiency of detector d2 is not between 0 and 1"):
+        plane.copy()
