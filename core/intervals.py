@@ -29,11 +29,17 @@ def runs(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, flo
     return [(start, stop) for start, stop in spans if stop > start]
 
 
+def ranges(spans: list[tuple[float, float]], seconds: AnyFloats) -> list[slice]:
+    """The samples of each of the intervals ``spans``."""
+    found = np.searchsorted(seconds, np.reshape(spans, (-1, 2))).tolist()
+    return [slice(first, last + (last == len(seconds) - 1)) for first, last in found]
+
+
 def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> NDArray[np.bool_]:
     """(n,) True for the samples in any of the intervals ``spans``."""
     inside = np.zeros(len(seconds), bool)
-    for first, last in np.searchsorted(seconds, np.reshape(spans, (-1, 2))).tolist():
-        inside[first : last + (last == len(seconds) - 1)] = True
+    for samples in ranges(spans, seconds):
+        inside[samples] = True
     return inside
 
 

@@ -19,7 +19,9 @@ from .common_mode import CommonModeFilter
 from .despline import Despline
 from .detrend import Detrend
 from .gram import MOST_COPIED
+from .ground import GroundFilter
 from .highpass import HighpassFilter
+from .polynomial import PolynomialFilter
 from .taper import Taper
 
 LANCZOS = 0.5e-9
@@ -70,8 +72,7 @@ class HighpassPlanning(Planning[HighpassFilter]):
         effect = Effect(
             "high-pass decimation", tuple(choices), size, "rms of the stream: its low part removed wrongly altogether"
         )
-        left_in = {m: size[m] + context.mean_emission for m in size}
-        return Estimate((effect,), cost, left_in | context.sky_error(1.0))
+        return Estimate((effect,), cost, _left_in(context))
 
 
 class DetrendPlanning(Planning[Detrend]):
@@ -87,6 +88,43 @@ class DetrendPlanning(Planning[Detrend]):
         """Its cost."""
         functions = self.operator.order + 1
         return Estimate((), Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=4e-9 + 2e-9 * functions))
+
+
+class PolynomialPlanning(Planning[PolynomialFilter]):
+    """Exact: it has no coarser form."""
+
+    of = PolynomialFilter
+
+    def memory(self, observation: Observation) -> int:
+        """The polynomials; the pointing of a mask; parts in float64."""
+        return 8 * (self.operator.order + 5 + ROWS) * observation.n_samples
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost; leaving it out leaves the mean and the slow part in."""
+        functions = self.operator.order + 1
+        cost = Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=4e-9 + 1.2e-9 * functions)
+        return Estimate((), cost, _left_in(context))
+
+
+class GroundPlanning(Planning[GroundFilter]):
+    """Exact: it has no coarser form."""
+
+    of = GroundFilter
+
+    def memory(self, observation: Observation) -> int:
+        """The trend, twice; bins; parts in float64."""
+        return 8 * (2 * self.operator.trend + 4 + ROWS) * observation.n_samples
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost; leaving it out leaves the mean and the template in."""
+        cost = Cost(fixed=0.01, per_time=1e-7, per_sample=5e-9 + 2e-9 * self.operator.trend)
+        return Estimate((), cost, _left_in(context))
+
+
+def _left_in(context: Context) -> dict[str, float]:
+    """Bound on what is in the stream and the map where a filter that removes the mean is left out."""
+    size = context.bound(context.fluctuation, context.first.duration, common=True)
+    return {m: size[m] + context.mean_emission for m in size} | context.sky_error(1.0)
 
 
 class DesplinePlanning(Planning[Despline]):

@@ -68,6 +68,8 @@ ACTING = {
     "HighpassFilter": {"frequency": "0.5 Hz"},
     "CommonModeFilter": {},
     "Detrend": {},
+    "GroundFilter": {"bin": "0.01 deg"},
+    "PolynomialFilter": {},
     "Despline": {},
     "Taper": {"share": "1"},
 }

@@ -291,6 +291,12 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
     },
     "Detrend": {"order": ({}, {"order": 2}), "mask": ({}, {"mask": {"radius": "20 arcsec"}})},
     "Despline": {"knots": ({}, {"knots": "5 s"})},
+    "PolynomialFilter": {
+        "order": ({}, {"order": 2}),
+        "interval": ({}, {"interval": "throw"}),
+        "mask": ({}, {"mask": {"radius": "20 arcsec"}}),
+    },
+    "GroundFilter": {"bin": ({}, {"bin": "0.02 deg"}), "split": ({}, {"split": True}), "trend": ({}, {"trend": 3})},
     "Taper": {"share": ({}, {"share": "20 %"})},
     "CommonModeFilter": {
         "modes": ({}, {"modes": 2}),
@@ -400,6 +406,8 @@ CHAINS = {
     "CommonModeFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "CommonModeFilter"],
     "Detrend": ["WhiteNoise", "PinkNoise", "Efficiency", "Detrend"],
     "Despline": ["WhiteNoise", "PinkNoise", "Efficiency", "Despline"],
+    "PolynomialFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "PolynomialFilter"],
+    "GroundFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "GroundFilter"],
     "Taper": ["WhiteNoise", "PinkNoise", "Efficiency", "Taper"],
     "BinMap": ["SkyMap", "WhiteNoise", "Efficiency", "BinMap"],
     "PowerSpectrum": ["WhiteNoise", "PinkNoise", "Efficiency", "PowerSpectrum"],
@@ -430,6 +438,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "WhiteNoise": {},
     "BinMap": {"pixel": "4 arcsec"},
     "HighpassFilter": {"frequency": "0.1 Hz"},
+    "GroundFilter": {"bin": "0.01 deg"},
     "PointingDaisy": SCAN,
     "PointingStare": {"scan_duration": "12 s"},
     "PointingBackAndForth": TURN,
@@ -458,6 +467,7 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 REFUSALS = {
     ("BinMap", "projection"): "'TAN'",
     ("SkyMap", "missing"): "NaN",
+    ("PolynomialFilter", "interval"): "no interval 'throw'",
     ("TransferFunction", "map"): "there is no map 'chart'",
     ("CompareMaps", "map"): "there is no map 'chart'",
     ("MapSpectrum", "maps"): "no TAN map 'chart'",
