@@ -39,8 +39,9 @@ class FunctionOperator(Operator):
         values = np.asarray(made)
         if len(self.provides) != 1 or values.dtype.kind not in "fiu" or values.shape != block.shape:
             what = f"an array of shape {values.shape}" if values.dtype.kind in "fiu" else f"{made!r:.40}"
-            wanted = f"nothing, or the stream {sorted(self.provides)[0]}, an array of shape {block.shape}"
-            wanted = wanted if len(self.provides) == 1 else "nothing: it provides several streams, in block.detdata"
+            wanted = f"nothing: it provides {len(self.provides) or 'no'} streams; several stand in block.detdata"
+            if len(self.provides) == 1:
+                wanted = f"nothing, or the stream {next(iter(self.provides))}, an array of shape {block.shape}"
             raise PipelineError(f"the function returned {what}", place=self.label, cure=f"return {wanted}")
         block.new(next(iter(self.provides)), zero=False)[...] = values
 

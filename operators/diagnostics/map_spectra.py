@@ -15,7 +15,8 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_sources
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
+from zonda.core.numerics.transforms import gaussian_taps
 from zonda.core.output import Output
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
@@ -110,11 +111,11 @@ def map_spectra(
         raise PipelineError("the maps have different grids", place=place, cure="name maps of one step")
     window = window_of(first, None, taper, least)
     known = {name: np.where(window > 0, values, np.nan) for name, values in noise.items() if name == names[0] or wanted}
-    white = {name: np.nan_to_num(values) for name, values in known.items() if np.isfinite(values).any()}
+    sigma = first.smoothed_by / FWHM_PER_SIGMA
+    side = gaussian_taps(sigma / first.pixel)
+    left = 2 * float(side @ side) - side[0] ** 2  # what smoothing leaves of the noise of independent pixels: (sum K^2)^(1/2)
+    white = {name: np.nan_to_num(values) / left for name, values in known.items() if np.isfinite(values).any()}
     edges = ring_edges(first.signal.shape, first.pixel, bins)
-    middle = np.sqrt(edges[1:] * edges[:-1])
-    sigma = first.smoothed_by / np.sqrt(8 * np.log(2))
-    smoothing = np.exp(-((2 * np.pi * middle * sigma) ** 2)) if sigma else 1.0
-    spectra = radial_spectra(planes, window, first.pixel, edges, white, smoothing)
+    spectra = radial_spectra(planes, window, first.pixel, edges, white, sigma)
     words: dict[str, Any] = {"half_difference": f"half the difference, {first.difference}"}
     return MapSpectra(spectra, {name: str(words.get(name, name)) for name in planes}, first.fwhm)

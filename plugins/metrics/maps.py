@@ -180,6 +180,9 @@ class PeakSnr(_OfSmoothMap):
             if not near.any():
                 cure = "add a WhiteNoise and leave BinMap.noise at its default"
                 raise InputError("the map does not know its white noise", place="peak_snr", cure=cure)
+            if not found > 0:
+                cure = "add a step that makes noise, or choose noise: white"
+                raise InputError("the noise map is zero: the ratio is infinite", place="peak_snr", cure=cure)
             w = product.weights[near]
             factor = found / math.sqrt(float((w * product.noise[near] ** 2).sum() / w.sum()))
             error /= found

@@ -98,6 +98,8 @@ def test_provenance_names_the_source():
         (lambda: zonda.Pipeline([*STEPS, double]), r"step 5 is the function double(.|\n)*zonda.operator\(double\) at step 5"),
         (lambda: signal(zonda.operator(lambda block: 3)), r"returned an array of shape \(\)(.|\n)*the stream signal"),
         (lambda: signal(zonda.operator(lambda block: "no")), "returned 'no'"),
+        (lambda: signal(zonda.operator(double, provides=())), "return nothing: it provides no streams"),
+        (lambda: signal(zonda.operator(double, provides=("signal", "more"))), "return nothing: it provides 2 streams"),
         (lambda: zonda.Pipeline([STEPS[0], zonda.operator(double)]), "double needs signal, which no step provides"),
     ],
 )

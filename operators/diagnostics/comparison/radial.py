@@ -86,7 +86,7 @@ def radial_spectra(
     pixel: float,
     edges: Floats,
     noise: Mapping[str, Floats] | None = None,
-    smoothing: Floats | float = 1.0,
+    smoothing: float = 0.0,
 ) -> RadialSpectra:
     """Equation (1) of maps (ny, nx); pixels that are NaN in one of them count in none.
 
@@ -101,7 +101,7 @@ def radial_spectra(
     noise
         (ny, nx) standard errors of some of the maps, of independent pixels before the smoothing.
     smoothing
-        (n,) squared transfer of the smoothing in each ring.
+        Standard deviation of the Gaussian that they are smoothed with, rad.
     """
     known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
     window = np.where(known, window, 0.0)
@@ -126,11 +126,11 @@ def radial_spectra(
         first, second = (list(transforms.values()) * 2)[:2]
         cross = summed((first * second.conj()).real) / np.sqrt(summed(np.abs(first) ** 2) * summed(np.abs(second) ** 2))
         wavenumber = summed(k) / number
-    white = {name: area * float((np.where(known, window * n, 0.0) ** 2).sum()) for name, n in (noise or {}).items()}
-    levels = {name: np.broadcast_to(level * np.asarray(smoothing), (count,)) for name, level in white.items()}
+        passed = summed(np.exp(-((2 * np.pi * k * smoothing) ** 2))) / number
+    white = {name: area * float((np.where(known, window * n, 0.0) ** 2).sum()) * passed for name, n in (noise or {}).items()}
     if len(maps) < 2:
         cross = np.full(count, math.nan)
-    return RadialSpectra(edges, wavenumber, power, number / 2 / correlated, levels, cross)
+    return RadialSpectra(edges, wavenumber, power, number / 2 / correlated, white, cross)
 
 
 @dataclass(frozen=True)

@@ -139,6 +139,18 @@ def test_map_spectrum(tmp_path, products):
     assert set(run.products["map_spectra"].spectra.white) == set()
 
 
+def test_the_white_level_of_a_smoothed_map_is_that_of_its_pixels_before(tmp_path, products):
+    """The noise that a smoothed map states is that behind the smoothing, sqrt(4 pi) sigma / pixel times smaller."""
+    noise = np.random.default_rng(5).standard_normal((SIDE, SIDE)) * 1e-5
+    run = data(tmp_path, {"map": product(noise).smoothed(BEAM * ARCSEC)})
+    MapSpectrum(bins=16).finalize(run)
+    s = run.products["map_spectra"].spectra
+    good = (s.modes > 2) & (s.scale > 1.2 * BEAM * ARCSEC)  # beyond, less than 1 % of the power is left
+    assert np.count_nonzero(good) >= 3
+    score = (s.power["map"] / s.white["map"] - 1) * np.sqrt(s.modes)
+    assert np.abs(score[good]).max() < 4
+
+
 def test_what_is_missing_is_named(tmp_path, products):
     run = data(tmp_path, products)
     with pytest.raises(PipelineError, match="there is no map 'mpa'") as caught:

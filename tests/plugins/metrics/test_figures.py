@@ -1,5 +1,6 @@
 """Figures against known answers: analytic maps and spectra, and where a default would be wrong."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -153,6 +154,8 @@ def test_peak_snr():
     assert real.error >= 1
     with pytest.raises(ZondaError, match="no signal"):
         measure(data(map=product(blob(12))), "peak_snr")
+    with pytest.raises(ZondaError, match="the noise map is zero"):
+        measure(data(map=replace(product(blob(12)), half_difference=np.zeros((SIDE, SIDE)))), "peak_snr", noise="half_difference")
 
 
 # ---- coverage
