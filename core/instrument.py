@@ -18,6 +18,7 @@ from .errors import InputError
 from .focalplane import Focalplane
 from .registry import bands, instruments
 from .storage import packed
+from .variants import LIKE, variant
 
 SPEED_OF_LIGHT = 299792458.0
 
@@ -203,9 +204,8 @@ class Instrument(Parameters):
 
     def varied(self, **changes: Any) -> Instrument:
         """This instrument with fields changed, as ``{like: ..., ...}`` in a pipeline file (`core.variants.variant`)."""
-        from .variants import LIKE, variant
-
-        return variant({LIKE: self, **changes})
+        made: Instrument = variant({LIKE: self, **changes})
+        return made
 
     @property
     def identity(self) -> tuple[str, ...]:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .configuration.parameters import named
 from .registry import instruments
-
-if TYPE_CHECKING:
-    from .instrument import Instrument
 
 LIKE = "like"
 """Key that names what a variant differs from."""
@@ -24,7 +21,7 @@ def is_variant(value: Any) -> bool:
     return isinstance(value, Mapping) and LIKE in value
 
 
-def variant(given: Mapping[str, Any], context: Any = None) -> Instrument:
+def variant(given: Mapping[str, Any], context: Any = None) -> Any:
     """The instrument ``given["like"]`` (a registered name or an Instrument) with the other keys of ``given`` changed.
 
     A mapping for ``telescope`` changes the keys that it names; ``band`` is replaced as a whole. Where telescope or band change
@@ -36,7 +33,7 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Instrument:
     pydantic.ValidationError, PydanticCustomError
         For keys and values that an instrument does not take, and an unknown name.
     """
-    base: Instrument = named(instruments, given[LIKE])
+    base = named(instruments, given[LIKE])
     if not hasattr(base, "focalplane"):
         raise ValueError(f"like takes the name of an instrument, not {given[LIKE]!r}")
     changes = {key: value for key, value in given.items() if key != LIKE}
@@ -60,14 +57,14 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Instrument:
     return made.model_copy(update={key: text for key, text in texts.items() if key not in changes})
 
 
-def differences(base: Instrument, other: Instrument) -> dict[str, tuple[Any, Any]]:
+def differences(base: Any, other: Any) -> dict[str, tuple[Any, Any]]:
     """What differs between two instruments but for their names and descriptions: (of ``base``, of ``other``) by key."""
     one, two = (_flat(x.model_dump(mode="json")) for x in (base, other))
     texts = ("name", "description", "provenance")
     return {key: (one.get(key), two.get(key)) for key in {**one, **two} if one.get(key) != two.get(key) and key not in texts}
 
 
-def written(given: Mapping[str, Any], made: Instrument) -> dict[str, Any]:
+def written(given: Mapping[str, Any], made: Any) -> dict[str, Any]:
     """The mapping ``given`` of a variant that came to be ``made``, in units and full paths, to be read again."""
     dumped = made.model_dump(mode="json")
     found: dict[str, Any] = {LIKE: given[LIKE]} | {key: dumped[key] for key in given if key != LIKE}
@@ -76,8 +73,8 @@ def written(given: Mapping[str, Any], made: Instrument) -> dict[str, Any]:
     return found
 
 
-def _diffraction(instrument: Instrument) -> float:
-    return 1 / (instrument.band.centre * instrument.telescope.diameter)
+def _diffraction(instrument: Any) -> float:
+    return 1.0 / float(instrument.band.centre * instrument.telescope.diameter)
 
 
 def _flat(dumped: Mapping[str, Any]) -> dict[str, Any]:

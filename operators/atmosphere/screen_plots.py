@@ -1,27 +1,93 @@
-"""Pictures of `Screens`: the layers at a moment, and a strip of the PWV over the field."""
+"""`Screens`: the layers at a moment and the PWV over the field, and their pictures."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from zonda.core.drawable import Sketch
-
-if TYPE_CHECKING:
-    from .screens import LayerScreen, Screens
+from zonda.core.types import Floats
 
 ACROSS = (4, 5, 3)
 """Panels in a row: what leaves the fewest places empty."""
 SIDE = 2.7
 """Of a panel with its labels, in."""
+MARGINS = (0.62, 0.55, 0.45, 0.42)
+"""Left, bottom, right and top of each panel, in."""
 COLOURS = "RdBu_r"
+
+
+@dataclass(frozen=True)
+class LayerScreen:
+    """One layer about the point that the boresight looks through at a moment.
+
+    Attributes
+    ----------
+    height, distance
+        Of the layer, and along the line of sight, m.
+    wind
+        (east, north), m/s.
+    values
+        (n_along, n_across) fluctuation of the PWV at zenith in this layer, m: p a_l g_l PWV.
+    spacing
+        Between the values, m.
+    track
+        (n, 2) across and along the wind, m, where the boresight passes through the layer during the scan; 0 at the moment.
+    fwhm, field
+        Width of the beam there, and diameter of the field of view, m.
+    """
+
+    height: float
+    distance: float
+    wind: tuple[float, float]
+    values: Floats
+    spacing: float
+    track: Floats
+    fwhm: float
+    field: float
+
+
+@dataclass(frozen=True)
+class Screens:
+    """The layers at a moment, and the PWV over the field of view at several.
+
+    Attributes
+    ----------
+    layers
+        From the lowest up.
+    moment
+        Of ``layers``, s since the scan's start.
+    seconds
+        (k,) of ``pwv``, s since the scan's start.
+    pwv
+        (k, n, n) fluctuation of the PWV along the line of sight, m; rows eta, columns xi; NaN beyond the field.
+    side
+        Of the field, rad.
+    mean_pwv
+        At zenith, m.
+    observation
+        Name of the scan.
+    """
+
+    layers: list[LayerScreen]
+    moment: float
+    seconds: Floats
+    pwv: Floats
+    side: float
+    mean_pwv: float
+    observation: str
+
+    def sketches(self, name: str) -> list[Sketch]:
+        """See `core.drawable.Drawable`."""
+        return sketches(name, self)
 
 
 def sketches(name: str, found: Screens) -> list[Sketch]:
     """The layers, and the strip."""
-    layers = _grid(len(found.layers), (0.62, 0.55, 0.45, 0.42))
+    layers = _grid(len(found.layers))
     for ax, layer in zip(layers, found.layers, strict=True):
         _layer(ax, layer)
     text = (
@@ -29,7 +95,7 @@ def sketches(name: str, found: Screens) -> list[Sketch]:
         "the frame that drifts with the layer's wind (arrow). Line: where the boresight passes through the layer in the scan; "
         "cross: at this moment; solid circle: the beam (FWHM); dotted: the field of view."
     )
-    strip = _grid(len(found.seconds), (0.62, 0.55, 0.45, 0.42))
+    strip = _grid(len(found.seconds))
     half = math.degrees(found.side) * 30
     for ax, second, pwv in zip(strip, found.seconds, found.pwv, strict=True):
         change = pwv - np.nanmean(pwv)
@@ -46,11 +112,11 @@ def sketches(name: str, found: Screens) -> list[Sketch]:
     ]
 
 
-def _grid(count: int, margins: tuple[float, float, float, float]) -> list[Any]:
-    """``count`` square axes in rows. ``margins``: left, bottom, right, top of each, in."""
+def _grid(count: int) -> list[Any]:
+    """``count`` square axes in rows."""
     from matplotlib.figure import Figure
 
-    left, bottom, right, top = margins
+    left, bottom, right, top = MARGINS
     columns = min(count, min(ACROSS, key=lambda n: -count % n))
     rows = -(-count // columns)
     inner = SIDE - left

@@ -9,7 +9,6 @@ frame that drifts with its wind, and the fluctuation of the PWV along lines of s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -19,7 +18,6 @@ from pydantic import Field
 
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data
-from zonda.core.drawable import Sketch
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.output import Output
@@ -31,79 +29,13 @@ from zonda.core.types import Floats
 from .drawing import drifting_layers, height_of_vapour
 from .model import AtmosphereModel, ExpectedLoad
 from .response import airmass
+from .screen_plots import LayerScreen, Screens
 from .turbulence.lines_of_sight import LinesOfSight
 
 MOST_CELLS = 400
 """Lattice points along each side of a layer's picture."""
 LEAST_BEAMS = 4.0
 """Width of a layer's picture in beams, at least."""
-
-
-@dataclass(frozen=True)
-class LayerScreen:
-    """One layer about the point that the boresight looks through at a moment.
-
-    Attributes
-    ----------
-    height, distance
-        Of the layer, and along the line of sight, m.
-    wind
-        (east, north), m/s.
-    values
-        (n_along, n_across) fluctuation of the PWV at zenith in this layer, m: p a_l g_l PWV.
-    spacing
-        Between the values, m.
-    track
-        (n, 2) across and along the wind, m, where the boresight passes through the layer during the scan; 0 at the moment.
-    fwhm, field
-        Width of the beam there, and diameter of the field of view, m.
-    """
-
-    height: float
-    distance: float
-    wind: tuple[float, float]
-    values: Floats
-    spacing: float
-    track: Floats
-    fwhm: float
-    field: float
-
-
-@dataclass(frozen=True)
-class Screens:
-    """The layers at a moment, and the PWV over the field of view at several.
-
-    Attributes
-    ----------
-    layers
-        From the lowest up.
-    moment
-        Of ``layers``, s since the scan's start.
-    seconds
-        (k,) of ``pwv``, s since the scan's start.
-    pwv
-        (k, n, n) fluctuation of the PWV along the line of sight, m; rows eta, columns xi; NaN beyond the field.
-    side
-        Of the field, rad.
-    mean_pwv
-        At zenith, m.
-    observation
-        Name of the scan.
-    """
-
-    layers: list[LayerScreen]
-    moment: float
-    seconds: Floats
-    pwv: Floats
-    side: float
-    mean_pwv: float
-    observation: str
-
-    def sketches(self, name: str) -> list[Sketch]:
-        """See `core.drawable.Drawable`."""
-        from .screen_plots import sketches
-
-        return sketches(name, self)
 
 
 class AtmosphereScreens(Output):

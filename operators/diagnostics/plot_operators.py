@@ -51,8 +51,10 @@ from .drawing.pictures import (
 )
 from .drawing.plots import ScanTrack
 from .drawing.sky_axes import SkyAxes
+from .drawing.stream_comparison import draw_stream_comparison
 from .map_spectra import MapSpectra
 from .series import Modes, Spectrum, TimeStream
+from .stream_statistics import StreamComparison
 from .transfer_function import Transfer
 
 __all__ = ["Picture", "Plots", "pictures"]
@@ -227,6 +229,8 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
             yield Drawing(f"comparison {name}", draw_comparison, partial(tuple, (file, product, style.contours)))
         elif isinstance(product, MapSpectra):
             yield Drawing(f"map spectra {name}", draw_map_spectra, partial(tuple, (file, product)))
+        elif isinstance(product, StreamComparison):
+            yield Drawing(f"stream comparison {name}", draw_stream_comparison, partial(tuple, (file, product)))
 
 
 def _steps_before(data: Data) -> dict[str, str]:

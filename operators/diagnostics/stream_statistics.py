@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.drawable import Sketch
 from zonda.core.notebook import html_table
 from zonda.core.product import Record
 from zonda.core.storage.ecsv import Column
@@ -234,12 +233,6 @@ class StreamComparison(Record):
             text += f", scatter over detectors {scatter:.2g}" if math.isfinite(scatter) else ""
             found.append((figure.replace("_", " of the ") if "rms_" in figure else figure, text))
         return found
-
-    def sketches(self, name: str) -> list[Sketch]:
-        """See `core.drawable.Drawable`."""
-        from .drawing.stream_comparison import sketches
-
-        return sketches(name, self)
 
     def _repr_html_(self) -> str:
         return html_table(f"{self.stream} and {self.reference}", self.lines())

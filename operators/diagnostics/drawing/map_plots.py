@@ -35,7 +35,6 @@ def plot_map(
     title: str = "",
     fwhm: float | None = None,
     limit: float | None = None,
-    circle: float | None = None,
     unit: str = "K_RJ",
 ) -> Axes:
     """A brightness map in K_RJ with its colour bar and resolution.
@@ -58,13 +57,10 @@ def plot_map(
         Resolution, rad; drawn to scale.
     limit
         Largest brightness of the colour scale, K; default: what `SHOWN` % of the pixels stay below.
-    circle
-        Diameter of a circle about the centre of the map, rad (where a noise figure was taken).
     unit
         Of the values; those in K_RJ are shown in the unit that reads best.
     """
     import matplotlib as mpl
-    from matplotlib.patches import Ellipse
 
     axes = located(wcs)
     ax = map_axes(values.shape, axes)[0] if ax is None else ax
@@ -74,14 +70,19 @@ def plot_map(
     shown = np.ma.masked_invalid(values * factor)
     style = {"vmin": bottom * factor, "vmax": top * factor, "cmap": mpl.colormaps[name].with_extremes(bad="0.85")}
     _show(ax, axes, shown, label if unit else "brightness", **style)
-    dx, dy = np.radians(axes.scales) if _is_world(ax) else (ARCMIN, ARCMIN)
     if fwhm:
-        _draw_beam(ax, (dx, dy), fwhm)
-    if circle:
-        centre = _centre(ax, axes, values.shape)
-        ax.add_patch(Ellipse(centre, circle / dx, circle / dy, fill=False, edgecolor="black", linestyle=":", linewidth=1.2))
+        _draw_beam(ax, _scales(ax, axes), fwhm)
     _head(ax, title)
     return ax  # type: ignore[no-any-return]
+
+
+def plot_circle(ax: Any, wcs: Any, shape: tuple[int, ...], diameter: float) -> None:
+    """A dotted circle of ``diameter`` [rad] about the centre of a map (ny, nx) that is drawn in ``ax``."""
+    from matplotlib.patches import Ellipse
+
+    axes = located(wcs)
+    width, height = (diameter / scale for scale in _scales(ax, axes))
+    ax.add_patch(Ellipse(_centre(ax, axes, shape), width, height, fill=False, edgecolor="black", linestyle=":", linewidth=1.2))
 
 
 def plot_plain(
@@ -236,12 +237,16 @@ def _centre(ax: Any, axes: SkyAxes | AstropyAxes, shape: tuple[int, ...]) -> tup
     return axes.reference if isinstance(axes, SkyAxes) and axes.projection != "CAR" else middle
 
 
-def _draw_beam(ax: Any, scales: tuple[float, float], fwhm: float) -> None:
-    """The beam's half-power circle in the lower left corner, to scale. ``scales``: rad per unit of the axes."""
+def _scales(ax: Any, axes: SkyAxes | AstropyAxes) -> Any:
+    """rad per unit of the axes, along x and y."""
+    return np.radians(axes.scales) if _is_world(ax) else (ARCMIN, ARCMIN)
+
+
+def _draw_beam(ax: Any, scales: Any, fwhm: float) -> None:
+    """The beam's half-power circle in the lower left corner, to scale. ``scales``: of `_scales`."""
     from matplotlib.patches import Ellipse
 
-    dx, dy = scales
-    width, height = fwhm / dx, fwhm / dy
+    width, height = (fwhm / scale for scale in scales)
     x0, x1 = ax.get_xlim()
     y0, y1 = ax.get_ylim()
     sign = 1 if x1 > x0 else -1

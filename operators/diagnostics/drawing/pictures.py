@@ -17,7 +17,7 @@ from ..series import Modes, Spectrum, TimeStream, unit_of_stream
 from .canvas import DPI
 from .flat_map import FlatMap
 from .map_layout import map_axes
-from .map_plots import SHOWN, contour_text, plot_contours, plot_coverage, plot_map
+from .map_plots import SHOWN, contour_text, plot_circle, plot_contours, plot_coverage, plot_map
 from .plot_modes import plot_modes
 from .plots import ScanTrack, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .png import png_of
@@ -217,6 +217,7 @@ def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | 
     axes = map_axes(covered.shape, whole.sky, len(panels))
     for ax, (shown, title) in zip(axes, panels, strict=True):
         values = np.where(covered, next(iter(shown.planes.values())), np.float32(np.nan))
-        width = style.central_diameter if circle else None
-        plot_map(values, whole.sky, ax=ax, title=title, fwhm=fwhm or None, limit=limit, circle=width)
+        plot_map(values, whole.sky, ax=ax, title=title, fwhm=fwhm or None, limit=limit)
+        if circle:
+            plot_circle(ax, whole.sky, values.shape, style.central_diameter)
     return axes[0]

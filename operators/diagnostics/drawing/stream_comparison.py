@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..stream_statistics import StreamComparison
 
 
-def sketches(name: str, found: StreamComparison) -> list[Sketch]:
+def draw_stream_comparison(file: str, found: StreamComparison) -> list[Sketch]:
     """Spectra, their ratio and the coherence."""
     spectra, ratio, coherence = new_figure(
         (7.2, 7.2), [(0.12, 0.52, 0.86, 0.43), (0.12, 0.29, 0.86, 0.21), (0.12, 0.07, 0.86, 0.20)]
@@ -39,7 +39,7 @@ def sketches(name: str, found: StreamComparison) -> list[Sketch]:
     for ax in (spectra, ratio, coherence):
         _finish(ax, f, last=ax is coherence)
     write_title(spectra, f"{found.stream} and {found.reference}")
-    return [Sketch(name, "Streams compared", _caption(found), spectra)]
+    return [Sketch(file, "Streams compared", _caption(found), spectra)]
 
 
 def _finish(ax: Any, f: Any, last: bool) -> None:

@@ -19,6 +19,7 @@ from zonda.core.maps.healpix_plane import on_plane
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.operators.diagnostics.drawing import pictures
+from zonda.operators.diagnostics.drawing.map_plots import plot_circle
 from zonda.operators.diagnostics.drawing.plots import (
     map_axes,
     plot_coverage,
@@ -103,7 +104,8 @@ def drawn(ax):
 
 
 def test_a_map_has_world_axes_a_unit_and_its_beam(values, wcs):
-    ax = drawn(plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC, circle=60 * ARCSEC))
+    ax = plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC)
+    plot_circle(drawn(ax), wcs, values.shape, 60 * ARCSEC)
     assert ax.get_title() == "The map"
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("RA (ICRS)", "Dec (ICRS)")
     assert [t.get_text() for t in ax.get_xticklabels()] == ["4ʰ59ᵐ55ˢ", "5ʰ00ᵐ00ˢ", "5ʰ00ᵐ05ˢ"]
@@ -314,7 +316,7 @@ def test_the_pixels_are_those_of_savefig(values, wcs):
     from PIL import Image as Bitmap
 
     def figure():
-        return plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC, circle=60 * ARCSEC)
+        return plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC)
 
     stream = io.BytesIO()
     figure().figure.savefig(stream, format="png")
