@@ -50,6 +50,18 @@ class Data:
     laid_out: bool = False
     """The layouts are those of all parts of a campaign: `Operator.observe` takes them as they are."""
 
+    @property
+    def n_scans(self) -> int:
+        """How many scans there are; where some of them are looked at (`Operator.check`), as the last one's number tells."""
+        return max(len(self.observations), self.observations[-1].index + 1) if self.observations else 0
+
+    def check_scan(self, number: int, place: str) -> None:
+        """Refuse the number of a scan that is not there (PipelineError)."""
+        if number >= self.n_scans:
+            there = f"choose 0 to {self.n_scans - 1}" if self.n_scans > 1 else "leave it out"
+            text = f"there is no observation {number}: the pipeline makes {self.n_scans}, counted from 0"
+            raise PipelineError(text, place=place, cure=f"{there}, or make more scans")
+
     def add(self, label: str, product: Product) -> None:
         """Add an observation's share to the partial product of a step."""
         whole = self.partial.setdefault(label, product)

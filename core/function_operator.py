@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, cast, overload
 
@@ -15,7 +16,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from .block import Block
-from .errors import PipelineError
+from .errors import PipelineError, ZondaError
 from .operator import Operator
 
 Function = Callable[[Block], Any]
@@ -32,8 +33,18 @@ class FunctionOperator(Operator):
     _call: Any = PrivateAttr(None)
 
     def exec(self, block: Block, state: Any) -> None:
-        """Call the function; an array that it returns becomes the stream that it provides."""
-        made = self._call(block)
+        """Call the function; an array that it returns becomes the stream that it provides.
+
+        Raises PipelineError from whatever the function raises, with the step, the function and its place.
+        """
+        try:
+            made = self._call(block)
+        except (ZondaError, MemoryError):
+            raise
+        except Exception as err:
+            words = "".join(str(err).strip().splitlines()[:1])
+            text = f"the function {self.function} raised {type(err).__name__}{': ' * bool(words)}{words}"
+            raise PipelineError(text, place=self.label, cure=f"mend it: {_where(err) or self.source}") from err
         if made is None:
             return
         values = np.asarray(made)
@@ -117,6 +128,13 @@ def operator(
     step: FunctionOperator = made(name=label, function=_named(function, own), source=_place(function))
     step._call = function
     return step
+
+
+def _where(err: Exception) -> str:
+    """``file.py, line 12`` of the innermost code that raised it and is no library's: the function's own or what it calls."""
+    frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(err.__traceback__)][1:]
+    own = [place for place in frames if "site-packages" not in place[0] and not place[0].startswith("<")]
+    return f"{own[-1][0]}, line {own[-1][1]}" if own else ""
 
 
 def _named(function: Any, own: str) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .emission import mean_emission
 from .flags import EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
 from .intervals import Intervals, runs
@@ -224,6 +225,11 @@ class Observation:
     def dec(self) -> AnyFloats:
         """(n_samp,) rad, ICRS."""
         return self.derotate("boresight_radec")[1]
+
+    @property
+    def mean_emission(self) -> dict[str, float]:
+        """Of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated (`core.emission`); empty where there is none."""
+        return mean_emission(self)
 
     def __repr__(self) -> str:
         return f"<Observation {self.name}: {self.n_detectors} detectors x {self.n_samples} samples at {self.sample_rate:g} Hz>"

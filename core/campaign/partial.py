@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +112,7 @@ class Thinned(Observation):
 
     samples: int = 0
     detectors: int = 0
+    emission: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """No flags are made for the samples that are not here."""
@@ -123,6 +124,10 @@ class Thinned(Observation):
     @property
     def n_detectors(self) -> int:
         return self.detectors
+
+    @property
+    def mean_emission(self) -> dict[str, float]:
+        return self.emission
 
     @classmethod
     def made(cls, scan: dict[str, Any], index: int, scene: Scene, plane: Focalplane) -> Thinned:
@@ -168,6 +173,7 @@ def _thinned(observation: Observation, number: int) -> dict[str, Any]:
         "boresight_azel": observation.boresight_azel[kept],
         "boresight_radec": observation.boresight_radec[kept],
         "centre": list(observation.centre),
+        "emission": observation.mean_emission,
         "focal_plane": {name: getattr(observation.focalplane, name) for name in LEVELS} if number == 0 else {},
         "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],
     }

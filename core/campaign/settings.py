@@ -56,6 +56,9 @@ class Tls(Parameters):
 class Campaign(Parameters):
     """Many observations of one pipeline, worked through as tasks on any engine. Keys are those of `--set`."""
 
+    KEYS_BELONG_IN: ClassVar[str] = "grid"
+    """Where a pipeline's key belongs that stands beside these."""
+
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
     """Every combination of these values, e.g. {site: [atacama, mauna_kea], PointingDaisy.radius: [2 arcmin, 4 arcmin]}."""
     observations: list[Annotated[dict[str, Any], Field(min_length=1)]] = Field(default_factory=list)
@@ -137,5 +140,7 @@ class Sweep(Parameters):
             raise ValueError("give over, points or seeds")
         return self
 
+    KEYS_BELONG_IN: ClassVar[str] = "over"
+    """Where a pipeline's key belongs that stands beside these."""
     CALLED: ClassVar[dict[str, str]] = {"over": "grid", "points": "observations", "seeds": "realizations"}
     """What a campaign calls its keys."""

@@ -82,7 +82,8 @@ def explain(
         else:  # another branch of a union
             k = branches[new.span]
             other = "or: " + new.message.removeprefix(found[k].message.split(": ")[0] + ": ")
-            found[k] = replace(found[k], help="\n".join(filter(None, (other, found[k].help))))
+            text = "\n".join(filter(None, (other, found[k].help)))
+            found[k] = replace(found[k], label=found[k].label or new.label, help=text)
     return _together(found)
 
 
@@ -142,7 +143,9 @@ class _Validated:
         owner, _ = _field(self.model, loc[:-1])
         options = list(self.keys if self.keys and len(loc) == 1 else (owner or self.model).model_fields)
         meant = SYNONYMS.get(str(key).lower(), "")
-        hint = f"did you mean '{meant}'?" if meant in options else nearest(key, options, "not a known key")
+        inner = getattr(owner or self.model, "KEYS_BELONG_IN", "") if "." in str(key) else ""
+        known = f"write {inner}: {{{key}: [...]}}" if inner else "not a known key"
+        hint = f"did you mean '{meant}'?" if meant in options else nearest(key, options, known)
         inside = self.name(loc[:-1])
         message = f"unknown {'parameter' if self.python else 'key'} '{key}' for {inside}"
         return Diagnostic(message, span, glued(key, options) or hint, f"{inside} takes: {', '.join(options)}")
@@ -185,7 +188,9 @@ class _Validated:
             return f"{given} has a character that is not allowed here", f"use letters, digits and '_'{within}"
         wanted = _WANTED.get(kind.split("_")[0])
         if wanted and kind.endswith(("_parsing", "_type", "_from_float")) and e["msg"].startswith("Input"):
-            return f"expected {_IN_PYTHON.get(wanted, wanted) if self.python else wanted}, got {given}", ""
+            single = kind == "list_type" and isinstance(e["input"], str | int | float)
+            label = f"write [{given if self.python else e['input']}]" if single else ""
+            return f"expected {_IN_PYTHON.get(wanted, wanted) if self.python else wanted}, got {given}", label
         return str(context.get("error") or e["msg"]), context.get("label") or ""
 
 

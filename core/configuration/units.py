@@ -147,11 +147,15 @@ def _factors(text: str) -> Iterator[tuple[tuple[float, tuple[int, ...]], float] 
 
 
 class Unit:
-    """Annotation: read a quantity and convert it to ``unit``, an SI unit of `KINDS` or any that astropy knows."""
+    """Annotation: read a quantity and convert it to ``unit``, an SI unit of `KINDS` or any that astropy knows.
 
-    def __init__(self, unit: str) -> None:
+    ``examples`` are what messages give, where those of the kind would mislead (elevations are degrees).
+    """
+
+    def __init__(self, unit: str, *examples: str) -> None:
         self.unit = unit
-        self.kind = KINDS.get(unit, Kind(f"a quantity in {unit}", (f"1 {unit}",), (unit,)))
+        kind = KINDS.get(unit, Kind(f"a quantity in {unit}", (f"1 {unit}",), (unit,)))
+        self.kind = kind._replace(examples=examples or kind.examples)
 
     def __repr__(self) -> str:
         return f"Unit({self.unit!r})"

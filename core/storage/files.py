@@ -173,7 +173,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = temporary_sibling(path)
     try:
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             if path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
             yield temporary
@@ -201,6 +201,18 @@ def product_path(folder: str | os.PathLike[str], name: str, suffix: str = "") ->
     return Path(folder) / f"{stem[:180]}{suffix}"
 
 
+def make_folder(path: str | os.PathLike[str]) -> Path:
+    """Make a folder and those above it; its path. Raises OSError, and `OutputError` where the file system takes no new ones."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileNotFoundError as error:
+        above = next(parent for parent in folder.absolute().parents if parent.is_dir())
+        cure = "choose another output folder"
+        raise OutputError(f"cannot be made: {above} takes no new folders", place=str(folder), cure=cure) from error
+    return folder
+
+
 def check_output_folder(path: str | os.PathLike[str]) -> Path:
     """Create an output folder and prove that it takes files, before a long run starts; its path.
 
@@ -213,7 +225,7 @@ def check_output_folder(path: str | os.PathLike[str]) -> Path:
     probe = temporary_sibling(folder / "probe")  # where a kill leaves one, a campaign finds it by this name
     try:
         with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             probe.write_bytes(b"zonda")
     finally:
         discard(probe)

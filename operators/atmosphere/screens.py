@@ -20,7 +20,7 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
-from zonda.core.output import Output
+from zonda.core.output import Output, Progress
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.storage.fits_image import Cards, image_pieces
@@ -61,11 +61,19 @@ class AtmosphereScreens(Output):
     pixels: int = Field(48, ge=4, le=512)
     """Points along each side of the field."""
 
+    def check(self, data: Data) -> list[str]:
+        """Refuse a scan that is not there."""
+        data.check_scan(self.observation, self.label)
+        return []
+
+    def watch(self, data: Data, done: Progress) -> None:
+        """Refuse a scan that is not there before any is simulated; a part of a campaign does not know how many there are."""
+        if done == "pointing" and not data.laid_out:
+            data.check_scan(self.observation, self.label)
+
     def finalize(self, data: Data) -> None:
         """Evaluate the layers and write them."""
-        if self.observation >= len(data.observations):
-            cure = f"choose observation from 0 to {len(data.observations) - 1}"
-            raise PipelineError(f"there is no scan {self.observation}", place=self.label, cure=cure)
+        data.check_scan(self.observation, self.label)
         load = data.observations[self.observation].expected_load
         if not isinstance(load, ExpectedLoad):
             raise PipelineError("there is no atmosphere to show", place=self.label, cure="add AtmosphereLayers")

@@ -8,7 +8,6 @@ import numpy as np
 from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
-from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
 from zonda.core.types import Floats
@@ -35,11 +34,14 @@ class TimeStreams(Operator):
     observation: int = Field(0, ge=0)
     """Which scan, counted from 0."""
 
+    def check(self, data: Data) -> list[str]:
+        """Refuse a scan that is not there."""
+        data.check_scan(self.observation, self.label)
+        return []
+
     def observe(self, data: Data) -> None:
         """Refuse a scan that is not there."""
-        if self.observation >= len(data.observations):
-            text = f"there is no observation {self.observation}: the pipeline makes {len(data.observations)}, counted from 0"
-            raise PipelineError(text, place=self.label, cure="choose another one")
+        data.check_scan(self.observation, self.label)
 
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:

@@ -210,7 +210,7 @@ class Pointing(Operator):
                 place=self.label,
                 cure="give the scene or this operator a target, e.g. 05h00m00s +20d00m00s",
             )
-        begin, before = scene.time, len(data.observations)
+        begin, before, first = scene.time, data.n_scans, len(data.observations)
         if data.observations:
             last = data.observations[-1]
             begin = last.start.shifted(last.duration + self.gap)
@@ -221,7 +221,7 @@ class Pointing(Operator):
             observation = self.of_scan(k, scene.instrument)._scan(data, target, start, before + k, self._offset(k), rate, moved)
             sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
             data.observations.append(observation)
-        report(self.label, data.observations[before:], moved, sampled)
+        report(self.label, data.observations[first:], moved, sampled)
 
     def _jitter_key(self, data: Data, index: int) -> NDArray[np.uint32]:
         return stream_key(data.scene.seed, self.label, "jitter", index)

@@ -14,6 +14,8 @@ import click
 
 from zonda.core.cli import complete
 
+from .arguments import checked
+
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
 
@@ -119,10 +121,13 @@ def pipeline_text(path: Path, instrument: str, site: str | None, target: str | N
     import numpy as np
 
     from zonda.core.configuration.pipeline_file import parse
+    from zonda.core.configuration.target import Target
     from zonda.core.errors import PointingError
     from zonda.core.registry import instruments, sites
     from zonda.core.run.first_look import first_look
 
+    if target is not None:
+        checked("--target", lambda: Target.parse(target))
     camera = instruments.create(instrument)
     site = site or camera.telescope.site or "chajnantor"
     where = sites.create(site)

@@ -7,11 +7,13 @@ from typing import Any
 
 import click
 
+from zonda.core.cli import complete
+
 
 @click.command()
-@click.argument("pipeline", metavar="[FILE_OR_NAME]", required=False)
-@click.option("--instrument", metavar="NAME", help="Without a pipeline: the camera.")
-@click.option("--site", metavar="NAME", help="Without a pipeline: where it stands.")
+@click.argument("pipeline", metavar="[FILE_OR_NAME]", required=False, shell_complete=complete.pipelines)
+@click.option("--instrument", metavar="NAME", shell_complete=complete.instruments, help="Without a pipeline: the camera.")
+@click.option("--site", metavar="NAME", shell_complete=complete.sites, help="Without a pipeline: where it stands.")
 @click.option("--pwv", metavar="PWV", help="Water at zenith, e.g. '1.2 mm'.  [default: the climatology's median]")
 @click.option("--month", type=click.IntRange(1, 12), metavar="1-12", help="Of the climatology.  [default: the present one]")
 @click.option("--quantile", type=float, metavar="SHARE", help="Of the PWV in that month, e.g. 0.25.")
@@ -51,9 +53,12 @@ def sensitivity(
 
     one_blas_thread()
     ensure_cache()
+    from zonda.core.storage.files import check_output_folder
     from zonda.plugins.forecast import report
     from zonda.plugins.forecast.sensitivity import sensitivity as forecast
 
+    if output is not None:
+        check_output_folder(output)
     found = forecast(pipeline, settings=settings, **asked)
     needed = None if reach is None else found.reach(reach)
     if audit is not None:

@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import click
+
+from zonda.core.cli import complete
 
 from .arguments import checked, instant_of, place_of
 
@@ -22,6 +25,10 @@ class WithDefault(click.Group):
             args = ["show", *args]
         return super().parse_args(ctx, args)
 
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
+        """Sites beside the commands."""
+        return [*super().shell_complete(ctx, incomplete), *complete.sites(ctx, self.commands["show"].params[0], incomplete)]
+
 
 @click.group(cls=WithDefault, subcommand_metavar="SITE [OPTIONS] | fetch SITE [OPTIONS]")
 def weather() -> None:
@@ -34,14 +41,15 @@ def weather() -> None:
 SIGNS = {"ignore_unknown_options": True}
 """A southern latitude begins with a minus."""
 
-_site = click.argument("site", metavar="SITE")
+_site = click.argument("site", metavar="SITE", shell_complete=complete.sites)
 _time = click.option("--time", metavar="TIME", help="UTC unless it carries an offset, e.g. 2024-11-25T07:00.  [default: now]")
 
 
 @weather.command(context_settings=SIGNS)
 @_site
 @_time
-@click.option("--instrument", "instruments", multiple=True, metavar="NAME", help="Whose bands to show; may be repeated.")
+@click.option("--instrument", "instruments", multiple=True, metavar="NAME", shell_complete=complete.instruments,
+              help="Whose bands to show; may be repeated.")  # fmt: skip
 @click.option("--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]")
 @click.option("--file", metavar="FILE.nc", help="ERA5 file to take the weather from, instead of the climatology.")
 @click.option("--table", metavar="FILE.csv", help="Table to take the weather from, instead of the climatology.")
@@ -73,7 +81,7 @@ def show(
     given = {key: value for key, value in (("pwv", pwv), ("file", file), ("table", table)) if value is not None}
     cls, values = weather.resolve(given)
     source = checked("weather", lambda: cls.model_validate(values))
-    angle = checked("--elevation", lambda: Unit("rad").parse(elevation))
+    angle = checked("--elevation", lambda: Unit("rad", "60 deg").parse(elevation))
     if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
         limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
         raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zonda.core.cli import complete
+
 from .arguments import checked, instant_of, place_of
 
 if TYPE_CHECKING:
@@ -21,10 +23,12 @@ if TYPE_CHECKING:
 
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("target", nargs=-1, required=True, metavar="TARGET")
-@click.option("--site", metavar="SITE", help="Registered name, or 'latitude, longitude, altitude'.  [required]")
+@click.option("--site", metavar="SITE", shell_complete=complete.sites,
+              help="Registered name, or 'latitude, longitude, altitude'.  [required]")  # fmt: skip
 @click.option("--time", metavar="TIME", help="The night that is meant; UTC unless it carries an offset.  [default: now]")
 @click.option("--above", default="30 deg", show_default=True, metavar="ANGLE", help="Lowest elevation that is useful.")
-@click.option("--instrument", "instruments", multiple=True, metavar="NAME", help="Whose transmission to show; may be repeated.")
+@click.option("--instrument", "instruments", multiple=True, metavar="NAME", shell_complete=complete.instruments,
+              help="Whose transmission to show; may be repeated.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only where --output is given.")
 @click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the figure.  [default: out/when]")
 def when(
@@ -43,7 +47,7 @@ def when(
     """
     from zonda.core import registry
     from zonda.core.configuration.units import Unit
-    from zonda.core.storage.files import atomic_path, product_path
+    from zonda.core.storage.files import atomic_path, check_output_folder, product_path
 
     for part in target:
         if part.startswith("--"):
@@ -52,9 +56,11 @@ def when(
         raise click.MissingParameter(param_hint="'--site'", param_type="option")
     name = " ".join(target)
     subject, place, moment = target_of(name), place_of(site), instant_of(time)
-    limit = checked("--above", lambda: Unit("rad").parse(above))
+    limit = checked("--above", lambda: Unit("rad", "30 deg").parse(above))
     if not 0 <= limit < math.pi / 2:
         raise click.BadParameter(f"{above} is outside the limits, 0 deg to 90 deg", param_hint="'--above'")
+    if output is not None:
+        check_output_folder(output)
     bands: dict[str, Band] = {text: registry.instruments.create(text).band for text in instruments}
 
     from .visibility import months, night_of

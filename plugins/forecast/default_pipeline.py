@@ -117,12 +117,12 @@ def text(asked: Asked) -> str:
     """The pipeline as YAML. Raises as `make`."""
     asked.check()
     instrument, site = registry.instruments.create(asked.instrument), registry.sites.create(asked.site)
-    elevation = positive("--elevation", "rad", asked.elevation, ELEVATION)
+    elevation = positive("--elevation", Unit("rad", "60 deg"), asked.elevation, ELEVATION)
     if elevation > math.pi / 2:
         raise InputError(f"an elevation of {asked.elevation} is outside the limits, 0 to 90 deg", place="--elevation")
-    wanted = positive("--time", "s", asked.time, 3600.0)
+    wanted = positive("--time", Unit("s", "3 h"), asked.time, 3600.0)
     usual = min(2 * max(instrument.field_of_view, 10 * instrument.beam_fwhm), WIDEST)
-    scan = daisy(instrument, elevation, positive("--area", "rad", asked.area, usual), wanted)
+    scan = daisy(instrument, elevation, positive("--area", Unit("rad"), asked.area, usual), wanted)
     span = scan.scans * (scan.duration + 30) - 30
     middle = _midnight(site, asked.month)
     if asked.target is None:
@@ -238,11 +238,11 @@ def _in(unit: Unit, value: float, *names: str) -> str:
     return f"{number:.3g} {name}"
 
 
-def positive(place: str, unit: str, given: str | None, usual: float) -> float:
+def positive(place: str, unit: Unit, given: str | None, usual: float) -> float:
     """A quantity above 0 in SI; ``usual`` where none is given. Raises InputError about ``place``."""
-    value = usual if given is None else parsed(place, Unit(unit).parse, given)
+    value = usual if given is None else parsed(place, unit.parse, given)
     if not value > 0:
-        raise InputError(f"{given} is not positive", place=place, cure=f"write e.g. {Unit(unit).example}")
+        raise InputError(f"{given} is not positive", place=place, cure=f"write e.g. {unit.example}")
     return value
 
 

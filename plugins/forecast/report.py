@@ -165,7 +165,6 @@ def as_dict(found: Sensitivity) -> dict[str, Any]:
 
 def write(found: Sensitivity, folder: Path) -> list[Path]:
     """See `Sensitivity.write`. Raises OutputError."""
-    folder.mkdir(parents=True, exist_ok=True)
     check_output_folder(folder)
     seconds = found.times
     columns = [Column("time", seconds, "s", "integration time")]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
 from zonda.core.notebook import html_table
 from zonda.core.numerics.angles import ARCMIN
@@ -154,11 +155,11 @@ def sensitivity(
     survey = survey_of(file)
     size = max(RADIUS, BEAMS * survey.fwhm)
     if isinstance(radius, str):
-        size = default_pipeline.positive("--radius", "rad", radius, size)
+        size = default_pipeline.positive("--radius", Unit("rad"), radius, size)
     elif radius is not None:
         size = float(radius)
     depth = depth_of(survey, size)
-    seconds = default_pipeline.positive("--time", "s", asked.get("time"), float(depth.seconds[-1]))
+    seconds = default_pipeline.positive("--time", Unit("s", "3 h"), asked.get("time"), float(depth.seconds[-1]))
     instrument = survey.scene.instrument
     units = factors(instrument.band, survey.fwhm)
     return Sensitivity(file, survey, depth, size, seconds, units, calculator.of_survey(survey, seconds))

@@ -30,7 +30,7 @@ from pydantic import Field, model_validator
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, KelvinRootSecond
-from zonda.core.data import Data, Observation
+from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
 from zonda.core.types import Floats
@@ -39,8 +39,6 @@ from zonda.operators.diagnostics.series import Modes, Spectrum
 BINS, NEAR = 30, 1.5
 CORRELATED = 35 / 18
 """c of equation (1)."""
-INSTANTS = 64
-"""At which the levels of a scan are evaluated."""
 
 
 class _OfSpectrum(FigureMetric):
@@ -200,37 +198,20 @@ class MeanTScan(FigureMetric):
         """Of a brightness."""
         return "K_RJ"
 
-    reads: ClassVar[frozenset[str]] = frozenset()
+    reads: ClassVar[frozenset[str]] = frozenset({"atmosphere", "signal"})
 
     of: Literal["scan", "atmosphere"] = "scan"
     """T_scan: the atmosphere's share of the calibrated stream; or T_atm: its brightness, before any efficiency."""
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """Equation (4), every scan weighted by its duration."""
-        scans = [o for o in data.observations if "atmosphere" in o.smooth]
-        if not scans or len(scans) < len(data.observations):
-            cure = "add AtmosphereLayers and Efficiency; in a campaign, measure it in one scan's run"
-            raise InputError("the levels of the atmosphere are not known here", place="mean_t_scan", cure=cure)
-        means = [mean_t_scan(o, calibrated=self.of == "scan") for o in scans]
-        return float(np.average(means, weights=[o.duration for o in scans])), math.nan
+        means = [o.mean_emission for o in data.observations]
+        if not means or not all(means):
+            text = "the levels of the atmosphere are not known here"
+            raise InputError(text, place="mean_t_scan", cure="add AtmosphereLayers and Efficiency")
+        return float(np.average([m[self.of] for m in means], weights=[o.duration for o in data.observations])), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
         what = "epsilon T_atm / (zeta e^-tau)" if self.of == "scan" else "T_atm"
         return f"mean of {what} over detectors and time"
-
-
-def mean_t_scan(observation: Observation, *, calibrated: bool = True) -> float:
-    """Equation (4) of one scan, K_RJ; not ``calibrated``: <T_atm>. Mean over detectors that are not flagged."""
-    plane, good, n = observation.focalplane, observation.good_detectors, observation.n_samples
-    every = slice(0, observation.n_detectors)
-    total = 0.0
-    instants = np.unique(((np.arange(INSTANTS) + 0.5) * n / INSTANTS).astype(int))
-    for t in instants:
-        at = slice(int(t), int(t) + 1)
-        level = observation.smooth["atmosphere"].evaluate(every, at)[:, 0].astype(np.float64)
-        if calibrated:
-            transmission = observation.smooth["transmission"].evaluate(every, at)[:, 0]
-            level *= plane.illumination_efficiency / (plane.main_beam_efficiency * transmission)
-        total += float(level[good].mean())
-    return total / len(instants)

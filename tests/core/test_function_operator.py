@@ -108,6 +108,23 @@ def test_mistakes(make, said):
         make()
 
 
+def test_what_the_function_raises_is_named_with_the_step_and_chained():
+    def deep(block):
+        return block.detdata["signal"].reshape(-1, 7, 11)  # numpy raises
+
+    with pytest.raises(PipelineError, match=r"calibrate: the function .*deep raised ValueError: cannot reshape") as caught:
+        signal(zonda.operator(deep, name="calibrate"), threads=2)
+    assert isinstance(caught.value.__cause__, ValueError)
+    line = deep.__code__.co_firstlineno + 1
+    assert caught.value.cure == f"mend it: {__file__}, line {line}"
+
+    def refuses(block):
+        raise PipelineError("not today", place="refuses")
+
+    with pytest.raises(PipelineError, match=r"^refuses: not today$"):
+        signal(zonda.operator(refuses))
+
+
 def test_a_pipeline_file_does_not_know_it():
     from zonda.core.configuration.pipeline_file import parse
 

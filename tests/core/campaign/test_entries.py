@@ -106,6 +106,7 @@ def test_a_target_is_at_the_same_place_on_the_next_night():
         ("{grid: {BinMap.pixel: [4 arcsec, 2 s]}}", ["BinMap, pixel: expected an angle"], "17:46"),
         ("{grid: {BinMap.pixle: [4 arcsec]}}", ["unknown key 'pixle' for BinMap", "did you mean 'pixel'?"], "17:19"),
         ("{observations: [{time: now}]}", ["cannot read 'now' as a time"], "17:34"),
+        ("{BinMap.pixel: [4 arcsec]}", ["unknown key 'BinMap.pixel'", "write grid: {BinMap.pixel: [...]}"], "17:12"),
         ("{realization: 2}", ["unknown key 'realization'", "did you mean 'realizations'?"], "17:12"),
         ("{engine: dsk}", ["did you mean 'dask'?"], "17:20"),
         ("{nights: 2, combine: [site]}", ["which is no axis of this campaign; its axes: night"], "17:11"),

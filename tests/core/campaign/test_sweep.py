@@ -9,6 +9,7 @@ from astropy.table import Table
 from zonda.core.campaign.table import Point, draw
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
+from zonda.core.figures import measure
 
 from ...scenes import camera
 from .conftest import command
@@ -84,6 +85,7 @@ def test_it_is_resumed_and_its_own_yaml_makes_it_again(path, tmp_path, capsys, m
         ("WhiteNoise.net: [1", "WhitNoise.net: [1", "nothing is called 'WhitNoise'", 19),
         ("2 mK s(1/2), 4", "2 s, 4", "expected a noise level", 19),
         ("seeds: 3", "sedes: 3", "unknown", 20),
+        ("  over:\n    WhiteNoise.net: [1", "  WhiteNoise.net: [1", r"write over: \{WhiteNoise.net: \[...\]\}", 18),
         ("seeds: 3", "seeds: 0", "seeds", 20),
         ("sweep:\n", "campaign: {realizations: 2}\nsweep:\n", "either a sweep or a campaign", 18),
         ("  - MeasureFigures: {metrics: [central_rms, coverage]}\n", "", "no step measures figures", 17),
@@ -116,12 +118,26 @@ def test_points_are_drawn_in_the_unit_of_the_first():
     assert list(ax.lines[0].get_xdata()) == [1, 2, 3]
 
 
-def test_a_figure_that_a_sum_of_scans_does_not_have_leaves_the_others(path, tmp_path):
-    """The mean levels of the atmosphere are those of scans, which the finished sum does not hold."""
-    path.write_text(YAML.replace("[central_rms, coverage]", "[mean_t_scan, central_rms]").replace("seeds: 3", "seeds: 1"))
+def test_the_mean_emission_of_scans_is_that_of_a_plain_run(path, tmp_path):
+    """The levels of the atmosphere are those of scans, which a task hands on beside its maps."""
+    text = YAML.replace("[central_rms, coverage]", "[mean_t_scan, {mean_t_scan: {of: atmosphere}}]").replace(
+        "seeds: 3", "seeds: 1"
+    )
+    text = text.replace("scan_duration: 5 s", "scan_duration: 5 s, scans: 2").replace(
+        "  - WhiteNoise", "  - AtmosphereLayers\n  - WhiteNoise"
+    )
+    text = text.replace("[1 mK s(1/2), 2 mK s(1/2), 4000 uK s(1/2)]", "[1 mK s(1/2)]")
+    path.write_text(text)
     folder = tmp_path / "out"
     assert command("run", path, "--output", folder) == 0
     table = Table.read(folder / "sweep.ecsv")
-    assert list(np.isfinite(table["mean"])) == [False] * 3 + [True] * 3
-    figures = Table.read(next(folder.glob("*1-mK*")) / "figures.ecsv")
-    assert figures["description"][0].startswith("not known: the levels of the atmosphere")
+    file = parse(text[: text.index("sweep:")] + text[text.index("operators:") :])
+    data = file.pipeline().run(file.scene(), output=tmp_path / "plain", threads=1)
+    plain = [measure(data, "mean_t_scan", of=of).value for of in ("scan", "atmosphere")]
+    assert list(table["mean"]) == pytest.approx(plain, rel=1e-9)
+    assert plain[0] > plain[1] > 0  # divided by a transmission below 1
+
+
+def test_the_mean_emission_needs_an_atmosphere():
+    with pytest.raises(ConfigurationError, match="MeasureFigures needs atmosphere, which no step provides"):
+        parse(YAML.replace("[central_rms, coverage]", "[mean_t_scan, central_rms]"))

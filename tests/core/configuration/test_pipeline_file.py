@@ -185,6 +185,7 @@ def test_a_bad_step(toys: Any, step: str, column: int, length: int, words: list[
         (("seed: 3", "precision: float16"), 5, 12, ["'float32' or 'float64'", "did you mean 'float64'?"]),
         (("seed: 3", "requires: [zonda>=99]"), 5, 12, ["this pipeline needs zonda>=99", "is installed"]),
         (("seed: 3", "requires: [not-on-this-machine>=1]"), 5, 12, ["needs the package not-on-this-machine", "not installed"]),
+        (("seed: 3", "requires: zonda"), 5, 11, ["expected a list, got 'zonda'", "^^^^^ write [zonda]"]),
         (("seed: 3", "requires: ['?']"), 5, 12, ["'?' is not a requirement"]),
         (("seed: 3", "runs: {a: {only: [sqy]}}"), 5, 19, ["names 'sqy', which no step provides", "did you mean 'sky'?"]),
         (("seed: 3", "runs: {a: {onyl: [sky]}}"), 5, 12, ["unknown key 'onyl'", "did you mean 'only'?"]),

@@ -11,6 +11,7 @@ import zonda
 import zonda.testing
 from zonda.core.drawable import Drawable
 from zonda.core.errors import PipelineError
+from zonda.core.run.first_look import first_look
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.model import ExpectedLoad
 from zonda.operators.atmosphere.screens import AtmosphereScreens, pwv_at
@@ -113,9 +114,30 @@ def test_files_and_pictures(run):
     assert (folder / "screens_field.png").is_file()
 
 
+def test_a_scan_that_is_not_there_is_told_before_any_is_simulated(tmp_path):
+    daisy = zonda.PointingDaisy(scan_duration="2 s", scans=20)
+    simulated = []
+
+    @zonda.operator(linear=True)
+    def count(block):
+        simulated.append(block)
+
+    def pipeline(observation):
+        more = [zonda.WhiteNoise(), zonda.Efficiency(), count, AtmosphereScreens(observation=observation)]
+        return zonda.Pipeline([daisy, zonda.AtmosphereLayers(), *more])
+
+    first_look(pipeline(19), scenes.scene(), saved=False)  # looks at some of the scans alone
+    text = "AtmosphereScreens: there is no observation 20: the pipeline makes 20(.|\n)*choose 0 to 19"
+    with pytest.raises(PipelineError, match=text):
+        first_look(pipeline(20), scenes.scene(), saved=False)
+    with pytest.raises(PipelineError, match=text):
+        pipeline(20).run(scenes.scene(), output=tmp_path, threads=1)
+    assert not simulated
+
+
 def test_refusals():
     data = zonda.Data(scenes.scene())
-    with pytest.raises(PipelineError, match="there is no scan 0"):
+    with pytest.raises(PipelineError, match="there is no observation 0: the pipeline makes 0"):
         AtmosphereScreens().finalize(data)
     data.observations.append(scenes.scan(samples=100))
     with pytest.raises(PipelineError, match="no atmosphere to show"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from zonda.core.errors import ZondaError
 from zonda.core.maps.map_file import write_map
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.halves import DIFFERENCES, halves_of
@@ -133,3 +134,8 @@ def test_the_file_says_what_was_subtracted(bench, tmp_path):
 @pytest.mark.parametrize("noise", ["net", "scatter"])
 def test_contract(noise):
     check_operator(BinMap(pixel="6 arcsec", half_difference="detectors", noise=noise))
+
+
+def test_a_choice_that_is_nearly_right_is_suggested():
+    with pytest.raises(ZondaError, match="did you mean 'detectors'"):
+        BinMap(pixel="6 arcsec", half_difference="detector")

@@ -51,6 +51,12 @@ def test_names_are_completed(tmp_path):
     assert completed("zonda run nowhere/x", tmp_path) == []
     assert completed("zonda new pipeline --instrument mus", tmp_path) == ["mustang2"]
     assert completed("zonda new pipeline --site green", tmp_path) == ["green_bank"]
+    assert completed("zonda weather green", tmp_path) == ["green_bank"]
+    assert completed("zonda weather fe", tmp_path) == ["fetch"]
+    assert completed("zonda weather fetch green", tmp_path) == ["green_bank"]
+    assert completed("zonda weather green_bank --instrument mus", tmp_path) == ["mustang2"]
+    assert completed("zonda when mars --site green", tmp_path) == ["green_bank"]
+    assert completed("zonda sensitivity --instrument mus", tmp_path) == ["mustang2"]
     assert "--no-prune" in completed("zonda run --no", tmp_path)
 
 

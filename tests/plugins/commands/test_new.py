@@ -72,6 +72,7 @@ def test_nothing_is_overwritten(here, capsys):
         (["pipeline", "nowhere/x"], "there is no such folder"),
         (["pipeline", "x", "--instrument", "mustng2"], "did you mean 'mustang2'"),
         (["pipeline", "x", "--site", "gren_bank"], "green_bank"),
+        (["pipeline", "x", "--target", "mars"], "Invalid value for --target: cannot read 'mars' as a position"),
         (["pipeline", "x", "--target", "nonsense"], "cannot read 'nonsense' as a position"),
         (["pipeline", "x", "--target", "05h -80d"], "it never rises"),
         (["plugin", "3x"], "is no name for a plugin"),

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
+from zonda.core.errors import OutputError
 from zonda.core.registry import sites
 from zonda.core.site import Site
 from zonda.plugins.commands.visibility import (
@@ -212,6 +213,7 @@ def test_a_site_without_climatology_has_no_pwv() -> None:
         (["05h", "--site", "green_bank"], "a position needs two"),
         (["05h", "+20d", "--site", "green_bank", "--above", "95 deg"], "outside the limits, 0 deg to 90 deg"),
         (["05h", "+20d", "--site", "green_bank", "--abov", "5 deg"], "--abov"),
+        (["05h", "+20d", "--site", "green_bank", "--above", "20"], "20 has no unit; write an angle such as '30 deg'"),
         (["05h", "+20d"], "Missing option '--site'"),
         (["05h", "+20d", "--site", "green_bank", "--time", "soon"], "cannot read 'soon' as a time"),
     ],
@@ -220,6 +222,13 @@ def test_mistakes(arguments: list[str], said: str) -> None:
     done = CliRunner().invoke(when, arguments)
     assert done.exit_code == 2
     assert said in done.output
+
+
+def test_a_folder_that_takes_no_files_is_told_before_anything_is_computed() -> None:
+    done = CliRunner().invoke(when, ["05h", "+20d", "--site", "green_bank", "--output", "/proc/zonda"])
+    assert isinstance(done.exception, OutputError)
+    assert str(done.exception) == "/proc/zonda: cannot be made: /proc takes no new folders\n  = choose another output folder"
+    assert done.output == ""
 
 
 def test_an_unknown_option_is_named_where_the_site_is_absent_too() -> None:
