@@ -40,8 +40,7 @@ class TimeStreams(Operator):
         return []
 
     def observe(self, data: Data) -> None:
-        """Refuse a scan that is not there."""
-        data.check_scan(self.observation, self.label)
+        self.check(data)
 
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:
@@ -74,6 +73,5 @@ class TimeStreams(Operator):
         data.add(self.label, state)
 
     def finalize(self, data: Data) -> None:
-        kept: TimeStream | None = data.take(self.label)
-        if kept is not None:
+        if (kept := data.take(self.label)) is not None:
             data.products[kept.product] = kept
