@@ -1,14 +1,17 @@
-"""Kinds of steps that the executor treats in a way of their own: map makers, and the step that makes the sky the signal."""
+"""Kinds of steps that the executor treats in a way of their own: map makers, and the step that adds up what is calibrated."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+from pydantic import PrivateAttr
+
 from .block import Block
+from .numerics.smooth import FieldSums
 from .operator import Operator
 from .output import Output
-from .signal import MAIN, is_stream
+from .signal import MAIN, Component, is_stream
 
 
 class MapMaker(Operator):
@@ -20,44 +23,73 @@ class MapMaker(Operator):
     """
 
 
-class SkySignal(Operator):
-    """Makes the sky the signal: there is nothing to calibrate where no step makes anything else.
+class _Reads:
+    """The ``requires`` of a `CalibratedSignal`: the streams that there are."""
 
-    The pipeline puts it before the first step that reads ``signal``, where no step provides that and all that is provided up to
-    there is ``sky``. It is not one of the pipeline's own steps.
+    def __get__(self, operator: CalibratedSignal | None, owner: type) -> frozenset[str]:
+        return frozenset({"sky"}) if operator is None else operator._reads
+
+
+class CalibratedSignal(Operator):
+    """Adds up the sky and the components that enter calibrated, where no step makes anything else: nothing is to be calibrated.
+
+    The pipeline puts it before the first step that reads ``signal``, where no step provides that and nothing else is provided up
+    to there. It is not one of the pipeline's own steps.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"sky"})
+    requires: ClassVar[Any] = _Reads()
     provides: ClassVar[frozenset[str]] = frozenset({MAIN})
     linear: ClassVar[bool] = True
     knows_means: ClassVar[bool] = True
 
+    _reads: frozenset[str] = PrivateAttr(frozenset({"sky"}))
+    _means: FieldSums = PrivateAttr(default_factory=FieldSums)
+
     @property
     def label(self) -> str:
         """Its name in timings."""
-        return "(sky as signal)"
+        return "(sky as signal)" if self._reads == {"sky"} else "(sum as signal)"
 
     def exec(self, block: Block, state: Any) -> None:
-        block.new(MAIN, zero=False)[...] = block.detdata.get("sky", 0.0)  # a signal without the sky is nothing
-        if "sky" in block.means:
-            block.means[MAIN] = block.means["sky"]
+        out, empty = block.new(MAIN, zero=False), True
+        names = [name for name in sorted(self._reads) if name in block.detdata]  # a signal without the sky has none
+        for name in names:
+            if empty:
+                out[...] = block.detdata[name]
+            else:
+                out += block.detdata[name]
+            empty = False
+        if empty:
+            out.fill(0)
+        if fields := [block.means[name] for name in names if name in block.means]:
+            block.means[MAIN] = self._means.of(fields)
 
 
 def place_of_signal(operators: Sequence[Operator]) -> int | None:
-    """Index of the first step that reads ``signal`` where the sky alone is to be the signal, else None."""
+    """Index of the first step that reads ``signal`` where what is calibrated makes up the signal, else None."""
     if any(forms(o) for o in operators):
         return None
     for index, operator in enumerate(operators):
         if MAIN in operator.requires:
-            made = set().union(*(o.provides for o in operators[:index])) - {"boresight"}
-            return index if made == {"sky"} else None
+            return index if _calibrated(operators[:index]) else None
     return None
 
 
-def with_sky_signal(operators: Sequence[Operator]) -> list[Operator]:
-    """The steps, and a `SkySignal` where it has its place."""
+def _calibrated(operators: Sequence[Operator]) -> frozenset[str]:
+    """What these steps provide, where all of it is sky or enters calibrated; else nothing."""
+    made = [name for o in operators for name in o.provides if name != "boresight"]
+    known = all(name == "sky" or (isinstance(name, Component) and name.enters == "calibrated") for name in made)
+    return frozenset(made) if known else frozenset()
+
+
+def with_calibrated_signal(operators: Sequence[Operator]) -> list[Operator]:
+    """The steps, and a `CalibratedSignal` where it has its place."""
     place = place_of_signal(operators)
-    return list(operators) if place is None else [*operators[:place], SkySignal(), *operators[place:]]
+    if place is None:
+        return list(operators)
+    step = CalibratedSignal()
+    step._reads = _calibrated(operators[:place])
+    return [*operators[:place], step, *operators[place:]]
 
 
 def forms(operator: Operator) -> bool:
@@ -75,3 +107,9 @@ def makes_products(operator: Operator) -> bool:
     provide.)"""
     names = operator.provides
     return bool(names) and not any(n == "boresight" or is_stream(n) for n in names) and not isinstance(operator, Output)
+
+
+def acts(operator: Operator) -> bool:
+    """Whether it works on observations: neither an output nor a step that points the telescope and has no ``exec``."""
+    points = "boresight" in operator.provides and type(operator).exec is Operator.exec
+    return not isinstance(operator, Output) and not points

@@ -10,8 +10,9 @@ kelvin) and its turbulent part (float32) are such fields; see ``docs/atmosphere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -131,6 +132,24 @@ class SmoothField:
         """The field times a per-detector factor (n_det,)."""
         return SmoothField(self.weights * np.asarray(per_detector)[:, None], self.coefficients, self.step, self.n_samples)
 
+    def plus(self, other: SmoothField) -> SmoothField:
+        """The sum of two fields over the same detectors and samples, at the shorter of their steps."""
+        step = min(self.step, other.step)
+        parts = [part.refined(step) for part in (self, other)]
+        weights = np.hstack([np.asarray(part.weights, np.float64) for part in parts])
+        return SmoothField(weights, np.vstack([part.coefficients for part in parts]), step, self.n_samples)
+
+    def refined(self, step: int) -> SmoothField:
+        """The same field at a shorter ``step``, by halving: b_2k = (c_k + c_k+1) / 2, b_2k-1 = (c_k-1 + 6 c_k + c_k+1) / 8."""
+        now, c = self.step, np.asarray(self.coefficients, np.float64)
+        while now > step:
+            now //= 2
+            finer = np.empty((len(c), 2 * c.shape[1] - 3))
+            finer[:, 0::2] = (c[:, :-1] + c[:, 1:]) / 2
+            finer[:, 1::2] = (c[:, :-2] + 6 * c[:, 1:-1] + c[:, 2:]) / 8
+            c = finer[:, : -(-self.n_samples // now) + 3]
+        return SmoothField(self.weights, np.ascontiguousarray(c), now, self.n_samples)
+
     def time_mean(self) -> NDArray[np.float64]:
         """(n_det,) mean over the scan."""
         return np.asarray(self.weights @ self.coefficients.mean(1), np.float64)
@@ -167,6 +186,22 @@ class SmoothField:
     def forget(self) -> None:
         """Give back the memory of what was kept for other blocks."""
         self._kept.clear()
+
+
+class FieldSums:
+    """Sums of fields, each worked out once: all blocks are given the same object."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, ...], tuple[Sequence[SmoothField], SmoothField]] = {}
+
+    def of(self, fields: Sequence[SmoothField]) -> SmoothField:
+        """The sum of one or more fields. Called from several threads at once."""
+        if len(fields) == 1:
+            return fields[0]
+        key = tuple(map(id, fields))
+        if key not in self._made:  # the fields are held with their sum, so that none of another scan takes their place
+            self._made.setdefault(key, (fields, reduce(SmoothField.plus, fields)))
+        return self._made[key][1]
 
 
 def product(rows: AnyFloats, matrix: AnyFloats) -> NDArray[np.float64]:

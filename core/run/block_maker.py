@@ -144,8 +144,9 @@ class BlockMaker:
 
     def _is_read(self, step: Operator) -> bool:
         """Whether a step must act: one of its streams is read later, or it makes products."""
-        streams = [n for n in step.provides if is_stream(n)]
-        return len(streams) < len(step.provides) or any(n in self._streams for n in streams)
+        provides = step.provides - {"boresight"}
+        streams = [n for n in provides if is_stream(n)]
+        return not provides or len(streams) < len(provides) or any(n in self._streams for n in streams)
 
     def _of_use(self, signals: Sequence[Formed]) -> set[int]:
         """The steps, by identity, that change the streams of a block that is made again, of which only ``signals`` are of use."""

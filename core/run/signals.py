@@ -16,7 +16,7 @@ from itertools import combinations
 
 from ..configuration.diagnostics import nearest
 from ..errors import PipelineError
-from ..mapmaker import MapMaker, filters, forms, with_sky_signal
+from ..mapmaker import MapMaker, acts, filters, forms, with_calibrated_signal
 from ..observation import Observation
 from ..operator import Operator
 from ..output import Output
@@ -213,8 +213,8 @@ class Signals:
 
 
 def acting_steps(operators: Sequence[Operator]) -> list[Operator]:
-    """Of these, the operators that act on observations; with the step that makes the sky the signal, where nothing else does."""
-    return with_sky_signal([o for o in operators if not isinstance(o, Output) and "boresight" not in o.provides])
+    """Of these, the operators that act on observations; with a step that adds up what is calibrated, where none forms a signal."""
+    return with_calibrated_signal([o for o in operators if acts(o)])
 
 
 def note_signals(observations: Iterable[Observation], components: Iterable[str], formed: Iterable[Formed]) -> None:
@@ -227,12 +227,12 @@ def note_signals(observations: Iterable[Observation], components: Iterable[str],
 
 
 def _generators(operators: Sequence[Operator]) -> list[Operator]:
-    """The steps that make components: those before ``signal`` is formed, pointing apart."""
+    """The steps that make components: those before ``signal`` is formed."""
     found = []
     for operator in operators:
         if MAIN in operator.provides | operator.requires:
             break
-        if operator.provides and "boresight" not in operator.provides:
+        if operator.provides - {"boresight"}:
             found.append(operator)
     return found
 

@@ -13,7 +13,7 @@ M, tens of kelvin, stays beside the stream as a float64 `SmoothField`; everythin
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -28,7 +28,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals
-from zonda.core.numerics.smooth import Series, SmoothField, series_into
+from zonda.core.numerics.smooth import FieldSums, Series, SmoothField, series_into
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import AnyFloats, Floats
@@ -101,6 +101,8 @@ class Calibration:
     gain: Floats
     transmission: SmoothField | None
     mean: SmoothField | None
+    means: FieldSums = field(default_factory=FieldSums)
+    """M with the means of what enters calibrated."""
 
 
 def _scatter(step: Efficiency, observation: Observation) -> None:
@@ -155,12 +157,14 @@ def _make_signal(block: Block, state: Calibration, instantaneous: bool) -> int:
         clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
     else:
         clipped = _calibrate_sky(sky, streams[1], factors[0], signal)
+    block.means.pop("signal", None)
+    means = [] if mean is None else [mean]
     for name in block.entering("calibrated"):
         signal += have[name]
+        means += [block.means[name]] if name in block.means else []
     have["signal"] = signal
-    block.means.pop("signal", None)
-    if mean is not None:
-        block.means["signal"] = mean
+    if means:
+        block.means["signal"] = state.means.of(means)
     return int(clipped)
 
 
