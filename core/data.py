@@ -119,7 +119,8 @@ class Data:
                 yield observation, rows, kept(observation, stream, rows)
 
     def __repr__(self) -> str:
-        return f"<Data: {len(self.observations)} observations, products {sorted(self.products)}>"
+        number = len(self.observations)
+        return f"<Data: {number} observation{'s' * (number != 1)}, products {sorted(self.products)}>"
 
     def _repr_html_(self) -> str:
         return html_table(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from .configuration.docstrings import described
+from .configuration.docstrings import described, source_is_known
 from .data import STREAMS, Block, Data, Observation, Stream
 from .made_up import N_DETECTORS, N_SAMPLES, Given, Points, given_signal, made_up_scan, made_up_scene
 from .mapmaker import MapMaker, filters
@@ -57,10 +57,14 @@ def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] |
 
 
 def check_parameters_are_documented(operator: Operator) -> None:
-    """The class and every field have a docstring: messages, schema and documentation are made of them."""
+    """The class and every field have a docstring: messages, schema and documentation are made of them.
+
+    Those of fields are read from the source. A class that was typed at the prompt of `python` has none: its fields pass.
+    """
     assert (type(operator).__doc__ or "").strip(), "the class has no docstring"
-    for name, field in described(type(operator)).items():
-        assert field.description, f"parameter {name} has no docstring"
+    if source_is_known(type(operator)):
+        for name, field in described(type(operator)).items():
+            assert field.description, f"parameter {name} has no docstring"
 
 
 def check_parameters_survive_text(operator: Operator) -> None:

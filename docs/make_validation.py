@@ -32,7 +32,7 @@ zonda validate --list
 
 The verdicts are computed from the numbers. With the paper's value p, its error e and the half width r to which it is stated,
 and n realizations of mean m and scatter s, the gap is max(0, |m - p| - r), or what lies beyond a limit. Its distance is
-gap / (e² + s²)^½ for one realization and gap / (e² + s²/n)^½ for the mean: the first says whether the paper's figure is a
+gap / √(e² + s²) for one realization and gap / √(e² + s²/n) for the mean: the first says whether the paper's figure is a
 likely realization, the second whether it is the expectation. A dash: they differ, and no error is stated or found, as of closed
 forms.
 

@@ -152,7 +152,18 @@ def executed(path: Path) -> dict[str, bytes]:
         local = Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets}/kernel"}})
         place = {"metadata": {"path": folder}}
         NotebookClient(notebook, timeout=600, coalesce_streams=True, config=local, resources=place).execute()
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [output for output in cell.outputs if without_progress(output)]
     return {"notebook.ipynb": nbformat.writes(notebook).encode()}
+
+
+def without_progress(output: Any) -> bool:
+    """Remove lines of the progress bar, which depend on the machine, from a cell's output; False if nothing else is in it."""
+    if output.output_type != "stream":
+        return True
+    output.text = re.sub(r"^.*\[[#.]+\] +\d+ %.*\n?", "", output.text, flags=re.M)
+    return bool(output.text.strip())
 
 
 def tutorial(path: Path) -> dict[str, bytes]:

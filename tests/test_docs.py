@@ -128,6 +128,19 @@ def test_notebooks_are_kept_without_results(path):
                 compile("".join(cell["source"]), path.name, "exec")
 
 
+def test_no_page_shows_lines_of_the_progress_bar():
+    """They depend on the machine, and say nothing about the result."""
+    from types import SimpleNamespace
+
+    keep = script("site_pages").without_progress
+    bar = "scan-000: SkyMap, WhiteNoise, E [#...................] 7 %\n"
+    alone = SimpleNamespace(output_type="stream", text=bar + bar.replace("7 %", "89 %, 1 s left"))
+    mixed = SimpleNamespace(output_type="stream", text=f"{bar}4 tasks in 17.4 s\n")
+    table = SimpleNamespace(output_type="execute_result", data={})
+    assert [keep(output) for output in (alone, mixed, table)] == [False, True, True]
+    assert mixed.text == "4 tasks in 17.4 s\n"
+
+
 def test_what_is_in_the_gallery_says_what_it_shows():
     pages = script("site_pages")
     for path in sorted((ROOT / "docs" / "gallery").glob("*.yaml")):

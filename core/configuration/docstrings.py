@@ -45,6 +45,12 @@ def described(model: type[BaseModel]) -> dict[str, FieldInfo]:
     return model.model_fields
 
 
+def source_is_known(model: type) -> bool:
+    """Whether the source of the class and of its bases can be read; not that of what was typed at the prompt of `python`."""
+    places = [_places[cls] for cls in model.__mro__ if cls in _places]
+    return all(linecache.getlines(file, module) for file, _, module in places)
+
+
 def _docstrings(cls: type) -> dict[str, str]:
     """The docstring of each attribute that the class itself annotates, empty where it has none."""
     if cls not in _places:

@@ -23,6 +23,12 @@ def data():
     return pipeline.run(scene(camera(19)), keep=["signal", "atmosphere", "white"], threads=1)
 
 
+def test_it_is_shown_with_its_scans_and_products(data):
+    assert repr(data) == "<Data: 2 observations, products ['map', 'quiet/map']>"
+    data = zonda.Data(data.scene, data.observations[:1])
+    assert repr(data) == "<Data: 1 observation, products []>"
+
+
 def test_products_by_name(data):
     assert data["map"] is data.products["map"]
     assert data["quiet/map"] is data.products["quiet/map"]

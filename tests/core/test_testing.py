@@ -372,3 +372,22 @@ def test_the_mean_is_no_trap():
 def test_whoever_says_that_it_knows_of_means_must(broken, words):
     with pytest.raises(AssertionError, match=words):
         check_operator(broken)
+
+
+TYPED = """
+import zonda
+class Typed(zonda.Operator):
+    "An operator typed at the prompt of python, whose source is in no file."
+    requires = provides = frozenset({"signal"})
+    level: float = 2.0
+    "A parameter."
+    def exec(self, block, state):
+        block.detdata["signal"] *= self.level
+"""
+
+
+def test_an_operator_typed_at_the_prompt_keeps_the_contract():
+    """Python keeps no source of it, so docstrings of fields cannot be asked for."""
+    names = {"__name__": __name__}
+    exec(compile(TYPED, "<stdin>", "exec"), names)
+    check_operator(names["Typed"]())

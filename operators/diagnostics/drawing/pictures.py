@@ -131,7 +131,7 @@ def draw_spectra(file: str, spectrum: Spectrum, before: str) -> list[Sketch]:
         part = replace(spectrum, psd={name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind})
         extra, caption = "" if kind == "K_RJ" else f"_{'_'.join(part.psd)}", f"Mean of {many} {where}"
         if kind == "K_RJ":
-            caption += ", referred to the calibrated sky: divided by ζe^-τ, the atmosphere times ε"
+            caption += ", referred to the calibrated sky: divided by ζ exp(−τ), the atmosphere multiplied by ε"
         caption += "."
         if "signal" in part.psd:
             caption += " The signal holds the mean emission too, which changes as the scan moves in elevation."
@@ -176,7 +176,7 @@ def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
     made = []
     for which in stream.streams:
         extra = "" if which == "signal" else f"_{which}"
-        meaning = "divided by ζe^-τ, with what is left of the mean emission" if which == "signal" else "at the detector"
+        meaning = "divided by ζ exp(−τ), with the mean emission that no filter has removed" if which == "signal" else "at the detector"
         meaning = meaning if unit_of_stream(which) == "K_RJ" else "along the line of sight, without its mean"
         caption = f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}. Pale: samples; dark: means over 1 s."
         ax = plot_tod(stream, name=which, title=f"Time streams of {stream.observation} {where}")
