@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from typing import Any, TypeVar
 
-import numpy as np
 from pydantic_core import PydanticCustomError
 
 from ..configuration.units import Unit
@@ -39,11 +38,8 @@ def _kelvin_per(product: MapArrays, unit: str, spectral_index: float) -> float |
         cure = "convert a map that a run made, or set map.band = zonda.Band(...)"
         raise InputError(f"the band of the map is not known: no {unit}", place="map", cure=cure)
     beam = math.pi / (4 * math.log(2)) * product.resolution**2 if plain == "Jy/beam" else None
-    area: float | Floats = product.pixel**2
-    if plain == "Jy/pixel" and product.header is not None:  # on a tangent plane pixels become smaller outwards
-        area = area * np.cos(product.distance()) ** 3
     index = spectral_index if plain in SURFACE_BRIGHTNESS_UNITS else 0.0
-    return to_kelvin_rj(plain, product.band, 1.0, index, beam) * prefix / (area if plain == "Jy/pixel" else 1.0)
+    return to_kelvin_rj(plain, product.band, 1.0, index, beam) * prefix / (product.areas() if plain == "Jy/pixel" else 1.0)
 
 
 def smoothing_width(given: Any, beam: float) -> float:

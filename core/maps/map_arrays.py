@@ -28,7 +28,7 @@ SMALL = 1 << 20
 
 @dataclass
 class MapArrays:
-    """A map in the TAN projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the pixels ``pixels``.
+    """A map in the TAN or CAR projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the pixels ``pixels``.
 
     Attributes
     ----------
@@ -44,11 +44,11 @@ class MapArrays:
         Noise map from the difference of two halves of the samples (``difference``: which, ``even - odd scans``),
         (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2): its variance is that of ``signal`` where both have hits; NaN elsewhere.
     header
-        Keywords of the WCS (TAN maps), else None; a dict that `astropy.io.fits.Header` takes.
+        Keywords of the WCS (images), else None; a dict that `astropy.io.fits.Header` takes.
     centre
         (lon, lat) [rad] of the map's centre in ``frame``.
     pixel
-        Side of a pixel [rad]; for HEALPix the square root of its area.
+        Side of a pixel [rad]; of CAR in latitude; for HEALPix the square root of its area.
     nside, nest, pixels
         HEALPix parameters and sorted pixel numbers, else 0, False, None.
     fwhm
@@ -86,12 +86,39 @@ class MapArrays:
 
     @property
     def wcs(self) -> Any:
-        """The `astropy.wcs.WCS` of a TAN map."""
+        """The `astropy.wcs.WCS` of an image."""
         from astropy.wcs import WCS
 
         if self.header is None:
             raise InputError("a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy")
         return WCS(self.header)
+
+    @property
+    def projection(self) -> Literal["TAN", "CAR", "HEALPix"]:
+        """Of its pixels."""
+        if self.header is None:
+            return "HEALPix"
+        return "CAR" if str(self.header["CTYPE1"]).endswith("-CAR") else "TAN"
+
+    @property
+    def latitudes(self) -> Floats:
+        """(ny,) latitudes of the rows of a CAR map [rad]."""
+        header: Any = self.header
+        rows = np.arange(len(self.signal)) + 1.0 - float(header["CRPIX2"])
+        return np.asarray(np.radians(rows * float(header["CDELT2"])), np.float64)
+
+    def areas(self) -> Floats | float:
+        """Solid angles of the pixels [sr]: one number (HEALPix), of rows (ny, 1) (CAR), or of all pixels (TAN).
+
+            TAN: side^2 cos^3(distance from the tangent point),   CAR: 2 side sin(side / 2) cos(latitude)
+
+        That of a TAN pixel is meant for maps about their tangent point.
+        """
+        if self.header is None:
+            return self.pixel**2
+        if self.projection == "CAR":
+            return 2 * self.pixel * math.sin(self.pixel / 2) * np.cos(self.latitudes)[:, None]
+        return self.pixel**2 * np.cos(self.distance()) ** 3
 
     @property
     def resolution(self) -> float:
@@ -112,18 +139,17 @@ class MapArrays:
     def seconds_per_beam(self) -> Floats | float | None:
         """What one sample in a pixel adds to the integration time of all detectors per beam [s]: times ``hits``, that time.
 
-            1 / sample rate x beam area / pixel area,   pi FWHM^2 / (4 ln 2) / pixel^2 (cos^-3 of the distance, TAN)
+            1 / sample rate x beam area / pixel area,   beam area = pi FWHM^2 / (4 ln 2)
 
         The beam is the telescope's, not what smoothing made of it. One number where pixels are equal to 0.1 %, else an array,
         shape of ``signal``; None where the rate or the beam is not known.
         """
         if not (self.sample_rate > 0 and self.fwhm > 0):
             return None
-        per_pixel = math.pi / math.log(16) * (self.fwhm / self.pixel) ** 2 / self.sample_rate
-        if self.header is None:
-            return per_pixel
-        larger = np.cos(self.distance()) ** -3
-        return per_pixel if larger.max() < 1.001 else per_pixel * larger
+        beam, areas = math.pi / math.log(16) * self.fwhm**2 / self.sample_rate, np.asarray(self.areas())
+        if areas.max() < 1.001 * areas.min():
+            return beam / float(areas.max())
+        return np.asarray(np.broadcast_to(beam / areas, self.signal.shape), np.float64)
 
 
 @lru_cache(maxsize=1)  # the maps of all signals share it

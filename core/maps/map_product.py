@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..notebook import html_table
 from ..numerics.angles import ARCMIN, FWHM_PER_SIGMA
-from ..numerics.transforms import convolved, gaussian_taps
+from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
 from ..types import Floats
 from .map_arrays import MapArrays
 
@@ -80,15 +80,16 @@ class MapProduct(MapArrays):
     def smoothed_rms(
         self, fwhm: float, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal"
     ) -> float:
-        """``smoothed(fwhm).rms(radius, of)``; of a TAN map, only what the circle sees is smoothed."""
+        """``smoothed(fwhm).rms(radius, of)``; of an image, only what the circle sees is smoothed."""
         if self.header is None or getattr(self, of) is None:
             return self.smoothed(fwhm).rms(radius, of)
         near = self.distance() <= radius
         reach = math.ceil(5 * fwhm / FWHM_PER_SIGMA / self.pixel)
-        window = tuple(_around(np.flatnonzero(near.any(axis=axis)), reach) for axis in (1, 0))
+        across = math.ceil(reach / float(np.cos(self.latitudes).min())) if self.projection == "CAR" else reach
+        window = tuple(_around(np.flatnonzero(near.any(axis=axis)), more) for axis, more in ((1, reach), (0, across)))
         names = ("signal", "hits", "weights", "noise", "half_difference")
         planes: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[window] for n in names}
-        cut = replace(self, **planes)
+        cut = replace(self, header=_cut_below(self.header, window[0].start or 0), **planes)
         return _rms(getattr(cut.smoothed(fwhm), of), cut.weights, near[window])
 
     def smoothed(self, fwhm: float) -> MapProduct:
@@ -131,10 +132,16 @@ class MapProduct(MapArrays):
         )
 
     def _convolver(self, fwhm: float) -> Any:
-        """f(values, power): values convolved with the power-th power of the Gaussian kernel, whose sum is 1."""
+        """f(values, power): values convolved with the power-th power of the Gaussian kernel, whose sum is 1.
+
+        Of a CAR map, along each row with its own width, then along the columns: right to FWHM tan(latitude).
+        """
         sigma = fwhm / FWHM_PER_SIGMA / self.pixel
         if self.header is not None:
             taps = gaussian_taps(sigma)
+            if self.projection == "CAR":
+                rows = [gaussian_taps(sigma / cosine) for cosine in np.cos(self.latitudes)]
+                return lambda values, power: convolved_rows(values, taps**power, [row**power for row in rows])
             return lambda values, power: convolved(values, taps**power)
 
         def sphere(values: Floats, power: float) -> Floats:
@@ -191,6 +198,13 @@ def _rms(values: Floats, weights: Floats, where: NDArray[np.bool_]) -> float:
     use = where & np.isfinite(values)
     w = weights[use]
     return float(np.sqrt((w * values[use] ** 2).sum() / w.sum())) if use.any() and w.sum() > 0 else math.nan
+
+
+def _cut_below(header: Any, rows: int) -> Any:
+    """The header of an image without its first ``rows`` rows."""
+    found = header.copy()
+    found["CRPIX2"] = float(header["CRPIX2"]) - rows
+    return found
 
 
 def _around(places: NDArray[np.int64], reach: int) -> slice:

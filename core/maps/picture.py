@@ -41,8 +41,8 @@ def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float |
         cure = nearest(plane, have) or f"choose from: {', '.join(have)}"
         raise InputError(f"the map has no plane {plane!r}", place="map.plot", cure=cure)
     values = np.where(product.hits > 0, values, np.nan)
-    if product.header is None:
-        from .healpix_plane import on_plane
+    if product.projection != "TAN":
+        from .on_plane import on_plane
 
         flat, wcs = on_plane(product, {plane: values})
         values = flat[plane]

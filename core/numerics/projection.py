@@ -176,7 +176,15 @@ def homographies(quaternions: Floats, wcs: Wcs) -> Floats:
     0-based, with integer coordinates at pixel centres. Error: some 1e-13 of the distance to the image centre in pixels.
     Each coefficient lies in one piece (Fortran's order).
     """
-    matrix = pixel_matrix(wcs)
+    return ray_coefficients(quaternions, pixel_matrix(wcs))
+
+
+def ray_coefficients(quaternions: Floats, matrix: Floats) -> Floats:
+    """Coefficients h (n, 9): ``matrix`` (3, 3) times the direction of a detector, times the length of (xi, eta, 1).
+
+    Its components are h0 xi + h1 eta + h2, h3 xi + h4 eta + h5, h6 xi + h7 eta + h8. Each coefficient lies in one piece
+    (Fortran's order).
+    """
     h = empty((9, len(quaternions)))
     for s in chunks(len(quaternions)):
         turn = _rotations(quaternions[s])

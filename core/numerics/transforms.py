@@ -64,6 +64,16 @@ def convolved(values: AnyFloats, taps: AnyFloats) -> AnyFloats:
     return np.ascontiguousarray(_along_columns(np.ascontiguousarray(_along_columns(values, taps).T), taps).T)
 
 
+def convolved_rows(values: Floats, taps: Floats, rows: list[Floats]) -> Floats:
+    """As `convolved`, with a kernel of its own along each row (``rows``); ``taps`` is for the columns."""
+    n = values.shape[1]
+    along = np.empty_like(values)
+    for values_of, kernel, out in zip(values, rows, along, strict=True):
+        reach = min(len(kernel) - 1, n - 1)
+        out[:] = np.convolve(values_of, np.concatenate([kernel[reach:0:-1], kernel[: reach + 1]]))[reach : reach + n]
+    return np.asarray(_along_columns(along, taps))
+
+
 def _along_columns(values: AnyFloats, taps: AnyFloats) -> AnyFloats:
     """sum_k taps[|k|] values[j + k] along the first axis; zeros beyond the ends."""
     out: AnyFloats = values * taps[0]

@@ -89,14 +89,14 @@ class CompareMaps(Output):
 def resolution(plane: Plane, reference: Plane, product: Any) -> float:
     """FWHM [rad] of the map with the wider beam; sqrt(2) times that of a map which is not smoothed yet. 0: not known."""
     own = plane.fwhm or 0.0
-    if isinstance(product, MapProduct) and product.header is not None and not product.smoothed_by:
+    if isinstance(product, MapProduct) and product.projection == "TAN" and not product.smoothed_by:
         own *= math.sqrt(2)
     return max(own, reference.fwhm or 0.0)
 
 
 def covered(plane: Plane, product: Any, least: float) -> Plane:
     """The plane without the pixels that `window_of` leaves out."""
-    if not isinstance(product, MapProduct) or product.header is None:
+    if not isinstance(product, MapProduct) or product.projection != "TAN":
         return plane
     return replace(plane, values=np.where(window_of(product, least=least) > 0, plane.values, np.nan))
 

@@ -93,13 +93,15 @@ def map_spectra(
 ) -> MapSpectra:
     """Spectra of ``wanted`` maps. ``settings``: rings, least coverage, taper [rad]. Raises PipelineError about ``place``."""
     bins, least, taper = settings
-    flat = {name: product for name, product in maps.items() if product.header is not None and product.contents == "all"}
+    flat = {name: product for name, product in maps.items() if product.projection == "TAN" and product.contents == "all"}
     if missing := [name for name in wanted if name not in flat]:
-        cure = f"name some of these: {', '.join(flat)}" if flat else "leave nside and contents of the map out"
+        cure = f"name some of these: {', '.join(flat)}" if flat else "leave nside, projection and contents of the map out"
         raise PipelineError(f"there is no TAN map {missing[0]!r}", place=place, cure=cure)
     names = wanted or [name for name in flat if "/" not in name][:1]
     if not names:
-        raise PipelineError("there is no TAN map of the signal", place=place, cure="leave nside and contents of the map out")
+        raise PipelineError(
+            "there is no TAN map of the signal", place=place, cure="leave nside, projection and contents of the map out"
+        )
     first = flat[names[0]]
     planes: dict[str, Floats] = {name: flat[name].signal for name in names}
     noise = {name: flat[name].noise for name in names if not name.startswith("noiseless/")}

@@ -19,10 +19,10 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.drawable import Drawable, Sketch
 from zonda.core.early import take
-from zonda.core.maps.healpix_plane import on_plane
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import Noise, maps_of, noise_sources
+from zonda.core.maps.on_plane import on_plane
 from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, atomic_path, product_path
 from zonda.core.types import AnyFloats
@@ -265,12 +265,16 @@ def _flat(
     style: Style | None = None,
     per_beam: AnyFloats | float | None = None,
 ) -> FlatMap:
-    """What pictures need of a map; a HEALPix map on a plane about its centre."""
+    """What pictures need of a map; a HEALPix or CAR map on a plane about its centre."""
     found = {plane: getattr(product, plane) for plane in ("hits", "weights", *planes)}
-    header, is_flat = product.header, product.header is not None
+    header, is_flat = product.header, product.projection == "TAN"
     rms: dict[str, float] = {}
     if not is_flat:
-        found, wcs = on_plane(product, found)
+        each = {"per_beam": per_beam} if isinstance(per_beam, np.ndarray) else {}
+        found, wcs = on_plane(product, found | each)
+        if each:
+            there = found.pop("per_beam")
+            per_beam = np.where(np.isfinite(there), there, np.nanmean(there))
         header = wcs.to_header(relax=True)
         rms = {} if style is None else {p: product.rms(style.central_diameter / 2, of=p) for p in planes}
     arrays = {plane: np.asarray(values, np.float32) for plane, values in found.items()}
@@ -289,7 +293,7 @@ def _map(name: str, product: MapProduct, style: Style) -> tuple[Any, ...]:
 
 def _snr(product: MapProduct, style: Style) -> AnyFloats | None:
     """The SNR of a map as it is shown, where contours of it are wanted and its noise is known."""
-    if not style.contours or product.header is None:
+    if not style.contours or product.projection != "TAN":
         return None
     smoothing = 0.0 if product.smoothed_by else product.fwhm if style.smooth is None else style.smooth
     plane = with_noise(plane_of(product, "map"), product, math.hypot(product.fwhm, product.smoothed_by, smoothing))

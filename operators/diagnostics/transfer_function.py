@@ -108,8 +108,8 @@ def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
     """The map ``name`` of a signal, which can be compared; else a PipelineError about ``place``."""
     product = data.products.get(product_name(stream_of(signal), name))
     any_map = product or data.products.get(name)
-    if isinstance(any_map, MapProduct) and (any_map.header is None or any_map.contents == "hits"):
-        cure = "leave nside and contents of the map out"
+    if isinstance(any_map, MapProduct) and (any_map.projection != "TAN" or any_map.contents == "hits"):
+        cure = "leave nside, projection and contents of the map out"
         raise PipelineError("a transfer function needs a TAN map of the signal", place=place, cure=cure)
     if not isinstance(product, MapProduct):
         cure = "set map to the product of the step that makes it, or that step's product to map"

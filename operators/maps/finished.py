@@ -17,7 +17,7 @@ from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
 from zonda.core.types import Floats
 
-from .grid import Grid, TangentGrid
+from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES
 from .map_sums import MapSums
 from .parameters import MapParameters
@@ -63,17 +63,16 @@ def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: Map
             (even, w_even), (odd, w_odd) = (_mean(sums.half(stream, k, part)) for k in (0, 1))
             with np.errstate(invalid="ignore", divide="ignore"):
                 half[part] = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
-    image = isinstance(grid, TangentGrid)
-    keep = slice(None) if image else hits > 0
+    keep = hits > 0 if isinstance(grid, HealpixGrid) else slice(None)
     planes: list[NDArray[Any]] = [signal, hits, weight, noise] + ([half] if half is not None else [])
-    planes = [plane[keep].reshape(grid.shape if isinstance(grid, TangentGrid) else -1) for plane in planes]
+    planes = [plane[keep].reshape(-1 if isinstance(grid, HealpixGrid) else grid.shape) for plane in planes]
     common: dict[str, Any] = {
         "frame": step.frame, "weighting": step.weights, "noise_from": step.noise, "fwhm": layout["fwhm"], "scans":
         list(sums.scans), "centre": tuple(layout["middle"]), "half_difference": planes[4] if half is not None else None,
         "difference": DIFFERENCES[step.split],
         "contents": step.contents, "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
     }  # fmt: skip
-    if isinstance(grid, TangentGrid):
+    if not isinstance(grid, HealpixGrid):
         header = grid.wcs.to_header(relax=True)
         return MapProduct(planes[0], planes[1], planes[2], planes[3], header=header, pixel=grid.pixel, **common)
     size = math.sqrt(4 * math.pi / (12 * grid.nside**2))

@@ -1,4 +1,4 @@
-"""Pixel grids: tangent-plane (TAN) images and HEALPix, and which of their pixels a sample falls in."""
+"""Pixel grids: tangent-plane (TAN) images and HEALPix (CAR: `plate_carree`), and which of their pixels a sample falls in."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
 from zonda.core.numerics.tangent import TangentWcs
 from zonda.core.types import Floats
+
+from .plate_carree import PlateCarreeGrid
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -78,7 +80,7 @@ class HealpixGrid:
         out[:] = np.where(self.pixels_covered[place] == pixel, place, -1)
 
 
-Grid = TangentGrid | HealpixGrid
+Grid = TangentGrid | PlateCarreeGrid | HealpixGrid
 
 
 def tangent_wcs(centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs") -> TangentWcs:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -12,11 +12,15 @@ from zonda.core.data import Observation, percent
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.numerics.projection import pixel_matrix, share_outside
 
+from . import plate_carree
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
 from .mosaic import MOST_FIELDS, whole_of
+from .plate_carree import PlateCarreeGrid, box_about, box_of, grid_of_box, layout_about
 
 if TYPE_CHECKING:
     from .parameters import MapParameters
+
+Image = TypeVar("Image", TangentGrid, PlateCarreeGrid)
 
 
 def layout_of(
@@ -52,6 +56,14 @@ def layout_of(
         pixels = covered_healpix(observations, step.nside, step.ordering == "nested", step.frame)
         found["pixels"] = np.union1d(found["pixels"], pixels) if "pixels" in found else pixels
     found["fields"] = fields_of(step, observations, found.get("fields", []))
+    if step.projection == "CAR" and not step.nside:
+        found["pixel"] = step.pixel
+        if step.width is not None:
+            found["box"] = box_about(step, (found["fields"][0][0], found["fields"][0][1]))
+        else:
+            found["box"] = box_of(step, observations, found.get("box"))
+        found["middle"] = layout_about(found)
+        return found
     *found["middle"], half_width, half_height = whole_of(found["fields"], step.label)
     found["half"] = [half_width, half_height]
     return found
@@ -70,13 +82,13 @@ def fields_of(step: MapParameters, observations: Sequence[Observation], before: 
     for icrs, scans in together.items():
         longitude, latitude = (float(x) for x in in_frame(icrs, step.frame))
         reach = (0.0, 0.0)
-        if step.nside is None and step.width is None:
+        if step.nside is None and step.width is None and step.projection == "TAN":
             reach = covering_extent(scans, (longitude, latitude), step.frame)
         if (field := known.get((longitude, latitude))) is None:
             field = known[longitude, latitude] = [longitude, latitude, 0.0, 0.0]
             found.append(field)
         field[2:] = [max(field[2], reach[0]), max(field[3], reach[1])]
-    if len(found) > MOST_FIELDS and step.nside is None:
+    if len(found) > MOST_FIELDS and step.nside is None and step.projection == "TAN":
         return [list(whole_of(found, step.label))]
     return found[:1] if step.nside else found
 
@@ -85,6 +97,8 @@ def grid_of(step: MapParameters, layout: Mapping[str, Any]) -> Grid:
     """The grid of a layout."""
     if step.nside:
         return HealpixGrid(step.nside, step.ordering == "nested", np.asarray(layout["pixels"], np.int64), step.frame)
+    if "box" in layout:
+        return checked(step, grid_of_box(layout["box"], step.pixel, step.frame))
     longitude, latitude = layout["middle"]
     return image_grid(step, (longitude, latitude), layout.get("half", (0.0, 0.0)))
 
@@ -95,15 +109,24 @@ def image_grid(step: MapParameters, middle: tuple[float, float], half: Sequence[
     width = width if width is not None else 2 * half[0] + 2 * step.pixel
     height = height if height is not None else 2 * half[1] + 2 * step.pixel
     nx, ny = (max(1, math.ceil(side / step.pixel - 1e-6)) for side in (width, height))
+    return checked(step, TangentGrid(middle, step.pixel, (ny, nx), step.frame))
+
+
+def checked(step: MapParameters, grid: Image) -> Image:
+    """``grid``; InputError where it has more than `MOST_PIXELS` pixels."""
+    ny, nx = grid.shape
     if nx * ny > MOST_PIXELS:
         cure = "choose larger pixels or a smaller width, or nside for a HEALPix map"
         raise InputError(f"a map of {nx} x {ny} pixels is too large", place=step.label, cure=cure)
-    return TangentGrid(middle, step.pixel, (ny, nx), step.frame)
+    return grid
 
 
 def outside(step: MapParameters, observations: Sequence[Observation]) -> str:
     """The share of the samples outside an image of a given width."""
     longitude, latitude, *_ = whole_of(fields_of(step, observations, []), step.label)
+    if step.projection == "CAR":
+        car = grid_of_box(box_about(step, (longitude, latitude)), step.pixel, step.frame)
+        return f"samples outside the map: about {percent(plate_carree.share_outside(car, observations), 2)}"
     grid = image_grid(step, (longitude, latitude), (0.0, 0.0))
     scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in observations)
     return f"samples outside the map: about {percent(share_outside(scans, pixel_matrix(grid.wcs), grid.shape), 2)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -28,8 +29,9 @@ class MapParameters(MapMaker):
     """Height of the map; where absent, the width if that is given, else it covers the scans."""
     centre: Target | None = None
     """Centre of the map; where absent, the scans' target; of several targets the middle of all scans."""
-    projection: Literal["TAN"] = "TAN"
-    """Projection of the image."""
+    projection: Literal["TAN", "CAR"] = "TAN"
+    """Projection of the image: TAN (tangent plane), or CAR (plate carrée), whose pixels are those of pixell's full-sky maps.
+    Width and height are those on the sky at the centre."""
     frame: Literal["icrs", "galactic"] = "icrs"
     """Celestial frame of the map."""
     nside: int | None = Field(None, ge=1, le=2**20)
@@ -86,6 +88,9 @@ class MapParameters(MapMaker):
         image_only = {"pixel", "width", "height", "centre", "projection"} & self.model_fields_set
         if self.nside is not None and image_only:
             raise ValueError(f"{sorted(image_only)[0]} belongs to an image, nside to a HEALPix map; give one of them")
+        if self.projection == "CAR" and abs(self.pixel * (n := round(math.pi / self.pixel)) / math.pi - 1) > 1e-9:
+            cure = f"{math.degrees(math.pi / n) * 3600:.9g} arcsec"
+            raise ValueError(f"in a CAR map 180 deg must be a whole number of pixels; the nearest that fits is {cure}")
         if self.nside is None and "ordering" in self.model_fields_set:
             raise ValueError("ordering belongs to a HEALPix map; give nside too")
         return self

@@ -217,7 +217,9 @@ class Survey:
     @property
     def _grid(self) -> TangentGrid:
         grid = self.steps.binning.grid
-        assert isinstance(grid, TangentGrid)
+        if not isinstance(grid, TangentGrid):
+            text, cure = "the forecast is made for TAN maps", "leave nside and projection of BinMap out"
+            raise PipelineError(text, place="zonda sensitivity", cure=cure)
         return grid
 
     def check_radius(self, radius: float) -> None:

@@ -73,7 +73,7 @@ def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> floa
 
         (2 N)^(-1/2),   N = (sum w)^2 / sum_ij w_i w_j rho_ij^2,   rho = exp(-d^2 / 4 sigma^2)
 
-    sigma that of the smoothing. HEALPix: N is the area divided by 2 pi sigma^2. NaN without pixels.
+    sigma that of the smoothing. HEALPix and CAR: N is the area divided by 2 pi sigma^2. NaN without pixels.
     """
     from zonda.core.numerics.transforms import convolved, gaussian_taps
 
@@ -82,8 +82,9 @@ def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> floa
         return math.nan
     sigma = product.smoothed_by / FWHM_PER_SIGMA / product.pixel
     per_cell = 2 * math.pi * sigma**2
-    if product.header is None:
-        independent = int(np.count_nonzero(w)) / max(per_cell, 1.0)
+    if product.projection != "TAN":
+        area = float(np.broadcast_to(product.areas(), w.shape)[w != 0].sum())
+        independent = min(area / product.pixel**2 / per_cell if per_cell else np.inf, float(np.count_nonzero(w)))
     else:
         rows, columns = np.flatnonzero(w.any(axis=1)), np.flatnonzero(w.any(axis=0))
         w = w[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
@@ -93,9 +94,9 @@ def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> floa
 
 
 def flat(product: MapProduct, metric: str) -> MapProduct:
-    """A TAN map; PipelineError about ``metric`` for a HEALPix map."""
-    if product.header is None:
-        raise PipelineError(f"{metric} needs a TAN map", place=metric, cure="leave BinMap.nside out")
+    """A TAN map; PipelineError about ``metric`` for another."""
+    if product.projection != "TAN":
+        raise PipelineError(f"{metric} needs a TAN map", place=metric, cure="leave BinMap.nside and projection out")
     return product
 
 

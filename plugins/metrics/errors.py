@@ -140,8 +140,10 @@ class Transfer(Metric):
     def measure(self, data: Data) -> Floats:
         """(2, n): T_i, and its standard deviation from the instrument's noise in the main map."""
         sky, main = _map(data, _sky_alone(data.provenance.get("runs", {}))), _map(data)
-        if sky.header is None:
-            raise InputError("the metric transfer needs a TAN map", place="transfer", cure="leave BinMap.nside out")
+        if sky.projection != "TAN":
+            raise InputError(
+                "the metric transfer needs a TAN map", place="transfer", cure="leave BinMap.nside and projection out"
+            )
         image = input_of(data, "transfer")
         window = sky.hits / np.percentile(sky.hits[sky.hits > 0], 99)
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)

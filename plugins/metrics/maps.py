@@ -239,6 +239,5 @@ def coverage(product: MapProduct, radius: float, least: float | None = None) -> 
     centre = float(np.median(time[near]))
     if least is None:
         return centre
-    solid = product.pixel**2
-    sizes = solid * np.cos(product.distance()) ** 3 if product.header is not None else np.full(time.shape, solid)
+    sizes = np.broadcast_to(product.areas(), time.shape)
     return float(sizes[(time >= least * centre) & (product.hits > 0)].sum()) / ARCMIN**2

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from zonda.core.errors import InputError
-from zonda.core.maps.healpix_plane import on_plane
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.on_plane import on_plane
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
@@ -134,10 +134,13 @@ def plane_of(product: MapProduct | Image, name: str) -> Plane:
         return Plane(name, np.asarray(product.values, np.float64), product.header, product.unit, 0.0)
     fwhm = math.hypot(product.fwhm, product.smoothed_by) or None
     planes = {"signal": np.where(product.hits > 0, product.signal, np.nan), "noise": product.noise}
-    if product.header is not None:
+    if product.projection == "TAN":
         return Plane(name, planes["signal"], product.header, product.unit, fwhm, planes["noise"])
-    assert product.pixels is not None
-    header, found = _on_plane(product.nside, product.nest, product.pixels, planes, product.frame)
+    if product.pixels is not None:
+        header, found = _on_plane(product.nside, product.nest, product.pixels, planes, product.frame)
+    else:
+        made, wcs = on_plane(product, planes, size=min(MOST, max(product.signal.shape)))
+        header, found = wcs.to_header(relax=True), {key: np.asarray(values, np.float64) for key, values in made.items()}
     return Plane(name, found["signal"], header, product.unit, fwhm, found["noise"])
 
 

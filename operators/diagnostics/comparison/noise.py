@@ -21,7 +21,7 @@ def with_noise(plane: Plane, product: MapProduct, fwhm: float) -> Plane:
     there is a half-difference, it is multiplied by the rms of half-difference / noise, smoothed alike, over pixels with at least
     `LEAST` of the samples. So noise that is correlated between pixels counts in full.
     """
-    if product.header is None or product.contents != "all":
+    if product.projection != "TAN" or product.contents != "all":
         return plane.smoothed(fwhm)
     known = bool(np.isfinite(product.noise).any())
     with np.errstate(divide="ignore"):

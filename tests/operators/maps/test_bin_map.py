@@ -359,7 +359,7 @@ def test_two_maps_need_two_names(bench):
 @pytest.mark.parametrize(
     "bad",
     [
-        {"pixel": "0 arcsec"}, {"nside": 100}, {"nside": 64, "pixel": "2 arcsec"}, {"ordering": "nested"}, {"projection": "CAR"},
+        {"pixel": "0 arcsec"}, {"nside": 100}, {"nside": 64, "pixel": "2 arcsec"}, {"ordering": "nested"}, {"projection": "SIN"},
         {"centre": "az 180 deg el 60 deg"}, {"smooth": "-1 arcsec"}, {"smooth": "0 arcsec"},
         {"weights": "best"}, {"product": "a/b"},
     ],

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from zonda.core.errors import OutputError
-from zonda.core.maps.healpix_plane import on_plane
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.on_plane import on_plane
 from zonda.operators.diagnostics.drawing import pictures
 from zonda.operators.diagnostics.drawing.map_plots import plot_circle
 from zonda.operators.diagnostics.drawing.plots import (
@@ -499,8 +499,8 @@ def test_a_healpix_map_is_drawn(data):
 
 
 def healpix(nside, pixels, centre, frame):
-    ones = np.ones(len(pixels))
-    return MapProduct(ones, ones, ones, ones, None, None, centre, 0.01, frame, nside=nside, pixels=pixels)
+    ones, side = np.ones(len(pixels)), np.sqrt(np.pi / 3) / nside
+    return MapProduct(ones, ones, ones, ones, None, None, centre, side, frame, nside=nside, pixels=pixels)
 
 
 def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
