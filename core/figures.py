@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from .accuracy.metrics import Metric, OfFunction, chosen
+from .accuracy.metrics import Metric, OfFunction, get
 from .configuration.parameters import Parameters
 from .configuration.values import TextValue, mistake, refusal
 from .errors import PipelineError, ZondaError
@@ -169,10 +169,10 @@ class Choice(TextValue):
             return cls(value.own_name(), value)
         try:
             if isinstance(value, str):
-                return cls(value.partition("(")[0].strip(), chosen(value))
+                return cls(value.partition("(")[0].strip(), get(value))
             if isinstance(value, Mapping) and len(value) == 1:
                 name, given = next(iter(value.items()))
-                return cls(str(name), chosen(str(name), given or {}))
+                return cls(str(name), get(str(name), given or {}))
         except ZondaError as err:
             raise refusal(err) from None
         raise mistake(f"cannot read {value!r:.60} as a metric; write its name, or {{name: {{parameter: value}}}}")
@@ -210,7 +210,7 @@ def measure(data: Data, metric: str | FigureMetric, **parameters: Any) -> Figure
     """
     if isinstance(metric, FigureMetric):
         return Choice(metric.own_name(), metric).figure(data)
-    return Choice(metric.partition("(")[0], chosen(metric, parameters)).figure(data)
+    return Choice(metric.partition("(")[0], get(metric, parameters)).figure(data)
 
 
 @dataclass

@@ -78,27 +78,22 @@ class OfFunction(Metric):
         return np.asarray(self.function(data), np.float64)
 
 
-def get(name: str) -> Metric:
+def get(name: str, parameters: Mapping[str, Any] | None = None) -> Metric:
     """The metric that ``name`` stands for: a name, or name(parameter=value, ...) with values as in YAML.
 
-    Raises `RegistryError` with the nearest name where there is none, `ParameterError` for parameters that are wrong.
+    ``parameters``: more of them. Raises `RegistryError` with the nearest name where there is none, `ParameterError` for
+    parameters that are wrong, `InputError` where a metric has none.
     """
-    return chosen(name)
-
-
-def chosen(name: str, parameters: Mapping[str, Any] | None = None) -> Metric:
-    """As `get`, with parameters given apart. Raises `InputError` where a metric has none."""
     head, parenthesis, rest = name.strip().partition("(")
     if parenthesis and not rest.endswith(")"):
         raise InputError(f"cannot read the metric {name!r}", place="metric", cure="write name(parameter=value, ...)")
     given = {**_arguments(name, rest[:-1]), **(parameters or {})}
     found = registry.metrics.get(head.strip())
-    if isinstance(found, type) and issubclass(found, Metric):
-        if given and not issubclass(found, Parameters):
-            raise InputError(f"the metric {head} has no parameters", place="metric", cure=f"write {head} alone")
-        return found(**given)
-    if given:
+    is_class = isinstance(found, type) and issubclass(found, Metric)
+    if given and not (is_class and issubclass(found, Parameters)):
         raise InputError(f"the metric {head} has no parameters", place="metric", cure=f"write {head} alone")
+    if is_class:
+        return found(**given)  # type: ignore[no-any-return]
     return found if isinstance(found, Metric) else OfFunction(found)
 
 

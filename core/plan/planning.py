@@ -31,6 +31,8 @@ class Planning(Generic[O]):
         The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
     reads_streams
         It makes a product of the time streams themselves (spectra, files), in which errors of a sample count.
+    holds
+        Its `memory`, where that is the same for every observation.
     smaller
         What lessens its `memory`, in a few words (``choose a larger pixel``), for a run that does not fit.
     """
@@ -39,6 +41,7 @@ class Planning(Generic[O]):
     cost: ClassVar[Cost | None] = None
     knobs: ClassVar[tuple[Knob, ...]] = ()
     reads_streams: ClassVar[bool] = False
+    holds: ClassVar[int] = 0
     smaller: ClassVar[str] = ""
 
     def __init__(self, operator: O) -> None:
@@ -65,7 +68,7 @@ class Planning(Generic[O]):
         An upper bound, asked after `Operator.observe` and before `Operator.prepare`: a run that would not fit is refused before
         it starts.
         """
-        return 0
+        return self.holds
 
     def sweeps(self, observation: Observation) -> int:
         """How often `Operator.measure` goes through its stream with `Stream.sweep`; 0: it wants ``stream.array``."""

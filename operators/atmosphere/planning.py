@@ -377,7 +377,5 @@ class ScreensPlanning(Planning[AtmosphereScreens]):
 
     of = AtmosphereScreens
     cost = Cost(once=0.3, kernel="python")
-
-    def memory(self, observation: Observation) -> int:
-        """The fields and the tiles of the turbulence about them."""
-        return 100_000_000
+    holds = 100_000_000
+    """The fields and the tiles of the turbulence about them."""

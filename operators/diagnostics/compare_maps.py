@@ -23,7 +23,7 @@ from .comparison.files import plane_of, read_plane, write_comparison
 from .comparison.noise import with_noise
 from .comparison.planes import Plane
 from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
-from .series import key_of
+from .series import about, key_of
 from .transfer_function import window_of
 
 
@@ -73,8 +73,7 @@ class CompareMaps(Output):
         key = key_of(self, "comparison")
         data.products[key] = found
         if data.output is not None:
-            meta = {"SEED": data.scene.seed, "PIPELINE": str(data.provenance.get("name", ""))}
-            write_comparison(found, product_path(data.output, key), meta)
+            write_comparison(found, product_path(data.output, key), about(data))
 
     def _reference(self, data: Data) -> Plane:
         if self.file is None:

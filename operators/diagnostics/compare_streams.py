@@ -20,7 +20,7 @@ from zonda.core.storage.files import product_path
 from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
 
 from .power_spectrum import Welch, calibration, on_sky
-from .series import key_of
+from .series import about, key_of
 from .stream_statistics import Pair, StreamComparison, pair
 
 LEAST_SEGMENTS = 8
@@ -144,7 +144,6 @@ def tell(step: CompareStreams, data: Data, found: StreamComparison) -> None:
         data.tally.state(step.label, figure, text)
     data.products[found.product] = found
     if data.output is not None:
-        made = {"PIPELINE": str(data.provenance.get("name", "")), "SEED": data.provenance.get("seed")}
-        made |= {"STREAM": found.stream, "REFERENCE": found.reference, "SCANS": found.observations, "SEGMENTS": found.segments}
+        made = about(data, STREAM=found.stream, REFERENCE=found.reference, SCANS=found.observations, SEGMENTS=found.segments)
         write_ecsv(product_path(data.output, found.product, ".ecsv"), found.columns(), made)
         write_ecsv(product_path(data.output, f"{found.product}_detectors", ".ecsv"), found.detector_columns(), made)

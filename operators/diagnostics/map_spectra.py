@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,7 +22,7 @@ from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
 from .comparison.radial import RadialSpectra, radial_spectra, ring_edges
-from .series import key_of
+from .series import about, key_of
 from .transfer_function import window_of
 
 
@@ -83,9 +82,7 @@ class MapSpectrum(Output):
         key = key_of(self, "map_spectra")
         data.products[key] = found
         if data.output is not None:
-            meta = {"SEED": data.scene.seed, "PIPELINE": str(data.provenance.get("name", ""))}
-            path: Path = product_path(data.output, key, ".ecsv")
-            write_ecsv(path, found.columns(), {k: v for k, v in meta.items() if v not in ("", None)})
+            write_ecsv(product_path(data.output, key, ".ecsv"), found.columns(), about(data))
 
 
 def map_spectra(

@@ -14,7 +14,7 @@ from zonda.core.output import Output
 from zonda.core.signal import Signal
 from zonda.core.storage.files import product_path
 
-from .series import key_of
+from .series import about, key_of
 
 
 class ProductsRead:
@@ -73,9 +73,7 @@ class MeasureFigures(Output):
         for figure in figures:
             data.tally.state(self.label, figure.name, str(figure).partition(" = ")[2])
         if data.output is not None:
-            made = {"PIPELINE": str(data.provenance.get("name", "")), "SEED": data.provenance.get("seed")}
-            made |= {"ZONDA": str(data.provenance.get("versions", {}).get("zonda", ""))}
-            figures.write(product_path(data.output, key, ".ecsv"), made)
+            figures.write(product_path(data.output, key, ".ecsv"), about(data))
 
 
 def _figure(choice: Choice, data: Data, names: list[str]) -> Figure:

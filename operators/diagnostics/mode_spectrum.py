@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from zonda.core.storage.ecsv import write_ecsv
 from zonda.core.storage.files import product_path
 
 from .components import Lagged, components
-from .series import Modes, key_of
+from .series import Modes, about, key_of
 
 MOST_ROWS = 4096
 """Detectors times delays: the covariance of more takes minutes and gigabytes."""
@@ -29,7 +29,7 @@ KEPT = 64
 class Found:
     """What `ModeSpectrum.measure` puts down for `ModeSpectrum.collect`."""
 
-    modes: Modes | None = field(default=None)
+    modes: Modes | None = None
 
 
 class ModeSpectrum(Operator):
@@ -85,7 +85,9 @@ class ModeSpectrum(Operator):
             return
         data.products[found.product] = found
         if data.output is not None:
-            _write(found, data)
+            made = about(data, SCAN=found.observation)
+            write_ecsv(product_path(data.output, found.product, ".ecsv"), found.columns(), {**made, "SCANS": len(found.values)})
+            write_ecsv(product_path(data.output, f"{found.product}_streams", ".ecsv"), found.stream_columns(), made)
 
 
 def _find(step: ModeSpectrum, stream: Stream) -> Modes | None:
@@ -111,14 +113,3 @@ def _find(step: ModeSpectrum, stream: Stream) -> Modes | None:
         [observation.focalplane.names[d] for d in chosen], step.delays, lag / observation.sample_rate if step.delays else 0.0,
         "" if step.normalize else "K_RJ", observation.name, step.label, key_of(step, "modes"),
     )  # fmt: skip
-
-
-def _write(found: Modes, data: Data) -> None:
-    """Both tables."""
-    made = {
-        "PIPELINE": str(data.provenance.get("name", "")),
-        "SEED": data.provenance.get("seed"),
-        "SCAN": found.observation,
-    }
-    write_ecsv(product_path(data.output, found.product, ".ecsv"), found.columns(), {**made, "SCANS": len(found.values)})
-    write_ecsv(product_path(data.output, f"{found.product}_streams", ".ecsv"), found.stream_columns(), made)

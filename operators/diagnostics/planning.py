@@ -25,10 +25,8 @@ class PlotsPlanning(Planning[Plots]):
 
     of = Plots
     cost = Cost(once=1.2, kernel="python")
-
-    def memory(self, observation: Observation) -> int:
-        """matplotlib and the pictures."""
-        return 150_000_000
+    holds = 150_000_000
+    """matplotlib and the pictures."""
 
 
 class ReportPlanning(Planning[Report]):
@@ -36,10 +34,8 @@ class ReportPlanning(Planning[Report]):
 
     of = Report
     cost = Cost(once=0.1, kernel="python")
-
-    def memory(self, observation: Observation) -> int:
-        """The page."""
-        return 10_000_000
+    holds = 10_000_000
+    """The page."""
 
 
 class TransferFunctionPlanning(Planning[TransferFunction]):
@@ -47,10 +43,8 @@ class TransferFunctionPlanning(Planning[TransferFunction]):
 
     of = TransferFunction
     cost = Cost(once=0.15, kernel="python")
-
-    def memory(self, observation: Observation) -> int:
-        """Fourier transforms of the maps."""
-        return 20_000_000
+    holds = 20_000_000
+    """Fourier transforms of the maps."""
 
 
 class MeasureFiguresPlanning(Planning[MeasureFigures]):
@@ -58,10 +52,8 @@ class MeasureFiguresPlanning(Planning[MeasureFigures]):
 
     of = MeasureFigures
     cost = Cost(once=0.1, kernel="python")
-
-    def memory(self, observation: Observation) -> int:
-        """Smoothed maps, and Fourier transforms of maps."""
-        return 20_000_000
+    holds = 20_000_000
+    """Smoothed maps, and Fourier transforms of maps."""
 
 
 class ModeSpectrumPlanning(Planning[ModeSpectrum]):
@@ -89,10 +81,8 @@ class CompareMapsPlanning(Planning[CompareMaps]):
 
     of = CompareMaps
     cost = Cost(once=0.5, kernel="python")
-
-    def memory(self, observation: Observation) -> int:
-        """Planes and Fourier transforms of two maps."""
-        return 60_000_000
+    holds = 60_000_000
+    """Planes and Fourier transforms of two maps."""
 
 
 class MapSpectrumPlanning(Planning[MapSpectrum]):
@@ -100,10 +90,8 @@ class MapSpectrumPlanning(Planning[MapSpectrum]):
 
     of = MapSpectrum
     cost = Cost(once=0.2, kernel="python")
-
-    def memory(self, observation: Observation) -> int:
-        """Fourier transforms of the maps."""
-        return 30_000_000
+    holds = 30_000_000
+    """Fourier transforms of the maps."""
 
 
 class TimeStreamsPlanning(Planning[TimeStreams]):

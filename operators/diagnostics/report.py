@@ -23,7 +23,7 @@ from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import write_text
 from zonda.core.types import AnyFloats
 
-from .plot_operators import Picture, Plots, pictures
+from .plot_operators import DRAWN, Picture, Plots, pictures
 from .report_results import class_of, flux_density, has_white_noise, results
 from .report_text import LONG, Html, details, folded, readable, sexagesimal, small, spread, table
 
@@ -42,23 +42,7 @@ class Report(Output):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    optional: ClassVar[frozenset[str]] = frozenset(
-        {
-            "pictures",
-            "map_file",
-            "tod_file",
-            "map",
-            "spectrum",
-            "time_streams",
-            "transfer_function",
-            "figures",
-            "modes",
-            "comparison",
-            "map_spectra",
-            "screens",
-            "stream_comparison",
-        }
-    )
+    optional: ClassVar[frozenset[str]] = DRAWN | {"pictures", "map_file", "tod_file", "figures"}
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
 
     central_diameter: Angle = quantity("1 arcmin", gt=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from zonda.core.storage.ecsv import Column
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
+    from zonda.core.data import Data
     from zonda.core.operator import Operator
 
 
@@ -142,6 +143,13 @@ class TimeStream(Record):
     def __iadd__(self, other: TimeStream) -> TimeStream:
         """The first one stays."""
         return self
+
+
+def about(data: Data, **more: Any) -> dict[str, Any]:
+    """What tables of a run say of it: pipeline, seed, version, and ``more``; without what is empty."""
+    known = data.provenance
+    meta = {"PIPELINE": known.get("name"), "SEED": data.scene.seed, "ZONDA": known.get("versions", {}).get("zonda"), **more}
+    return {key: value for key, value in meta.items() if value not in ("", None)}
 
 
 def key_of(step: Operator, usual: str) -> str:

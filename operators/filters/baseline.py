@@ -30,6 +30,11 @@ from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.smooth import spline_basis
 from zonda.core.types import Floats
 
+from .source_mask import MASKED, Inside
+
+SPOILT = "samples not finite"
+"""Count of samples that are left as they are."""
+
 ROWS = 32
 """Detectors that are worked on in float64 at a time."""
 
@@ -125,21 +130,25 @@ class Fit:
         return left, found
 
 
-def in_double(block: Block, work: Callable[[Floats, slice], int]) -> int:
-    """Let ``work`` change the signal of a block in float64, its mean included; no mean is left beside it.
+def in_double(label: str, block: Block, remove: Callable[[Floats, Mask | None], int], inside: Inside | None = None) -> None:
+    """Let ``remove`` change the signal of a block in float64, its mean included; no mean is left beside it.
 
-    ``work(rows, detectors)`` changes samples (n_det, n_samp) of up to `ROWS` detectors in place. The sum of the numbers that it
-    returns is returned.
+    ``remove(rows, masked)`` changes samples (n_det, n_samp) of up to `ROWS` detectors in place and returns how many were not
+    finite; ``masked``: which of them are ``inside`` a source mask. The step ``label`` counts both.
     """
-    signal, mean, found = block.detdata["signal"], block.means.pop("signal", None), 0
+    signal, mean, tally = block.detdata["signal"], block.means.pop("signal", None), block.observation.tally
+    masked = inside.at(block.detectors, block.samples) if inside is not None else None
+    if masked is not None:
+        tally.count(label, MASKED, int(masked.sum()), masked.size)
+    spoilt = 0
     for part in chunks(len(signal), ROWS):
-        detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
         rows = signal[part].astype(np.float64)
         if mean is not None:
-            rows += mean.evaluate(detectors, block.samples)
-        found += work(rows, detectors)
+            first = block.detectors.start
+            rows += mean.evaluate(slice(first + part.start, first + part.stop), block.samples)
+        spoilt += remove(rows, None if masked is None else masked[part])
         signal[part] = rows
-    return found
+    tally.count(label, SPOILT, spoilt)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -29,12 +29,12 @@ def sections(frequency: float, rate: float) -> Floats:
     return np.asarray(bessel(ORDER, 2 * frequency / rate, "high", output="sos"), np.float64)
 
 
-def amplitude(frequency: float, cutoff: float, rate: float) -> float:
-    """|H| at a frequency, Hz."""
+def amplitude(frequency: Floats, cutoff: float, rate: float) -> Floats:
+    """|H| at frequencies (n,), Hz; beyond half of the sample ``rate`` that there."""
     from scipy.signal import sosfreqz
 
-    at = min(frequency, rate / 2)
-    return float(np.abs(sosfreqz(sections(cutoff, rate), [2 * np.pi * at / rate])[1][0]))
+    at = np.minimum(frequency, rate / 2)
+    return np.abs(sosfreqz(sections(cutoff, rate), 2 * np.pi * at / rate)[1])
 
 
 @dataclass(frozen=True)

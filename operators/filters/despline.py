@@ -12,7 +12,6 @@ from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
 from zonda.core.operator import Operator
 
 from .baseline import Fit, in_double, splines
-from .detrend import SPOILT
 
 MOST = 2000
 """Knots of a scan: the normal equations are solved whole."""
@@ -50,4 +49,4 @@ class Despline(Operator):
 
     def exec(self, block: Block, state: Fit) -> None:
         """Subtract the fit from each row."""
-        block.observation.tally.count(self.label, SPOILT, in_double(block, lambda rows, _: state.remove(rows)))
+        in_double(self.label, block, state.remove)

@@ -11,10 +11,7 @@ from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
 from zonda.core.operator import Operator
 
 from .baseline import Fit, in_double, polynomials
-from .source_mask import MASKED, Inside, SourceMask, check_mask
-
-SPOILT = "samples not finite"
-"""Count of samples that are left as they are."""
+from .source_mask import Inside, SourceMask, check_mask
 
 
 class Detrend(Operator):
@@ -45,11 +42,4 @@ class Detrend(Operator):
     def exec(self, block: Block, state: tuple[Fit, Inside | None]) -> None:
         """Subtract the fit from each row."""
         fit, inside = state
-        masked = inside.at(block.detectors, block.samples) if inside else None
-        if masked is not None:
-            block.observation.tally.count(self.label, MASKED, int(masked.sum()), masked.size)
-        first = block.detectors.start
-        spoilt = in_double(
-            block, lambda rows, at: fit.remove(rows, None if masked is None else masked[at.start - first : at.stop - first])
-        )
-        block.observation.tally.count(self.label, SPOILT, spoilt)
+        in_double(self.label, block, fit.remove, inside)

@@ -32,7 +32,6 @@ from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
 from .baseline import Basis, Fit, Mask, in_double, polynomials
-from .detrend import SPOILT
 
 
 class GroundFilter(Operator):
@@ -70,7 +69,7 @@ class GroundFilter(Operator):
 
     def exec(self, block: Block, state: Template) -> None:
         """Subtract the template and the trend from each row."""
-        block.observation.tally.count(self.label, SPOILT, in_double(block, lambda rows, _: state.remove(rows)))
+        in_double(self.label, block, lambda rows, _: state.remove(rows))
 
 
 def _bins(observation: Observation, width: float, split: bool) -> NDArray[np.int64]:

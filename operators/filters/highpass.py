@@ -13,14 +13,11 @@ from zonda.core.errors import PipelineError
 from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
 from zonda.core.types import AnyFloats, Floats
 
-from .baseline import Fit, in_double, polynomials
+from .baseline import SPOILT, Fit, in_double, polynomials
 from .bessel import BesselPlan, sections
 from .brick_wall import HighpassPlan, plan_highpass
 from .parameters import HighpassParameters
-from .source_mask import MASKED, Inside, check_mask, filter_outside
-
-SPOILT = "samples not finite"
-"""Count of samples that are left as they are."""
+from .source_mask import Inside, check_mask, filter_outside
 
 ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
 
@@ -74,19 +71,12 @@ class HighpassFilter(HighpassParameters):
     def exec(self, block: Block, state: State) -> None:
         """Filter the block's rows in place."""
         plan, bad, inside = state
-        tally, masked = block.observation.tally, None
-        if inside is not None:
-            masked = inside.at(block.detectors, block.samples)
-            tally.count(self.label, MASKED, int(masked.sum()), masked.size)
-        if masked is None and isinstance(plan, HighpassPlan):
+        if inside is None and isinstance(plan, HighpassPlan):
             block.means.pop("signal", None)
-            spoilt = plan.apply(block.detdata["signal"], bad)
-        else:
-            first, act = block.detectors.start, plan.apply if isinstance(plan, BesselPlan) else partial(_brick_wall, plan)
-            spoilt = in_double(
-                block, lambda rows, at: act(rows, bad, None if masked is None else masked[at.start - first : at.stop - first])
-            )
-        tally.count(self.label, SPOILT, spoilt)
+            block.observation.tally.count(self.label, SPOILT, plan.apply(block.detdata["signal"], bad))
+            return
+        act = plan.apply if isinstance(plan, BesselPlan) else partial(_brick_wall, plan)
+        in_double(self.label, block, lambda rows, masked: act(rows, bad, masked), inside)
 
 
 def _brick_wall(plan: HighpassPlan, rows: Floats, bad: NDArray[np.intp], masked: NDArray[np.bool_] | None) -> int:

@@ -42,7 +42,8 @@ class HighpassPlanning(Planning[HighpassFilter]):
         passed."""
         frequency, rate = self.operator.frequency, observation.sample_rate
         if self.operator.response == "bessel" and frequency < rate / 2:
-            lowest = next((f for f in np.geomspace(1e-3, 1, 200) * frequency if amplitude(f, frequency, rate) >= 0.01), frequency)
+            tried = np.geomspace(1e-3, 1, 200) * frequency
+            lowest = float(tried[np.argmax(amplitude(tried, frequency, rate) >= 0.01)])  # the last, 0.7, is
             return Traits(response=lambda f: float(f >= lowest))
         cut = frequency if observation.duration * frequency >= 1 else 0.0
         return Traits(response=lambda f: float(f >= cut))

@@ -27,8 +27,7 @@ from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
 from .baseline import Basis, Fit, in_double, polynomials
-from .detrend import SPOILT
-from .source_mask import MASKED, Inside, SourceMask, check_mask
+from .source_mask import Inside, SourceMask, check_mask
 
 Part = Literal[
     "whole", "scanning", "throw", "throw_leftright", "throw_rightleft", "scan_leftright", "scan_rightleft"
@@ -86,14 +85,7 @@ class PolynomialFilter(Operator):
     def exec(self, block: Block, state: tuple[Pieces, Inside | None]) -> None:
         """Subtract the fits from each row."""
         pieces, inside = state
-        masked = inside.at(block.detectors, block.samples) if inside else None
-        if masked is not None:
-            block.observation.tally.count(self.label, MASKED, int(masked.sum()), masked.size)
-        first = block.detectors.start
-        spoilt = in_double(
-            block, lambda rows, at: pieces.remove(rows, None if masked is None else masked[at.start - first : at.stop - first])
-        )
-        block.observation.tally.count(self.label, SPOILT, spoilt)
+        in_double(self.label, block, pieces.remove, inside)
 
 
 @dataclass(frozen=True)

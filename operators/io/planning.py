@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from zonda.core.data import Observation
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
@@ -15,14 +14,12 @@ class SaveMapPlanning(Planning[SaveMap]):
     """A cost for every map."""
 
     of = SaveMap
+    holds = 20_000_000
+    """A map and its copy in the file's units."""
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         return Estimate((), Cost(once=0.02 * (1 + len(context.work.signals)), kernel="python"))
-
-    def memory(self, observation: Observation) -> int:
-        """A map and its copy in the file's units."""
-        return 20_000_000
 
 
 class SaveTODPlanning(Planning[SaveTOD]):
