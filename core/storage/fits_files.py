@@ -39,13 +39,15 @@ def opened(path: str | os.PathLike[str], place: str, cure: str, kind: str = "FIT
                 yield hdus
 
 
-def check_size(path: str | os.PathLike[str], hdu: Any, place: str) -> None:
-    """Before data are read: OSError where the file ends before them, `InputError` where they need more memory than is free."""
+def check_size(path: str | os.PathLike[str], hdu: Any, place: str, *, whole: bool = True) -> None:
+    """Before data are read: OSError where the file ends before them, `InputError` where, read ``whole``, they need more memory
+    than is free."""
     size = _data_bytes(hdu.header)
     tiled = hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU"
     if tiled and size > packed.UNPACKED_MAX:
         raise packed.too_large(size, packed.UNPACKED_MAX, place, least=False)
-    check_memory(size, "the array or table", place)
+    if whole:
+        check_memory(size, "the array or table", place)
     info = hdu.fileinfo()
     if info is None or tiled or Path(path).suffix.lower() in COMPRESSED:
         return

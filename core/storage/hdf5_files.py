@@ -27,13 +27,22 @@ def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> It
 
     External links, data kept in other files and virtual data sets are refused: a file must not make zonda open others.
     """
+    with reading(place, kind, cure), checked(path, place, cure) as file:
+        yield file
+
+
+def checked(path: str | os.PathLike[str], place: str, cure: str) -> Any:
+    """As `opened`, for as long as the caller keeps the `h5py.File` open; errors are those of h5py, but for files that harm."""
     import h5py
 
-    with reading(place, kind, cure):
-        survey(path, place, cure)
-    with reading(place, kind, cure), h5py.File(path, "r") as file:
+    survey(path, place, cure)
+    file = h5py.File(path, "r")
+    try:
         _refuse_other_files(file, place)
-        yield file
+    except BaseException:
+        file.close()
+        raise
+    return file
 
 
 def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
@@ -56,8 +65,9 @@ def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
         )
 
 
-def check_size(dataset: Any, place: str) -> None:
-    """Refuse a data set that claims more than its file can hold, or than memory is free, before it is read (`InputError`)."""
+def check_size(dataset: Any, place: str, *, whole: bool = True) -> None:
+    """Refuse a data set that claims more than its file can hold before it is read, or, read ``whole``, than memory is free
+    (`InputError`)."""
     size = int(dataset.size or 0) * int(dataset.dtype.itemsize)
     if size > COMPRESSION_MAX * os.path.getsize(dataset.file.filename):
         raise InputError(
@@ -66,7 +76,8 @@ def check_size(dataset: Any, place: str) -> None:
             cure="the file is corrupt or was never filled: copy or make it again",
         )
     _check_chunks(dataset, place)
-    check_memory(size, str(dataset.name), place)
+    if whole:
+        check_memory(size, str(dataset.name), place)
 
 
 def _check_chunks(dataset: Any, place: str) -> None:

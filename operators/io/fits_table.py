@@ -6,16 +6,19 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from zonda.core.errors import InputError
 from zonda.core.flags import of_before
 from zonda.core.intervals import Intervals
 from zonda.core.maps.map_file import ascii_text
 from zonda.core.storage.files import writing
-from zonda.core.storage.fits_files import check_size, opened
+from zonda.core.storage.fits_files import COMPRESSED, check_size, opened
 from zonda.core.stream_names import UNITS
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
@@ -24,6 +27,9 @@ from .time_ordered_data import TimeOrderedData
 from .toast_hdf5 import azimuth_elevation
 
 SUFFIX = ".fits"
+
+TABLES = ("TOD", "SAMPLES", "DETECTORS", "PROVENANCE")
+CURE = "give a file that SaveTOD wrote, whole"
 
 _DETECTOR_UNITS = {
     "fwhm": "rad",
@@ -201,6 +207,60 @@ def _bytes_of(table: Any) -> bytes:
     return stream.getvalue()[2880:]  # without the primary header, which the file has already
 
 
+class Reader:
+    """An open file, as `toast_reading.Reader`; streams are read from their bytes.
+
+    Raises
+    ------
+    InputError
+        No such file, not FITS, one of the tables is missing, or the file is compressed.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.place = f"time-ordered data {path}"
+        with opened(path, self.place, CURE) as file:
+            for hdu in file:
+                check_size(path, hdu, self.place, whole=hdu.name != "TOD")
+            missing = [name for name in TABLES if name not in file]
+            if missing:
+                raise InputError(f"has no table {missing[0]}", place=self.place, cure=CURE)
+            self.tod = _read(file)
+            columns, row, begin = file["TOD"].columns, int(file["TOD"].header["NAXIS1"]), file["TOD"].fileinfo()["datLoc"]
+            shape = self.tod.n_detectors, self.tod.n_samples
+            if int(file["TOD"].header["NAXIS2"]) != shape[0]:
+                raise InputError("TOD and DETECTORS have other numbers of rows", place=self.place, cure=CURE)
+        self.streams, self._at = {}, {}
+        for column in columns:
+            kind = {"D": ">f8", "E": ">f4"}.get(column.format[-1:])
+            if kind and (column.format[:-1] or "1") == str(shape[1]):
+                self.streams[column.name.lower()] = column.unit or ""
+                self._at[column.name.lower()] = begin + columns.dtype.fields[column.name][1], np.dtype(kind)
+        self._row, self._lock = row, threading.Lock()
+        if Path(path).suffix.lower() in COMPRESSED:
+            raise InputError("is compressed: its streams cannot be read in parts", place=self.place, cure="unpack it first")
+        self.tod.check(self.place)
+        self._file = open(path, "rb", buffering=0)  # noqa: SIM115
+
+    def read(self, stream: str, detectors: NDArray[np.intp], samples: slice) -> AnyFloats:
+        """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and type."""
+        begin, kind = self._at[stream]
+        found = np.empty((len(detectors), samples.stop - samples.start), kind)
+        for row, detector in zip(found, detectors.tolist(), strict=True):
+            with self._lock:
+                self._file.seek(begin + detector * self._row + samples.start * kind.itemsize)
+                size = self._file.readinto(row.data.cast("B"))
+            if size != row.nbytes:
+                raise InputError("is truncated", place=self.place, cure=CURE)
+        return found.astype(kind.newbyteorder("="))
+
+    def flags(self, detectors: NDArray[np.intp], samples: slice) -> None:
+        """The file has no flags of single samples of detectors."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
 def read(path: str | os.PathLike[str]) -> TimeOrderedData:
     """Read what `Writer` writes.
 
@@ -210,26 +270,31 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
         No such file, not FITS, or one of the tables is missing.
     """
     place = f"time-ordered data {path}"
-    with opened(path, place, "give a file that SaveTOD wrote, whole") as file:
+    with opened(path, place, CURE) as file:
         for hdu in file:
             check_size(path, hdu, place)
         tod = _read(file)
+        table = file["TOD"]
+        shape = tod.n_detectors, tod.n_samples
+        names = (c for c in table.columns.names if c != "DETECTOR")
+        tod.streams = {c.lower(): _native(table.data[c]).reshape(shape) for c in names}
     tod.check(place)
     return tod
 
 
+def _native(values: Any) -> Any:
+    """The same numbers in the machine's order of bytes."""
+    array = np.asarray(values)
+    return array.astype(array.dtype.newbyteorder("="))
+
+
 def _read(file: Any) -> TimeOrderedData:
-    header, tod = file[0].header, file["TOD"]
+    """All but the streams."""
+    header = file[0].header
     samples, detectors, provenance = (file[name].data for name in ("SAMPLES", "DETECTORS", "PROVENANCE"))
     fixed = {"NAME", "QUAT", "XI", "ETA", "FLAGS"}
-
-    def native(values: Any) -> Any:
-        array = np.asarray(values)
-        return array.astype(array.dtype.newbyteorder("="))
-
-    shape = len(detectors), len(samples)
     about = file["SAMPLES"].header
-    flags, detector_flags = native(samples["FLAGS"]), native(detectors["FLAGS"])
+    flags, detector_flags = _native(samples["FLAGS"]), _native(detectors["FLAGS"])
     if "FLAGBITS" not in about:
         flags, detector_flags = of_before(flags, samples=True), of_before(detector_flags, samples=False)
     intervals: Intervals = {}
@@ -239,21 +304,21 @@ def _read(file: Any) -> TimeOrderedData:
     return TimeOrderedData(
         name=header["OBJECT"],
         start=header["DATE-OBS"],
-        seconds=native(samples["SECONDS"]),
-        times=native(samples["TIME"]),
+        seconds=_native(samples["SECONDS"]),
+        times=_native(samples["TIME"]),
         sample_rate=header["SAMPRATE"],
         telescope=header["TELESCOP"],
         field_of_view=float(np.radians(header["FOV"])),
         site=(header["SITE"], float(np.radians(header["SITELAT"])), float(np.radians(header["SITELON"])), header["SITEALT"]),
-        boresight_azel=native(samples["BORESIGHT_AZEL"]),
-        boresight_radec=native(samples["BORESIGHT_RADEC"]),
+        boresight_azel=_native(samples["BORESIGHT_AZEL"]),
+        boresight_radec=_native(samples["BORESIGHT_RADEC"]),
         flags=flags,
         detector_flags=detector_flags,
         names=[str(d) for d in detectors["NAME"]],
-        quats=native(detectors["QUAT"]),
-        columns={c.lower(): native(detectors[c]) for c in detectors.names if c not in fixed},
-        streams={c.lower(): native(tod.data[c]).reshape(shape) for c in tod.columns.names if c != "DETECTOR"},
+        quats=_native(detectors["QUAT"]),
+        columns={c.lower(): _native(detectors[c]) for c in detectors.names if c not in fixed},
         intervals=intervals,
         weather=weather,
         metadata={str(key): json.loads(value) for key, value in zip(provenance["KEY"], provenance["VALUE"], strict=True)},
+        offsets=np.stack([_native(detectors["XI"]), _native(detectors["ETA"])], axis=1),
     )

@@ -22,7 +22,7 @@ from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
 from zonda.core.stream_names import UNITS, StreamName, StreamsAsked, StreamsNeeded
 
-from . import fits_table, toast_hdf5
+from . import fits_table, toast_hdf5, toast_reading
 from .time_ordered_data import TimeOrderedData
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def load_tod(path: str | os.PathLike[str]) -> TimeOrderedData:
     InputError
         When it cannot be read as such.
     """
-    return _module(path).read(path)  # type: ignore[no-any-return]
+    return fits_table.read(path) if is_fits(path) else toast_reading.read(path)
 
 
 def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
@@ -179,9 +179,10 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
     OutputError
         When it cannot be written.
     """
+    module: Any = fits_table if is_fits(path) else toast_hdf5
     types = {s.dtype.name for s in tod.streams.values()}
     with atomic_path(path) as temporary:
-        writer = _module(path).Writer(temporary, tod, list(tod.streams), "float64" if types != {"float32"} else "float32")
+        writer = module.Writer(temporary, tod, list(tod.streams), "float64" if types != {"float32"} else "float32")
         try:
             for name, values in tod.streams.items():
                 writer.write(name, slice(0, tod.n_detectors), slice(0, tod.n_samples), values)
@@ -191,5 +192,12 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
     return Path(path)
 
 
-def _module(path: str | os.PathLike[str]) -> Any:
-    return fits_table if Path(path).suffix.lower() in (".fits", ".fit") else toast_hdf5
+def reader(path: str | os.PathLike[str]) -> fits_table.Reader | toast_reading.Reader:
+    """An open file, whose streams are read in rectangles. Raises InputError when it cannot be read as such."""
+    return fits_table.Reader(path) if is_fits(path) else toast_reading.Reader(path)
+
+
+def is_fits(path: str | os.PathLike[str]) -> bool:
+    """Whether the path names a FITS file."""
+    name = Path(path).name.lower()
+    return name.endswith((".fits", ".fit", ".fits.gz", ".fit.gz"))

@@ -37,7 +37,7 @@ class TimeOrderedData:
     site
         name, latitude [rad], longitude [rad], altitude [m].
     boresight_azel, boresight_radec
-        (n_samp, 4) quaternions (x, y, z, w), see `Observation`.
+        (n_samp, 4) quaternions (x, y, z, w), see `Observation`; (0, 4): the file does not have them.
     flags, detector_flags
         (n_samp,) and (n_det,) uint8, TOAST's bits (`core.flags`): samples with a bit of 15 and detectors with one of 7 are not
         to be used.
@@ -54,6 +54,8 @@ class TimeOrderedData:
         At the telescope; None: not known.
     metadata
         Text and numbers that say where the data come from.
+    offsets
+        (n_det, 2) `xi` and `eta` to the last bit, where the file has them; None: they follow from ``quats``.
     """
 
     name: str
@@ -75,6 +77,7 @@ class TimeOrderedData:
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
     metadata: dict[str, str | int | float] = field(default_factory=dict)
+    offsets: NDArray[np.float64] | None = None
 
     @property
     def n_samples(self) -> int:
@@ -87,8 +90,10 @@ class TimeOrderedData:
     def check(self, place: str) -> None:
         """Raise an `InputError` about ``place`` where shapes do not fit each other, or times and pointing are not finite."""
         n, d = np.shape(self.times)[:1], np.shape(self.names)
-        shapes = {"seconds": n, "times": n, "flags": n, "boresight_azel": (*n, 4), "boresight_radec": (*n, 4)}
-        shapes |= {"quats": (*d, 4), "detector_flags": d}
+        shapes = {"seconds": n, "times": n, "flags": n, "quats": (*d, 4), "detector_flags": d}
+        pointed = [name for name in ("boresight_azel", "boresight_radec") if len(getattr(self, name))]
+        shapes |= dict.fromkeys(pointed or ("boresight_azel",), (*n, 4))
+        shapes |= {} if self.offsets is None else {"offsets": (*d, 2)}
         wrong = [name for name, shape in shapes.items() if np.shape(getattr(self, name)) != shape]
         wrong += [name for name, column in self.columns.items() if np.shape(column) != d]
         wrong += [name for name, stream in self.streams.items() if stream.shape[:2] != (*d, *n) or stream.dtype.kind not in "fiu"]
@@ -108,12 +113,12 @@ class TimeOrderedData:
 
         sotodlib's xi is a sine (`xieta_sotodlib`): the same to 3e-7 rad at 0.5 deg, 35 arcsec less at 4 deg, 46 arcmin at 17 deg.
         """
-        return np.asarray(-self._directions[1] / self._directions[2])
+        return np.asarray(-self._directions[1] / self._directions[2]) if self.offsets is None else self.offsets[:, 0]
 
     @property
     def eta(self) -> NDArray[np.float64]:
         """(n_det,) offset towards increasing elevation, as `xi`."""
-        return np.asarray(-self._directions[0] / self._directions[2])
+        return np.asarray(-self._directions[0] / self._directions[2]) if self.offsets is None else self.offsets[:, 1]
 
     def xieta_sotodlib(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """xi, eta, gamma (n_det,) [rad] as sotodlib and so3g define them: sines, of the same signs as ours; gamma is the angle of
@@ -166,7 +171,15 @@ class TimeOrderedData:
             },
             intervals=o.intervals,
             weather=o.weather,
-            metadata={"seed": o.seed, "observation_index": o.index, **(metadata or {})},
+            metadata={
+                "seed": o.seed,
+                "observation_index": o.index,
+                "centre_ra": o.centre[0],
+                "centre_dec": o.centre[1],
+                "telescope_diameter": instrument.telescope.diameter,
+                **(metadata or {}),
+            },
+            offsets=np.stack([f.xi, f.eta], axis=1),
         )
 
 

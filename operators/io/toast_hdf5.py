@@ -1,4 +1,4 @@
-"""TOAST 3's HDF5 observation file, layout version 2, written and read with h5py alone.
+"""TOAST 3's HDF5 observation file, layout version 2, written with h5py alone (`toast_reading` reads it).
 
 What TOAST requires of a file is in its `toast.io.observation_hdf_utils`; sotodlib's ``load_toast_h5_file`` reads the same
 file. TOAST wants float64 signals, and an uncompressed ``detdata/signal``.
@@ -9,18 +9,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from zonda.core.configuration.time import Instant
-from zonda.core.errors import InputError
-from zonda.core.flags import Flags, of_before
-from zonda.core.intervals import Intervals
 from zonda.core.storage.files import writing
-from zonda.core.storage.hdf5_files import Disk, check_size, opened
+from zonda.core.storage.hdf5_files import Disk
 from zonda.core.stream_names import UNITS
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
@@ -32,7 +27,7 @@ SUFFIX = ".h5"
 FLAGS_ARE = "zonda_flags"
 """Attribute of ``metadata/other`` in files whose flags have TOAST's bits; an earlier zonda wrote none."""
 
-_COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
+COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
     "fwhm": ("fwhm", "arcmin", "rad"),
     "polarization_angle": ("gamma", "rad", "rad"),
     "band_centre": ("bandcenter", "GHz", "Hz"),
@@ -44,6 +39,9 @@ _COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
     "main_beam_efficiency": ("main_beam_efficiency", "", ""),
     "illumination_efficiency": ("illumination_efficiency", "", ""),
 }
+
+OFFSETS = ("tangent_xi", "tangent_eta")
+"""Columns of the focal plane: `Focalplane.xi` and `Focalplane.eta`, which quaternions hold to rounding."""
 
 
 def name_uid(name: str) -> int:
@@ -157,11 +155,13 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
     table["name"] = np.array(tod.names).astype("S")
     table["quat"] = tod.quats
     for ours, values in tod.columns.items():
-        theirs, unit, si = _COLUMNS[ours]
+        theirs, unit, si = COLUMNS[ours]
         table[theirs] = u.Quantity(values, si).to(unit) if unit else values
     if "polarization_angle" in tod.columns:
         table["psi_pol"] = table["gamma"]
         table["pol_leakage"] = np.zeros(tod.n_detectors)
+    for name, values in zip(OFFSETS, (tod.xi, tod.eta), strict=True):
+        table[name] = values
     table["pixel"] = table["name"]
     table["uid"] = np.array([name_uid(d) for d in tod.names], np.uint32)
     table.meta["sample_rate"] = tod.sample_rate * u.Hz
@@ -169,7 +169,7 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
     write_table_hdf5(table, group, path="focalplane", serialize_meta=True)
 
 
-_WEATHER = {  # ours: (TOAST's name, unit)
+WEATHER = {  # ours: (TOAST's name, unit)
     "pwv": ("pwv", "m"),
     "humidity": ("humidity", ""),
     "pressure": ("surface_pressure", "Pa"),
@@ -186,22 +186,9 @@ def _write_weather(group: Any, weather: GroundWeather) -> None:
     group.attrs["weather_time"] = weather.time
     for name in ("ice_water", "liquid_water"):
         group.attrs[f"weather_{name}"] = "0.0 mm"
-    for ours, (theirs, unit) in _WEATHER.items():
+    for ours, (theirs, unit) in WEATHER.items():
         value, text = (weather.pwv * 1e3, "mm") if ours == "pwv" else (getattr(weather, ours), unit)
         group.attrs[f"weather_{theirs}"] = f"{value!r} {text}".rstrip()
-
-
-def _read_weather(attributes: Any) -> GroundWeather | None:
-    """None where there is none, or one that states no numbers (TOAST's simulated weather names its distribution alone)."""
-    import astropy.units as u
-
-    if not {"weather_time", *(f"weather_{theirs}" for theirs, _ in _WEATHER.values())} <= set(attributes):
-        return None
-    stated = {
-        ours: float(u.Quantity(str(attributes[f"weather_{theirs}"])).to_value(unit or u.dimensionless_unscaled))
-        for ours, (theirs, unit) in _WEATHER.items()
-    }
-    return GroundWeather(time=float(attributes["weather_time"]), **stated)
 
 
 def _write_metadata(file: Any, tod: TimeOrderedData) -> None:
@@ -263,103 +250,3 @@ def azimuth_elevation(boresight_azel: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
     azimuth = -np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
     elevation = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
     return azimuth % (2 * np.pi), elevation
-
-
-def _read_flags(file: Any, names: list[str]) -> tuple[Flags, Flags]:
-    """Flags of samples and of detectors, in TOAST's bits."""
-    shared, other = file["shared"], file["metadata/other"].attrs
-    found = json.loads(file.attrs["observation_detector_flags"])
-    flags = shared["flags"][:] if "flags" in shared else np.zeros(len(shared["times"]), np.uint8)
-    detector_flags = np.array([found[d] for d in names], np.uint8)
-    if "zonda_start_utc" in other and FLAGS_ARE not in other:
-        return of_before(flags, samples=True), of_before(detector_flags, samples=False)
-    return flags, detector_flags
-
-
-def _read_intervals(file: Any, times: AnyFloats, seconds: AnyFloats) -> Intervals:
-    found: Intervals = {}
-    for name, spans in file["intervals"].items() if "intervals" in file else ():
-        start, stop = np.interp(np.asarray(spans[:], np.float64), times, seconds)
-        found[name] = list(zip(start.tolist(), stop.tolist(), strict=True))
-    return found
-
-
-def read(path: str | os.PathLike[str]) -> TimeOrderedData:
-    """Read what `Writer` writes, and the same items of any TOAST layout-2 file.
-
-    Raises
-    ------
-    InputError
-        No such file, not HDF5, another layout, or an item that TOAST requires is missing.
-    """
-    place, cure = f"time-ordered data {path}", "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it"
-    with opened(path, place, "HDF5 in TOAST's layout", cure) as file:
-        version = file.attrs.get("toast_format_version")
-        if version != 2:
-            raise InputError(
-                f"toast_format_version is {version}, not 2", place=place, cure="save it again with TOAST 3.0 or later"
-            )
-        tod = _read(file, place)
-    tod.check(place)
-    return tod
-
-
-def _read(file: Any, place: str) -> TimeOrderedData:
-    import astropy.units as u
-    from astropy.io.misc.hdf5 import read_table_hdf5
-    from astropy.table import QTable
-
-    instrument, shared, detdata = file["instrument"], file["shared"], file["detdata"]
-    intervals = file["intervals"].values() if "intervals" in file else ()
-    for dataset in (
-        *shared.values(),
-        *intervals,
-        *(detdata[name] for name in detdata if name != "flags"),
-        instrument["focalplane"],
-    ):
-        check_size(dataset, place)
-    table = QTable(read_table_hdf5(instrument, path="focalplane", character_as_bytes=False))
-    order = {name: k for k, name in enumerate(np.asarray(table["name"]).astype(str))}
-    names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]
-    rows = np.array([order[d] for d in names], int)
-    columns = {}
-    for ours, (theirs, unit, si) in _COLUMNS.items():
-        if theirs in table.colnames:
-            values = table[theirs][rows]
-            columns[ours] = np.array(u.Quantity(values, unit).to_value(si) if unit else values, np.float64)
-    other = file["metadata/other"].attrs
-    times = shared["times"][:]
-    seconds = shared["seconds"][:] if "seconds" in shared else times - times[0]
-    start = other.get("zonda_start_utc")
-    if start is None:
-        start = Instant(round(float(times[0]) * 1e9)).isoformat()
-    kept = (k for k in other if k.startswith("zonda_") and k not in ("zonda_start_utc", FLAGS_ARE))
-    own = {k.removeprefix("zonda_"): other[k] for k in kept}
-    flags, detector_flags = _read_flags(file, names)
-    a = instrument.attrs
-    return TimeOrderedData(
-        name=str(file.attrs["observation_name"]),
-        start=str(start),
-        seconds=seconds,
-        times=times,
-        sample_rate=float(table.meta["sample_rate"].to_value(u.Hz)),
-        telescope=str(a["telescope_name"]),
-        field_of_view=float(table.meta["field_of_view"].to_value(u.rad)),
-        site=(
-            str(a["site_name"]),
-            float(np.radians(a["site_lat_deg"])),
-            float(np.radians(a["site_lon_deg"])),
-            float(a["site_alt_m"]),
-        ),
-        boresight_azel=shared["boresight_azel"][:],
-        boresight_radec=shared["boresight_radec"][:],
-        flags=flags,
-        detector_flags=detector_flags,
-        names=names,
-        quats=np.asarray(table["quat"][rows], np.float64),
-        columns=columns,
-        streams={name: detdata[name][:] for name in detdata if name != "flags"},
-        intervals=_read_intervals(file, times, seconds),
-        weather=_read_weather(a),
-        metadata={k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()},
-    )

@@ -30,7 +30,7 @@ from zonda.core.flags import (
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.weather import GroundWeather
-from zonda.operators.io import fits_table, toast_hdf5
+from zonda.operators.io import fits_table, toast_reading
 from zonda.operators.io.save_tod import SaveTOD, load_tod, save_tod
 from zonda.operators.io.time_ordered_data import detector_quaternions
 
@@ -406,7 +406,7 @@ def test_a_stream_that_is_not_there(make_observation, streams, mean):
     operator.discard(observation, state)
 
 
-@pytest.mark.parametrize("module", [toast_hdf5, fits_table])
+@pytest.mark.parametrize("module", [toast_reading, fits_table])
 def test_files_that_cannot_be_read(module, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         module.read(tmp_path / "absent")
