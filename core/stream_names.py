@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from .signal import BUILT_IN, MAIN
+from .configuration.diagnostics import nearest
+from .errors import PipelineError
+from .signal import BUILT_IN, MAIN, is_signal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from .observation import Observation
 
 StreamName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """What a parameter ``streams`` may list: ``signal``, a component (``sky``, or one of a plugin), or what else a step makes
 (``pwv``)."""
+
+AnyStream = Annotated[str, Field(pattern=rf"^([A-Za-z_][A-Za-z0-9_]*|{MAIN}/[A-Za-z][A-Za-z0-9_]*)$")]
+"""The same, or the stream of a signal of `runs` (``signal/noiseless``)."""
 
 COMPONENTS = frozenset(map(str, BUILT_IN))
 """Signal components of zonda's own operators."""
@@ -37,4 +47,15 @@ class StreamsNeeded:
     """
 
     def __get__(self, operator: Any, owner: type) -> frozenset[str]:
-        return frozenset({MAIN, *(getattr(operator, "streams", None) or ())}) - COMPONENTS
+        asked = (MAIN if is_signal(name) else name for name in getattr(operator, "streams", None) or ())
+        return frozenset({MAIN, *asked}) - COMPONENTS
+
+
+def check_signals(streams: Iterable[str], observation: Observation, place: str) -> None:
+    """Refuse the stream of a signal that is not formed: that `runs` does not have, or that is a remainder (PipelineError)."""
+    for name in streams:
+        if is_signal(name) and name not in observation.signals:
+            have = [one for one in observation.signals if not one.partition("/")[2].startswith("_")]
+            listed = f"streams of signals: {', '.join(have)}; of a remainder there are maps alone"
+            cure = "\n".join(filter(None, (nearest(name, have[1:]), listed)))
+            raise PipelineError(f"there is no stream {name!r}", place=place, cure=cure)

@@ -97,7 +97,7 @@ def job(
         keep_tasks=first.keep_tasks,
         pipelines=tuple(draft.pipelines),
         plans=tuple(draft.plans),
-        source=tuple(source.file.resolved_yaml() for source in sources),
+        source=tuple(source.file.resolved_yaml(folder) for source in sources),
         files=draft.inputs,
         combinations=tuple(draft.combinations),
         tasks=tuple(draft.tasks),
@@ -151,7 +151,7 @@ class _Draft:
             first_look(file.pipeline(), scene_of(file, entry.seed, entry.time))
             made = plan(file, keep=self._pruning.keep, drop=self._pruning.drop, prune_all=self._pruning.prune_all)
         self._files.append(made.apply(file))
-        self.pipelines.append(self._files[-1].resolved_yaml())
+        self.pipelines.append(self._files[-1].resolved_yaml(self._folder))
         self.plans.append(tuple(tuple(map(str, row)) for row in made.summary.short))
         self.inputs |= _inputs(self._files[-1], self._folder)
         return len(self.pipelines) - 1
@@ -212,9 +212,9 @@ def scene_of(file: PipelineFile, seed: int, time: Instant) -> Scene:
     return file.scene().model_copy(update={"seed": seed, "time": time})
 
 
-def changed(job: Job) -> list[str]:
-    """Files that have changed since the campaign was planned."""
-    return [path for path, stamp in job.files.items() if _stamp(Path(path), stamp.partition(":")[0]) != stamp]
+def changed(job: Job, folder: Path) -> list[str]:
+    """Files that have changed since the campaign in ``folder`` was planned."""
+    return [path for path, stamp in job.files.items() if _stamp(folder / path, stamp.partition(":")[0]) != stamp]
 
 
 def common_layouts(
@@ -249,7 +249,7 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
 
     first = {task.entry: task for task in reversed(job.tasks_of(number))}
     looks = [Look(t.pipeline, t.seed, Instant(t.time), t.about) for t in sorted(first.values(), key=lambda t: t.number)]
-    files = [parse(text, name="campaign") for text in job.pipelines]
+    files = [parse(text, name="campaign", folder=folder) for text in job.pipelines]
     path = layout_path(folder, number)
     if parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]}) != job.combinations[number].layout:
         raise InputError(
@@ -295,9 +295,11 @@ def _placed(place: str) -> Iterator[None]:
 
 def _inputs(file: PipelineFile, folder: Path) -> dict[str, str]:
     """The file and the inputs that it names, each with its stamp; of those in the campaign's own ``folder`` a hash."""
-    own, arrays = [Path(file.place).resolve()] if Path(file.place).is_file() else [], folder.resolve() / INPUTS
+    own, root = [Path(file.place).resolve()] if Path(file.place).is_file() else [], folder.resolve()
+    arrays = root / INPUTS
     inputs = [path for path in paths_in([file.scene(), *file.operators]) if path.is_file()]
-    stamps = {str(p): _stamp(p, "bytes" if p.is_relative_to(arrays) else "file") for p in inputs}
+    stamps = {str(p): _stamp(p, "file") for p in inputs if not p.is_relative_to(arrays)}
+    stamps |= {str(p.relative_to(root)): _stamp(p, "bytes") for p in inputs if p.is_relative_to(arrays)}
     return {str(p): _stamp(p, "text") for p in own} | stamps
 
 

@@ -109,7 +109,7 @@ def campaign(
             return Products(folder, (), ())
         check_output_folder(folder)
         with lock(folder), _inputs(folder) as inputs:
-            source = _source(pipeline, scene, keys, settings, inputs)
+            source = _source(pipeline, scene, keys, settings, (inputs, folder))
             call = f"{PLACE}({pipeline.name}, {', '.join(f'{key}={value!r}' for key, value in axes.items())})"
             result = run.begin([source], folder, call, pool, _say, Pruning(prune_all=prune))
     sets = tuple((dict(c.axes), folder / c.folder) for c in Job.read(folder).combinations)
@@ -155,9 +155,12 @@ def _inputs(folder: Path) -> Iterator[Path]:
         raise
 
 
-def _source(pipeline: Pipeline, scene: Scene, keys: list[str], settings: Campaign, inputs: Path) -> CampaignFile:
-    """The pipeline file that says the same. Raises `PipelineError` for what no file can say."""
-    steps = [_in_files(step, inputs) for step in pipeline.operators]
+def _source(pipeline: Pipeline, scene: Scene, keys: list[str], settings: Campaign, folders: tuple[Path, Path]) -> CampaignFile:
+    """The pipeline file that says the same. ``folders``: of arrays, and of products.
+
+    Raises `PipelineError` for what no file can say.
+    """
+    steps = [_in_files(step, folders[0]) for step in pipeline.operators]
     header = CampaignHeader(
         name=pipeline.name,
         description=pipeline.description,
@@ -165,7 +168,7 @@ def _source(pipeline: Pipeline, scene: Scene, keys: list[str], settings: Campaig
         only=list(pipeline.only),
         precision=pipeline.precision,
         campaign=settings,
-        outputs=inputs.parent,
+        outputs=folders[1],
     )
     named = {"site": _named(scene.site, sites), "instrument": _named(scene.instrument, instruments)}
     text = PipelineFile(header, named, tuple(map(Step, keys, steps)), PLACE, scene).resolved_yaml()

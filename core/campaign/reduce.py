@@ -52,7 +52,7 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
     """As `combine`; the finished data. Raises `InputError` where a partial product is missing or damaged."""
     combination, tasks = job.combinations[number], job.tasks_of(number)
     first = tasks[0]
-    file = pipeline_of(job.pipelines[first.pipeline])
+    file = pipeline_of(job.pipelines[first.pipeline], folder)
     pipeline, scene = file.pipeline(), scene_of(file, first.seed, Instant(first.time))
     data = Data(scene, output=check_output_folder(folder / combination.folder))
     data.provenance = {

@@ -112,7 +112,7 @@ def share(
         write_sources(made, folder)
         publish(made, folder)
     job = Job.read(folder)
-    if job.source != tuple(s.file.resolved_yaml() for s in sources) or job.version != __version__:
+    if job.source != tuple(s.file.resolved_yaml(folder) for s in sources) or job.version != __version__:
         raise OutputError("holds another campaign", place=str(folder), cure="choose another output folder")
     share_out(pool, job.need, job.name)
     mine = [task for task in job.tasks if task.number % which[1] == which[0] - 1]
@@ -136,7 +136,7 @@ def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
     for path, text in zip(sources_of(job, folder), job.source, strict=True):
         if not path.is_file() or digest_of_text(path.read_text(encoding="utf-8", errors="replace")) != digest_of_text(text):
             reasons.append(f"{path} has changed")
-    reasons += [f"{path} has changed or is gone" for path in changed(job)]
+    reasons += [f"{path} has changed or is gone" for path in changed(job, folder)]
     if reasons and not anyway:
         raise InputError(
             "; ".join(reasons),

@@ -107,7 +107,7 @@ def _run(order: Order) -> str:
     from ..pipeline import Part
     from .prepare import scene_of
 
-    task, folder, file = order.task, order.folder, pipeline_of(order.pipeline)
+    task, folder, file = order.task, order.folder, pipeline_of(order.pipeline, order.folder)
     part = Part(task.scans, layouts_in(layout_path(folder, task.combination), order.layout), f"{task.entry:06d}-")
     data = file.pipeline().run_part(
         scene_of(file, task.seed, Instant(task.time)),
@@ -121,11 +121,11 @@ def _run(order: Order) -> str:
 
 
 @lru_cache(4)
-def pipeline_of(text: str) -> PipelineFile:
-    """A pipeline, kept by the worker with what its operators remember (maps that were read and convolved)."""
+def pipeline_of(text: str, folder: Path) -> PipelineFile:
+    """A pipeline of the campaign in ``folder``, kept by the worker with what its operators remember (maps read and convolved)."""
     from ..configuration.pipeline_file import parse
 
-    return parse(text, name="campaign")
+    return parse(text, name="campaign", folder=folder)
 
 
 @lru_cache(4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,10 @@ class PipelineFile:
             precision=header.precision,
         )
 
-    def resolved_yaml(self) -> str:
+    def resolved_yaml(self, folder: Path | None = None) -> str:
         """The file with every default filled in, which loads again to the same thing.
 
+        Paths of files in ``folder`` are written from there on: it may move.
         Site and instrument stay names where they were names, and a variant stays one; what they stand for is written under
         ``x-resolved``.
         """
@@ -108,10 +110,21 @@ class PipelineFile:
         tree["operators"] = [{step.key: _filled(step.operator)} for step in self.steps]
         if named:
             tree["x-resolved"] = named
+        if folder is not None:
+            tree["operators"] = _from_there(tree["operators"], f"{folder.resolve()}{os.sep}")
         return f"# zonda {__version__}: every default filled in\n{yaml_places.dump(tree)}"
 
     def __repr__(self) -> str:
         return f"<PipelineFile {self.place}: {' > '.join(step.key for step in self.steps)}>"
+
+
+def _from_there(value: Any, folder: str) -> Any:
+    """A tree in which texts that begin with ``folder`` are without it."""
+    if isinstance(value, dict):
+        return {key: _from_there(inner, folder) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_from_there(inner, folder) for inner in value]
+    return value.removeprefix(folder) if isinstance(value, str) else value
 
 
 def _filled(operator: Operator) -> dict[str, Any]:

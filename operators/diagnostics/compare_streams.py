@@ -17,7 +17,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.storage.ecsv import write_ecsv
 from zonda.core.storage.files import product_path
-from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
+from zonda.core.stream_names import AnyStream, StreamsAsked, StreamsNeeded, check_signals
 
 from .power_spectrum import Welch, calibration, on_sky
 from .series import about, key_of
@@ -54,9 +54,10 @@ class CompareStreams(Operator):
     optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
-    stream: StreamName = "signal"
-    """Which stream: `signal`, a component, or another that a step above makes (`pwv`)."""
-    reference: StreamName = "atmosphere"
+    stream: AnyStream = "signal"
+    """Which stream: `signal`, that of a signal of `runs` (`signal/noiseless`), a component, or another that a step above makes
+    (`pwv`)."""
+    reference: AnyStream = "atmosphere"
     """What it is compared with."""
     detectors: int = Field(16, ge=1)
     """Number of detectors, chosen evenly among those not flagged."""
@@ -75,6 +76,7 @@ class CompareStreams(Operator):
         return self.stream, self.reference
 
     def prepare(self, observation: Observation) -> Pairs:
+        check_signals(self.streams, observation, self.label)
         return begin(self, observation)
 
     def exec(self, block: Block, state: Pairs) -> None:

@@ -26,6 +26,8 @@ from zonda.core.storage.fits_image import Cards
 from .healpix import is_healpix
 
 IN_A_FILE = "an array is given in Python, as in SkyMap(map=array); in a pipeline file write file: my_map.fits"
+GIVEN = "ZARRAY"
+"""FITS key of a file that an array was written to: `ArrayMap.text`."""
 _STRUCTURE = frozenset(
     ["SIMPLE", "XTENSION", "BITPIX", "PCOUNT", "GCOUNT", "EXTEND", "BSCALE", "BZERO", "BLANK", "END", "COMMENT", "HISTORY"]
 )
@@ -47,6 +49,8 @@ class ArrayMap:
         FITS keywords: unit, world coordinates, beam.
     table
         The `astropy.io.fits.BinTableHDU` of a HEALPix map, else None.
+    given
+        Hash of what was given, before world coordinates were added; empty: it is as it was given.
     """
 
     NOUN: ClassVar[str] = "an array"
@@ -54,6 +58,7 @@ class ArrayMap:
     values: NDArray[Any]
     header: Cards
     table: Any = None
+    given: str = ""
 
     @classmethod
     def parse(cls, value: Any) -> ArrayMap:
@@ -125,7 +130,13 @@ class ArrayMap:
 
     def with_wcs(self, header: Cards) -> ArrayMap:
         """The image with these world coordinates."""
-        return ArrayMap(self.values, self.header.copy().add(header), self.table)
+        return ArrayMap(self.values, self.header.copy().add(header), self.table, self.given or self.digest)
+
+    @property
+    def text(self) -> str:
+        """What the log says of it: ``array of 64 x 48, float64, hash 0123456789abcdef``."""
+        kind = "" if self.table is not None else f", {self.values.dtype.name}"
+        return f"{self.name}{kind}, hash {self.given or self.digest}"
 
     def record(self) -> dict[str, Any]:
         """What products say of it: shape, type, unit, hash."""
@@ -134,10 +145,14 @@ class ArrayMap:
         return {**shape, "type": self.values.dtype.name, **unit, "hash": self.digest}
 
     def write(self, path: Path) -> None:
-        """As a FITS file that reads back to the same bits: header values are rounded as astropy does, in memory too."""
+        """As a FITS file that reads back to the same bits: header values are rounded as astropy does, in memory too.
+
+        The key `GIVEN` says what it was.
+        """
         from astropy.io import fits
 
-        made = fits.PrimaryHDU(self.values, fits.Header(dict(self.header.items()))) if self.table is None else self.table
+        made = fits.PrimaryHDU(self.values, fits.Header(dict(self.header.items()))) if self.table is None else self.table.copy()
+        made.header[GIVEN] = self.text
         made.writeto(path, overwrite=True)
 
     def __eq__(self, other: object) -> bool:

@@ -7,7 +7,7 @@ keys and the parameters that would mend it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,12 +19,14 @@ from zonda.core.storage.fits_image import read_image
 from zonda.core.types import Floats
 
 from . import stokes
-from .array import ArrayMap
+from .array import GIVEN, ArrayMap
 from .geometry import geometry
 from .healpix import is_healpix, read_healpix
 from .inputs import HealpixMap, Wanted, WcsMap
 from .planes import chosen, plane_of_cube
 from .units import beam_solid_angle, filled, unit_of
+
+T = TypeVar("T", WcsMap, HealpixMap, WcsMap | HealpixMap)
 
 
 def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
@@ -48,7 +50,7 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
     if plain is not None and plain[1].ndim > 1 and tangent.plain(plain[0]) is not None:  # nothing that astropy need be asked
         with reading(place, "FITS", cure):
             check_memory(8 * plain[1].size, "the array or table", place)
-            return _image(place, plain[1].astype(np.float64), plain[0], wanted)
+            return _told(_image(place, plain[1].astype(np.float64), plain[0], wanted), plain[0].get(GIVEN))
     with opened(path, place, cure) as hdus:
         hdu, notes = chosen(hdus, wanted.hdu, place)
         check_size(path, hdu, place)
@@ -59,7 +61,7 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
                 notes |= stokes.of_extensions(hdu.name, [other.name for other in hdus if other.is_image], place)
             found = _image(place, np.asarray(hdu.data), hdu.header, wanted)
         found.notes = notes | found.notes
-        return found
+        return _told(found, hdu.header.get(GIVEN))
 
 
 def read_array(array: ArrayMap, place: str, **options: Any) -> WcsMap | HealpixMap:
@@ -67,8 +69,15 @@ def read_array(array: ArrayMap, place: str, **options: Any) -> WcsMap | HealpixM
     wanted = Wanted(**options)
     if array.table is not None:
         with reading(place, "FITS", "check the table"):
-            return read_healpix(array.table, place, wanted)
-    return _image(place, array.values, array.header, wanted)
+            return _told(read_healpix(array.table, place, wanted), array.text)
+    return _told(_image(place, array.values, array.header, wanted), array.text)
+
+
+def _told(found: T, text: object) -> T:
+    """The map, with a note of the array that it was in Python."""
+    if text:
+        found.notes["input"] = f"{text}, in {found.unit}, given in Python"
+    return found
 
 
 def _image(place: str, values: Floats, header: Any, wanted: Wanted) -> WcsMap:

@@ -68,6 +68,35 @@ def test_an_array_gives_the_bits_of_its_file(with_array, module_bench):
         assert found[0].header["CRPIX1"] == 32.123456789012345
 
 
+def test_products_say_what_the_array_was(with_array, module_bench, tmp_path):
+    """Shape, type, unit and hash, as a plain run of the array states them in the log and in its provenance."""
+    _, ours = with_array
+    pipeline = zonda.Pipeline(steps(sky()))
+    plain = pipeline.run(scene(camera(7)), output=tmp_path, threads=1)
+    told = {what: value for who, what, value in plain.tally if who == "SkyMap"}["input"]
+    assert told == f"array of 64 x 48, float64, hash {pipeline.operators[1].map.record()['hash']}, in K_RJ, given in Python"
+    for folder in (ours, tmp_path):
+        with fits.open(folder / "map.fits") as found:
+            assert told in [row["VALUE"] for row in found["TALLY"].data]
+
+
+def test_the_folder_may_move(tmp_path, module_bench):
+    pipeline, where = zonda.Pipeline(steps(sky())), scene(camera(7))
+    zonda.campaign(pipeline, where, output=tmp_path / "a", realizations=2, **SERIAL)
+    whole = module_bench.planes(tmp_path / "a")
+    moved = tmp_path / "elsewhere" / "b"
+    moved.parent.mkdir()
+    (tmp_path / "a").rename(moved)
+    for path in (moved / "resolved.yaml", moved / "campaign.json"):
+        assert str(tmp_path / "a" / "inputs") not in path.read_text()
+    (moved / "map.fits").unlink()
+    assert module_bench.command("resume", moved) == 0  # nothing has changed or is gone
+    again = tmp_path / "again"
+    arguments = ("--output", again, "--no-prune", "--engine", "serial", "--threads", 1)
+    assert module_bench.command("run", moved / "resolved.yaml", *arguments) == 0
+    assert module_bench.planes(again) == whole
+
+
 def test_it_is_an_ordinary_campaign_then(with_array, module_bench, capsys):
     _, ours = with_array
     assert module_bench.command("status", ours) == 0

@@ -172,3 +172,38 @@ def test_what_cannot_be_compared(tmp_path):
     data = scenes.run(steps, scenes.scan(7, 20))
     assert "stream_comparison" not in data.products
     assert ("CompareStreams", "scans too short to compare streams", "1") in [tuple(row) for row in data.tally.told()]
+
+
+def signals(reference, runs):
+    daisy = zonda.PointingDaisy(radius="1 arcmin", scan_duration="20 s")
+    made = [zonda.AtmosphereLayers(), zonda.WhiteNoise(), zonda.Efficiency(), zonda.HighpassFilter(frequency="0.2 Hz")]
+    compared = zonda.CompareStreams(stream="signal", reference=reference, segment="2 s")
+    pipeline = zonda.Pipeline([daisy, *made, compared], runs=runs)
+    return pipeline.run(scenes.scene(scenes.camera(7)), keep=["signal", *([reference] if "/" in reference else [])], threads=1)
+
+
+def test_the_stream_of_a_signal_as_it_is_filtered():
+    """Of both, behind the filter: their difference is the atmosphere's, whatever the noise."""
+    data = signals("signal/quiet", {"quiet": {"only": ["white"]}})
+    found, (x, y) = data.products["stream_comparison"], (data.tod(name) for name in ("signal", "signal/quiet"))
+    assert (found.stream, found.reference) == ("signal", "signal/quiet")
+    rate = scenes.camera(7).sample_rate
+    expected = [pair(a, b, rate, round(rate / found.frequency[0])) for a, b in zip(x, y, strict=True)]
+    # tod() holds the float32 streams that the step read, whose means are zero behind the filter: the same spectra
+    for row, name in ((0, "power"), (1, "reference")):
+        np.testing.assert_allclose(found.power[row], np.mean([getattr(p, name) for p in expected], axis=0), rtol=1e-6)
+    assert found.power[0].mean() > found.power[1].mean()  # the atmosphere is in one of them alone
+
+
+@pytest.mark.parametrize(
+    ("reference", "runs", "said"),
+    [
+        ("signal/quite", {"quiet": {"only": ["white"]}}, "no stream 'signal/quite'(.|\\n)*did you mean 'signal/quiet'"),
+        ("signal/none", {}, "streams of signals: signal; of a remainder there are maps alone"),
+    ],
+)
+def test_a_signal_that_there_is_not(reference, runs, said):
+    daisy = zonda.PointingDaisy(radius="1 arcmin", scan_duration="4 s")
+    steps = [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.CompareStreams(reference=reference, segment="1 s")]
+    with pytest.raises(ZondaError, match=said):
+        zonda.Pipeline(steps, runs=runs).run(scenes.scene(scenes.camera(7)), threads=1)
