@@ -197,6 +197,10 @@ class Observation:
         """
         return self.key(*self.instrument.identity, *names)
 
+    def camera_key(self, *names: str | int) -> NDArray[np.uint32]:
+        """As `detector_key`, for what stays as it is from scan to scan: time constants, sidelobes."""
+        return stream_key(self.seed, "camera", *self.instrument.identity, *names)
+
     def derotate(self, which: str) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """(lon, lat, psi) of ``boresight_azel`` or ``boresight_radec`` [rad]; for azel lon = -azimuth."""
         x, y, z, w = getattr(self, which).T

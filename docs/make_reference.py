@@ -21,6 +21,7 @@ FOLDERS = {
     "atmosphere": "Atmosphere",
     "noise": "Noise",
     "optics": "Optics",
+    "detectors": "Detectors",
     "filters": "Filters",
     "maps": "Maps",
     "diagnostics": "Diagnostics",

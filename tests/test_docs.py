@@ -180,11 +180,11 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     (tmp_path / "page_for_authors.py").write_text(first + "".join(others))  # a file: docstrings of fields are read from it
     monkeypatch.syspath_prepend(str(tmp_path))
     page = importlib.import_module("page_for_authors")
-    drift, demean = page.GainDrift(period="20 s"), page.Demean()
+    drift, demean = page.SwingingGain(period="20 s"), page.Demean()
     zonda.testing.check_operator(drift)
     zonda.testing.check_operator(demean)
     zonda.testing.check_operator(page.Rms())
-    zonda.testing.check_operator(page.GroundPickup())
+    zonda.testing.check_operator(page.AzimuthSlope())
     zonda.testing.check_operator(page.Peak())
 
     def signal(*steps):
@@ -215,12 +215,12 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     steps = [
         zonda.PointingStare(scan_duration="5 s"),
         zonda.WhiteNoise(),
-        page.GroundPickup(slope="1 K"),
+        page.AzimuthSlope(slope="1 K"),
         zonda.Efficiency(),
         page.Peak(),
         page.SavePeak(),
     ]
-    data = zonda.Pipeline(steps, runs={"clean": {"without": ["ground"]}}).run(scene, output=tmp_path)
+    data = zonda.Pipeline(steps, runs={"clean": {"without": ["slope"]}}).run(scene, output=tmp_path)
     assert (tmp_path / "peaks.txt").read_text().split()[::2] == ["peak", "clean/peak"]
     assert abs(data.products["peak"] - data.products["clean/peak"]) > 1
 
@@ -234,4 +234,4 @@ def test_the_operator_that_contributing_shows_keeps_the_contract(tmp_path, monke
     (tmp_path / "page_for_contributors.py").write_text(textwrap.dedent(text))
     monkeypatch.syspath_prepend(str(tmp_path))
     page = importlib.import_module("page_for_contributors")
-    zonda.testing.check_operator(page.GainDrift(period="20 s"))
+    zonda.testing.check_operator(page.SwingingGain(period="20 s"))

@@ -16,7 +16,7 @@ from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
 from ..run.signals import acting_steps, remainder
-from ..signal import MAIN, TRANSMISSION, is_stream
+from ..signal import MAIN, TRANSMISSION, Component, is_stream
 from .context import Work
 
 
@@ -165,9 +165,15 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
                 others = [o for o in steps[: list(steps).index(operator)] if name in o.provides]
                 if not others:
                     read.pop(name, None)
-        for name in operator.requires | operator.optional:
+        for name in operator.requires | operator.optional | (_components_before(operator, steps) if forms(operator) else set()):
             read.setdefault(name, operator.label)
     return needed, left_out
+
+
+def _components_before(operator: Operator, steps: Sequence[Operator]) -> set[str]:
+    """The components that a step which forms the signal finds, whatever steps make them."""
+    before = list(steps)[: list(steps).index(operator)]
+    return {name for o in before for name in o.provides if isinstance(name, Component)}
 
 
 def _products(operator: Operator) -> set[str]:

@@ -1,13 +1,17 @@
-"""Planning of the optics: costs and memory (`core.plan`)."""
+"""Planning of the optics: bounds, costs and memory (`core.plan`)."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from zonda.core.observation import Observation
+from zonda.core.plan.calibration import calibration
 from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Estimate, Traits
+from zonda.core.plan.estimate import Cost, Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency
+from .ground_pickup import GroundPickup
 from .quotient import AT_ONCE
 
 
@@ -28,3 +32,31 @@ class EfficiencyPlanning(Planning[Efficiency]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         return Estimate((), Cost(0.005, 1e-8, 0.9e-9))
+
+
+class GroundPlanning(Planning[GroundPickup]):
+    """It has no coarser form."""
+
+    of = GroundPickup
+
+    def traits(self, observation: Observation) -> Traits:
+        """Its rms."""
+        return Traits(rms=self._rms(observation))
+
+    def memory(self, observation: Observation) -> int:
+        """The profile, and what it is made of."""
+        return 64 * observation.n_samples + 8 * observation.n_detectors
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size and cost. A filter that removes what the detectors have in common removes most of it: that is not counted."""
+        step, o = self.operator, context.first
+        size = context.bound(max(self._rms(x) for x in context.observations), o.duration, common=True)
+        text = "rms (e / 45 deg)^power at the lowest elevation, at the detector, over zeta e^-tau"
+        cost = Cost(fixed=0.01, per_time=5e-9 * 50 / step.fwhm, per_sample=1e-9)
+        return Estimate((Effect("ground pickup", (full("exact"),), size, text),), cost, size)
+
+    def _rms(self, observation: Observation) -> float:
+        step = self.operator
+        elevation = observation.elevation
+        ends = np.array([elevation.min(), elevation.max()]) / (np.pi / 4)
+        return step.rms * (1 + 3 * step.scatter) * float(np.max(ends**step.power)) * calibration(observation)

@@ -1,6 +1,7 @@
 """What an operator says its output depends on is what it depends on: one input sample is changed, and the outputs are compared.
 
-``sample``: only the same detector at the same instant changes; ``time``: only the same detector; ``all``: anything may.
+``sample``: only the same detector at the same instant changes; ``time``: only the same detector; ``detectors``: only the same
+instant; ``all``: anything may.
 Operators that claim more than they use are reported too: ``time`` and ``all`` must spread.
 """
 
@@ -68,6 +69,9 @@ ACTING = {
     "HighpassFilter": {"frequency": "0.5 Hz"},
     "CommonModeFilter": {},
     "Detrend": {},
+    "Crosstalk": {},
+    "GainDrift": {},
+    "TimeConstant": {"tau": "0 s"},
     "GroundFilter": {"bin": "0.01 deg"},
     "PolynomialFilter": {},
     "Despline": {},
@@ -95,6 +99,9 @@ def test_one_sample(bench: Any, name: str) -> None:
         elif operator.couples == "time":
             assert not others.any()
             assert changed[DETECTOR].mean() > 0.9
+        elif operator.couples == "detectors":
+            assert not np.delete(changed, SAMPLE, axis=1).any()
+            assert changed[:, SAMPLE].sum() > 1
         else:
             assert operator.couples == "all"
             assert others.mean() > 0.9

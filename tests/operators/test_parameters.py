@@ -26,7 +26,7 @@ from zonda.core.registry import noise_models, operators
 from zonda.core.site import Site
 from zonda.operators.io.save_tod import load_tod
 
-STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
+STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "ground", "glitches", "signal")
 SCAN = {"scan_duration": "12 s", "scans": 2, "radius": "1 arcmin", "sample_rate": "50 Hz", "offsets": "box"}
 TURN = {"scan_duration": "40 s", "throw": "4 arcmin", "speed": "30 arcsec/s", "acceleration": "20 arcsec/s2"}
 REFUSED = "refused"
@@ -80,6 +80,8 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     header["BUNIT"] = "Jy/beam"
     fits.PrimaryHDU(values, header).writeto(folder / "beam.fits")
     healpy.write_map(folder / "sphere.fits", np.arange(12.0 * 64**2), coord="C", column_units="uK_CMB", dtype=np.float64)
+    a, b, *_ = instrument().focalplane().names
+    (folder / "shares.csv").write_text(f"detector,source,share\n{a},{b},0.01\n")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
     seen = Data(scene())
     operators.get("PointingStare")(scan_duration="1 s").observe(seen)
@@ -291,6 +293,26 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
     },
     "Detrend": {"order": ({}, {"order": 2}), "mask": ({}, {"mask": {"radius": "20 arcsec"}})},
     "Despline": {"knots": ({}, {"knots": "5 s"})},
+    "GroundPickup": {
+        "rms": ({}, {"rms": "2 mK"}),
+        "fwhm": ({}, {"fwhm": "5 deg"}),
+        "power": ({}, {"power": -2.0}),
+        "scatter": ({}, {"scatter": "5 %"}),
+        "realization": ({}, {"realization": 1}),
+    },
+    "Glitches": {
+        "rate": ({}, {"rate": "1 Hz"}),
+        "amplitude": ({}, {"amplitude": "1 K"}),
+        "decay": ({}, {"decay": "50 ms"}),
+        "flag_above": ({}, {"flag_above": "1 mK"}),
+    },
+    "GainDrift": {
+        "rms": ({}, {"rms": "1 %"}),
+        "slope": ({}, {"slope": 1.0}),
+        "fastest": ({}, {"fastest": "1 Hz"}),
+    },
+    "TimeConstant": {"tau": ({}, {"tau": "20 ms"}), "scatter": ({}, {"scatter": "10 %"})},
+    "Crosstalk": {"level": ({}, {"level": "1 %"}), "file": ({}, {"file": "shares.csv"})},
     "PolynomialFilter": {
         "order": ({}, {"order": 2}),
         "interval": ({}, {"interval": "throw"}),
@@ -406,6 +428,11 @@ CHAINS = {
     "CommonModeFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "CommonModeFilter"],
     "Detrend": ["WhiteNoise", "PinkNoise", "Efficiency", "Detrend"],
     "Despline": ["WhiteNoise", "PinkNoise", "Efficiency", "Despline"],
+    "GroundPickup": ["GroundPickup"],
+    "Glitches": ["Glitches"],
+    "GainDrift": ["WhiteNoise", "Efficiency", "GainDrift"],
+    "TimeConstant": ["WhiteNoise", "Efficiency", "TimeConstant"],
+    "Crosstalk": ["WhiteNoise", "Efficiency", "Crosstalk"],
     "PolynomialFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "PolynomialFilter"],
     "GroundFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "GroundFilter"],
     "Taper": ["WhiteNoise", "PinkNoise", "Efficiency", "Taper"],
@@ -439,6 +466,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "BinMap": {"pixel": "4 arcsec"},
     "HighpassFilter": {"frequency": "0.1 Hz"},
     "GroundFilter": {"bin": "0.01 deg"},
+    "Glitches": {"rate": "0.5 Hz"},
+    "GainDrift": {"fastest": "0.5 Hz"},
     "PointingDaisy": SCAN,
     "PointingStare": {"scan_duration": "12 s"},
     "PointingBackAndForth": TURN,

@@ -12,7 +12,7 @@ from zonda.core.pipeline import Pipeline
 from zonda.core.plan import structure as shares
 from zonda.core.plan.planner import plan
 from zonda.core.plan.structure import Structure, prune, work
-from zonda.core.signal import Signal
+from zonda.core.signal import Component, Signal
 
 
 def kind(name, requires=(), provides=(), optional=(), base=Operator, **attributes):
@@ -46,6 +46,15 @@ def test_everything_is_needed_where_a_map_is_written():
     found, runs, structure = acting(POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE, runs=RUNS)
     assert found == {"Point", "Sky", "Air", "Noise", "Sum", "Filter", "Map", "Save"}
     assert runs == set(RUNS)
+    assert not structure.rows
+
+
+def test_a_component_that_a_step_declares_as_one_is_part_of_the_sum():
+    """The step that forms the signal adds up every `Component`, whether it names it or not."""
+    ground = kind("Ground", {"boresight"}, {Component("ground", "at the detector")})
+    found, runs, structure = acting(POINT, NOISE, ground, SUM, MAP, SAVE, runs={"clean": {"without": ["ground"]}})
+    assert found == {"Point", "Noise", "Ground", "Sum", "Map", "Save"}
+    assert runs == {"clean"}
     assert not structure.rows
 
 

@@ -1,0 +1,1 @@
+"""What detectors and their readout do to the signal."""

@@ -1,0 +1,155 @@
+"""Crosstalk between detectors.
+
+    y_d = x_d + sum_e C_de x_e,   C_dd = 0,                                                                (1)
+
+at every instant, C_de the share of the signal of detector e that is read in detector d. The sum is formed in the order of the
+detectors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import model_validator
+
+from zonda.core.block import Block
+from zonda.core.compilation.jit import nb
+from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Fraction
+from zonda.core.errors import InputError
+from zonda.core.focalplane import Focalplane
+from zonda.core.observation import Observation
+from zonda.core.operator import Operator
+from zonda.core.storage.ecsv import read_table
+from zonda.core.types import Floats
+
+NEXT = 1.2
+"""Detectors up to this many of the smallest distance away are neighbours: six in a hexagon, four in a square."""
+
+COLUMNS = ("detector", "source", "share")
+"""Of a matrix in a file."""
+
+
+class Crosstalk(Operator):
+    """Add to the signal of each detector shares of the signals of others, equation (1).
+
+    A sample that is not finite adds nothing to others. Either `level` of each nearest neighbour in the focal plane of the same
+    band, or the shares in a `file`.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    linear: ClassVar[bool] = True
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "detectors"
+
+    level: Fraction = quantity("0.3 %", ge=-0.5, le=0.5)
+    """Share of each nearest neighbour's signal."""
+    file: InputPath | None = None
+    """Table (ECSV or CSV) of shares, with columns `detector` and `source` (names) and `share`; instead of `level`."""
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Crosstalk:
+        if self.file is not None and "level" in self.model_fields_set:
+            raise ValueError("give either level, for nearest neighbours, or file")
+        return self
+
+    def prepare(self, observation: Observation) -> Shares:
+        """The shares by detector. Raises InputError for a file that does not suit the focal plane."""
+        plane = observation.focalplane
+        found = neighbours(plane, self.level) if self.file is None else read_shares(self.file, plane)
+        observation.tally.state(self.label, "pairs of detectors with crosstalk", f"{len(found.source)}")
+        return found
+
+    def exec(self, block: Block, state: Shares) -> None:
+        """Equation (1); the block has all detectors."""
+        signal = block.detdata["signal"]
+        given = block.buffer("(before)", block.shape)
+        given[...] = signal
+        _add_shares(given, state.first, state.source, state.share, signal)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """C of equation (1), row by row.
+
+    Attributes
+    ----------
+    first
+        (n_det + 1,) where the entries of each detector begin.
+    source, share
+        (n,) whose signal, and which share of it.
+    """
+
+    first: NDArray[np.int64]
+    source: NDArray[np.int64]
+    share: Floats
+
+    @classmethod
+    def of(cls, n_det: int, detector: NDArray[np.int64], source: NDArray[np.int64], share: Floats) -> Shares:
+        """From entries in any order."""
+        order = np.lexsort((source, detector))
+        first = np.searchsorted(detector[order], np.arange(n_det + 1))
+        return cls(np.asarray(first, np.int64), source[order], share[order])
+
+
+def neighbours(plane: Focalplane, level: float) -> Shares:
+    """``level`` for each pair of nearest neighbours of one band; detectors in one place are none."""
+    from scipy.spatial import cKDTree
+
+    at, bands = np.stack([plane.xi, plane.eta], axis=1), np.asarray(plane.band)
+    pairs = []
+    for band in np.unique(bands):
+        of_band = np.flatnonzero(bands == band)
+        places, where = np.unique(at[of_band].round(12), axis=0, return_inverse=True)
+        if len(places) > 1:
+            tree = cKDTree(places)
+            reach = NEXT * float(np.min(tree.query(places, k=[2])[0]))
+            near = tree.sparse_distance_matrix(tree, reach, output_type="coo_matrix")
+            held = [of_band[where.ravel() == k] for k in range(len(places))]
+            pairs += [(d, e) for i, j in zip(near.row, near.col, strict=True) if i != j for d in held[i] for e in held[j]]
+    found = np.array(pairs, np.int64).reshape(-1, 2)
+    return Shares.of(len(plane), found[:, 0], found[:, 1], np.full(len(found), level))
+
+
+def read_shares(path: Path, plane: Focalplane) -> Shares:
+    """C from a table of `COLUMNS`."""
+    table = read_table(path)
+    number = {name: k for k, name in enumerate(plane.names)}
+    index = []
+    for column in COLUMNS[:2]:
+        names = table.texts(column)
+        row = next((k for k, name in enumerate(names) if name not in number), None)
+        if row is not None:
+            raise InputError(
+                f"{column} {names[row]!r} in row {row + 1} is no detector of the focal plane", place=table.place,
+                cure=f"the names are such as {', '.join(plane.names[:3])}",
+            )  # fmt: skip
+        index.append(np.array([number[name] for name in names], np.int64))
+    detector, source = index
+    share = table.numbers(COLUMNS[2])
+    itself = np.flatnonzero(detector == source)
+    if itself.size:
+        raise InputError(
+            f"row {int(itself[0]) + 1} is a detector's share of itself",
+            place=table.place,
+            cure="remove it; gains are not crosstalk",
+        )
+    if len(set(zip(detector.tolist(), source.tolist(), strict=True))) < len(share):
+        raise InputError("a pair of detectors is there twice", place=table.place, cure="remove one of the rows")
+    return Shares.of(len(plane), detector, source, share)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _add_shares(given, first, source, share, out):  # type: ignore[no-untyped-def]
+    """Equation (1); the detectors' samples in turn, so that a sample has the same bits in every block."""
+    for d in range(out.shape[0]):
+        for k in range(first[d], first[d + 1]):
+            row, factor = given[source[k]], out.dtype.type(share[k])
+            for t in range(out.shape[1]):
+                if np.isfinite(row[t]):
+                    out[d, t] += factor * row[t]

@@ -1,0 +1,145 @@
+"""Glitches: short pulses in single detectors, such as cosmic rays make.
+
+    g(t) = sum_i A_i exp(-(t - t_i) / tau)   for t >= t_i,                                                 (1)
+
+arrivals t_i of a Poisson process of rate lambda in each detector, amplitudes A_i exponentially distributed with mean A: shot
+noise of mean lambda A tau and variance lambda A^2 tau (Campbell 1909; Planck 2013 results X has such pulses and their rates). A
+sample is the value at its time; what arrives between two samples is seen from the next one on, decayed. After `REACH` tau a pulse
+is over.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from zonda.core.block import Block
+from zonda.core.compilation.jit import nb
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Hertz, Kelvin, Seconds
+from zonda.core.data import Data
+from zonda.core.numerics.random import uniforms
+from zonda.core.observation import Observation
+from zonda.core.operator import Operator
+from zonda.core.signal import Component
+from zonda.core.types import Floats
+
+REACH = 23
+"""Decay times after which a pulse counts no more: e^-23 = 1e-10."""
+
+
+class Glitches(Operator):
+    """Pulses at random times in each detector that decay exponentially, equation (1): the component ``glitches`` at the detector.
+
+    With `flag_above`, samples in which they exceed that much are lost as a glitch finder would lose them: they are not a number,
+    filters bridge them in every signal, and no map uses them. All is counted in the log.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({Component("glitches", "at the detector")})
+
+    rate: Hertz = quantity("2 mHz", ge=0, le=1e3)
+    """Mean number of pulses per second in each detector."""
+    amplitude: Kelvin = quantity("0.1 K", gt=0)
+    """Mean amplitude, K_RJ at the detector."""
+    decay: Seconds = quantity("10 ms", gt=0, le=60)
+    """Decay time."""
+    flag_above: Kelvin | None = Field(None, ge=0)
+    """Samples above this (K_RJ at the detector) are lost; where absent, none are."""
+
+    def prepare(self, observation: Observation) -> Arrivals:
+        """All pulses of the scan."""
+        found = arrivals(self, observation)
+        inside = int(np.count_nonzero(found.time >= 0))
+        observation.tally.count(self.label, "glitches", inside)
+        return found
+
+    def exec(self, block: Block, state: Arrivals) -> None:
+        """Add the pulses of the block's detectors."""
+        stream, observation = block.new("glitches"), block.observation
+        threshold = math.inf if self.flag_above is None else self.flag_above
+        lost = 0
+        for row, d in zip(stream, range(block.detectors.start, block.detectors.stop), strict=True):
+            of = slice(int(state.first[d]), int(state.first[d + 1]))
+            if of.stop > of.start:
+                seconds = observation.seconds[block.samples]
+                lost += _add_pulses(state.time[of], state.amplitude[of], self.decay, seconds, threshold, row)
+        if self.flag_above is not None:
+            size = block.shape[0] * block.shape[1]
+            observation.tally.count(self.label, "samples lost to glitches", lost, size)
+
+    def collect(self, data: Data, observation: Observation, state: Arrivals) -> None:
+        """State how many detectors had one."""
+        hit = int(np.count_nonzero(np.diff(state.first)))
+        observation.tally.count(self.label, "detectors with glitches", hit, observation.n_detectors)
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """The pulses of a scan, those of a detector together in time order.
+
+    Attributes
+    ----------
+    first
+        (n_det + 1,) where those of each detector begin.
+    time, amplitude
+        (n,) s since the start, K.
+    """
+
+    first: NDArray[np.int64]
+    time: Floats
+    amplitude: Floats
+
+
+def arrivals(step: Glitches, observation: Observation) -> Arrivals:
+    """Pulses of all detectors from `REACH` decay times before the scan to its end."""
+    begin, end = -REACH * step.decay, float(observation.seconds[-1])
+    times, sizes, count = [], [], [0]
+    for d in range(observation.n_detectors):
+        when, u = _of_detector(step, observation, d, end - begin)
+        times.append(begin + when)
+        sizes.append(-step.amplitude * np.log(u))
+        count.append(len(when))
+    return Arrivals(np.cumsum(count, dtype=np.int64), np.concatenate(times), np.concatenate(sizes))
+
+
+def _of_detector(step: Glitches, observation: Observation, detector: int, span: float) -> tuple[Floats, Floats]:
+    """(arrival times within ``span``, uniform deviates of the amplitudes): waiting times are exponential."""
+    if step.rate == 0:
+        return np.zeros(0), np.zeros(0)
+    key, mean = observation.detector_key(step.label), step.rate * span
+    number = int(mean + 6 * math.sqrt(mean) + 16)
+    while True:
+        u = uniforms(key, 0, 2 * number, stream=detector).reshape(-1, 2)  # pairs, so that more of them begin with the same
+        when = np.cumsum(-np.log(u[:, 0])) / step.rate
+        if when[-1] > span:
+            kept = int(np.searchsorted(when, span))
+            return when[:kept], u[:kept, 1]
+        number *= 2
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _add_pulses(times, amplitudes, decay, seconds, threshold, out):  # type: ignore[no-untyped-def]
+    """Add equation (1) at ``seconds`` (n,) to ``out`` (n,); NaN where it is above the threshold. Returns how many are.
+
+    Each sample is the sum over the pulses in their order, whatever the block.
+    """
+    lost, first = 0, 0
+    for t in range(seconds.size):
+        while first < times.size and times[first] < seconds[t] - REACH * decay:
+            first += 1
+        total, k = 0.0, first
+        while k < times.size and times[k] <= seconds[t]:
+            total += amplitudes[k] * np.exp((times[k] - seconds[t]) / decay)
+            k += 1
+        if total > threshold:
+            out[t] = np.nan
+            lost += 1
+        elif total > 0.0:
+            out[t] += total
+    return lost

@@ -1,0 +1,115 @@
+"""Planning of the detectors' effects: bounds, costs and memory (`core.plan`)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from zonda.core.observation import Observation
+from zonda.core.plan.calibration import calibration
+from zonda.core.plan.context import Context
+from zonda.core.plan.estimate import Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.planning import Planning
+
+from .crosstalk import Crosstalk
+from .gain_drift import GainDrift, grid
+from .glitches import REACH, Glitches
+from .time_constant import REACH as REMEMBERED
+from .time_constant import TimeConstant
+
+NEIGHBOURS = 6
+"""Of a detector in a hexagonal focal plane."""
+
+
+class GainPlanning(Planning[GainDrift]):
+    """It has no coarser form."""
+
+    of = GainDrift
+
+    def traits(self, observation: Observation) -> Traits:
+        """Gains that the calibration does not know."""
+        return Traits(gain_error=self.operator.rms)
+
+    def memory(self, observation: Observation) -> int:
+        """The gains at their nodes."""
+        step, _, _ = grid(observation, self.operator.fastest)
+        return 8 * observation.n_detectors * (observation.n_samples // step + 4)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size: all that is in the stream, the mean emission included, changes by the rms of the gains."""
+        rms, o = self.operator.rms, context.first
+        size = context.bound(rms * (context.fluctuation + context.mean_emission), o.duration) | context.sky_error(rms)
+        text = "rms of the gains x (rms of the stream + mean emission); of the sky, rms of the gains"
+        return Estimate((Effect("gain drift", (full("exact"),), size, text),), Cost(fixed=0.01, per_sample=2e-9))
+
+
+class TimeConstantPlanning(Planning[TimeConstant]):
+    """It has no coarser form. Where the signal is not straight between samples, it errs by 1 - sinc^2(f / f_s)."""
+
+    of = TimeConstant
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size for a point source: 1 - |H| at the highest frequency of a beam that passes."""
+        o, tau = context.first, self.operator.tau
+        speed = context.coverage.speed if context.coverage else 0.0
+        # a Gaussian of FWHM passes to 1 % of its power below 0.71 v / FWHM
+        frequency = min(0.71 * speed / float(o.focalplane.fwhm.min()), o.sample_rate / 2)
+        loss = 1 - 1 / math.hypot(1, 2 * math.pi * frequency * tau)
+        straight = 1 - float(np.sinc(frequency / o.sample_rate)) ** 2
+        text = "1 - |1 / (1 + 2 pi i f tau)| at f = 0.71 v / FWHM"
+        effects = (
+            Effect("time constant", (full("exact between samples in straight lines"),), context.sky_error(loss), text),
+            Effect("time constant: straight lines between samples", (full("exact at samples"),),
+                   context.sky_error(straight), "1 - sinc^2(f / f_s) at f = 0.71 v / FWHM"),
+        )  # fmt: skip
+        remembered = REMEMBERED * tau * o.sample_rate
+        return Estimate(effects, Cost(fixed=0.001, per_sample=4e-9 * (1 + remembered / 2048)))
+
+
+class CrosstalkPlanning(Planning[Crosstalk]):
+    """Exact: it has no coarser form."""
+
+    of = Crosstalk
+
+    def memory(self, observation: Observation) -> int:
+        """The pairs."""
+        return 24 * NEIGHBOURS * observation.n_detectors
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size: six neighbours' signals."""
+        level = abs(self.operator.level) if self.operator.file is None else 0.0
+        size = context.bound(
+            NEIGHBOURS * level * (context.fluctuation + context.mean_emission), context.first.duration, common=True
+        )
+        effect = Effect(
+            "crosstalk", (full("exact"),), size | context.sky_error(NEIGHBOURS * level), "6 level x rms of the stream"
+        )
+        return Estimate((effect,) if level else (), Cost(fixed=0.01, per_sample=1e-9 + 0.3e-9 * NEIGHBOURS))
+
+
+class GlitchPlanning(Planning[Glitches]):
+    """It has no coarser form."""
+
+    of = Glitches
+
+    def traits(self, observation: Observation) -> Traits:
+        """Its rms, Campbell's theorem."""
+        return Traits(rms=self._rms(observation))
+
+    def memory(self, observation: Observation) -> int:
+        """Times and amplitudes, and what they are sorted from."""
+        span = observation.duration + REACH * self.operator.decay
+        return int(64 * observation.n_detectors * (self.operator.rate * span + 8))
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size and cost."""
+        step, o = self.operator, context.first
+        size = context.bound(self._rms(o), step.decay)
+        text = "sqrt(rate decay) amplitude (Campbell), at the detector, over zeta e^-tau"
+        cost = Cost(fixed=0.01 + 1e-5 * o.n_detectors, per_sample=1.5e-9)
+        return Estimate((Effect("glitches", (full("exact"),), size, text),), cost, size)
+
+    def _rms(self, observation: Observation) -> float:
+        step = self.operator
+        return math.sqrt(step.rate * step.decay) * step.amplitude * calibration(observation)

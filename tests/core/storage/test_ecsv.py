@@ -1,0 +1,73 @@
+"""Small tables: what is written is read; astropy's are read; what is wrong is named with its place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.table import Table as AstropyTable
+
+from zonda.core.errors import InputError
+from zonda.core.storage.ecsv import Column, read_table, write_ecsv
+
+
+def test_what_is_written_is_read(tmp_path):
+    columns = [Column("name", ["a b", 'say "c"'], "", "who"), Column("ra", [1.5, -2.25], "deg", "where")]
+    table = read_table(write_ecsv(tmp_path / "t.ecsv", columns, {"made": "by a test", "seed": 1}))
+    assert table.texts("name") == ["a b", 'say "c"']
+    np.testing.assert_allclose(table.numbers("ra", "rad"), np.radians([1.5, -2.25]), rtol=1e-15)
+    assert len(table) == 2
+
+
+def test_tables_of_astropy(tmp_path):
+    path = tmp_path / "t.ecsv"
+    made = AstropyTable({"name": ["one two", "three"], "flux": [1.0, 2.0] * u.mJy, "index": [-0.7, 3.5]})
+    made.meta["comment"] = ["a", "b"]
+    made.write(path, format="ascii.ecsv")
+    table = read_table(path)
+    assert table.texts("name") == ["one two", "three"]
+    np.testing.assert_allclose(table.numbers("flux", "Jy"), [1e-3, 2e-3])
+    np.testing.assert_allclose(table.numbers("index"), [-0.7, 3.5])
+
+
+def test_csv_has_its_units_in_brackets(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("\ufeff# name, ra [arcmin], n\n# a remark\nx, 60, 3\n\ny,120,4\n", encoding="utf-8")
+    table = read_table(path)
+    np.testing.assert_allclose(table.numbers("ra", "deg"), [1, 2])
+    np.testing.assert_array_equal(table.numbers("n"), [3, 4])
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "match"),
+    [
+        ("", ("a", ""), "has no rows"),
+        ("a,a\n1,2\n", ("a", ""), "has two columns 'a'"),
+        ("a,b\n1\n", ("a", ""), "row 1 has 1 values, not 2"),
+        ("a,b\n1,2\n", ("c", ""), "has no column 'c'"),
+        ("a\n1\ninf\n", ("a", ""), "a of row 2 is 'inf', not a finite number"),
+        ("a\n1\nx\n", ("a", ""), "a of row 2 is 'x'"),
+        ("a\n1\n", ("a", "deg"), "a has no unit"),
+        ("a [K]\n1\n", ("a", "deg"), "a has the unit 'K'"),
+        ("a [nonsense]\n1\n", ("a", "deg"), "a has the unit 'nonsense'"),
+        ("# %ECSV 1.0\n# ---\n# - nonsense\na\n1\n", ("a", ""), "cannot be read as ECSV"),
+        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\n", ("a", ""), "cannot be read as ECSV"),
+        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\nb\n1\n", ("a", ""), "incomplete or corrupt: b"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path, text, what, match):
+    path = tmp_path / "bad.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=match) as caught:
+        read_table(path).numbers(*what)
+    assert "bad.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"\x89HDF\r\n\x1a\n\x00\xff", b"\xff\xfe\x00"])
+def test_other_files(tmp_path, content):
+    path = tmp_path / "other.bin"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read as a table"):
+        read_table(path)
+    with pytest.raises(InputError, match="no such file"):
+        read_table(tmp_path / "none")
