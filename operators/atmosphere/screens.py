@@ -92,8 +92,9 @@ def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: 
     at = o.n_samples // 2 if moment is None else int(np.searchsorted(seconds, min(moment, float(seconds[-1]))))
     step = model.resolution().step
     samples = np.linspace(0, o.n_samples - 1, moments + 2)[1:-1].astype(np.int64) // step * step
-    radius = float(np.hypot(o.focalplane.xi, o.focalplane.eta).max())
-    line = np.linspace(-1, 1, pixels) * (radius or 1e-6)
+    plane = o.focalplane
+    radius = max(float(np.hypot(plane.xi, plane.eta).max()), float(plane.fwhm.max()) / 2)  # of one detector its beam
+    line = np.linspace(-1, 1, pixels) * radius
     xi, eta = (grid.ravel() for grid in np.meshgrid(line, line))
     inside = np.hypot(xi, eta) <= radius * (1 + 1e-9)
     pwv = np.full((moments, pixels * pixels), np.nan)

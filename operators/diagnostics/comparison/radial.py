@@ -48,7 +48,7 @@ class RadialSpectra:
     modes
         (n,) independent modes.
     white
-        (n,) of maps whose noise is known: what independent pixels of that noise have, behind the smoothing.
+        (n,) of maps whose noise is known: what independent pixels of that noise have, behind the smoothing; NaN without modes.
     coherence
         (n,) of the first two maps; NaN of one map alone.
     """

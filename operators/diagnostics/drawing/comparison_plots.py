@@ -127,8 +127,9 @@ def plot_radial_spectra(
         ax.fill_between(scale[good], low, high, color=colour, alpha=0.15, linewidth=0)
         values.append(y[good])
         if name in found.white:
-            ax.plot(scale, found.white[name] / ARCSEC**2, "--", color=colour, linewidth=1.0, label=f"white level of {name}")
-            values.append(found.white[name] / ARCSEC**2)
+            level, known = found.white[name] / ARCSEC**2, np.isfinite(found.white[name])
+            ax.plot(scale[known], level[known], "--", color=colour, linewidth=1.0, label=f"white level of {name}")
+            values.append(level[known])
     ax.set_xscale("log")
     ax.set_yscale("log")
     every = np.concatenate(values) if values else np.ones(1)

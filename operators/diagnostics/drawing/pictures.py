@@ -176,7 +176,9 @@ def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
     made = []
     for which in stream.streams:
         extra = "" if which == "signal" else f"_{which}"
-        meaning = "divided by ζ exp(−τ), with the mean emission that no filter has removed" if which == "signal" else "at the detector"
+        meaning = (
+            "divided by ζ exp(−τ), with the mean emission that no filter has removed" if which == "signal" else "at the detector"
+        )
         meaning = meaning if unit_of_stream(which) == "K_RJ" else "along the line of sight, without its mean"
         caption = f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}. Pale: samples; dark: means over 1 s."
         ax = plot_tod(stream, name=which, title=f"Time streams of {stream.observation} {where}")

@@ -142,3 +142,11 @@ def test_refusals():
     data.observations.append(scenes.scan(samples=100))
     with pytest.raises(PipelineError, match="no atmosphere to show"):
         AtmosphereScreens().finalize(data)
+
+
+def test_the_field_of_one_detector_is_its_beam():
+    instrument = scenes.camera(1)
+    steps = [zonda.PointingDaisy(scan_duration="2 s"), zonda.AtmosphereLayers(pwv="5 mm"), AtmosphereScreens(moments=2, pixels=8)]
+    found = zonda.Pipeline(steps).run(scenes.scene(instrument), threads=1)["screens"]
+    assert found.side == instrument.beam_fwhm
+    assert np.isfinite(found.pwv[:, 3:5, 3:5]).all()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from matplotlib.figure import Figure
 
 import zonda
 import zonda.testing
@@ -18,6 +19,8 @@ from zonda.core.numerics.angles import ARCSEC
 from zonda.operators.diagnostics.compare_maps import CompareMaps
 from zonda.operators.diagnostics.comparison.files import plane_of
 from zonda.operators.diagnostics.comparison.noise import with_noise
+from zonda.operators.diagnostics.comparison.radial import radial_spectra
+from zonda.operators.diagnostics.drawing.comparison_plots import plot_radial_spectra
 from zonda.operators.diagnostics.map_spectra import MapSpectrum
 from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.plugins.checks import scenes
@@ -149,6 +152,15 @@ def test_the_white_level_of_a_smoothed_map_is_that_of_its_pixels_before(tmp_path
     assert np.count_nonzero(good) >= 3
     score = (s.power["map"] / s.white["map"] - 1) * np.sqrt(s.modes)
     assert np.abs(score[good]).max() < 4
+
+
+def test_rings_without_modes_have_no_white_level_and_are_drawn():
+    values = np.random.default_rng(2).standard_normal((2, 5))
+    edges = np.array([0.15, 0.22, 0.24, 0.5]) / ARCSEC  # modes of 5 pixels are 0.2 apart, of 2 pixels 0.5
+    found = radial_spectra({"map": values}, np.ones((2, 5)), ARCSEC, edges, {"map": np.ones((2, 5))})
+    assert np.isfinite(found.white["map"]).tolist() == [True, False, True]
+    ax = plot_radial_spectra(Figure().add_subplot(), found, "K_RJ")
+    assert np.isfinite(ax.get_ylim()).all()
 
 
 def test_what_is_missing_is_named(tmp_path, products):
