@@ -1,10 +1,15 @@
-"""Small scenes that several tests share."""
+"""Small scenes that several tests share, and what several do with them."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+
+from zonda.core.data import Block
 
 
 def camera(detectors: int) -> str:
@@ -38,3 +43,36 @@ def write_sky(path: Path, side: int, pixel: float, rms: float) -> None:
     image.header.update({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": middle, "CRPIX2": middle, "CRVAL1": 75.0})
     image.header.update({"CRVAL2": 20.0, "CDELT1": -pixel, "CDELT2": pixel, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K_RJ"})
     image.writeto(path)
+
+
+def in_blocks(step, observation, data, streams, means=None, sizes=(16,)):
+    """The products of a step of one scan whose ``streams`` (n_det, n_samp) come in blocks of ``sizes`` detectors, and the rest."""
+    state = step.prepare(observation)
+    first = 0
+    for size in [*sizes, observation.n_detectors]:
+        last = min(first + size, observation.n_detectors)
+        if last > first:
+            part = {k: v[first:last] for k, v in streams.items()}
+            step.exec(Block(observation, slice(first, last), slice(0, observation.n_samples), part, means or {}), state)
+        first = last
+    step.collect(data, observation, state)
+    step.finalize(data)
+    return data.products
+
+
+def installed_plugin(source, target):
+    """The environment of a process that sees a distribution, installed from its folder into another one; without network."""
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "--target",
+        str(target),
+    ]
+    subprocess.run([*pip, str(source)], check=True, capture_output=True, text=True)
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(target), os.environ.get("PYTHONPATH", "")])}

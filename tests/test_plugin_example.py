@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.scenes import installed_plugin
+
 HERE = Path(__file__).parent
 EXAMPLE = HERE / "plugin_example"
 
@@ -16,20 +18,7 @@ def installed(tmp_path_factory):
     """An environment in which the plugin is installed (into a folder of its own, so that other tests do not see it)."""
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
     subprocess.run(["cp", "-r", str(EXAMPLE), str(source)], check=True)  # building writes into the source folder
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "--no-index",
-        "--target",
-        str(target),
-    ]
-    subprocess.run([*pip, str(source / "plugin_example")], check=True, capture_output=True, text=True)
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(target), os.environ.get("PYTHONPATH", "")])}
+    return installed_plugin(source / "plugin_example", target)
 
 
 def zonda(environment, *arguments, cwd=None):

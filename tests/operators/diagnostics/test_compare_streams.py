@@ -8,7 +8,7 @@ import scipy.signal
 from astropy.table import Table
 
 import zonda
-from zonda.core.data import Block
+from tests.scenes import in_blocks
 from zonda.core.errors import ZondaError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
@@ -22,17 +22,7 @@ N, RATE, LENGTH = 20000, 50.0, 500
 def compare(observation, data, streams, means=None, sizes=(16,), **options):
     """The product of one scan that comes in blocks of ``sizes`` detectors."""
     step = zonda.CompareStreams(**({"segment": "10 s", "detectors": 19} | options))
-    state = step.prepare(observation)
-    first = 0
-    for size in [*sizes, observation.n_detectors]:
-        last = min(first + size, observation.n_detectors)
-        if last > first:
-            part = {k: v[first:last] for k, v in streams.items()}
-            step.exec(Block(observation, slice(first, last), slice(0, observation.n_samples), part, means or {}), state)
-        first = last
-    step.collect(data, observation, state)
-    step.finalize(data)
-    return data.products["stream_comparison"]
+    return in_blocks(step, observation, data, streams, means, sizes)["stream_comparison"]
 
 
 def streams(seed=5):

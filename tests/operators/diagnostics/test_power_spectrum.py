@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from tests.scenes import in_blocks
 from zonda.core.data import Block
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.smooth import SmoothField
@@ -18,17 +19,7 @@ def welch(values, sample_rate, length):
 
 
 def run(operator, observation, data, streams, means=None, sizes=(16,)):
-    state = operator.prepare(observation)
-    first = 0
-    for size in [*sizes, observation.n_detectors]:
-        last = min(first + size, observation.n_detectors)
-        if last > first:
-            part = {k: v[first:last] for k, v in streams.items()}
-            operator.exec(Block(observation, slice(first, last), slice(0, observation.n_samples), part, means or {}), state)
-        first = last
-    operator.collect(data, observation, state)
-    operator.finalize(data)
-    return data.products["spectrum"]
+    return in_blocks(operator, observation, data, streams, means, sizes)["spectrum"]
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import zonda
+from tests.scenes import installed_plugin
 from zonda.core import cli
 from zonda.core.configuration.pipeline_file import load
 
@@ -104,21 +104,7 @@ def test_the_tests_of_a_new_plugin_pass_at_once(here, capsys):
         *(f"src/zonda_my_camera/{n}" for n in inside),
     }
     assert not any("$" in (folder / name).read_text().replace("$ ", "") for name in files)
-    target = here / "site"
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "--no-index",
-        "--target",
-        str(target),
-    ]
-    subprocess.run([*pip, str(folder)], check=True, capture_output=True, text=True)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(target), os.environ.get("PYTHONPATH", "")])}
+    environment = installed_plugin(folder, here / "site")
     tests = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     done = subprocess.run(tests, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
