@@ -8,7 +8,7 @@ parameters, as an operator's are. It is named in three ways: ``central_rms``, ``
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -20,7 +20,6 @@ from .configuration.parameters import Parameters
 from .configuration.values import TextValue, mistake, refusal
 from .errors import PipelineError, ZondaError
 from .notebook import html_table
-from .product import Record
 from .signal import Signal
 from .storage.ecsv import Column, write_ecsv
 from .types import Floats
@@ -213,57 +212,34 @@ def measure(data: Data, metric: str | FigureMetric, **parameters: Any) -> Figure
     return Choice(metric.partition("(")[0], get(metric, parameters)).figure(data)
 
 
-@dataclass
-class Figures(Record):
-    """The figures of a run, by name, in their order. Figures of several runs are not added up: a campaign measures its sum.
+class Figures:
+    """The figures of a run in their order: iterate over them, or take one by its name."""
 
-    Attributes
-    ----------
-    names, values, units, errors, descriptions
-        (n,) each, see `Figure`.
-    """
-
-    names: list[str]
-    values: Floats
-    units: list[str]
-    errors: Floats
-    descriptions: list[str]
-
-    @classmethod
-    def from_figures(cls, figures: Sequence[Figure]) -> Figures:
-        """Of figures in their order."""
-        columns: list[Any] = [[getattr(f, key) for f in figures] for key in ("name", "value", "unit", "error", "description")]
-        return cls(columns[0], np.array(columns[1], np.float64), columns[2], np.array(columns[3], np.float64), columns[4])
-
-    def __iadd__(self, other: Figures) -> Figures:
-        """Refused: figures of parts are no figures of the whole."""
-        cure = "measure once, on the sum of all scans"
-        raise PipelineError("figures of several runs cannot be added up", place="figures", cure=cure)
+    def __init__(self, figures: Iterable[Figure]) -> None:
+        self._known = {figure.name: figure for figure in figures}
 
     def __iter__(self) -> Iterator[Figure]:
-        rows = zip(self.names, self.values, self.units, self.errors, self.descriptions, strict=True)
-        return (Figure(name, float(value), unit, float(error), text) for name, value, unit, error, text in rows)
+        return iter(self._known.values())
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self._known)
 
     def __getitem__(self, name: str) -> Figure:
         """By name, however its parameters are ordered. Raises KeyError where there is none."""
         with suppress(ValueError):  # what is no metric any more has the name that it was given
-            name = name if name in self.names else Choice.parse(name).name
-        found = next((f for f in self if f.name == name), None)
-        if found is None:
-            raise KeyError(f"no figure {name!r}: there are {', '.join(self.names)}")
-        return found
+            name = name if name in self._known else Choice.parse(name).name
+        if name not in self._known:
+            raise KeyError(f"no figure {name!r}: there are {', '.join(self._known)}")
+        return self._known[name]
 
     def write(self, path: str | Path, meta: Mapping[str, Any]) -> Path:
         """An ECSV table that `astropy.table.Table.read` knows: name, value, error, unit, description."""
         columns = [
-            Column("name", self.names, "", "metric and parameters"),
-            Column("value", self.values, "", "in `unit`"),
-            Column("error", self.errors, "", "standard error, in `unit`; nan: not known"),
-            Column("unit", self.units, "", "empty: a pure number"),
-            Column("description", self.descriptions, "", "what was measured"),
+            Column("name", [f.name for f in self], "", "metric and parameters"),
+            Column("value", [f.value for f in self], "", "in `unit`"),
+            Column("error", [f.error for f in self], "", "standard error, in `unit`; nan: not known"),
+            Column("unit", [f.unit for f in self], "", "empty: a pure number"),
+            Column("description", [f.description for f in self], "", "what was measured"),
         ]
         return write_ecsv(path, columns, meta)
 

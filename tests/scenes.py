@@ -46,7 +46,7 @@ def write_sky(path: Path, side: int, pixel: float, rms: float) -> None:
 
 
 def in_blocks(step, observation, data, streams, means=None, sizes=(16,)):
-    """The products of a step of one scan whose ``streams`` (n_det, n_samp) come in blocks of ``sizes`` detectors, and the rest."""
+    """The products of a step of one scan whose ``streams`` (n_det, n_samp) come in blocks of ``sizes`` detectors and the rest."""
     state = step.prepare(observation)
     first = 0
     for size in [*sizes, observation.n_detectors]:

@@ -69,7 +69,7 @@ class MeasureFigures(Output):
             found.append(_figure(choice, data, names[:count]))
             del names[:count]
         key = key_of(self, "figures")
-        figures = data.products[key] = Figures.from_figures(found)
+        figures = data.products[key] = Figures(found)
         for figure in figures:
             data.tally.state(self.label, figure.name, str(figure).partition(" = ")[2])
         if data.output is not None:

@@ -46,8 +46,8 @@ def test_figures_of_a_run(tmp_path):
     assert (there.value, there.error) == pytest.approx((rings.transfer[0], rings.error[0]), rel=1e-6)
     assert 0.1 < figures["peak_ratio"].value < 1.2
     table = Table.read(tmp_path / "out" / "figures.ecsv", format="ascii.ecsv")
-    assert list(table["name"]) == figures.names
-    assert table["value"] == pytest.approx(figures.values, rel=1e-8)
+    assert list(table["name"]) == [f.name for f in figures]
+    assert table["value"] == pytest.approx([f.value for f in figures], rel=1e-8)
     assert list(table["unit"])[:2] == ["K_RJ", "K_RJ"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "<h2>Figures</h2>" in page
