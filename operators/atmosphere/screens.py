@@ -45,7 +45,7 @@ class AtmosphereScreens(Output):
     the beam, the field of view and the boresight's track through it. Makes the product ``screens`` (a `Screens`); where there is
     an output folder, it is written there as ``screens.fits`` and ``screens.ecsv``. `Plots` and `Report` show it.
 
-    Raises `PipelineError` where there is no `AtmosphereLayers`, or no scan of that number.
+    Raises `PipelineError` where there is no `AtmosphereLayers`, or no scan of that number. A campaign has none: its log says so.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -72,7 +72,10 @@ class AtmosphereScreens(Output):
             data.check_scan(self.observation, self.label)
 
     def finalize(self, data: Data) -> None:
-        """Evaluate the layers and write them."""
+        """Evaluate the layers and write them; on the sum of a campaign's scans, which has no scan any more, say so instead."""
+        if data.laid_out:
+            data.tally.state(self.label, "not drawn", "the scans of a campaign are not here when it is combined; run one of them")
+            return
         data.check_scan(self.observation, self.label)
         load = data.observations[self.observation].expected_load
         if not isinstance(load, ExpectedLoad):

@@ -150,3 +150,16 @@ def test_the_field_of_one_detector_is_its_beam():
     found = zonda.Pipeline(steps).run(scenes.scene(instrument), threads=1)["screens"]
     assert found.side == instrument.beam_fwhm
     assert np.isfinite(found.pwv[:, 3:5, 3:5]).all()
+
+
+def test_the_log_of_a_campaign_says_that_there_is_no_scan(tmp_path):
+    steps = [
+        zonda.PointingDaisy(scan_duration="2 s"), zonda.AtmosphereLayers(pwv="5 mm"), zonda.Efficiency(),
+        zonda.BinMap(pixel="4 arcsec", width="2 arcmin"), AtmosphereScreens(), zonda.SaveMap(),
+    ]  # fmt: skip
+    scene = zonda.Scene(
+        site="green_bank", instrument={"like": "mustang2", "detectors": 7}, time="2024-11-25T07:00", target="05h +20d"
+    )
+    made = zonda.campaign(zonda.Pipeline(steps), scene, output=tmp_path / "out", realizations=2, engine="serial")
+    assert ("AtmosphereScreens", "not drawn") in {row[1:3] for row in made.tally}
+    assert (tmp_path / "out" / "map.fits").is_file()
