@@ -41,6 +41,8 @@ class Data:
     """Folder (Path) that products are written to; None: nothing is written."""
     threads: int = 1
     """Threads that the run may use."""
+    band: str = ""
+    """Name of the band that these are the data of, where the camera has several."""
 
     partial: dict[str, Product] = field(default_factory=dict)
     """What steps have added up so far, by label."""
@@ -71,6 +73,16 @@ class Data:
         if whole is not product:
             whole += product
             self.partial[label] = whole
+
+    @property
+    def scans(self) -> list[Observation]:
+        """The observations, of several bands those of the first: what was pointed."""
+        bands = len(self.scene.instrument.bands) if not self.band else 0
+        return self.observations[:: bands or 1]
+
+    def named(self, key: str) -> str:
+        """The name of a product or file of these data, the band's behind it where the camera has several."""
+        return f"{key}_{self.band}" if self.band else key
 
     def take(self, label: str) -> Any:
         """The partial product of a step, None where it has none; it is not held here any longer."""

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import InputError
 from .notebook import html_table
 from .types import Floats
 
-DEFAULTS = {"polarization_angle": 0.0, "polarization_efficiency": 0.0, "knee": 0.0, "slope": 1.0, "minimum_frequency": 1e-3}
+DEFAULTS: dict[str, float] = {
+    "polarization_angle": 0.0, "polarization_efficiency": 0.0, "band": 0, "wafer": 0, "knee": 0.0, "slope": 1.0,
+    "minimum_frequency": 1e-3,
+}  # fmt: skip
 """Of columns that are not given."""
+
+WHOLE = ("band", "wafer")
+"""Columns of whole numbers."""
 
 
 @dataclass(repr=False)
@@ -40,7 +48,9 @@ class Focalplane:
     net
         Noise-equivalent temperature on the sky, K_RJ sqrt(s): the rms of one second of integration.
     band
-        Name of the band each detector observes in.
+        Whole numbers: which of the instrument's `bands` each detector observes in; 0 where there is one.
+    wafer
+        Whole numbers: which part of the focal plane each detector is on.
     knee, slope, minimum_frequency
         Pink noise: frequency at which it equals white noise of ``net`` [Hz], exponent of the fall f^-slope, frequency below which
         it is flat [Hz]. The knee is 0 where there is none.
@@ -55,15 +65,14 @@ class Focalplane:
     net: Floats
     polarization_angle: Floats = field(default_factory=lambda: np.zeros(0))
     polarization_efficiency: Floats = field(default_factory=lambda: np.zeros(0))
-    band: list[str] = field(default_factory=list)
+    band: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    wafer: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     knee: Floats = field(default_factory=lambda: np.zeros(0))
     slope: Floats = field(default_factory=lambda: np.zeros(0))
     minimum_frequency: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         n = len(self.names)
-        if not self.band:
-            self.band = [""] * n
         for name, default in DEFAULTS.items():
             if not getattr(self, name).size:
                 setattr(self, name, np.full(n, default))
@@ -75,7 +84,7 @@ class Focalplane:
             if len(value) != n:
                 raise InputError(f"{f.name} has {len(value)} entries for {n} detectors", place="focal plane")
             if isinstance(value, np.ndarray):
-                setattr(self, f.name, np.asarray(value, np.float64))
+                setattr(self, f.name, np.asarray(value, np.int64 if f.name in WHOLE else np.float64))
                 if not np.isfinite(value).all():
                     bad = self.names[int(np.flatnonzero(~np.isfinite(value))[0])]
                     raise InputError(f"{f.name} of detector {bad} is not finite", place="focal plane")
@@ -97,7 +106,7 @@ class Focalplane:
             return html_table("Focalplane", [("detectors", 0)])
         rows = [
             ("detectors", len(self)),
-            ("bands", ", ".join(sorted(set(self.band)))),
+            ("bands", len(set(self.band.tolist()))),
             ("farthest from the boresight", f"{np.degrees(np.arctan(self.radius)) * 60:.4g} arcmin"),
             ("FWHM", span(self.fwhm, np.degrees(3600), "arcsec")),
             ("NET on the sky", span(self.net, 1e3, "mK_RJ sqrt(s)")),
@@ -123,3 +132,17 @@ class Focalplane:
     def copy(self) -> Focalplane:
         """An independent copy (an observation may change its own, e.g. `Efficiency` sets the efficiencies)."""
         return Focalplane(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
+    def of_band(self, number: int) -> Focalplane:
+        """The detectors of one band, in their order, as those of a camera that has no other: copies."""
+        rows = np.flatnonzero(self.band == number)
+        found: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "names"}
+        return Focalplane([self.names[row] for row in rows], **(found | {"band": np.zeros(len(rows), np.int64)}))
+
+    @classmethod
+    def of_bands(cls, planes: Mapping[str, Focalplane]) -> Focalplane:
+        """The detectors of several bands by name, one band after the other; their names end with the band's."""
+        columns = [f.name for f in fields(cls) if f.name not in ("names", "band")]
+        found: dict[str, Any] = {c: np.concatenate([getattr(plane, c) for plane in planes.values()]) for c in columns}
+        names = [f"{detector}-{band}" for band, plane in planes.items() for detector in plane.names]
+        return cls(names, **found, band=np.repeat(np.arange(len(planes)), [len(plane) for plane in planes.values()]))

@@ -1,119 +1,29 @@
-"""A telescope with its camera, and the passband the camera sees."""
+"""A telescope with its camera."""
 
 from __future__ import annotations
 
-import io
 import math
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from .configuration.files import InputPath
+from .band import PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
 from .configuration.parameters import Parameters, named, named_or_written, quantity
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
+from .configuration.values import mistake
 from .errors import InputError
 from .focalplane import Focalplane
 from .registry import bands, instruments
-from .storage import packed
+from .types import Floats
 from .variants import LIKE, variant
 
-SPEED_OF_LIGHT = 299792458.0
+__all__ = ["SPEED_OF_LIGHT", "Band", "CameraBand", "Instrument", "Telescope", "hexagonal_packing"]
 
 
-class Band(Parameters):
-    """A passband: flat between two edges, or tabulated in a file of two columns (frequency in GHz, transmission)."""
-
-    name: str
-    """Registered name."""
-    low: Hertz | None = None
-    """Lower edge of a flat band."""
-    high: Hertz | None = None
-    """Upper edge of a flat band."""
-    file: InputPath | None = None
-    """Table of two columns, frequency in GHz and transmission (any scale); `#` begins a comment."""
-    provenance: str = ""
-    """Where these numbers come from."""
-
-    _table: tuple[NDArray[np.float64], NDArray[np.float64]] = PrivateAttr()
-
-    def _as_argument(self) -> str:
-        return named_or_written(self, bands)
-
-    @model_validator(mode="after")
-    def _tabulate(self) -> Band:
-        if self.file is not None:
-            if self.low is not None or self.high is not None:
-                raise ValueError("give either low and high, or file")
-            self._table = _read_passband(self.file)
-        elif self.low is not None and self.high is not None and 0 < self.low < self.high:
-            self._table = (np.linspace(self.low, self.high, 61), np.ones(61))
-        else:
-            raise ValueError("a band needs 0 < low < high, or file")
-        return self
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Band) and self.model_dump() == other.model_dump()
-
-    def __hash__(self) -> int:
-        return hash((self.name, self.low, self.high, self.file))
-
-    @property
-    def frequency(self) -> NDArray[np.float64]:
-        """(n,) Hz, increasing."""
-        return self._table[0]
-
-    @property
-    def transmission(self) -> NDArray[np.float64]:
-        """(n,) relative transmission, peak 1."""
-        return self._table[1]
-
-    @property
-    def identity(self) -> tuple[str, ...]:
-        """Name and passband, as text that is the same on every machine: two bands of one name are two bands."""
-        if self.file is None:
-            return self.name, f"{self.low:.9g}", f"{self.high:.9g}"
-        table = ",".join(f"{nu:.9g} {t:.9g}" for nu, t in zip(*self._table, strict=True))
-        return self.name, table
-
-    @property
-    def centre(self) -> float:
-        """Transmission-weighted mean frequency, Hz."""
-        nu, t = self._table
-        return float(np.trapezoid(nu * t, nu) / np.trapezoid(t, nu))
-
-    @property
-    def width(self) -> float:
-        """Equivalent width, integral of the (peak-normalized) transmission, Hz."""
-        return float(np.trapezoid(self.transmission, self.frequency))
-
-
-GIGAHERTZ_MAX = 1e5
-"""Beyond, a column that was meant to be in GHz is in Hz."""
-
-
-def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    place, cure = f"passband file {path}", "write two columns: frequency in GHz and transmission"
-    try:
-        table = np.loadtxt(io.StringIO(packed.text(path, place)), ndmin=2)
-    except OSError:
-        raise InputError("no such file", place=place, cure="check the path; it is relative to the folder zonda runs in") from None
-    except ValueError as err:
-        raise InputError(f"cannot be read as numbers: {err}", place=place, cure=cure) from None
-    if table.shape[1] != 2 or len(table) < 2:
-        raise InputError(f"has {len(table)} rows of {table.shape[1]} columns", place=place, cure=cure)
-    if not np.isfinite(table).all():
-        raise InputError("contains NaN or infinity", place=place, cure=cure)
-    if table[:, 0].max() > GIGAHERTZ_MAX:
-        raise InputError(f"has a frequency above {GIGAHERTZ_MAX:g} GHz", place=place, cure=cure)
-    nu, t = table[:, 0] * 1e9, table[:, 1]
-    if (np.diff(nu) <= 0).any() or nu[0] <= 0:
-        raise InputError("frequencies must be positive and increase", place=place, cure=cure)
-    if (t < 0).any() or t.max() <= 0:
-        raise InputError("transmission must be >= 0 and somewhere > 0", place=place, cure=cure)
-    return nu, t / t.max()
+ARRAY = 0.475
+"""Radius of an array of one of several bands, in units of the distance between the centres of two that are neighbours."""
 
 
 class Telescope(Parameters):
@@ -159,14 +69,19 @@ class Instrument(Parameters):
     """What it is, in one line."""
     telescope: Telescope
     """The dish it is mounted on."""
-    band: Band
-    """The passband: a registered name, or a Band."""
+    band: BandOfCamera
+    """The passband: a registered name, or a Band. Beside `bands`: the name of the one that is observed with."""
+    bands: list[CameraBand] = Field(default_factory=list, max_length=32)
+    """Bands that are observed at the same time, each with what its detectors have of their own; what a band does not state holds
+    as it is stated for the instrument. Maps and other products are made for each."""
+    pixels: Literal["shared", "separate"] = "shared"
+    """Of several bands: every pixel has detectors of every band, or the bands have arrays side by side."""
     detectors: int = Field(ge=1, le=1_000_000)
-    """Number of detectors."""
+    """Number of detectors. Of several bands, that of each."""
     field_of_view: Angle = Field(ge=0, le=1.0)
     """Diameter of the circle that holds all detectors."""
     polarization: Literal["none", "pairs"] = "none"
-    """`pairs`: a pixel has two polarized detectors at right angles, A and B; A lies at 0 and 45 deg in turn from pixel to pixel."""
+    """`pairs`: a pixel has two polarized detectors at right angles, A and B; A lies at 0 and 45 deg in turn."""
     fwhm: Angle | None = Field(None, gt=0)
     """Main-beam FWHM; where absent, the diffraction limit 1.22 lambda / D at the band centre."""
     main_beam_efficiency: Fraction = Field(gt=0, le=1)
@@ -189,12 +104,39 @@ class Instrument(Parameters):
     def _as_argument(self) -> str:
         return named_or_written(self, instruments)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_or_several_bands(cls, value: Any, info: ValidationInfo) -> Any:
+        """What all bands state need not be stated for the instrument; ``band`` beside ``bands`` chooses one of them."""
+        if not isinstance(value, dict) or not isinstance(value.get("bands"), list) or not value["bands"]:
+            return value
+        if (chosen := value.get("band")) is not None:
+            whole = cls.model_validate({k: v for k, v in value.items() if k != "band"}, context=info.context)
+            if not isinstance(chosen, str) or chosen not in whole.cameras:
+                text = "band beside bands chooses one of them, by its name"
+                raise mistake(text, "", f"write one of {', '.join(whole.cameras)}, or leave band or bands out")
+            camera = whole.cameras[chosen]
+            return camera.model_dump(mode="json") | {"telescope": camera.telescope, "band": camera.band}
+        own = [band.model_dump(mode="json") if isinstance(band, CameraBand) else band for band in value["bands"]]
+        stated = [key for key in PER_BAND if all(isinstance(band, dict) and band.get(key) is not None for band in own)]
+        return {"band": None} | {key: own[0][key] for key in stated} | value
+
     @model_validator(mode="after")
-    def _in_pairs(self) -> Instrument:
-        if self.polarization == "pairs" and self.detectors % 2:
-            raise ValueError(
-                f"polarization: pairs needs an even number of detectors, two in each pixel; detectors is {self.detectors}"
-            )
+    def _bands_fit(self) -> Instrument:
+        names = [band.name for band in self.bands]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise mistake(f"two bands are called {twice}", "", "give each a name of its own: products and files bear it")
+        if self.band is None and not self.bands:
+            raise mistake("a camera needs a band", "", "name one with band, or several with bands")
+        counts = {band.name: band.detectors or self.detectors for band in self.bands}
+        if self.pixels == "shared" and len(set(counts.values())) > 1:
+            listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
+            text = f"shared pixels need as many detectors in every band: {listed}"
+            raise mistake(text, "", "give all bands the same number of detectors, or write pixels: separate")
+        for name, number in (counts or {"": self.detectors}).items():
+            if self.polarization == "pairs" and number % 2:
+                who = f"detectors of {name} is" if name else "detectors is"
+                raise mistake(f"polarization: pairs needs an even number of detectors, two in each pixel; {who} {number}")
         return self
 
     @field_validator("band", mode="before")
@@ -208,13 +150,42 @@ class Instrument(Parameters):
         return made
 
     @property
+    def cameras(self) -> dict[str, Instrument]:
+        """By name of the band, the camera that has this band alone; one entry where there is one band.
+
+        Of bands with arrays side by side the field of view is that of one array.
+        """
+        if not self.bands:
+            return {self.band.name: self}
+        field = 2 * math.atan(math.tan(self.field_of_view / 2) * self._arrays[2])
+        common = {"bands": [], "field_of_view": field if self.pixels == "separate" else self.field_of_view}
+        return {b.name: self.model_copy(update={**common, "band": b.alone, **b.stated}) for b in self.bands}
+
+    def check_one_band(self, what: str) -> None:
+        """Raise `InputError` about ``what``, which is of one band, where there are several."""
+        if self.bands:
+            names = [band.name for band in self.bands]
+            text = f"{self.name} has the bands {', '.join(names)}; this is of one of them"
+            raise InputError(text, place=what, cure=f"choose it: --set instrument.band={names[0]}")
+
+    @property
+    def _arrays(self) -> tuple[Floats, Floats, float]:
+        """Centres of the arrays of separate bands, and their radius, in units of the radius of the field of view."""
+        x, y = hexagonal_packing(len(self.bands))
+        x, y = x - x.mean(), y - y.mean()
+        whole = float(np.hypot(x, y).max()) + ARRAY
+        return x / whole, y / whole, ARRAY / whole
+
+    @property
     def identity(self) -> tuple[str, ...]:
         """What tells its detectors' random numbers from those of another instrument or band: names and passband."""
         return "instrument", self.name, "band", *self.band.identity
 
     @property
     def beam_fwhm(self) -> float:
-        """`fwhm`, or the diffraction limit 1.22 lambda / D at the band centre, rad."""
+        """`fwhm`, or the diffraction limit 1.22 lambda / D at the band centre, rad; of several bands the smallest."""
+        if self.bands:
+            return min(camera.beam_fwhm for camera in self.cameras.values())
         if self.fwhm is not None:
             return self.fwhm
         return 1.22 * SPEED_OF_LIGHT / self.band.centre / self.telescope.diameter
@@ -223,8 +194,10 @@ class Instrument(Parameters):
         """The detector table: pixels at points of a hexagonal lattice that just fill `field_of_view`, nearest its centre first.
 
         A pixel has one detector, or two with ``polarization: pairs``: A and B, at right angles, next to each other in the table.
-        A of every second pixel lies at 0, of the others at 45 deg.
+        A of every second pixel lies at 0, of the others at 45 deg. Several bands follow each other, in the order of `bands`.
         """
+        if self.bands:
+            return self._of_several_bands()
         pair = 2 if self.polarization == "pairs" else 1
         pixels, n = self.detectors // pair, self.detectors
         x, y = hexagonal_packing(pixels)
@@ -243,11 +216,18 @@ class Instrument(Parameters):
             net=full(n, self.net),
             polarization_angle=angle,
             polarization_efficiency=full(n, float(pair == 2)),
-            band=[self.band.name] * n,
             knee=full(n, self.knee),
             slope=full(n, self.slope),
             minimum_frequency=full(n, self.pink_minimum_frequency),
         )
+
+    def _of_several_bands(self) -> Focalplane:
+        planes = {name: camera.focalplane() for name, camera in self.cameras.items()}
+        if self.pixels == "separate":
+            radius = math.tan(self.field_of_view / 2)
+            for plane, x, y in zip(planes.values(), *self._arrays[:2], strict=True):
+                plane.xi, plane.eta = plane.xi + radius * x, plane.eta + radius * y
+        return Focalplane.of_bands(planes)
 
 
 def hexagonal_packing(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

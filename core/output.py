@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import PrivateAttr
 
@@ -24,6 +24,10 @@ class Output(Operator):
 
     Its `observe` is called before that of all other steps: what it refuses (an output folder) is refused at once.
     """
+
+    one_band: ClassVar[bool] = False
+    """It makes products of those of one band: of a camera with several bands it acts once for each, on that band's data
+    (`Data.band`). Others act once, on all that there is; products there bear the band's name (``map_f090``)."""
 
     _shown: tuple[str, ...] = PrivateAttr(())
 

@@ -22,6 +22,7 @@ from .operator import Operator
 from .output import Output, Progress
 from .run import arguments
 from .run.ahead import Ahead
+from .run.bands import check_steps, data_of_bands, distribute, gather, hand_over, points
 from .run.budget import check_kept_memory, divided, least_memory, longest_of, with_scan_ahead
 from .run.execution import Execution
 from .run.order import check_order
@@ -51,6 +52,10 @@ class Part:
     scans: Sequence[int] | None = None
     layouts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     prefix: str = ""
+
+
+Bands = list[tuple["Pipeline", Data]]
+"""What observes with each band of the camera: the steps, and the band's data."""
 
 
 class Pipeline:
@@ -95,7 +100,9 @@ class Pipeline:
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             cures = dict.fromkeys(p.cure for p in problems if p.cure)
             raise PipelineError("\n".join(lines), place=self.name, cure="\n".join(cures))
-        self.signals = Signals(self.operators, arguments.runs(runs, name), self.only, self.name)
+        self._pointed: Bands = []
+        self._asked = arguments.runs(runs, name)
+        self.signals = Signals(self.operators, self._asked, self.only, self.name)
 
     @property
     def runs(self) -> dict[str, Signal]:
@@ -155,11 +162,43 @@ class Pipeline:
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:
             timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
-        for operator in sorted(self.operators, key=lambda o: not isinstance(o, Output)):  # outputs may refuse at once
-            self._timed(timer, operator, "observe", data)
-        self._execute(data, settings, tuple(keep), timer, memory)
-        self._finish(data, timer)
+        bands = self._of_bands(data)
+        self._observe(data, bands, timer)
+        for number, (pipeline, own) in enumerate(bands):
+            pipeline._execute(own, settings, tuple(keep), timer, memory, fresh=not number)
+        self._finish(data, bands, timer)
         return data
+
+    def _of_bands(self, data: Data) -> Bands:
+        """The pipeline and the data of each band (`core.run.bands`): this one, and all data, where there is one."""
+        found = data_of_bands(data)
+        if not found:
+            return [(self, data)]
+        check_steps(self.operators)
+        made = []
+        for own in found.values():
+            pipeline = Pipeline(
+                self.operators, runs=self._asked, only=self.only, name=self.name, description=self.description,
+                precision=self.precision,
+            )  # fmt: skip
+            pipeline.operators = [o for o in pipeline.operators if not points(o) and (not isinstance(o, Output) or o.one_band)]
+            made.append((pipeline, own))
+        return made
+
+    def _observe(self, data: Data, bands: Bands, timer: Timer, *, outputs: bool = True, prefix: str = "") -> None:
+        """Let all steps observe, outputs first: they may refuse at once. Bands share the pointing. ``prefix``: of scans."""
+        several = bands[0][1] is not data
+        for operator in sorted(self.operators, key=lambda o: not isinstance(o, Output)):
+            once = points(operator) if not isinstance(operator, Output) else outputs and not operator.one_band
+            if once or not (several or isinstance(operator, Output)) or (outputs and not several):
+                before = len(data.observations)
+                self._timed(timer, operator, "observe", data)
+                for observation in data.observations[before:]:  # unique names, before other steps see them
+                    observation.name = prefix + observation.name
+        if several:
+            distribute(data, [own for _, own in bands])
+            for pipeline, own in bands:
+                pipeline._observe(own, [(pipeline, own)], timer, outputs=outputs)
 
     @faults_named(exceptions=False)
     def run_part(
@@ -178,15 +217,13 @@ class Pipeline:
         timer = Timer()
         data.layouts, data.laid_out = dict(part.layouts), True
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
-        for operator in self.operators:
-            if not isinstance(operator, Output):
-                before = len(data.observations)
-                self._timed(timer, operator, "observe", data)
-                for observation in data.observations[before:]:  # unique names, before other steps see them
-                    observation.name = part.prefix + observation.name
-        if part.scans is not None:
-            data.observations = [data.observations[k] for k in part.scans]
-        self._execute(data, settings, (), timer, memory, fresh=False)
+        bands = self._of_bands(data)
+        self._observe(data, bands, timer, outputs=False, prefix=part.prefix)
+        for pipeline, own in bands:
+            if part.scans is not None:
+                own.observations = [own.observations[k] for k in part.scans]
+            pipeline._execute(own, settings, (), timer, memory, fresh=False)
+        gather(data, [own for _, own in bands])
         data.provenance["timings"] = timer.rows()
         manager().hook.zonda_pipeline_end(pipeline=self, data=data)
         return data
@@ -194,24 +231,31 @@ class Pipeline:
     @faults_named(exceptions=False)
     def finish(self, data: Data) -> Data:
         """Finish partial products that were combined, with the layouts that they have in common, and let the outputs act."""
-        for operator in self.operators:
-            if operator.label in data.layouts:
-                operator.observe(data)
+        bands = self._of_bands(data)
+        hand_over(data, [own for _, own in bands])
+        for pipeline, own in bands:
+            for operator in pipeline.operators:
+                if operator.label in own.layouts:
+                    operator.observe(own)
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
-        self._finish(data, Timer())
+        self._finish(data, bands, Timer())
         return data
 
     @faults_named(exceptions=False)
     def point(self, scene: Scene, layouts: Mapping[str, Any], output: Path, *, laid_out: bool = False) -> Data:
         """The observations of a scene, and ``layouts`` extended to them, or taken as they are where all is ``laid_out``."""
         data = Data(scene, output=output, layouts=dict(layouts), laid_out=laid_out)
-        for operator in self.operators:
-            if not isinstance(operator, Output):
-                operator.observe(data)
+        bands = self._of_bands(data)
+        self._observe(data, bands, Timer(), outputs=False)
+        gather(data, [own for _, own in bands])
+        self._pointed = bands
         return data
 
     def least_memory(self, observations: Sequence[Observation]) -> int:
         """Bytes with which a process runs the pipeline over these observations on one thread, libraries included."""
+        if len(self._pointed) > 1:
+            shares = ((p, [o for o in observations if o.instrument == own.scene.instrument]) for p, own in self._pointed)
+            return max(pipeline.least_memory(scans) for pipeline, scans in shares)
         observation = longest_of(observations)
         note_signals([observation], self.signals.components, self.signals.formed)
         return least_memory(self.chain, observation, Settings(dtype=self._dtype))
@@ -285,8 +329,20 @@ class Pipeline:
         data.threads = settings.threads
         return settings
 
-    def _finish(self, data: Data, timer: Timer) -> None:
-        """Subtract the remainders, finish all products, and let the outputs act."""
+    def _finish(self, data: Data, bands: Bands, timer: Timer) -> None:
+        """Finish the products of all bands, and let the outputs act."""
+        for pipeline, own in bands:
+            pipeline._make_products(own, timer)
+            if own is not data:
+                pipeline._let_outputs_act(own, timer)
+        gather(data, [own for _, own in bands])
+        self._watch(data, "maps")
+        self._let_outputs_act(data, timer, every=bands[0][1] is data)
+        data.provenance["timings"] = timer.rows()
+        manager().hook.zonda_pipeline_end(pipeline=self, data=data)
+
+    def _make_products(self, data: Data, timer: Timer) -> None:
+        """Subtract the remainders, and finish all products."""
         for name, parts in self.signals.remainders.items():
             for product in data.partial.values():
                 if product.signals and stream_of(name) not in product.signals:
@@ -294,13 +350,13 @@ class Pipeline:
             data.tally.state(name, "remainder", remainder(parts))
         for operator in self.chain.steps:
             self._timed(timer, operator, "finalize", data)
-        self._watch(data, "maps")
+
+    def _let_outputs_act(self, data: Data, timer: Timer, every: bool = True) -> None:
+        """Finish the outputs; not ``every``: those that act on all bands at once."""
         for operator in self.operators:
-            if isinstance(operator, Output):
+            if isinstance(operator, Output) and (every or not operator.one_band):
                 data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
                 self._timed(timer, operator, "finalize", data)
-        data.provenance["timings"] = timer.rows()
-        manager().hook.zonda_pipeline_end(pipeline=self, data=data)
 
     def _watch(self, data: Data, done: Progress) -> None:
         for operator in self.operators:

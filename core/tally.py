@@ -32,12 +32,12 @@ class Tally:
         with self._lock:
             self._figures[who, what] = text
 
-    def update(self, other: Tally, prefix: str = "") -> None:
-        """Add another tally's counts and statements, ``prefix`` before their operators' labels."""
+    def update(self, other: Tally, prefix: str = "", suffix: str = "") -> None:
+        """Add another tally's counts and statements, ``prefix`` before their operators' labels, ``suffix`` behind them."""
         for (who, what), number in other._counts.items():
-            self.count(prefix + who, what, number, other._totals.get((who, what), 0))
+            self.count(prefix + who + suffix, what, number, other._totals.get((who, what), 0))
         for (who, what), text in other._figures.items():
-            self.state(prefix + who, what, text)
+            self.state(prefix + who + suffix, what, text)
 
     def __iter__(self) -> Iterator[tuple[str, str, str]]:
         """Rows (who, what, value) in a fixed order."""

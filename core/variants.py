@@ -40,10 +40,16 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Any:
     if isinstance(changes.get("telescope"), Mapping):
         whole = base.telescope.model_dump(mode="json") | {"site": base.telescope.site}
         changes["telescope"] = whole | dict(changes["telescope"])
-    as_it_is = base.model_dump(mode="json") | {"telescope": base.telescope, "band": base.band}
+    if one_of(base, changes.get("band")):
+        base = base.cameras[changes.pop("band")]
+    elif changes.get("bands"):
+        changes["band"] = None
+    elif changes.get("band") is not None:
+        changes["bands"] = []
+    as_it_is = base.model_dump(mode="json") | {"telescope": base.telescope, "band": base.band, "bands": base.bands}
     made = type(base).model_validate(as_it_is | changes, context=context)
-    if "fwhm" not in changes and base.fwhm is not None:
-        made = made.model_copy(update={"fwhm": base.fwhm * _diffraction(made) / _diffraction(base)})
+    if "fwhm" not in changes:
+        made = _with_beams(base, made, kept="bands" not in changes)
     found = differences(base, made)
     if not found:
         return base
@@ -68,9 +74,30 @@ def written(given: Mapping[str, Any], made: Any) -> dict[str, Any]:
     """The mapping ``given`` of a variant that came to be ``made``, in units and full paths, to be read again."""
     dumped = made.model_dump(mode="json")
     found: dict[str, Any] = {LIKE: given[LIKE]} | {key: dumped[key] for key in given if key != LIKE}
+    if one_of(named(instruments, given[LIKE]), given.get("band")):
+        found["band"] = given["band"]
     if isinstance(changed := given.get("telescope"), Mapping):
         found["telescope"] = {key: dumped["telescope"].get(key, changed[key]) for key in changed}
     return found
+
+
+def one_of(instrument: Any, band: Any) -> bool:
+    """Whether ``band`` is the name of one of the bands of an instrument that has several."""
+    return isinstance(band, str) and any(own.name == band for own in getattr(instrument, "bands", ()))
+
+
+def _with_beams(base: Any, made: Any, kept: bool) -> Any:
+    """``made`` with beams that have the ratio to the diffraction limit that those of ``base`` have, where these are stated.
+
+    ``kept``: it has the bands of ``base``.
+    """
+    if base.bands and made.bands:
+        wider = base.telescope.diameter / made.telescope.diameter
+        bands = [b.model_copy(update={"fwhm": b.fwhm and b.fwhm * wider}) if kept else b for b in made.bands]
+        return made.model_copy(update={"fwhm": base.fwhm and base.fwhm * wider, "bands": bands})
+    if base.fwhm is None or base.bands or made.bands or _diffraction(made) == _diffraction(base):
+        return made
+    return made.model_copy(update={"fwhm": base.fwhm * _diffraction(made) / _diffraction(base)})
 
 
 def _diffraction(instrument: Any) -> float:
@@ -79,10 +106,11 @@ def _diffraction(instrument: Any) -> float:
 
 def _flat(dumped: Mapping[str, Any]) -> dict[str, Any]:
     telescope = {f"telescope.{key}": value for key, value in dumped["telescope"].items()}
-    band = {"band": dumped["band"]["name"]} | {
-        f"band.{k}": v for k, v in dumped["band"].items() if k not in ("name", "provenance")
-    }
-    return {key: value for key, value in dumped.items() if key not in ("telescope", "band")} | telescope | band
+    bands: dict[str, Any] = {}
+    for place, band in (("band", dumped["band"]), *((f"bands.{b['name']}", b) for b in dumped["bands"])):
+        bands |= {place: band["name"]} if band and place == "band" else {}
+        bands |= {f"{place}.{k}": v for k, v in (band or {}).items() if k not in ("name", "provenance")}
+    return {key: value for key, value in dumped.items() if key not in ("telescope", "band", "bands")} | telescope | bands
 
 
 def _name(base: str, told: str) -> str:

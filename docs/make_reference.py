@@ -9,7 +9,7 @@ from pathlib import Path
 from zonda.core.configuration.describe import choices, members, types_in
 from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Unit
-from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.instrument import Band, CameraBand, Instrument, Telescope
 from zonda.core.plan.planning import planning_class
 from zonda.core.registry import noise_models, operators
 from zonda.core.site import Site
@@ -27,7 +27,13 @@ FOLDERS = {
     "diagnostics": "Diagnostics",
     "io": "Files",
 }
-SCENE = {Site: "site", Instrument: "instrument", Telescope: "instrument.telescope", Band: "instrument.band"}
+SCENE = {
+    Site: "site",
+    Instrument: "instrument",
+    Telescope: "instrument.telescope",
+    Band: "instrument.band",
+    CameraBand: "instrument.bands",
+}
 
 
 def page() -> str:

@@ -70,7 +70,8 @@ class Partial:
             )
         # figures of scans of one number share a row, whatever the entry: there may be a million entries
         tally = _tally({**_rows(data.tally), "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.tally.figures()]})
-        return cls(data.partial, tally, [_thinned(o, k + before) for k, o in enumerate(data.observations)])
+        bands = max(1, len(data.scene.instrument.bands))
+        return cls(data.partial, tally, [_thinned(o, k // bands + before) for k, o in enumerate(data.observations)])
 
     def __iadd__(self, other: Partial) -> Partial:
         """Add what follows."""
@@ -96,11 +97,14 @@ class Partial:
         return cls(products, _tally(tree["tally"]), tree["scans"])
 
     def observations(self, scene: Scene) -> list[Observation]:
-        """All scans, thinned; the focal plane is as the steps left it in the very first one."""
-        plane = scene.instrument.focalplane()
-        for name, values in self.scans[0]["focal_plane"].items():
-            setattr(plane, name, values)
-        return [Thinned.made(scan, index, scene, plane) for index, scan in enumerate(self.scans)]
+        """All scans, thinned, each of its bands in turn; the focal plane is as the steps left it in the very first one."""
+        whole, cameras = scene.instrument.focalplane(), list(scene.instrument.cameras.values())
+        planes = [whole.of_band(k) if len(cameras) > 1 else whole for k in range(len(cameras))]
+        for plane, first in zip(planes, self.scans, strict=False):
+            for name, values in first["focal_plane"].items():
+                setattr(plane, name, values)
+        bands = [(scene.model_copy(update={"instrument": c}), plane) for c, plane in zip(cameras, planes, strict=True)]
+        return [Thinned.made(scan, k // len(bands), *bands[k % len(bands)]) for k, scan in enumerate(self.scans)]
 
 
 @dataclass

@@ -143,7 +143,7 @@ class _Draft:
 
     def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
         """Plan an entry's pipeline; its number."""
-        from ..plan.planner import plan
+        from ..plan.bands import plan
         from ..run.first_look import first_look
 
         with _placed(about(entry) or source.file.header.name):
@@ -237,7 +237,9 @@ def common_layouts(
             with _placed(look.place):
                 data = files[look.pipeline].pipeline().point(look.scene(files), layouts, folder)
             layouts = data.layouts
-            by_pipeline[look.pipeline] = tuple(o.n_detectors * o.n_samples for o in data.observations)
+            bands = len(data.observations) // len(data.scans)
+            sizes = [o.n_detectors * o.n_samples for o in data.observations]
+            by_pipeline[look.pipeline] = tuple(sum(sizes[k : k + bands]) for k in range(0, len(sizes), bands))
         by_start[at] = by_pipeline[look.pipeline]
     return layouts, [by_start[look.pipeline, look.time.nanoseconds] for look in looks]
 

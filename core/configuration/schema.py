@@ -10,6 +10,7 @@ from pydantic.errors import PydanticInvalidForJsonSchema
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from .. import registry
+from ..band import PER_BAND
 from ..components import Registry
 from ..errors import ZondaError
 from ..operator import Operator
@@ -47,6 +48,9 @@ def json_schema() -> dict[str, Any]:
     for definition in defs.values():
         if definition.get("title") == "Instrument":
             definition["properties"]["band"] = _name_or(definition["properties"]["band"], registry.bands)
+            several = definition["properties"]["bands"]
+            several["items"] = _name_or(several["items"], registry.bands)
+            definition["required"] = [key for key in definition["required"] if key not in ("band", *PER_BAND)]
             properties["instrument"]["anyOf"].append(_variant(definition))
     steps = _step(classes, references)
     properties["operators"] = {"type": "array", "minItems": 1, "description": "Steps, in order.", "items": steps}

@@ -54,8 +54,6 @@ class Provenance:
         from zonda import __version__
 
         cards = Cards([("ORIGIN", "zonda", "simulated, not observed"), ("CREATOR", f"zonda {__version__}", "software")])
-        if product.band is not None:
-            cards["RESTFRQ"] = product.band.centre, "[Hz] centre of the band"
         return cls(cards.add(Cards([("NSCANS", len(product.scans), "scans")])), b"")
 
     @classmethod
@@ -115,7 +113,11 @@ class MapFile:
 
     def first(self, about: Provenance) -> Cards:
         """Cards of the first header: the name, where it comes from, and its own cards."""
-        return Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(about.cards)
+        own = Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(about.cards)
+        if (band := self.product.band) is not None:
+            own["RESTFRQ"] = band.centre, "[Hz] centre of the band"
+            own["BAND"] = ascii_text(band.name), "name of the band"
+        return own
 
     def write(self, path: Path, about: Provenance) -> Path:
         """Write it atomically; its path. Raises `OutputError` where it cannot be written."""
@@ -209,8 +211,7 @@ def _origin(data: Data) -> Cards:
             ("INSTRUME", ascii_text(scene.instrument.name)),
             ("SITE", ascii_text(scene.site.name)),
             ("DATE-OBS", str(scene.time), "start of the first scan, UTC"),
-            ("RESTFRQ", scene.instrument.band.centre, "[Hz] centre of the band"),
-            ("NSCANS", len(data.observations), "scans"),
+            ("NSCANS", len(data.scans), "scans"),
         ]
     )
     if command := str(provenance.get("command", "")):

@@ -42,9 +42,10 @@ def plan(
     ensure_cache()
     from ..configuration.pipeline_file import load
     from ..run.first_look import first_look
+    from .bands import as_dict
+    from .bands import plan as make
     from .only import only as alone
-    from .planner import plan as make
-    from .result import as_dict
+    from .result import Plan
 
     file = load(pipeline, settings)
     if file.header.campaign is not None:
@@ -56,8 +57,10 @@ def plan(
     if only:
         file = alone(file, only)
     first_look(file.pipeline(), file.scene())
+    if audit:
+        file.scene().instrument.check_one_band("zonda plan --audit")
     made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)
-    if not audit:
+    if not audit or not isinstance(made, Plan):
         import json
 
         click.echo(json.dumps(as_dict(made), indent=2) if as_json else str(made))

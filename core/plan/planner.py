@@ -66,6 +66,7 @@ def plan(
     _check_arguments(file, keep, drop)
     begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
+    scene.instrument.check_one_band("zonda plan")
     labels = [o.label for o in pipeline.operators]
     everything = Structure.of_all(pipeline)
     structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything

@@ -45,7 +45,7 @@ def summary(
     for ceiling in ceilings if key else ():
         with suppress(ValidationError):
             return SUMMARY.validate_python(user_cache.recall(KIND, {**(key or {}), "memory": ceiling}))
-    from .planner import plan
+    from .bands import plan
 
     fresh = plan(file, keep=keep, drop=drop, prune_all=prune_all, threads=threads, memory=memory).summary
     if key:

@@ -51,6 +51,7 @@ class AtmosphereScreens(Output):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     optional: ClassVar[frozenset[str]] = frozenset({"atmosphere"})
     provides: ClassVar[frozenset[str]] = frozenset({"screens"})
+    one_band: ClassVar[bool] = True
 
     observation: int = Field(0, ge=0)
     """Number of the scan, counted from 0."""
@@ -84,7 +85,7 @@ class AtmosphereScreens(Output):
         key = self.name or "screens"
         data.products[key] = found
         if data.output is not None:
-            write(found, product_path(data.output, key))
+            write(found, product_path(data.output, data.named(key)))
 
 
 def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: int) -> Screens:

@@ -39,6 +39,7 @@ class CompareMaps(Output):
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
     provides: ClassVar[frozenset[str]] = frozenset({"comparison"})
+    one_band: ClassVar[bool] = True
 
     map: str = "map"
     """Which map, by its name among the products, e.g. noiseless/map."""
@@ -73,7 +74,7 @@ class CompareMaps(Output):
         key = key_of(self, "comparison")
         data.products[key] = found
         if data.output is not None:
-            write_comparison(found, product_path(data.output, key), about(data))
+            write_comparison(found, product_path(data.output, data.named(key)), about(data))
 
     def _reference(self, data: Data) -> Plane:
         if self.file is None:

@@ -66,6 +66,7 @@ class MapSpectrum(Output):
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
     provides: ClassVar[frozenset[str]] = frozenset({"map_spectra"})
+    one_band: ClassVar[bool] = True
 
     maps: list[str] = Field([], max_length=7)
     """Names of products, e.g. [map, source_free/map]. Default: the map and what holds noise alone."""
@@ -82,7 +83,7 @@ class MapSpectrum(Output):
         key = key_of(self, "map_spectra")
         data.products[key] = found
         if data.output is not None:
-            write_ecsv(product_path(data.output, key, ".ecsv"), found.columns(), about(data))
+            write_ecsv(product_path(data.output, data.named(key), ".ecsv"), found.columns(), about(data))
 
 
 def map_spectra(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, ClassVar, Self, cast
 
 from pydantic import Field, model_validator
@@ -37,6 +38,7 @@ class MeasureFigures(Output):
 
     requires: ClassVar[frozenset[str]] = cast(Any, ProductsRead())
     provides: ClassVar[frozenset[str]] = frozenset({"figures"})
+    one_band: ClassVar[bool] = True
 
     metrics: list[Choice] = Field(min_length=1)
     """What to measure: names, or mappings of a name to its parameters."""
@@ -68,12 +70,14 @@ class MeasureFigures(Output):
             count = len(choice.metric.needs()) if isinstance(choice.metric, FigureMetric) else 0
             found.append(_figure(choice, data, names[:count]))
             del names[:count]
+        if data.band:
+            found = [replace(figure, name=f"{figure.name} {data.band}") for figure in found]
         key = key_of(self, "figures")
         figures = data.products[key] = Figures(found)
         for figure in figures:
             data.tally.state(self.label, figure.name, str(figure).partition(" = ")[2])
         if data.output is not None:
-            figures.write(product_path(data.output, key, ".ecsv"), about(data))
+            figures.write(product_path(data.output, data.named(key), ".ecsv"), about(data))
 
 
 def _figure(choice: Choice, data: Data, names: list[str]) -> Figure:

@@ -209,7 +209,7 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
         if sources := noise_sources(maps, name):
             yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style))
     if data.observations:
-        yield Drawing("scan", draw_scan, lambda: ([ScanTrack.of(o) for o in data.observations],), True)
+        yield Drawing("scan", draw_scan, lambda: ([ScanTrack.of(o) for o in data.scans],), True)
     early = {p.product: p for p in data.partial.values() if isinstance(p, TimeStream)}
     for name, product in (data.products | early).items():
         file = product_path("", name).name

@@ -29,6 +29,8 @@ from .report_text import LONG, Html, details, folded, readable, sexagesimal, sma
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
+    from zonda.core.data import Observation
+    from zonda.core.instrument import Instrument
 
 _WIDE = 1000
 """Pictures wider than this many pixels take a whole row."""
@@ -148,49 +150,55 @@ def _figures(data: Data) -> str:
 def _scene(data: Data) -> str:
     scene = data.scene
     instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
-    band = instrument.band
+    cameras = instrument.cameras
+    number = " + ".join(str(camera.detectors) for camera in cameras.values())
     rows: list[tuple[str, Any]] = [
         ("Site", f"{site.name}: {np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°, {site.altitude:.0f} m"),
         ("Telescope", f"{telescope.name}, {telescope.diameter:.4g} m"),
-        (
-            "Instrument",
-            f"{instrument.name}: {instrument.detectors} detectors in a field of {angle_text(instrument.field_of_view)}",
-        ),
-        (
-            "Band",
-            f"{band.name}: {band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz about {band.centre / 1e9:.4g} GHz",
-        ),
+        ("Instrument", f"{instrument.name}: {number} detectors in a field of {angle_text(instrument.field_of_view)}"),
+        *(row for camera in cameras.values() for row in _band(camera, data, several=len(cameras) > 1)),
         ("Target", _target(scene.target) if scene.target is not None else "given by the pointing step"),
         ("Start", scene.time),
         ("Seed", scene.seed),
     ]
     if data.observations:
-        plane, rate = data.observations[0].focalplane, data.observations[0].sample_rate
-        rows[4:4] = [
-            ("Beam (FWHM)", spread(plane.fwhm * 648000 / np.pi, "″")),
-            ("1 K_RJ at a point source's peak", flux_density(1.0, float(np.mean(plane.fwhm)), data)),
-            ("Main-beam efficiency ζ", spread(plane.main_beam_efficiency)),
-            ("Illumination efficiency ε", spread(plane.illumination_efficiency)),
-            ("NET on the sky", _net(data)),
-            ("Read-out", f"{rate:.6g} Hz"),
-        ]
+        rows.insert(-3, ("Read-out", f"{data.observations[0].sample_rate:.6g} Hz"))
     if campaign := data.provenance.get("campaign"):
         rows.insert(
             0, ("Campaign", f"{campaign}; this table and the plan are of its first entry, figures of its last, counts of all")
         )
-    for kind, text in (("Site", site.provenance), ("Instrument", instrument.provenance), ("Band", band.provenance)):
+    bands = [(f"Band {c.band.name}" if len(cameras) > 1 else "Band", c.band.provenance) for c in cameras.values()]
+    for kind, text in (("Site", site.provenance), ("Instrument", instrument.provenance), *bands):
         if text:
             rows.append((f"{kind}: source of the numbers", text))
     return table(rows)
 
 
-def _net(data: Data) -> str:
+def _band(camera: Instrument, data: Data, *, several: bool) -> list[tuple[str, Any]]:
+    """A band, with what its detectors are like in the first scan."""
+    band, tell = camera.band, f" {camera.band.name}" if several else ""
+    edges = f"{band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz about {band.centre / 1e9:.4g} GHz"
+    rows: list[tuple[str, Any]] = [(f"Band{tell}", f"{band.name}: {edges}")]
+    scans = [o for o in data.observations if o.instrument == camera]
+    if scans:
+        plane = scans[0].focalplane
+        rows += [
+            (f"Beam (FWHM){tell}", spread(plane.fwhm * 648000 / np.pi, "″")),
+            (f"1 K_RJ at a point source's peak{tell}", flux_density(1.0, float(np.mean(plane.fwhm)), band)),
+            (f"Main-beam efficiency ζ{tell}", spread(plane.main_beam_efficiency)),
+            (f"Illumination efficiency ε{tell}", spread(plane.illumination_efficiency)),
+            (f"NET on the sky{tell}", _net(scans, data)),
+        ]
+    return rows
+
+
+def _net(scans: Sequence[Observation], data: Data) -> str:
     """NET of all detectors in all scans (they differ where noise follows from the load); of a campaign, in the first scan."""
-    known = data.observations[:1] if "campaign" in data.provenance else data.observations
+    known = scans[:1] if "campaign" in data.provenance else scans
     text = spread(np.concatenate([o.focalplane.net for o in known]) * 1e3, " mK_RJ √s")
     if not has_white_noise(data):
         return f"{text} (no white noise is simulated)"
-    return f"{text} (of the first scan)" if len(known) < len(data.observations) else text
+    return f"{text} (of the first scan)" if len(known) < len(scans) else text
 
 
 def _target(target: Target) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.band import Band
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
@@ -32,28 +33,28 @@ def brightness(kelvin: float) -> str:
     return scaled(kelvin, ((1, "\u00a0K_RJ"), (1e3, "\u00a0mK_RJ"), (1e6, "\u00a0µK_RJ"))).replace("-", "−")
 
 
-def flux_density(kelvin: float, fwhm: float, data: Data) -> str:
+def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
     """Flux density of a point source with a flat spectrum whose peak is ``kelvin`` behind a Gaussian beam of ``fwhm`` [rad]."""
-    jansky = kelvin / to_kelvin_rj("Jy/beam", data.scene.instrument.band, beam_solid_angle=math.pi / math.log(16) * fwhm**2)
+    jansky = kelvin / to_kelvin_rj("Jy/beam", band, beam_solid_angle=math.pi / math.log(16) * fwhm**2)
     return scaled(jansky, ((1, "\u00a0Jy"), (1e3, "\u00a0mJy"), (1e6, "\u00a0µJy")), least=0.9995)
 
 
 def results(data: Data, diameter: float) -> str:
     """Cards: how much was observed, how noisy and how deep the maps are. ``diameter`` [rad] of the circle where that is taken."""
     maps = maps_of(data.products)
-    seconds = sum(o.duration for o in data.observations)
+    seconds = sum(o.duration for o in data.scans)
     samples = sum(o.n_samples * o.n_detectors for o in data.observations)
     cards: list[Card] = [
-        (str(len(data.observations)), "scan" if len(data.observations) == 1 else "scans"),
+        (str(len(data.scans)), "scan" if len(data.scans) == 1 else "scans"),
         (f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s", "on the sky"),
         (f"{samples:,}".replace(",", "\u202f"), "samples of all detectors"),
     ]
     for figure in noise_figures(maps, diameter):
-        cards += _noise(figure, maps[figure.product], diameter, data)
+        cards += _noise(figure, maps[figure.product], diameter)
     main = [(name, product) for name, product in maps.items() if "/" not in name]
     cards += [card for name, product in main for card in _depth(name, product, diameter)]
     if has_white_noise(data):
-        cards += [card for name, product in main for card in expected(name, product, diameter, data)]
+        cards += [card for name, product in main for card in expected(name, product, diameter)]
     strongest = {"input": getattr(data.products.get("input"), "values", None)}
     strongest["noiseless map"] = getattr(maps.get("noiseless/map"), "signal", None)
     for what, values in strongest.items():
@@ -63,13 +64,13 @@ def results(data: Data, diameter: float) -> str:
     return f'<div class="cards">{body}</div>'
 
 
-def _noise(figure: NoiseFigure, product: MapProduct, diameter: float, data: Data) -> list[Card]:
+def _noise(figure: NoiseFigure, product: MapProduct, diameter: float) -> list[Card]:
     """How noisy the centre of a map is, smoothed with the beam where that can be done, and as it is."""
     of = {"half_difference": product.difference.replace(" - ", " − "), "source_free": "all but the sky"}[figure.of]
     where = f"rms, {_central(diameter)}, {of}"
     label = "" if figure.product == "map" else f", {figure.product}"
     if math.isfinite(figure.smoothed):
-        how = _smoothed(figure.smoothed, product.fwhm, data)
+        how = _smoothed(figure.smoothed, product)
         before = f"the same before smoothing, per {angle_text(product.pixel)} pixel"
         return [(brightness(figure.smoothed), f"{where}, {how}{label}"), (brightness(figure.rms), before)]
     if math.isfinite(figure.rms):
@@ -87,7 +88,7 @@ def has_white_noise(data: Data) -> bool:
     return any(cls is not None and "white" in cls.provides for cls in classes)
 
 
-def expected(name: str, product: MapProduct, diameter: float, data: Data) -> list[Card]:
+def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
     """What the NET and the samples promise for the centre of a map: a card, or none where nothing is known.
 
     Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 / A.
@@ -102,15 +103,16 @@ def expected(name: str, product: MapProduct, diameter: float, data: Data) -> lis
     factor = product.pixel / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
     if product.smoothed_by or factor > 0.5:  # pixels that are not small beside the beam
         return [(brightness(rms), f"white noise by NET and samples, {where}{label}")]
-    how = _smoothed(rms * factor, product.fwhm, data)
+    how = _smoothed(rms * factor, product)
     return [(brightness(rms * factor), f"white noise by NET and samples, {where}, {how}{label}")]
 
 
-def _smoothed(kelvin: float, fwhm: float, data: Data) -> str:
-    """What smoothing with the beam of ``fwhm`` [rad] made of a map: its resolution, and the flux density of ``kelvin`` in it."""
-    resolution = math.sqrt(2) * fwhm
-    how = f"{angle_text(fwhm)} beam and as much smoothing, added in quadrature"
-    return f"smoothed with the beam to {angle_text(resolution)} ({how}): {flux_density(kelvin, resolution, data)} per such beam"
+def _smoothed(kelvin: float, product: MapProduct) -> str:
+    """What smoothing with its beam made of a map: its resolution, and the flux density of ``kelvin`` in it."""
+    resolution = math.sqrt(2) * product.fwhm
+    how = f"{angle_text(product.fwhm)} beam and as much smoothing, added in quadrature"
+    text = f"smoothed with the beam to {angle_text(resolution)} ({how})"
+    return f"{text}: {flux_density(kelvin, resolution, product.band)} per such beam" if product.band else text
 
 
 def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:

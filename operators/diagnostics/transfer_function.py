@@ -58,6 +58,7 @@ class TransferFunction(Output):
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
     provides: ClassVar[frozenset[str]] = frozenset({"transfer_function"})
+    one_band: ClassVar[bool] = True
 
     modes: Literal["sky", "full"] = "sky"
     """Singular modes of the sky alone (`sky`: the paper's noiseless map), or of the complete data, applied to it (`full`)."""
@@ -101,7 +102,7 @@ class TransferFunction(Output):
         key = key_of(self, "transfer_function")
         found = data.products[key] = Transfer(rings, edges, self.modes, before.fwhm, self.label, self.map)
         if data.output is not None:
-            found.write(product_path(data.output, key, ".ecsv"), data.provenance)
+            found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
 
 
 def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:

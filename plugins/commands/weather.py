@@ -85,7 +85,8 @@ def show(
     if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
         limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
         raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")
-    bands = list(dict.fromkeys(registry.instruments.create(name).band for name in instruments))
+    cameras = (camera for name in instruments for camera in registry.instruments.create(name).cameras.values())
+    bands = list(dict.fromkeys(camera.band for camera in cameras))
     air = profile_of(source, place, when, seed)
     water = summary.pwv_by_month(place, when.datetime.year) if place.climatology is not None else None
 

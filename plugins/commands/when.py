@@ -61,7 +61,10 @@ def when(
         raise click.BadParameter(f"{above} is outside the limits, 0 deg to 90 deg", param_hint="'--above'")
     if output is not None:
         check_output_folder(output)
-    bands: dict[str, Band] = {text: registry.instruments.create(text).band for text in instruments}
+    cameras = {text: registry.instruments.create(text).cameras for text in instruments}
+    bands: dict[str, Band] = {
+        text if len(of) == 1 else f"{text} {name}": camera.band for text, of in cameras.items() for name, camera in of.items()
+    }
 
     from .visibility import months, night_of
     from .when_text import Seen, as_dict, lines

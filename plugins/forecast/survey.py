@@ -238,6 +238,7 @@ def survey_of(file: PipelineFile) -> Survey:
     Raises PipelineError for what the forecast does not cover, and what the steps raise.
     """
     chosen, scene = steps_of(file), file.scene()
+    scene.instrument.check_one_band("zonda sensitivity")
     header = file.header
     pipeline = Pipeline(chosen.operators, name=header.name, precision=header.precision)
     steps = Steps.among(pipeline.operators)  # copies, which know the scans

@@ -190,7 +190,7 @@ def test_the_flux_density_of_a_beam(data):
     low, high = band.frequency[0], band.frequency[-1]
     fwhm = np.radians(10 / 3600)
     expected = 2 * 1.380649e-23 * 1e-3 * 1.13309 * fwhm**2 / 299792458.0**2 * low * high / 1e-26  # Jy for 1 mK
-    shown = flux_density(1e-3, fwhm, data)
+    shown = flux_density(1e-3, fwhm, band)
     value, unit = shown.split("\u00a0")
     assert float(value) * {"Jy": 1, "mJy": 1e-3, "µJy": 1e-6}[unit] == pytest.approx(expected, rel=5e-3)  # three figures
 
@@ -201,16 +201,16 @@ def test_the_white_noise_that_is_expected():
     steps = [zonda.PointingDaisy(scan_duration="20 s"), zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="3 arcsec")]
     data = zonda.Pipeline(steps).run(scene)
     product, circle = data.products["map"], np.radians(2 / 60)
-    ((shown, what),) = expected("map", product, circle, data)
+    ((shown, what),) = expected("map", product, circle)
     value, unit = shown.split("\u00a0")
     smoothed = product.smoothed(product.fwhm).noise[product.distance() <= circle / 2]
     wanted = np.nanmedian(smoothed)
     assert float(value) * {"µK_RJ": 1e-6, "mK_RJ": 1e-3}[unit] == pytest.approx(wanted, rel=0.05)
     assert "smoothed with the beam to 12″ (8.5″ beam and as much smoothing, added in quadrature)" in what
     assert what in results(data, circle).replace("&#x27;", "'")
-    ((shown, what),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle, data)
+    ((shown, what),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle)
     assert "beam" not in what
-    assert expected("map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle, data) == []
+    assert expected("map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle) == []
 
 
 def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeypatch):

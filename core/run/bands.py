@@ -1,0 +1,114 @@
+"""A camera of several bands: the telescope is pointed once, and each band observes the scans as a camera that has no other.
+
+Every band has the bits that it has alone. What bands share is keyed without them: pointing, and the turbulence above the
+telescope. What belongs to detectors is keyed by instrument and band (`Observation.detector_key`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ..data import Data
+from ..errors import InputError, PipelineError
+from ..observation import Observation
+from ..operator import Operator
+from ..signal import MAIN, product_name, stream_of
+from ..tally import Tally
+
+
+def data_of_bands(data: Data) -> dict[str, Data]:
+    """By name of the band, the data of a run with that band alone; empty where the camera has one band."""
+    instrument = data.scene.instrument
+    return {
+        name: Data(
+            data.scene.model_copy(update={"instrument": camera}), provenance=dict(data.provenance), output=data.output,
+            threads=data.threads, laid_out=data.laid_out, band=name,
+        )
+        for name, camera in (instrument.cameras.items() if instrument.bands else ())
+    }  # fmt: skip
+
+
+def points(operator: Operator) -> bool:
+    """Whether a step points the telescope, which is done once for all bands."""
+    return "boresight" in operator.provides
+
+
+def check_steps(operators: list[Operator]) -> None:
+    """Refuse steps that observe with one band alone (`PipelineError`)."""
+    for operator in operators:
+        if points(operator) and operator.provides != {"boresight"}:
+            raise PipelineError(
+                "reads the detectors' streams, which it cannot for a camera of several bands",
+                place=operator.label,
+                cure="give the scene an instrument with one band: one run for each",
+            )
+
+
+def distribute(data: Data, bands: Sequence[Data]) -> None:
+    """Give each band its detectors of all scans, and what is laid out for it; what pointing tells is told once."""
+    for number, own in enumerate(bands):
+        own.observations = [_of_band(scan, number, own) for scan in data.observations]
+        own.layouts = _of(data.layouts, own.band)
+    for scan in data.observations:
+        data.tally.update(scan.tally)
+
+
+def hand_over(data: Data, bands: Sequence[Data]) -> None:
+    """Give each band its scans, layouts and partial products of combined data (`gather`); nothing where there is one band."""
+    if bands[0] is data:
+        return
+    for own in bands:
+        own.observations = [scan for scan in data.observations if scan.instrument == own.scene.instrument]
+        own.partial, own.layouts = _of(data.partial, own.band), _of(data.layouts, own.band)
+    data.partial, data.layouts = {}, {}
+
+
+def _of(whole: Mapping[str, Any], band: str) -> dict[str, Any]:
+    """What belongs to a band of what `gather` put together by label."""
+    return {key.removesuffix(_key(band)): value for key, value in whole.items() if key.endswith(_key(band))}
+
+
+def gather(data: Data, bands: Sequence[Data]) -> None:
+    """Put together what the bands made: products and entries of the log bear the band's name; nothing where there is one band."""
+    if bands[0] is data:
+        return
+    scans = zip(*(own.observations for own in bands), strict=True)
+    data.observations = [scan for together in scans for scan in together]
+    for own in bands:
+        band = own.band
+        for name, product in own.products.items():
+            if isinstance(product, list):  # of files
+                data.products.setdefault(name, []).extend(product)
+                continue
+            signal, _, plain = name.rpartition("/")
+            key = product_name(stream_of(signal) if signal else MAIN, own.named(plain))
+            if key in data.products:
+                cure = "rename the band, or give the step another product name"
+                raise PipelineError(f"two steps make the product {key!r}", place=f"band {band}", cure=cure)
+            data.products[key] = product
+        data.partial |= {label + _key(band): part for label, part in own.partial.items()}
+        data.layouts |= {label + _key(band): layout for label, layout in own.layouts.items()}
+        data.tally.update(own.tally, suffix=f" {band}")
+
+
+def _key(band: str) -> str:
+    return f"@{band}"
+
+
+def _of_band(scan: Observation, number: int, own: Data) -> Observation:
+    """A scan with one band's detectors."""
+    band = own.band
+    plane = scan.focalplane.of_band(number)
+    if not len(plane):
+        raise InputError(
+            f"the focal plane has no detector of the band {band}",
+            place=f"instrument {own.scene.instrument.name}",
+            cure="a class that lays out detectors of several bands joins them with Focalplane.of_bands",
+        )
+    return replace(
+        scan, name=f"{scan.name}-{band}", instrument=own.scene.instrument, focalplane=plane, flags=scan.flags.copy(),
+        detector_flags=scan.detector_flags[scan.focalplane.band == number], intervals=dict(scan.intervals), smooth={}, detdata={},
+        noise_levels={}, closed_forms={}, windows={}, quoted_net=None, expected_load=None, tally=Tally(),
+    )  # fmt: skip

@@ -1,0 +1,214 @@
+"""Cameras of several bands: each band has the bits that it has alone, products and files bear its name."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import zonda
+from zonda.core.errors import ZondaError
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.registry import bands
+
+BANDS: dict[str, dict[str, Any]] = {
+    "f090": {"low": "77 GHz", "high": "106 GHz", "net": "300 uK s(1/2)", "knee": "0.5 Hz"},
+    "f150": {"low": "130 GHz", "high": "170 GHz", "net": "360 uK s(1/2)", "fwhm": "1.4 arcmin"},
+}
+PLANES = ("signal", "hits", "weights", "noise", "half_difference")
+PIXELS = 19
+
+
+def camera(*names: str, **changes: Any) -> zonda.Instrument:
+    """6 m, with these bands."""
+    common = {
+        "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"}, "detectors": PIXELS, "field_of_view": "20 arcmin",
+        "main_beam_efficiency": 0.8, "illumination_efficiency": 0.9, "sample_rate": "50 Hz",
+    }  # fmt: skip
+    if len(names) > 1:
+        return zonda.Instrument(**common, bands=[{"name": name, **BANDS[name]} for name in names], **changes)
+    own = dict(BANDS[names[0]])
+    band = {"name": names[0], "low": own.pop("low"), "high": own.pop("high")}
+    return zonda.Instrument(**common, band=band, **own, **changes)
+
+
+def scene(*names: str, **changes: Any) -> zonda.Scene:
+    instrument = camera(*names, **changes)
+    return zonda.Scene(site="llano_de_chajnantor", instrument=instrument, time="2022-08-01T23:00", target="260d -10d", seed=3)
+
+
+def pipeline(*more: zonda.Operator, without: tuple[type, ...] = ()) -> zonda.Pipeline:
+    values = np.zeros((64, 64))
+    values[30, 34] = 1e-4
+    steps = [
+        zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="30 s", scans=2),
+        zonda.SkyMap(map=values, unit="K_CMB", pixel_size="30 arcsec", centre="target"),
+        zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %"),
+        zonda.WhiteNoise(scatter="10 %"),
+        zonda.PinkNoise(),
+        zonda.Efficiency(calibration_error="3 %"),
+        zonda.HighpassFilter(frequency="0.2 Hz"),
+        zonda.CommonModeFilter(),
+        zonda.BinMap(pixel="1 arcmin"),
+        *more,
+    ]
+    runs = {"noiseless": {"only": ["sky"], "modes": "full"}}
+    return zonda.Pipeline([s for s in steps if not isinstance(s, without)], runs=runs)
+
+
+@pytest.fixture(scope="module")
+def both() -> Any:
+    return pipeline().run(scene("f090", "f150"), keep=["signal", "white", "atmosphere"], threads=1)
+
+
+@pytest.mark.parametrize("name", BANDS)
+def test_a_band_alone_has_the_bits_that_it_has_beside_another(both: Any, name: str) -> None:
+    """Noise, its scatter, the calibration error, sky, atmosphere and filters: all of the maps."""
+    alone = pipeline().run(scene(name), keep=["signal"], threads=2)
+    for product in ("map", "noiseless/map"):
+        for plane in PLANES:
+            one, other = getattr(alone[product], plane), getattr(both[f"{product}_{name}"], plane)
+            np.testing.assert_array_equal(one, other)
+    for scan in range(2):
+        np.testing.assert_array_equal(alone.tod(scan=scan), both.tod(scan=f"scan-{scan:03d}-{name}"))
+    assert both[f"map_{name}"].band.name == name
+    assert both[f"map_{name}"].fwhm == alone["map"].fwhm
+
+
+def test_bands_see_one_atmosphere_and_have_noise_of_their_own(both: Any) -> None:
+    """The fluctuation of the emission, detector by detector, at 6 m: > 0.999 although the beams differ. White noise: correlated
+    by 0 within 4 standard errors, n^-1/2."""
+    scans = [next(o for o in both.observations if o.name == f"scan-000-{name}") for name in BANDS]
+    streams = [[o.detdata[what].astype(float) for o in scans] for what in ("atmosphere", "white")]
+    one, other = (x - x.mean(axis=1, keepdims=True) for x in streams[0])
+    correlation = (one * other).sum(1) / np.sqrt((one**2).sum(1) * (other**2).sum(1))
+    assert correlation.min() > 0.999
+    one, other = streams[1]
+    assert abs((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum())) < 4 / one.size**0.5
+
+
+def test_products_scans_and_the_log_bear_the_bands_names(both: Any) -> None:
+    assert {"map_f090", "map_f150", "noiseless/map_f090", "noiseless/map_f150", "input_f090"} <= set(both)
+    assert [o.name for o in both.observations] == [f"scan-00{k}-{name}" for k in range(2) for name in BANDS]
+    assert [o.name for o in both.scans] == ["scan-000-f090", "scan-001-f090"]
+    assert both.tally.get("BinMap f090", "samples binned") == both["map_f090"].hits.sum()
+    ratio = np.nanmax(both["input_f090"].values) / np.nanmax(both["input_f150"].values)
+    kelvin = [to_kelvin_rj("K_CMB", camera(name).band) for name in BANDS]
+    assert ratio == pytest.approx(kelvin[0] / kelvin[1], rel=1e-12)
+
+
+def test_files_per_band(tmp_path: Path) -> None:
+    text = ["SaveMap", "Report", "SaveTOD"]
+    steps = [getattr(zonda, name)() for name in text]
+    transfer = zonda.TransferFunction(bins=3)
+    made = pipeline(transfer, zonda.MeasureFigures(metrics=["central_rms"]), *steps, without=(zonda.PinkNoise,))
+    data = made.run(scene("f090", "f150"), output=tmp_path, threads=1)
+    for name in BANDS:
+        header = fits.getheader(tmp_path / f"map_{name}.fits")
+        assert header["BAND"] == name
+        assert header["RESTFRQ"] == pytest.approx(camera(name).band.centre)
+        assert header["NSCANS"] == 2
+        assert (tmp_path / f"noiseless_map_{name}.fits").exists()
+        assert (tmp_path / f"transfer_function_{name}.ecsv").exists()
+        assert (tmp_path / f"tod_scan-001-{name}.h5").exists()
+        assert f"central_rms {name}" in [f.name for f in data[f"figures_{name}"]]
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Band f090" in page
+    assert "Band f150" in page
+    assert "19 + 19 detectors" in page
+
+
+def test_arrays_side_by_side() -> None:
+    plane = camera("f090", "f150", pixels="separate").focalplane()
+    one, other = (np.stack([plane.xi, plane.eta])[:, plane.band == k] for k in (0, 1))
+    assert np.hypot(*(one[:, :, None] - other[:, None])).min() > 0  # no detector of one where there is one of the other
+    assert 2 * np.arctan(plane.radius) <= np.radians(20 / 60) * (1 + 1e-9)
+
+
+def test_values_of_the_instrument_hold_for_bands_that_do_not_state_theirs() -> None:
+    made = camera("f090", "f150", slope=1.5, knee="0.1 Hz").cameras
+    assert [c.slope for c in made.values()] == [1.5, 1.5]
+    assert [c.knee for c in made.values()] == [0.5, 0.1]
+    assert made["f090"].beam_fwhm == camera("f090").beam_fwhm  # the diffraction limit
+    assert made["f150"].beam_fwhm == pytest.approx(np.radians(1.4 / 60))
+
+
+def test_one_band_of_several_is_chosen_by_its_name() -> None:
+    whole = camera("f090", "f150")
+    for chosen in (whole.varied(band="f150"), zonda.Instrument(**whole.model_dump(mode="json") | {"band": "f150"})):
+        assert chosen == whole.cameras["f150"]
+        assert chosen.identity == camera("f150").identity
+    assert whole.varied(detectors=7).cameras["f150"].detectors == 7
+
+
+def test_a_variant_with_another_dish_keeps_the_ratio_to_the_diffraction_limit() -> None:
+    wide = camera("f090", "f150").varied(telescope={"diameter": "3 m"}).cameras
+    assert wide["f150"].beam_fwhm == pytest.approx(2 * np.radians(1.4 / 60))
+    assert wide["f090"].beam_fwhm == pytest.approx(2 * camera("f090").beam_fwhm)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"bands": [{"name": "a", **BANDS["f090"]}, {"name": "a", **BANDS["f150"]}]}, "two bands are called a"),
+        (
+            {"bands": [{"name": "a", **BANDS["f090"]}, {"name": "b", **BANDS["f150"], "detectors": 7}]},
+            "as many detectors in every band: a has 19, b has 7",
+        ),
+        ({"bands": [{"name": "a b", **BANDS["f090"]}]}, "bands.0.name: 'a b' has a character that is not allowed"),
+        ({"bands": ["f090x"]}, "unknown band 'f090x'"),
+        ({"bands": [{"name": "so_93gz", "net": "1 mK s(1/2)"}]}, "did you mean 'so_93ghz'"),
+        ({"band": "f220"}, "write one of f090, f150"),
+        ({"polarization": "pairs"}, "even number of detectors, two in each pixel; detectors of f090 is 19"),
+    ],
+)
+def test_bad_bands(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ZondaError, match=words):
+        zonda.Instrument(**camera("f090", "f150").model_dump(mode="json") | changes)
+
+
+def test_a_registered_band_by_its_name() -> None:
+    made = zonda.Instrument(
+        **camera("f090", "f150").model_dump(mode="json") | {"bands": ["so_93ghz", {"name": "so_145ghz", "knee": "1 Hz"}]}
+    )
+    assert made.cameras["so_93ghz"].band == bands.create("so_93ghz")
+    assert made.cameras["so_145ghz"].knee == 1
+
+
+def test_what_is_of_one_band_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "two.yaml"
+    lines = "\n".join(
+        [
+            "site: llano_de_chajnantor", "time: 2022-08-01T23:00", "target: 260d -10d",
+            "instrument: {name: x, telescope: {name: d, diameter: 6 m}, detectors: 7, field_of_view: 20 arcmin,",
+            "  main_beam_efficiency: 0.8, illumination_efficiency: 0.9, net: 1 mK s(1/2), sample_rate: 50 Hz,",
+            "  bands: [so_93ghz, so_145ghz]}",
+            "operators: [PointingDaisy: {scan_duration: 20 s}, WhiteNoise, Efficiency, BinMap: {pixel: 1 arcmin}]",
+        ]
+    )  # fmt: skip
+    file.write_text(lines)
+    with pytest.raises(ZondaError, match="x has the bands so_93ghz, so_145ghz; this is of one of them"):
+        zonda.sensitivity(str(file))
+    assert zonda.load(file, ["instrument.band=so_145ghz"]).scene().instrument.band.name == "so_145ghz"
+    made = zonda.plan(zonda.load(file))
+    assert set(made.plans) == {"so_93ghz", "so_145ghz"}
+    assert "band so_145ghz:" in str(made)
+    again = tmp_path / "again.yaml"
+    again.write_text(made.apply(zonda.load(file)).resolved_yaml())
+    assert zonda.load(again).scene().instrument == zonda.load(file).scene().instrument
+
+
+def test_steps_that_read_streams_from_files_are_refused() -> None:
+    class Reader(zonda.PointingStare):
+        provides = frozenset({"boresight", "signal"})
+
+    with pytest.raises(ZondaError, match="cannot for a camera of several bands"):
+        zonda.Pipeline([Reader(), zonda.BinMap()]).run(scene("f090", "f150"))
+
+
+def test_a_product_name_that_a_band_takes_is_refused() -> None:
+    made = pipeline(zonda.BinMap(pixel="1 arcmin", product="map_f150_f090"), zonda.BinMap(pixel="1 arcmin", product="map_f150"))
+    data = made.run(scene("f090", "f150"), threads=1)
+    assert isinstance(data["map_f150_f090_f090"], MapProduct)
