@@ -30,14 +30,15 @@ UNITS = {"transmission": "", "opacity": "", "flags": "", "pwv": "m", "path_delay
 
 
 class StreamsAsked:
-    """The ``optional`` of an operator with a parameter ``streams``: all components for the class, those asked for in an object.
+    """The ``optional`` of an operator with a parameter ``streams``: all components for the class, those asked for in an object,
+    and the streams of signals among them.
 
     So the executor keeps no stream that nobody reads, see `core.run.execution`.
     """
 
     def __get__(self, operator: Any, owner: type) -> frozenset[str]:
         asked = getattr(operator, "streams", None)
-        return COMPONENTS if asked is None else COMPONENTS & frozenset(asked)
+        return COMPONENTS if asked is None else frozenset(name for name in asked if name in COMPONENTS or f"{MAIN}/" in name)
 
 
 class StreamsNeeded:

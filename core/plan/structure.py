@@ -16,7 +16,7 @@ from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
 from ..run.signals import acting_steps, remainder
-from ..signal import MAIN, TRANSMISSION, Component, is_stream
+from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
 from .context import Work
 
 
@@ -71,8 +71,9 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
         pinned = dict.fromkeys(keep, "asked for with --keep")
         for other in [n for n in needed if not name and _takes_modes(pipeline, n)]:
             pinned |= {o.label: f"signal {other} takes its modes" for o in steps if o.couples == "all"}
-        found, left_out = _walk(steps, wanted, pinned)
-        if name and (reason := _useless(steps, found, wanted)):
+        compared = _is_compared(pipeline, name)
+        found, left_out = _walk(steps, wanted | {MAIN} if compared else wanted, pinned)
+        if name and not compared and (reason := _useless(steps, found, wanted)):
             rows.append(Row(name, "", reason))
         else:
             needed[name] = found
@@ -99,6 +100,11 @@ def _wanted(pipeline: Pipeline, name: str) -> set[str]:
         if isinstance(o, Output) and o.reads(name):
             found |= o.requires | o.optional
     return found
+
+
+def _is_compared(pipeline: Pipeline, name: str) -> bool:
+    """Whether a step that acts on the complete signal reads the stream of another one, too."""
+    return bool(name) and any(stream_of(name) in o.optional for o in pipeline.operators)
 
 
 def _in_place_of_complete(pipeline: Pipeline, needed: Mapping[str, Mapping[str, str]], keep: set[str]) -> str:

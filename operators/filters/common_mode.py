@@ -39,7 +39,7 @@ from . import focal_plane_mean
 from .gram import Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
 from .parameters import CommonModeParameters
-from .source_mask import MASKED, Inside
+from .source_mask import MASKED, Inside, counts
 
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
@@ -156,7 +156,7 @@ def _tell(step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz
     """State what was found; flag the dead detectors, which the complete signal shows."""
     observation, tally, who = stream.observation, stream.observation.tally, step.label
     if inside is not None:
-        masked, covered = inside.counts(observation.n_samples)
+        masked, covered = counts(inside, observation.n_samples)
         tally.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
         tally.count(who, "instants with all detectors in the source mask: no mode removed", covered, observation.n_samples)
     if stream.signal == MAIN:

@@ -9,14 +9,17 @@ what is removed, b - F b, is found outside of the mask and is subtracted inside 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import field_validator
+from pydantic import Field, field_validator, model_validator
 
-from zonda.core.configuration.parameters import Parameters, quantity
+from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
 from zonda.core.errors import PipelineError
@@ -26,18 +29,23 @@ from zonda.core.observation import Observation
 from zonda.core.types import AnyFloats, Floats
 
 from .brick_wall import bridge
+from .mask_image import read_mask
 
+RADIUS = math.radians(1 / 60)
+"""Of a disc, where none is given."""
 MASKED = "samples in the source mask, not used to find what is removed"
 """A count of the log."""
 
 
 class SourceMask(Parameters):
-    """A disc on the sky whose samples a filter does not use to find what it removes."""
+    """A disc on the sky, or masked pixels of an image, whose samples a filter does not use to find what it removes."""
 
-    radius: Angle = quantity("1 arcmin", gt=0, le=0.5)
-    """Radius of the disc."""
+    radius: Angle | None = Field(None, gt=0, le=0.5)
+    """Radius of the disc; where absent, 1 arcmin."""
     centre: Target | None = None
     """Centre of the disc; where absent, the target of the scan."""
+    file: InputPath | None = None
+    """In place of a disc: a FITS image (TAN) that is not zero where samples are masked. Beyond it nothing is."""
 
     @field_validator("centre")
     @classmethod
@@ -46,8 +54,16 @@ class SourceMask(Parameters):
             raise ValueError("the centre of a mask must be fixed on the sky; give ICRS or galactic coordinates")
         return value
 
+    @model_validator(mode="after")
+    def _one_kind(self) -> SourceMask:
+        if self.file is not None and (self.radius is not None or self.centre is not None):
+            raise ValueError("give either file, an image, or radius and centre of a disc")
+        return self
+
     def of(self, observation: Observation) -> Inside:
-        """Where the samples of a scan are inside."""
+        """Where the samples of a scan are inside. Raises InputError for a file that cannot be used."""
+        if self.file is not None:
+            return read_mask(self.file).of(observation)
         ra, dec = self.centre.icrs() if self.centre else observation.centre
         centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
         seen = empty((3, observation.n_samples))
@@ -56,12 +72,23 @@ class SourceMask(Parameters):
             seen[:, s] = sum(turn[:, k, :].T * centre[k] for k in range(3))
         plane = observation.focalplane
         rays = np.stack([-plane.eta, -plane.xi, np.ones(len(plane))])
-        return Inside(seen, rays / np.sqrt((rays * rays).sum(axis=0)), float(np.sin(self.radius / 2)))
+        return InsideDisc(seen, rays / np.sqrt((rays * rays).sum(axis=0)), float(np.sin((self.radius or RADIUS) / 2)))
+
+
+class Inside(Protocol):
+    """Which samples of a scan are in a mask."""
+
+    @property
+    def n_detectors(self) -> int:
+        """Of the scan."""
+
+    def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
+        """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
 
 
 @dataclass(frozen=True)
-class Inside:
-    """Which samples are in a mask.
+class InsideDisc:
+    """Which samples are in a disc.
 
     Attributes
     ----------
@@ -77,6 +104,11 @@ class Inside:
     rays: Floats
     half_chord: float
 
+    @property
+    def n_detectors(self) -> int:
+        """Of the scan."""
+        return int(self.rays.shape[1])
+
     def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
         a, b = self.rays[:, detectors], self.centre[:, samples]
@@ -85,13 +117,14 @@ class Inside:
             found += (a[k, :, None] - b[k]) ** 2
         return np.asarray(found <= (2 * self.half_chord) ** 2)
 
-    def counts(self, n_samples: int) -> tuple[int, int]:
-        """(samples of all detectors inside, instants at which all detectors are)."""
-        every, number, covered = slice(0, self.rays.shape[1]), 0, 0
-        for samples in chunks(n_samples, 1 << 10):
-            found = self.at(every, samples)
-            number, covered = number + int(found.sum()), covered + int(found.all(axis=0).sum())
-        return number, covered
+
+def counts(inside: Inside, n_samples: int) -> tuple[int, int]:
+    """(samples of all detectors inside, instants at which all detectors are)."""
+    every, number, covered = slice(0, inside.n_detectors), 0, 0
+    for samples in chunks(n_samples, 1 << 10):
+        found = inside.at(every, samples)
+        number, covered = number + int(found.sum()), covered + int(found.all(axis=0).sum())
+    return number, covered
 
 
 def filter_outside(
@@ -123,4 +156,4 @@ def check_mask(inside: Inside, observation: Observation, place: str) -> None:
     """Raise PipelineError where a mask covers all that the middle detector sees."""
     middle = int(np.argmin(np.hypot(observation.focalplane.xi, observation.focalplane.eta)))
     if inside.at(slice(middle, middle + 1), slice(0, observation.n_samples)).all():
-        raise PipelineError("the source mask covers the whole scan", place=place, cure="choose a smaller radius")
+        raise PipelineError("the source mask covers the whole scan", place=place, cure="choose a smaller one")

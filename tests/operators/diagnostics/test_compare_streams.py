@@ -197,3 +197,28 @@ def test_a_signal_that_there_is_not(reference, runs, said):
     steps = [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.CompareStreams(reference=reference, segment="1 s")]
     with pytest.raises(ZondaError, match=said):
         zonda.Pipeline(steps, runs=runs).run(scenes.scene(scenes.camera(7)), threads=1)
+
+
+def test_the_plan_keeps_a_signal_that_is_compared(tmp_path):
+    from zonda.core.configuration.pipeline_file import parse
+    from zonda.core.plan.planner import plan
+
+    text = """
+site: green_bank
+instrument: {like: mustang2, detectors: 7}
+time: 2024-11-25T07:00
+target: 05h00m00s +20d00m00s
+runs: {quiet: {only: [white]}, other: {only: [atmosphere]}}
+operators:
+  - PointingDaisy: {radius: 1 arcmin, speed: 50 arcsec/s, scan_duration: 10 s}
+  - AtmosphereLayers
+  - WhiteNoise
+  - Efficiency
+  - CompareStreams: {reference: signal/quiet, segment: 1 s}
+  - Report
+"""
+    file = parse(text)
+    applied = plan(file).apply(file)
+    assert list(applied.pipeline().runs) == ["quiet"]  # nothing reads the other
+    data = applied.pipeline().run(applied.scene(), output=tmp_path, threads=1)
+    assert data.products["stream_comparison"].reference == "signal/quiet"

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
 
 import zonda.testing
-from zonda.core.errors import PipelineError
+from zonda.core.errors import InputError, PipelineError
 from zonda.core.numerics.projection import directions
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.detrend import Detrend
 from zonda.operators.filters.highpass import HighpassFilter
-from zonda.operators.filters.source_mask import SourceMask
+from zonda.operators.filters.source_mask import SourceMask, counts
 
 N_DET, N = 37, 6000
 MASK = {"radius": "25 arcsec"}
@@ -41,7 +45,7 @@ def test_it_is_a_disc_on_the_sky(bench):
     near = np.abs(distance(bench, observation) - radius) < 1e-9 * radius
     np.testing.assert_array_equal(found[~near], (distance(bench, observation) <= radius)[~near])
     np.testing.assert_array_equal(inside.at(slice(3, 9), slice(100, 333)), found[3:9, 100:333])
-    assert inside.counts(N) == (int(found.sum()), int(found.all(axis=0).sum()))
+    assert counts(inside, N) == (int(found.sum()), int(found.all(axis=0).sum()))
     elsewhere = SourceMask(radius="25 arcsec", centre="05h +21d").of(observation)
     assert not elsewhere.at(slice(0, N_DET), slice(0, N)).any()
 
@@ -150,3 +154,90 @@ def test_they_keep_the_contract(step):
     zonda.testing.check_operator(
         type(step)(**{**step.model_dump(mode="json", exclude_unset=True), "mask": {"radius": "1 arcmin"}})
     )
+
+
+def image_of_discs(bench, path, centres, radius, turned=0.3):
+    """A FITS image, turned on the sky, that is 1 within ``radius`` [rad] of directions ``centres`` and 0 elsewhere; its WCS."""
+    made = WCS(naxis=2)
+    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = ["RA---TAN", "DEC--TAN"], np.degrees(bench.CENTRE), [150.2, 140.7]
+    made.wcs.cdelt, made.wcs.pc = [-1 / 3600, 1 / 3600], [[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]]
+    made.wcs.set()
+    ra, dec = np.radians(made.wcs_pix2world(*np.meshgrid(np.arange(300), np.arange(280)), 0))
+    sky = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    cosine = np.max([np.tensordot(c, sky, 1) for c in centres], axis=0)
+    fits.PrimaryHDU((cosine >= np.cos(radius)).astype(np.uint8), made.to_header()).writeto(path, overwrite=True)
+    return made
+
+
+def unit_vector(ra, dec):
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
+def test_an_image_is_looked_up_at_the_nearest_pixel(bench, tmp_path):
+    """As astropy finds the pixels; where the image has the disc, the disc up to pixels of its edge."""
+    observation, (ra, dec) = bench.observation(N_DET, N), bench.CENTRE
+    wcs = image_of_discs(bench, tmp_path / "mask.fits", [unit_vector(ra, dec)], 25 * bench.ARCSEC)
+    inside = SourceMask(file=tmp_path / "mask.fits").of(observation)
+    found = inside.at(slice(0, N_DET), slice(0, N))
+    looked = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    lon, lat = np.degrees(np.arctan2(looked[..., 1], looked[..., 0])) % 360, np.degrees(np.arcsin(looked[..., 2]))
+    x, y = wcs.wcs_world2pix(lon, lat, 0)
+    near = (np.abs(x - np.floor(x) - 0.5) < 1e-6) | (np.abs(y - np.floor(y) - 0.5) < 1e-6)  # between two pixels
+    on = (np.rint(x) >= 0) & (np.rint(x) < 300) & (np.rint(y) >= 0) & (np.rint(y) < 280)
+    masked = fits.getdata(tmp_path / "mask.fits")
+    expected = np.zeros(found.shape, bool)
+    expected[on] = masked[np.rint(y[on]).astype(int), np.rint(x[on]).astype(int)] != 0
+    np.testing.assert_array_equal(found[~near], expected[~near])
+    edge = np.abs(distance(bench, observation) - 25 * bench.ARCSEC) < np.sqrt(0.5) * bench.ARCSEC  # half a pixel's diagonal
+    disc = SourceMask(**MASK).of(observation).at(slice(0, N_DET), slice(0, N))
+    np.testing.assert_array_equal(found[~edge], disc[~edge])
+    np.testing.assert_array_equal(inside.at(slice(3, 9), slice(100, 333)), found[3:9, 100:333])
+    assert counts(inside, N) == (int(found.sum()), int(found.all(axis=0).sum()))
+    assert found.any()
+    assert not found.all()
+
+
+@pytest.mark.parametrize("kind", [HighpassFilter, CommonModeFilter, Detrend])
+def test_a_filter_takes_an_image(bench, tmp_path, kind):
+    ra, dec = bench.CENTRE
+    image_of_discs(
+        bench, tmp_path / "mask.fits", [unit_vector(ra, dec), unit_vector(ra, dec + 40 * bench.ARCSEC)], 10 * bench.ARCSEC
+    )
+    zonda.testing.check_operator(kind(mask={"file": tmp_path / "mask.fits"}))
+
+
+def test_a_file_is_resolved_and_loads_again(bench, tmp_path):
+    from zonda.core.configuration.pipeline_file import parse
+
+    image_of_discs(bench, tmp_path / "mask.fits", [unit_vector(*bench.CENTRE)], 10 * bench.ARCSEC)
+    text = """
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+operators: [PointingDaisy, WhiteNoise, Efficiency, {HighpassFilter: {mask: {file: mask.fits}}}, BinMap, SaveMap]
+"""
+    file = parse(text, folder=tmp_path)
+    again = parse(file.resolved_yaml())
+    assert again.operators[3].mask.file == file.operators[3].mask.file == tmp_path / "mask.fits"
+
+
+def test_files_that_are_no_masks(bench, tmp_path):
+    observation = bench.observation(3, 100)
+    image_of_discs(bench, tmp_path / "mask.fits", [unit_vector(*bench.CENTRE)], 10 * bench.ARCSEC)
+    with pytest.raises(ValueError, match="give either file, an image, or radius and centre"):
+        SourceMask(file=tmp_path / "mask.fits", radius="1 arcmin")
+    header = fits.getheader(tmp_path / "mask.fits")
+    path = tmp_path / "other.fits"
+    for values, change, said in (
+        (np.zeros((3, 4, 4)), {}, "has no two-dimensional image"),
+        (np.full((4, 4), np.nan), {}, "has pixels that are NaN"),
+        (np.zeros((4, 4)), {"CTYPE1": "RA---SIN", "CTYPE2": "DEC--SIN"}, "is not a plain TAN"),
+        (np.zeros((4, 4)), {"CTYPE1": "", "CTYPE2": ""}, "needs two celestial axes"),
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fits.PrimaryHDU(values, fits.Header({**header, "NAXIS": values.ndim, **change})).writeto(path, overwrite=True)
+            with pytest.raises(InputError, match=said) as caught:
+                SourceMask(file=path).of(observation)
+        assert str(path) in str(caught.value)
