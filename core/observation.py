@@ -233,7 +233,7 @@ class Observation:
     @property
     def mean_emission(self) -> dict[str, float]:
         """Of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated (`core.emission`); empty where there is none."""
-        return mean_emission(self)
+        return mean_emission(self.smooth, self.focalplane, self.good_detectors, self.n_samples)
 
     def __repr__(self) -> str:
         return f"<Observation {self.name}: {self.n_detectors} detectors x {self.n_samples} samples at {self.sample_rate:g} Hz>"

@@ -68,6 +68,17 @@ class Rows(NamedTuple):
         return max(needed, 2 * step / self.speed)
 
     @property
+    def overshoot(self) -> float:
+        """How far a turnaround reaches beyond the end of a row, rad: equations (1) and (2) at u = 1/2."""
+        return self.speed * self.turnaround * (0.25 + 1 / math.pi**2 if self.smooth else 0.25)
+
+    @property
+    def speed_within(self) -> float:
+        """The speed, rad/s, whose turnarounds reach a row's length beyond its ends at this acceleration; steps apart."""
+        b, reach = (4.0, 0.25 + 1 / math.pi**2) if self.smooth else (2.0, 0.25)
+        return math.sqrt(self.acceleration * self.width / (b * reach))
+
+    @property
     def pass_time(self) -> float:
         """Duration of all rows once, and the turnarounds between them, s."""
         return self.n * (self.leg + self.turnaround) - self.turnaround

@@ -13,13 +13,13 @@ from .depth import PARTS
 from .lines import prefixed
 
 if TYPE_CHECKING:
-    from .sensitivity import Sensitivity
+    from .result import Forecast
 
 PART_COLOURS = {"white": COLOURS["white"], "1/f": COLOURS["pink"], "atmosphere": COLOURS["atmosphere"]}
 NAMES = {"white": "white noise", "1/f": "1/f noise", "atmosphere": "atmosphere (indicative)"}
 
 
-def figure(found: Sensitivity) -> Any:
+def figure(found: Forecast) -> Any:
     """Depth against time, all noise and its parts, with bands of their stated errors: a matplotlib figure, not pyplot's."""
     from matplotlib.figure import Figure
 

@@ -16,16 +16,15 @@ from zonda.core.storage.files import atomic_path, check_output_folder, write_tex
 from . import default_pipeline
 from .depth import PARTS, UNITS, WITHIN, scatter
 from .lines import duration, in_unit, number, prefixed
-from .sensitivity import elevations
-from .survey import Survey
+from .survey import Survey, elevations
 
 if TYPE_CHECKING:
-    from .sensitivity import Sensitivity
+    from .result import Forecast
 
 TITLES = {"Jy": "point source"}
 
 
-def text(found: Sensitivity) -> str:
+def text(found: Forecast) -> str:
     """The table and what it stands for."""
     parts = [_header(found), _table(found), _errors(found)]
     if found.calculated is not None:
@@ -35,7 +34,7 @@ def text(found: Sensitivity) -> str:
     return "\n\n".join("\n".join(p) for p in parts)
 
 
-def _header(found: Sensitivity) -> list[str]:
+def _header(found: Forecast) -> list[str]:
     survey, header = found.survey, found.file.header
     o = survey.observations[0]
     low, high = (math.degrees(e) for e in elevations(survey))
@@ -64,7 +63,7 @@ def _filters(survey: Survey) -> list[str]:
     return [*found, "common mode"] if survey.common else found
 
 
-def _table(found: Sensitivity) -> list[str]:
+def _table(found: Forecast) -> list[str]:
     here = found.depth.total(found.seconds)
     scale = {unit: prefixed(float(here) * found.factors[unit], unit) for unit in UNITS}
     kelvin, name = scale["K_RJ"]
@@ -80,7 +79,7 @@ def _table(found: Sensitivity) -> list[str]:
     return ["  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
 
 
-def _errors(found: Sensitivity) -> list[str]:
+def _errors(found: Forecast) -> list[str]:
     error = found.depth.error
     each = [f"{p} {100 * error[p]:.0f} %" for p in PARTS if found.depth.variance[p][-1] > 0]
     lines = [f"stated errors of the rms: {', '.join(each)}; together {100 * found.depth.total_error(found.seconds):.0f} %"]
@@ -94,7 +93,7 @@ def _errors(found: Sensitivity) -> list[str]:
     return lines
 
 
-def _calculated(found: Sensitivity) -> list[str]:
+def _calculated(found: Forecast) -> list[str]:
     c = found.calculated
     assert c is not None
     what = f"{c.diameter:.4g} m dish, PWV {c.pwv * 1e3:.3g} mm, elevation {math.degrees(c.elevation):.1f} deg"
@@ -111,7 +110,7 @@ def made(asked: Mapping[str, Any], settings: Sequence[str]) -> str:
     return "\n".join(["# the pipeline:", text.rstrip(), *(f"# --set {s}" for s in settings), ""])
 
 
-def reached(found: Sensitivity, wanted: str, seconds: float) -> str:
+def reached(found: Forecast, wanted: str, seconds: float) -> str:
     """How long a depth takes, and what it then consists of."""
     parts = ", ".join(f"{p} {in_unit(float(found.depth.part(p, seconds)), 'K_RJ')}" for p in PARTS)
     low, high = ((1 + sign * found.depth.total_error(seconds)) ** 2 * seconds for sign in (-1, 1))
@@ -126,7 +125,7 @@ def reached(found: Sensitivity, wanted: str, seconds: float) -> str:
     return "\n".join(lines)
 
 
-def as_dict(found: Sensitivity) -> dict[str, Any]:
+def as_dict(found: Forecast) -> dict[str, Any]:
     """See `Sensitivity.as_dict`."""
     survey, c = found.survey, found.calculated
     low, high = elevations(survey)
@@ -163,8 +162,10 @@ def as_dict(found: Sensitivity) -> dict[str, Any]:
     }
 
 
-def write(found: Sensitivity, folder: Path) -> list[Path]:
+def write(found: Forecast, folder: Path) -> list[Path]:
     """See `Sensitivity.write`. Raises OutputError."""
+    from .picture import figure
+
     check_output_folder(folder)
     seconds = found.times
     columns = [Column("time", seconds, "s", "integration time")]
@@ -189,7 +190,7 @@ def write(found: Sensitivity, folder: Path) -> list[Path]:
     }
     paths = [write_ecsv(folder / "sensitivity.ecsv", columns, meta)]
     with atomic_path(folder / "sensitivity.png") as temporary:
-        found.plot().savefig(temporary)
+        figure(found).savefig(temporary)
     paths.append(folder / "sensitivity.png")
     paths.append(write_text(folder / "pipeline.yaml", found.file.resolved_yaml()))
     return paths

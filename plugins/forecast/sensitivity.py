@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
@@ -15,83 +13,26 @@ from zonda.core.notebook import html_table
 from zonda.core.numerics.angles import ARCMIN
 
 from . import calculator, default_pipeline, lines
-from .depth import PARTS, Depth, depth_of, factors, times
-from .survey import Survey, survey_of
+from .depth import depth_of, factors
+from .result import Forecast
+from .survey import survey_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.loaded import PipelineFile
-
-    from .audit import Audited
-    from .calculator import Calculated
 
 RADIUS, BEAMS = 0.5 * ARCMIN, 2.0
 """Radius of the circle that the depth is averaged over where none is given: the central arcmin, or this many FWHM if that is
 more."""
 
 
-@dataclass(frozen=True)
-class Sensitivity:
-    """The depth of a map against time.
-
-    Attributes
-    ----------
-    file, survey
-        The pipeline, and its scans.
-    depth
-        White noise, 1/f noise and atmosphere behind the beam, K_RJ.
-    radius
-        Of the circle that they are averaged over, rad.
-    seconds
-        The integration time that was asked for; that of the pipeline's scans where none was.
-    factors
-        By unit what a depth in K_RJ is multiplied by (`depth.factors`).
-    calculated
-        What the AtLAST calculator's formula gives for that time; None: the scene has no atmosphere.
-    audit
-        Simulated depths, see `audited`; None: nothing was simulated.
-    """
-
-    file: PipelineFile
-    survey: Survey
-    depth: Depth
-    radius: float
-    seconds: float
-    factors: Mapping[str, float]
-    calculated: Calculated | None
-    audit: Audited | None = None
-
-    def rms(self, seconds: float | None = None, unit: str = "K_RJ", part: str = "") -> float:
-        """The depth after an integration time [s] in a unit (`depth.UNITS`): of a part (`depth.PARTS`), or of all.
-
-        Raises InputError for an unknown unit or part, and a time that is not positive.
-        """
-        wanted = self.seconds if seconds is None else seconds
-        if unit not in self.factors or part not in ("", *PARTS):
-            cure = f"units are {', '.join(self.factors)}; parts are {', '.join(PARTS)}, or none for all"
-            raise InputError(f"no depth in {unit!r} of {part!r}", place="sensitivity", cure=cure)
-        if not wanted > 0:
-            raise InputError(f"a time of {wanted:g} s is not positive", place="sensitivity")
-        found = self.depth.part(part, wanted) if part else self.depth.total(wanted)
-        return float(found) * self.factors[unit]
-
-    def reach(self, rms: str | float) -> float:
-        """Integration time [s] after which the map is as deep as ``rms``: text with a unit of `depth.UNITS` (``10 uK``, which is
-        K_RJ; ``10 uK_CMB``, ``0.1 mJy/beam``), or K_RJ. Beyond the scans of the pipeline all parts fall as time^-1/2.
-
-        Raises InputError for what cannot be read or reached.
-        """
-        return self.depth.reach(lines.read_depth(rms, self.factors) if isinstance(rms, str) else rms)
+class Sensitivity(Forecast):
+    """The depth of a map against time, as text, table and picture."""
 
     def audited(self, seeds: int, threads: int | None = None) -> Sensitivity:
         """With the depth that ``seeds`` simulations of the pipeline find, see `audit`."""
         from .audit import audit
 
         return replace(self, audit=audit(self.file, self.depth, self.radius, seeds, threads))
-
-    @property
-    def times(self) -> Any:
-        """Integration times of a table, s."""
-        return times(self.depth, self.seconds)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything as numbers and text, for JSON."""
@@ -186,9 +127,3 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
             raise InputError("settings change a pipeline when it is loaded", place=default_pipeline.PLACE, cure=cure)
         return pipeline
     return load(pipeline, settings)
-
-
-def elevations(survey: Survey) -> tuple[float, float]:
-    """Lowest and highest elevation of the boresight, rad."""
-    ends = [(float(e.min()), float(e.max())) for e in (o.elevation for o in (survey.observations[0], survey.observations[-1]))]
-    return min(np.array(ends)[:, 0]), max(np.array(ends)[:, 1])

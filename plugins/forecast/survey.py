@@ -306,3 +306,9 @@ def _even(samples: Floats, place: str) -> float:
 
 def _rms(values: Floats) -> float:
     return math.sqrt(float(np.mean(np.asarray(values) ** 2)))
+
+
+def elevations(survey: Survey) -> tuple[float, float]:
+    """Lowest and highest elevation of the boresight, rad."""
+    ends = [(float(e.min()), float(e.max())) for e in (o.elevation for o in (survey.observations[0], survey.observations[-1]))]
+    return min(np.array(ends)[:, 0]), max(np.array(ends)[:, 1])

@@ -187,3 +187,23 @@ def test_a_limit_of_jerk_makes_turnarounds_smooth(observe: Callable[..., Data]) 
 def test_a_raster_that_is_cut_off_is_told(observe: Callable[..., Data]) -> None:
     with pytest.warns(UserWarning, match="scan-000 ends before all 5 rows are crossed: they take 60.18 s, scan_duration is 30 s"):
         observe(PointingRaster(**SCAN, scan_duration="30 s"))
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_how_far_turnarounds_reach(smooth: bool) -> None:
+    rows = ROWS._replace(smooth=smooth)
+    x, _ = rows.path(rows.leg + rows.turnaround * np.linspace(0, 1, 2001))
+    assert x.max() - rows.width / 2 == pytest.approx(rows.overshoot, rel=1e-12)  # u = 1/2 is one of the points
+    single = rows._replace(n=1, speed=rows._replace(n=1).speed_within)  # no step to the side
+    assert single.overshoot == pytest.approx(single.width, rel=1e-12)
+
+
+def test_turnarounds_beyond_a_rows_length_are_told(observe: Callable[..., Data], recwarn: pytest.WarningsRecorder) -> None:
+    fast = SCAN | {"speed": "4 arcmin/s"}  # v^2 / (2 a) = 8 arcmin, of 10: with the step a little more
+    observe(PointingRaster(**fast, scan_duration="100 s"))
+    assert not [w for w in recwarn if "turnarounds reach" in str(w.message)]
+    faster = SCAN | {"speed": "5 arcmin/s"}  # 12.5 arcmin and the step; T = 10 s, against 2 s for a row
+    with pytest.warns(
+        UserWarning, match=r"reach 0.2085 deg beyond rows of 0.1667 deg and take 83 % .* scan at 268.3 arcsec/s or less"
+    ):
+        observe(PointingRaster(**faster, scan_duration="100 s"))

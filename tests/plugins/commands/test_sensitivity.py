@@ -77,6 +77,42 @@ def test_json(capsys):
     assert row["depth"]["Jy"] == pytest.approx(2 * row["depth"]["Jy/beam"])
 
 
+FEW = *SHORT, "--set", "instrument={like: mustang2, detectors: 19}"
+
+
+def test_the_audit_stands_beside_the_forecast_whatever_the_threads(tmp_path, capsys):
+    """Each part with its difference in standard errors; the same bits with one thread and with two."""
+    found = []
+    for threads in (1, 2):
+        assert sensitivity("mustang2_cluster", *FEW, "--audit", "2", "--threads", threads, "--json") == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1]
+    rows = {row["part"]: row for row in found[0]["audit"]}
+    assert list(rows) == ["white", "1/f", "atmosphere", "together"]
+    for row in rows.values():
+        assert row["seeds"] == 2
+        assert row["z"] == pytest.approx((row["forecast"] - row["mean"]) / row["error"])
+    parts = [rows[name]["forecast"] ** 2 for name in ("white", "1/f", "atmosphere")]
+    assert rows["together"]["forecast"] ** 2 == pytest.approx(sum(parts))
+    # two maps know white noise to some 10 %; the forecast is good to 5 %
+    assert abs(rows["white"]["z"]) < 5
+    assert found[0]["calculator"].keys() >= {"Jy_at_centre", "Jy_over_band"}
+
+
+def test_the_audit_in_words(tmp_path, capsys):
+    assert sensitivity("mustang2_cluster", *FEW, "--audit", "2", "--output", tmp_path / "depth") == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "audit: 2 simulations of the whole pipeline forecast [" in text
+    assert "simulated standard error difference z white " in text
+    assert "at the band's centre, " in text
+    assert "averaged over the band" in text
+
+
+def test_a_folder_that_takes_no_files_is_told_before_anything_is_forecast(capsys):
+    assert sensitivity("mustang2_cluster", "--audit", "200", "--output", "/proc/zonda") == 2
+    assert "/proc/zonda: cannot be made: /proc takes no new folders" in capsys.readouterr().err
+
+
 def test_in_python():
     file = zonda.load("mustang2_cluster", ["PointingDaisy.scans=1", "PointingDaisy.scan_duration=30 s"])
     found = zonda.sensitivity(file)
@@ -100,6 +136,8 @@ def test_in_python():
         (("no_such_pipeline",), "no_such_pipeline"),
         ((*M2, "--target", "nowhere"), "--target"),
         ((*M2, "--quantile", "2"), "--quantile"),
+        ((*M2, "--elevation", "20"), "20 has no unit; write an angle such as '60 deg'"),
+        ((*M2, "--time", "2"), "2 has no unit; write a time such as '3 h'"),
         (("mustang2_cluster", *SHORT, "--set", "CommonModeFilter.modes=3"), "the forecast does not cover modes: 3"),
         (("mustang2_cluster", *SHORT, "--reach", "10 apples"), "'apples' is no unit of a depth"),
         (("mustang2_cluster", *SHORT, "--reach", "deep"), "cannot read 'deep' as a depth"),
