@@ -150,21 +150,25 @@ class PointingRaster(RasterParameters):
         tally.state(self.label, observation.name + RASTER, _stated(rows, self.position_angle, self.scan_duration))
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
         tally.count(self.label, what, int(rows.turning(observation.seconds).sum()), observation.n_samples)
-        if rows.overshoot > rows.width:
-            share = rows.turnaround / (rows.leg + rows.turnaround)
-            warnings.warn(
-                f"{self.label}: {observation.name}: turnarounds reach {rate_text(rows.overshoot, 0)} beyond rows of "
-                f"{rate_text(rows.width, 0)} and take {100 * share:.0f} % of the time, and the map is as wide: the speed is high for "
-                f"an acceleration of {rate_text(rows.acceleration, 2)}; scan at {rate_text(rows.speed_within, 1)} or less, make rows "
-                "longer, or give the map a width",
-                stacklevel=2,
-            )
-        if self.scan_duration < rows.pass_time - 1 / observation.sample_rate:
-            warnings.warn(
-                f"{self.label}: {observation.name} ends before all {rows.n} rows are crossed: they take "
-                f"{rows.pass_time:.4g} s, scan_duration is {self.scan_duration:.4g} s",
-                stacklevel=2,
-            )
+        for text in _doubts(rows, self.scan_duration, 1 / observation.sample_rate):
+            warnings.warn(f"{self.label}: {observation.name}{text}", stacklevel=2)
+
+
+def _doubts(rows: Rows, duration: float, interval: float) -> list[str]:
+    """What to warn of in scans of ``duration`` [s], sampled at an ``interval`` [s], behind their name."""
+    found = []
+    if rows.overshoot > rows.width:
+        share = rows.turnaround / (rows.leg + rows.turnaround)
+        found.append(
+            f": turnarounds reach {rate_text(rows.overshoot, 0)} beyond rows of {rate_text(rows.width, 0)} and take "
+            f"{100 * share:.0f} % of the time, and the map is as wide: the speed is high for an acceleration of "
+            f"{rate_text(rows.acceleration, 2)}; scan at {rate_text(rows.speed_within, 1)} or less, make rows longer, or give "
+            "the map a width"
+        )
+    if duration < rows.pass_time - interval:
+        took, lasts = f"{rows.pass_time:.4g} s", f"scan_duration is {duration:.4g} s"
+        found.append(f" ends before all {rows.n} rows are crossed: they take {took}, {lasts}")
+    return found
 
 
 def _beside(centre: Floats, x: Floats, y: Floats) -> Floats:
@@ -182,5 +186,6 @@ def _stated(rows: Rows, angle: float, duration: float) -> str:
     count = f"{rows.n} row{'s' if rows.n > 1 else ''} of {rate_text(rows.width, 0)}"
     apart = f", {rate_text(rows.spacing, 0)} apart" if rows.n > 1 else ""
     where = f" at position angle {math.degrees(angle) % 180:.4g} deg, at {rate_text(rows.speed, 1)}"
-    turn = f"; turnarounds of {rows.turnaround:.3g} s, up to {rate_text(rows.overshoot, 0)} beyond a row; all rows take {rows.pass_time:.4g} s"
+    turn = f"; turnarounds of {rows.turnaround:.3g} s, up to {rate_text(rows.overshoot, 0)} beyond a row"
+    turn += f"; all rows take {rows.pass_time:.4g} s"
     return f"{count}{apart}{where}{turn}, {duration / rows.pass_time:.3g} times in a scan"
