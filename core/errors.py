@@ -45,6 +45,17 @@ class PipelineError(ZondaError):
 
 
 @contextmanager
+def within(place: str) -> Iterator[None]:
+    """Errors that are raised inside name this place before their own; those with places in a file (`diagnostics`) keep them."""
+    try:
+        yield
+    except ZondaError as err:
+        if not hasattr(err, "diagnostics"):
+            err.place = f"{place}: {err.place}" if err.place else place
+        raise
+
+
+@contextmanager
 def placed(place: str) -> Iterator[None]:
     """Errors that are raised inside and name no place are given this one."""
     try:

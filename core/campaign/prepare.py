@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..configuration.files import paths_in
-from ..errors import InputError, ZondaError
+from ..errors import InputError, within
 from ..storage.files import product_path
 from . import parts
 from .entries import Entry, entries
@@ -146,7 +145,7 @@ class _Draft:
         from ..plan.bands import plan
         from ..run.first_look import first_look
 
-        with _placed(about(entry) or source.file.header.name):
+        with within(f"entry {about(entry) or source.file.header.name}"):
             file = _with_budget(source.load(entry.settings), share)
             first_look(file.pipeline(), scene_of(file, entry.seed, entry.time))
             made = plan(file, keep=self._pruning.keep, drop=self._pruning.drop, prune_all=self._pruning.prune_all)
@@ -234,7 +233,7 @@ def common_layouts(
             continue
         settled = bool(layouts) and all(layout.get("fixed") for layout in layouts.values())
         if not settled or look.pipeline not in by_pipeline:
-            with _placed(look.place):
+            with within(f"entry {look.place}"):
                 data = files[look.pipeline].pipeline().point(look.scene(files), layouts, folder)
             layouts = data.layouts
             bands = len(data.observations) // len(data.scans)
@@ -282,17 +281,6 @@ def _with_budget(file: PipelineFile, share: float) -> PipelineFile:
     budget = file.header.budget
     budget = budget * share if isinstance(budget, float | int) else budget
     return dataclasses.replace(file, header=file.header.model_copy(update={"budget": budget, "campaign": None}))
-
-
-@contextlib.contextmanager
-def _placed(place: str) -> Iterator[None]:
-    """Name the entry in every error of the body."""
-    try:
-        yield
-    except ZondaError as err:
-        if not hasattr(err, "diagnostics"):
-            err.place = f"entry {place}" + (f": {err.place}" if err.place else "")
-        raise
 
 
 def _inputs(file: PipelineFile, folder: Path) -> dict[str, str]:

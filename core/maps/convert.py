@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..numerics.radiation import SURFACE_BRIGHTNESS_UNITS, to_kelvin_rj
 from ..types import Floats
 from .map_arrays import MapArrays
-from .units import parse_unit, scale_of, written_unit
+from .units import KNOWN_UNITS, parse_unit, scale_of, written_unit
 
 Map = TypeVar("Map", bound=MapArrays)
 
@@ -21,7 +21,11 @@ Map = TypeVar("Map", bound=MapArrays)
 def converted(product: Map, unit: str, spectral_index: float) -> Map:
     """`MapProduct.to`: values times K_RJ per old unit over K_RJ per new unit."""
     scale = scale_of(product.unit)[1] or "K_RJ"
-    name = written_unit(str(unit), place="map", temperature_scale=scale)
+    try:
+        name = written_unit(str(unit), place="map.to", temperature_scale=scale)
+    except InputError as err:
+        cure = f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ"
+        raise InputError(err.message, place="map.to", cure=cure) from None
     factor = _kelvin_per(product, product.unit, spectral_index) / _kelvin_per(product, name, spectral_index)
     known = {plane: getattr(product, plane) for plane in ("signal", "noise", "half_difference")}
     weights = product.weights / factor**2 if product.weighting == "inverse_variance" else product.weights

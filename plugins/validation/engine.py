@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from zonda.core.errors import ZondaError
+from zonda.core.errors import within
 from zonda.core.storage.files import check_output_folder
 
 from .claims import Claim, ClaimsFile, Counter, Expected, Experiment
@@ -25,7 +24,7 @@ def validate(file: ClaimsFile, claims: Sequence[Claim], folder: Path, base: Path
     check_output_folder(folder)
     runs = Runs(folder, base, say)
     for claim in claims:
-        with _placed(claim):
+        with within(f"claim {claim.id}"):
             for _, experiment in claim.experiments():
                 runs.want(experiment)
             if claim.pictures:
@@ -34,10 +33,10 @@ def validate(file: ClaimsFile, claims: Sequence[Claim], folder: Path, base: Path
     rows = [row(claim, runs) for claim in claims]
     for found in rows:
         if found.claim.pictures:
-            with _placed(found.claim):
+            with within(f"claim {found.claim.id}"):
                 runs.draw(runs.pictured(found.claim), folder / found.claim.id)
         if found.claim.atmosphere:
-            with _placed(found.claim):
+            with within(f"claim {found.claim.id}"):
                 runs.draw_atmosphere(dict(found.claim.experiments())[""], folder / found.claim.id)
     write(file, rows, folder)
     return rows
@@ -86,14 +85,3 @@ def satisfied(expect: Expected, stated: Stated, found: Values) -> bool:
 def stated_by(claim: Claim) -> Stated:
     """The paper's numbers."""
     return Stated(claim.paper.value, claim.error.value, claim.rounding.value, claim.relation, claim.of)
-
-
-@contextlib.contextmanager
-def _placed(claim: Claim) -> Iterator[None]:
-    """Name the claim in every error of the body."""
-    try:
-        yield
-    except ZondaError as err:
-        if not hasattr(err, "diagnostics"):
-            err.place = f"claim {claim.id}" + (f": {err.place}" if err.place else "")
-        raise
