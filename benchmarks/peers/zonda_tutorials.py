@@ -44,9 +44,9 @@ def transfer(path: str) -> Any:
         )  # fmt: skip
         steps = [
             zonda.PointingDaisy(radius="6.5 arcmin", speed="100 arcsec/s", scan_duration="6 min"),
-            zonda.SkyMap(file=path, centre="target"), zonda.AtmosphereLayers(), zonda.WhiteNoise(), zonda.PinkNoise(), zonda.Efficiency(),
-            zonda.HighpassFilter(frequency="0.0167 Hz"), zonda.CommonModeFilter(), zonda.BinMap(pixel="1 arcsec"),
-            zonda.TransferFunction(),
+            zonda.SkyMap(file=path, centre="target"), zonda.AtmosphereLayers(), zonda.WhiteNoise(), zonda.PinkNoise(),
+            zonda.Efficiency(), zonda.HighpassFilter(frequency="0.0167 Hz"), zonda.CommonModeFilter(),
+            zonda.BinMap(pixel="1 arcsec"), zonda.TransferFunction(),
         ]  # fmt: skip
         found.append(zonda.Pipeline(steps).run(scene)["transfer_function"])
     return found
