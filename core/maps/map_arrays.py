@@ -82,7 +82,7 @@ class MapArrays:
     """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
     difference: str = "even - odd scans"
     band: Band | None = None
-    """Of the run: what `to` converts with; None: not known."""
+    """Band of the run, with which `to` converts units; None: not known."""
 
     @property
     def wcs(self) -> Any:

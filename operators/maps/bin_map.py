@@ -33,7 +33,7 @@ NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""
 
 LIGHTEST = 2.0**-10
-"""Least window of a sample that is in a map: the weights of all that are, of every detector, are more than rounding (`sums`)."""
+"""Smallest window of samples that are mapped: smaller ones have weights that are lost in rounding (`sums`)."""
 
 LIGHT = "instants that count as flagged: a window leaves less than 1/1024 of their weight"
 """A count of the log."""

@@ -34,7 +34,7 @@ _STRUCTURE = frozenset(
 """Keys that say how an array lies in a file, or nothing about the map."""
 
 _TYPES = [np.dtype(kind) for kind in ("u1", "i2", "i4", "i8", "f4", "f8")]
-"""Those that FITS knows."""
+"""Types of numbers that FITS has."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
