@@ -14,7 +14,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.run.first_look import first_look
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.model import ExpectedLoad
-from zonda.operators.atmosphere.screens import AtmosphereScreens, pwv_at
+from zonda.operators.atmosphere.screens import AtmosphereScreens, pwv_at, screens
 from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.plugins.checks import scenes
 
@@ -78,26 +78,26 @@ def test_layers_have_their_variance_and_wind(run):
 def test_the_boresight_sees_the_sum_of_the_layers(run):
     """What the layers' pictures show where the boresight is adds up to the stream there, but for the airmass.
 
-    A value between lattice points is taken from the nearest: it differs by at most the largest step between neighbours.
+    Between lattice points, 0.8 of a beam apart, the pictures are interpolated by cubic splines: 0.2 % from what the streams'
+    interpolation gives. The airmass of a curved atmosphere is smaller than 1 / sin(elevation) by less than 0.1 % at 60 deg.
     """
-    data, _ = run
-    found, (o,) = data.products["screens"], data.observations
+    from scipy.ndimage import map_coordinates
+
+    (o,) = run[0].observations
     model = o.expected_load.model()
-    total = allowed = 0.0
-    for screen in found.layers:
-        here = screen.track[np.abs(screen.track).sum(axis=1).argmin()]
-        middle = screen.values.shape[0] // 2
-        row, column = (round(middle + v / screen.spacing) for v in (here[1], here[0]))
-        total += screen.values[row, column]
-        allowed += max(np.abs(np.diff(screen.values, axis=axis)).max() for axis in (0, 1))
-    seconds = np.asarray(o.seconds)
-    sample = int(np.abs(seconds - seconds[0] - found.moment).argmin())
     step = model.resolution().step
-    sample = sample // step * step
+    sample = o.n_samples // 2 // step * step
+    seconds = np.asarray(o.seconds) - o.seconds[0]
+    found = screens(model, float(seconds[sample]), 1, 4)
+    assert found.moment == seconds[sample]
+    total = 0.0
+    for screen in found.layers:
+        across, along = screen.track[np.abs(screen.track).sum(axis=1).argmin()]
+        at = [[screen.values.shape[0] // 2 + place / screen.spacing] for place in (along, across)]
+        total += map_coordinates(screen.values, at, order=3)[0]
     direct = pwv_at(model, np.zeros(1), np.zeros(1), np.array([sample]))[0, 0]
-    airmass = 1 / np.sin(o.elevation[sample])
-    assert model.fluctuation.log_normal is False or abs(total) < 0.2 * model.pwv
-    assert total * airmass == pytest.approx(direct, abs=2 * allowed * airmass + 0.1 * abs(direct))
+    assert not model.fluctuation.log_normal
+    assert total / np.sin(o.elevation[sample]) == pytest.approx(direct, rel=0.01)
 
 
 def test_files_and_pictures(run):
