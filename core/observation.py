@@ -95,6 +95,8 @@ class Observation:
         Those of them on which no filter acts.
     tally
         What was counted or approximated.
+    hwp_angle
+        (n_samp,) rad, of a half-wave plate in the focal plane (`core.polarization`); None: there is none.
     output
         Folder (Path) for files that are written while the scan runs (see `Data.output`).
     """
@@ -127,6 +129,7 @@ class Observation:
     signals: tuple[str, ...] = ("signal",)
     unfiltered: frozenset[str] = frozenset()
     windows: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    hwp_angle: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if not self.flags.size:

@@ -24,7 +24,7 @@ EARTH = 6371e3
 NEAR = 1e3
 """m: what stands nearer than this stands at the same site."""
 HIGHER = 200.0
-"""Largest difference of height to a site whose climatology is used, m."""
+"""m: what stands no higher or lower than this has the same climatology."""
 
 
 class Scene(Parameters):

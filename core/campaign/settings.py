@@ -57,14 +57,12 @@ class Campaign(Parameters):
     """Many observations of one pipeline, worked through as tasks on any engine. Keys are those of `--set`."""
 
     KEYS_BELONG_IN: ClassVar[str] = "grid"
-    """The key under which a key of the pipeline belongs that was written beside these."""
+    """Where a pipeline's key belongs that stands beside these."""
 
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
     """Every combination of these values, e.g. {site: [atacama, mauna_kea], PointingDaisy.radius: [2 arcmin, 4 arcmin]}."""
     observations: list[Annotated[dict[str, Any], Field(min_length=1)]] = Field(default_factory=list)
     """One after the other, e.g. [{time: 2024-11-25T07:00}, {time: 2024-11-26T07:00, target: 06h +20d}]."""
-    schedule: str | None = None
-    """File of an observing schedule (TOAST's): the `schedule` of the pipeline's pointing step, whose rows are the scans."""
     nights: Nights | None = None
     """Repeat each on several nights at the same hour angle: a number, or {start: 2024-11-25, stop: 2024-12-25}."""
     realizations: int = Field(1, ge=1, le=100_000)
@@ -132,7 +130,7 @@ class Sweep(Parameters):
     seeds: int = Field(1, ge=1, le=100_000)
     """Realizations of each point, with the same random numbers at all points."""
     engine: Engine = "processes"
-    """The engine that executes the runs."""
+    """What works on the runs."""
     workers: int | None = Field(None, ge=1, le=100_000)
     """Worker processes of `processes`; where absent, one for each CPU."""
 
@@ -143,6 +141,6 @@ class Sweep(Parameters):
         return self
 
     KEYS_BELONG_IN: ClassVar[str] = "over"
-    """The key under which a key of the pipeline belongs that was written beside these."""
+    """Where a pipeline's key belongs that stands beside these."""
     CALLED: ClassVar[dict[str, str]] = {"over": "grid", "points": "observations", "seeds": "realizations"}
-    """The keys of a campaign that mean the same."""
+    """What a campaign calls its keys."""

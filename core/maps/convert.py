@@ -30,6 +30,8 @@ def converted(product: Map, unit: str, spectral_index: float) -> Map:
     known = {plane: getattr(product, plane) for plane in ("signal", "noise", "half_difference")}
     weights = product.weights / factor**2 if product.weighting == "inverse_variance" else product.weights
     planes: dict[str, Any] = {plane: None if values is None else values * factor for plane, values in known.items()}
+    if product.polarization is not None:
+        planes["polarization"] = product.polarization.scaled(factor, product.weighting == "inverse_variance")
     return replace(product, unit=name, weights=weights, **planes)
 
 
@@ -57,5 +59,5 @@ def smoothing_width(given: Any, beam: float) -> float:
     except PydanticCustomError as err:
         raise InputError(err.message(), place="map.smooth", cure="write map.smooth('9 arcsec')") from None
     if not width > 0:
-        raise InputError(f"{given} cannot be the width of a smoothing", place="map.smooth", cure="write map.smooth('9 arcsec')")
+        raise InputError(f"a width of {given} does not smooth", place="map.smooth", cure="write map.smooth('9 arcsec')")
     return width

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..instrument import Band
     from ..numerics.tangent import TangentWcs
     from ..storage.fits_image import Cards
+    from .polarized import Polarization
 
 SMALL = 1 << 20
 """Pixels of a map whose distances from the centre are kept."""
@@ -81,8 +82,10 @@ class MapArrays:
     contents: Literal["all", "hits"] = "all"
     """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
     difference: str = "even - odd scans"
+    polarization: Polarization | None = None
+    """Q and U; ``signal`` and the others are of I then, and ``hits`` and ``weights`` 0 where I, Q and U are not determined."""
     band: Band | None = None
-    """Band of the run, with which `to` converts units; None: not known."""
+    """Of the run: what `to` converts with; None: not known."""
 
     @property
     def wcs(self) -> Any:

@@ -17,6 +17,7 @@ from ..storage.files import atomic_path
 from ..storage.fits_image import BLOCK, Cards, image_pieces
 from ..types import AnyFloats
 from .map_arrays import MapArrays
+from .stokes import CONVENTION, MEANINGS, file_planes
 from .units import scale_of
 
 PLANES = ("signal", "hits", "weights", "noise", "half_difference")
@@ -28,7 +29,10 @@ _MEANING = {
     "noise": "standard error per pixel",
     "half_difference": "noise from the difference of two halves",
     "source_free": "map of all but the sky",
+    **MEANINGS,
 }
+COUNTS = ("hits", "condition")
+"""Planes without unit."""
 _SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
 _COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
 
@@ -86,6 +90,8 @@ class MapFile:
     @classmethod
     def of(cls, name: str, product: MapArrays) -> MapFile:
         """With the planes that a product has."""
+        if product.polarization is not None:
+            return cls(name, product, file_planes(product))
         wanted = PLANES if product.contents == "all" else ("hits",)
         found = {plane: getattr(product, plane) for plane in wanted}
         return cls(name, product, {plane: values for plane, values in found.items() if values is not None})
@@ -96,7 +102,9 @@ class MapFile:
         if plane == "weights":
             inverse = f"{unit}-2" if unit.isalpha() else f"({unit})-2"
             return inverse if self.product.weighting == "inverse_variance" else ""
-        return "" if plane == "hits" else unit
+        if plane.startswith("cov_"):
+            return f"{unit}2" if unit.isalpha() else f"({unit})2"
+        return "" if plane in COUNTS else unit
 
     @property
     def beam(self) -> Cards:
@@ -105,6 +113,12 @@ class MapFile:
         degrees = float(np.degrees(product.resolution))
         what = "[deg] FWHM: beam, smoothing in quadrature" if product.smoothed_by else "[deg] FWHM of the beam"
         return Cards([("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")] if degrees else ())
+
+    @property
+    def convention(self) -> Cards:
+        """In which Q and U are, where there are some."""
+        stated = ("POLCCONV", CONVENTION, "Q, U: angles from south to east")
+        return Cards([stated] if {"q", "u"} & self.planes.keys() else ())
 
     @property
     def halves(self) -> Cards:
@@ -137,12 +151,13 @@ class MapFile:
             header["EXTNAME"] = name.upper(), "extension name"
             if unit := self.unit(name):
                 header["BUNIT"] = unit, _MEANING[name]
-            if (scale := scale_of(self.product.unit)[1]) and name not in ("hits", "weights"):
+            if (scale := scale_of(self.product.unit)[1]) and name not in (*COUNTS, "weights"):
                 header["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
-            if name not in ("hits", "weights"):
+            if name not in (*COUNTS, "weights"):
                 header.add(self.beam)
-            if name == "half_difference":
+            if name.startswith("half_difference"):
                 header.add(self.halves)
+            header.add(self.convention)
             if k == 0:
                 header.add(self.first(about)).add(self.cards)
             yield from image_pieces(header, plane, extension=k > 0, dtype=_type(name, plane))
@@ -170,7 +185,7 @@ class MapFile:
         )
         if scale := scale_of(product.unit)[1]:
             made["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
-        made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards())
+        made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards()).add(self.convention)
         made.add(self.first(about)).add(self.cards)
         hdus = [fits.PrimaryHDU(), table]
         for hdu, more in zip(hdus, (self.first(about), made), strict=True):
@@ -185,7 +200,7 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
     """`MapProduct.write`."""
     path = Path(path).expanduser()
     if path.exists() and not overwrite:
-        raise OutputError("exists already", place=str(path), cure="choose another name, or write overwrite=True")
+        raise OutputError("is there already", place=str(path), cure="choose another name, or write overwrite=True")
     return MapFile.of("map", product).write(path, Provenance.of_a_map(product))
 
 

@@ -42,9 +42,19 @@ class MapProduct(MapArrays):
 
         return self.smoothed(smoothing_width(fwhm, self.fwhm))
 
-    def plot(self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None) -> Any:
-        """Draw a plane (``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``); the matplotlib Axes.
+    def stokes(self, which: str) -> MapProduct:
+        """I, Q or U of a polarized map as a map of its own, or P = sqrt(Q^2 + U^2) (which noise makes larger on the average).
 
+        Its weights are 1 over the diagonal of A^-1. Raises InputError for a map without Q and U, and for other names.
+        """
+        from .stokes import stokes_plane
+
+        return stokes_plane(self, which)
+
+    def plot(self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None) -> Any:
+        """Draw a plane; the matplotlib Axes.
+
+        Planes are ``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``; of a polarized map also ``Q``, ``U``, ``P``.
         Raises InputError for a plane that the map has not.
 
         Parameters
@@ -81,6 +91,8 @@ class MapProduct(MapArrays):
         self, fwhm: float, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal"
     ) -> float:
         """``smoothed(fwhm).rms(radius, of)``; of an image, only what the circle sees is smoothed."""
+        if self.polarization is not None:
+            return self.stokes("I").smoothed_rms(fwhm, radius, of)
         if self.header is None or getattr(self, of) is None:
             return self.smoothed(fwhm).rms(radius, of)
         near = self.distance() <= radius
@@ -96,14 +108,19 @@ class MapProduct(MapArrays):
         """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w over pixels with hits.
 
         Empty pixels neither contribute nor are filled. Noise: pixels are independent before, so its variance becomes
-        sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel itself. Raises InputError for a map in Jy/beam,
-        whose beam it would change.
+        sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel itself. I, Q and U are smoothed one by one.
+        Raises InputError for a map in Jy/beam, whose beam it would change.
         """
         if self.unit.endswith("/beam"):
             message = (
                 f"a map in {self.unit} is per beam of {math.degrees(self.resolution) * 3600:.3g} arcsec, which smoothing widens"
             )
             raise InputError(message, place="map", cure="smooth it before: map.smooth(...).to('Jy/beam')")
+        if self.polarization is not None:
+            from .stokes import smoothed_polarization
+
+            i, q, u = (self.stokes(which).smoothed(fwhm) for which in "IQU")
+            return replace(i, polarization=smoothed_polarization(self.polarization, i, q, u))
         convolve = self._convolver(fwhm)
         known = self.hits > 0
         weights = np.where(known, self.weights, 0.0)

@@ -8,16 +8,22 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from .map_product import MapProduct
+from .stokes import planes_of
 
 Noise = Literal["half_difference", "source_free"]
 """What holds noise alone: half the difference of two halves of the samples, the map of the signal without the sky."""
 
 
-def maps_of(products: Mapping[str, Any]) -> dict[str, MapProduct]:
-    """Every map among ``data.products``, by name, of ``signal`` first; not of signals that a step has for itself (_NAME)."""
+def maps_of(products: Mapping[str, Any], *, split: bool = True) -> dict[str, MapProduct]:
+    """Every map among ``data.products``, by name, of ``signal`` first; not of signals that a step has for itself (_NAME).
+
+    ``split``: I, Q and U of a polarized map are maps of their own (`stokes.planes_of`).
+    """
     found = (n for n, p in products.items() if isinstance(p, MapProduct) and not n.startswith("_"))
     names = sorted(found, key=lambda n: ("/" in n, n))
-    return {name: products[name] for name in names}
+    if not split:
+        return {name: products[name] for name in names}
+    return {shown: plane for name in names for shown, plane in planes_of(products[name], name).items()}
 
 
 @dataclass(frozen=True)

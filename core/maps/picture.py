@@ -12,6 +12,7 @@ from ..configuration.diagnostics import nearest
 from ..errors import InputError
 from ..types import AnyFloats
 from .map_arrays import MapArrays
+from .stokes import stokes_plane
 
 PLANES = ("signal", "noise", "hits", "weights", "half_difference")
 SHOWN = 99.5
@@ -35,6 +36,8 @@ class Shown:
 
 def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float | None) -> Any:
     """`MapProduct.plot`."""
+    if product.polarization is not None and plane in ("I", "Q", "U", "P"):
+        return draw_map(stokes_plane(product, plane), ax, "signal", title or plane, limit)
     values: AnyFloats | None = getattr(product, plane, None) if plane in PLANES else None
     if values is None:
         have = [name for name in PLANES if getattr(product, name) is not None]

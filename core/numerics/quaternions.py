@@ -62,6 +62,17 @@ def from_angles(longitude: Any, latitude: Any) -> Floats:
     return quaternions
 
 
+def detector_quaternions(xi: Any, eta: Any, angle: Any) -> Floats:
+    """Rotations (n, 4) that take the boresight frame's Z axis to (-eta, -xi, 1) and its X axis to the polarization angle.
+
+    q = Rz(phi) Ry(theta) Rz(angle - phi), theta = atan |(xi, eta)|, phi = atan2(-xi, -eta); see `core.focalplane.Focalplane`.
+    """
+    half, phi = np.arctan(np.hypot(xi, eta)) / 2, np.arctan2(-np.asarray(xi), -np.asarray(eta))
+    roll = np.asarray(angle) / 2
+    x, y = -np.sin(half) * np.sin(phi - roll), np.sin(half) * np.cos(phi - roll)
+    return np.stack([x, y, np.cos(half) * np.sin(roll), np.cos(half) * np.cos(roll)], 1)
+
+
 class Upright:
     """`from_angles` of unit vectors (n, 3), chunk by chunk: (n, 4), neighbours with neighbouring signs.
 

@@ -29,9 +29,9 @@ from .turbulence.covariance import NU, mixture
 from .turbulence.nodes import Layer
 
 SLOWEST = 1e-4
-"""Lowest speed of a layer whose spectrum is computed, m/s."""
+"""m/s: what is slower does not fluctuate."""
 NODES = 1500
-"""Number of nodes of the integral over q in equation (2)."""
+"""Of the integral over q in equation (2)."""
 
 
 KNOTS = 48

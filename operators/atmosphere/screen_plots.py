@@ -12,9 +12,9 @@ from zonda.core.drawable import Sketch
 from zonda.core.types import Floats
 
 ACROSS = (4, 5, 3)
-"""Numbers of panels in a row; the one that leaves the fewest places empty is used."""
+"""Panels in a row: what leaves the fewest places empty."""
 SIDE = 2.7
-"""Side of a panel with its labels, in."""
+"""Of a panel with its labels, in."""
 MARGINS = (0.62, 0.55, 0.45, 0.42)
 """Left, bottom, right and top of each panel, in."""
 COLOURS = "RdBu_r"

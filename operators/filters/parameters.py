@@ -14,16 +14,16 @@ from .source_mask import SourceMask
 
 
 class HighpassParameters(Operator):
-    """The parameters of `HighpassFilter`."""
+    """What is removed of each detector's scan."""
 
     frequency: Hertz = quantity("0.08 Hz", gt=0)
-    """Cutoff: lower frequencies are removed (`brick_wall`), or attenuated as the fourth power of the frequency (`bessel`)."""
+    """Cutoff: everything slower is removed (`brick_wall`), or lessened by its fourth power (`bessel`)."""
     response: Literal["brick_wall", "bessel"] = "brick_wall"
     """Brick wall without phase, or a causal Bessel filter with four poles."""
     degree: int | None = Field(3, ge=0, le=3)
     """Degree of the polynomial fitted to each detector's scan and removed first (1: a line; null: none, for `bessel` alone)."""
     trim: Seconds = quantity("0 s", ge=0)
-    """Time at either end of each scan that is flagged."""
+    """Flag this long at either end of each scan."""
     oversampling: float = Field(24.0, ge=8, le=1000)
     """Of the brick wall: coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut is about oversampling^-4."""
     mask: SourceMask | None = None
@@ -39,12 +39,12 @@ class HighpassParameters(Operator):
 
 
 class CommonModeParameters(Operator):
-    """The parameters of `CommonModeFilter`."""
+    """What the detectors have in common, and how it is found."""
 
     modes: int = Field(1, ge=1, le=100)
     """How many modes to remove."""
     method: Literal["svd", "mean"] = "svd"
-    """Singular modes, or the mean of all detectors at each instant (one mode), which needs little memory."""
+    """Singular modes, or the plain mean of all detectors at each instant (one mode), which streams of any size allow."""
     residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
     """Largest residual of a removed mode, equation (2)."""
     gap: float = Field(0.9, gt=0, lt=1)

@@ -143,6 +143,7 @@ def _samples_table(tod: TimeOrderedData) -> Any:
         column("BORESIGHT_AZEL", "4D", array=tod.boresight_azel),
         column("BORESIGHT_RADEC", "4D", array=tod.boresight_radec),
         column("FLAGS", "B", array=tod.flags),
+        *([] if tod.hwp_angle is None else [column("HWP_ANGLE", "D", unit="rad", array=tod.hwp_angle)]),
     ]
     table = fits.BinTableHDU.from_columns(columns, name="SAMPLES")
     table.header["FLAGBITS"] = ("TOAST", "bits of FLAGS")
@@ -319,6 +320,7 @@ def _read(file: Any) -> TimeOrderedData:
         columns={c.lower(): _native(detectors[c]) for c in detectors.names if c not in fixed},
         intervals=intervals,
         weather=weather,
+        hwp_angle=_native(samples["HWP_ANGLE"]) if "HWP_ANGLE" in samples.names else None,
         metadata={str(key): json.loads(value) for key, value in zip(provenance["KEY"], provenance["VALUE"], strict=True)},
         offsets=np.stack([_native(detectors["XI"]), _native(detectors["ETA"])], axis=1),
     )

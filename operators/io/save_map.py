@@ -25,7 +25,8 @@ class SaveMap(Output):
 
     ``map.fits``, ``noiseless_map.fits`` ...: the signal in the primary HDU (K_RJ), then HITS, WEIGHTS, NOISE and, where it was
     made, HALF_DIFFERENCE, all with the same world coordinates; HEALPix maps are explicit-index (partial) tables that healpy
-    reads. ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the central
+    reads. Of polarized maps I, Q, U (POLCCONV = COSMO), HITS, WEIGHTS, the covariance COV_II ... COV_UU and CONDITION.
+    ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the central
     arcminute. Every file carries beam, seed, versions, the resolved YAML and the log of the run.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
@@ -45,7 +46,7 @@ class SaveMap(Output):
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
-        maps = maps_of(data.products)
+        maps = maps_of(data.products, split=False)
         if not maps:
             raise PipelineError("there is no map to write", place=self.label, cure="add a step that makes one, e.g. BinMap")
         files = {product_path(folder, name, ".fits"): MapFile.of(name, product) for name, product in maps.items()}
@@ -59,7 +60,7 @@ class SaveMap(Output):
             for path in files:
                 if path.exists():
                     cure = "remove it, choose another output folder or set overwrite: true"
-                    raise OutputError("exists already", place=str(path), cure=cure)
+                    raise OutputError("is there already", place=str(path), cure=cure)
         about = Provenance.of(data)
         at_once = 1 if any(product.header is None for product in maps.values()) else MOST_AT_ONCE  # a table is copied
         with ThreadPoolExecutor(at_once, "SaveMap") as pool:  # the disk takes most of the time

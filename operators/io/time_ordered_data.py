@@ -12,6 +12,7 @@ from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
 from zonda.core.intervals import Intervals
+from zonda.core.numerics.quaternions import detector_quaternions
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
@@ -45,13 +46,16 @@ class TimeOrderedData:
         Detector names; (n_det, 4) rotations from the boresight's frame to the detectors'.
     columns
         Further detector columns, (n_det,) each, SI: fwhm [rad], net [K_RJ sqrt(s)], knee, minimum_frequency [Hz], slope,
-        band_centre, band_width [Hz], main_beam_efficiency, illumination_efficiency, polarization_angle [rad].
+        band_centre, band_width [Hz], main_beam_efficiency, illumination_efficiency, polarization_angle [rad],
+        polarization_efficiency.
     streams
         (n_det, n_samp) arrays; K_RJ but for `transmission`, which is relative.
     intervals
         By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`).
     weather
         At the telescope; None: not known.
+    hwp_angle
+        (n_samp,) rad, of a half-wave plate in the focal plane; None: there is none.
     metadata
         Text and numbers that say where the data come from.
     offsets
@@ -76,6 +80,7 @@ class TimeOrderedData:
     streams: dict[str, AnyFloats] = field(default_factory=dict)
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
+    hwp_angle: NDArray[np.float64] | None = None
     metadata: dict[str, str | int | float] = field(default_factory=dict)
     offsets: NDArray[np.float64] | None = None
 
@@ -94,6 +99,7 @@ class TimeOrderedData:
         pointed = [name for name in ("boresight_azel", "boresight_radec") if len(getattr(self, name))]
         shapes |= dict.fromkeys(pointed or ("boresight_azel",), (*n, 4))
         shapes |= {} if self.offsets is None else {"offsets": (*d, 2)}
+        shapes |= {} if self.hwp_angle is None else {"hwp_angle": n}
         wrong = [name for name, shape in shapes.items() if np.shape(getattr(self, name)) != shape]
         wrong += [name for name, column in self.columns.items() if np.shape(column) != d]
         wrong += [name for name, stream in self.streams.items() if stream.shape[:2] != (*d, *n) or stream.dtype.kind not in "fiu"]
@@ -160,6 +166,7 @@ class TimeOrderedData:
             columns={
                 "fwhm": f.fwhm,
                 "polarization_angle": f.polarization_angle,
+                "polarization_efficiency": f.polarization_efficiency,
                 "main_beam_efficiency": f.main_beam_efficiency,
                 "illumination_efficiency": f.illumination_efficiency,
                 "band_centre": np.full(n, instrument.band.centre),
@@ -171,6 +178,7 @@ class TimeOrderedData:
             },
             intervals=o.intervals,
             weather=o.weather,
+            hwp_angle=o.hwp_angle,
             metadata={
                 "seed": o.seed,
                 "observation_index": o.index,
@@ -181,14 +189,3 @@ class TimeOrderedData:
             },
             offsets=np.stack([f.xi, f.eta], axis=1),
         )
-
-
-def detector_quaternions(xi: AnyFloats, eta: AnyFloats, angle: AnyFloats) -> NDArray[np.float64]:
-    """Rotations (n, 4) that take the boresight frame's Z axis to (-eta, -xi, 1) and its X axis to the polarization angle.
-
-    q = Rz(phi) Ry(theta) Rz(angle - phi), theta = atan |(xi, eta)|, phi = atan2(-xi, -eta); see `Focalplane`.
-    """
-    half, phi = np.arctan(np.hypot(xi, eta)) / 2, np.arctan2(-np.asarray(xi), -np.asarray(eta))
-    roll = np.asarray(angle) / 2
-    x, y = -np.sin(half) * np.sin(phi - roll), np.sin(half) * np.cos(phi - roll)
-    return np.stack([x, y, np.cos(half) * np.sin(roll), np.cos(half) * np.cos(roll)], 1)

@@ -30,6 +30,7 @@ FLAGS_ARE = "zonda_flags"
 COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
     "fwhm": ("fwhm", "arcmin", "rad"),
     "polarization_angle": ("gamma", "rad", "rad"),
+    "polarization_efficiency": ("polarization_efficiency", "", ""),
     "band_centre": ("bandcenter", "GHz", "Hz"),
     "band_width": ("bandwidth", "GHz", "Hz"),
     "net": ("psd_net", "K s(1/2)", "K s(1/2)"),
@@ -159,7 +160,8 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
         table[theirs] = u.Quantity(values, si).to(unit) if unit else values
     if "polarization_angle" in tod.columns:
         table["psi_pol"] = table["gamma"]
-        table["pol_leakage"] = np.zeros(tod.n_detectors)
+        efficiency = tod.columns.get("polarization_efficiency", np.ones(tod.n_detectors))
+        table["pol_leakage"] = (1 - efficiency) / (1 + efficiency)  # TOAST's epsilon
     for name, values in zip(OFFSETS, (tod.xi, tod.eta), strict=True):
         table[name] = values
     table["pixel"] = table["name"]
@@ -233,6 +235,7 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
         "boresight_azel": tod.boresight_azel,
         "boresight_radec": tod.boresight_radec,
         "flags": tod.flags,
+        **({} if tod.hwp_angle is None else {"hwp_angle": tod.hwp_angle}),
     }
     group = file.create_group("shared")
     for name, values in shared.items():

@@ -165,6 +165,9 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         if theirs in table.colnames:
             values = table[theirs][rows]
             columns[ours] = np.array(u.Quantity(values, unit).to_value(si) if unit else values, np.float64)
+    if "pol_leakage" in table.colnames:
+        epsilon = np.asarray(table["pol_leakage"][rows], np.float64)
+        columns.setdefault("polarization_efficiency", (1 - epsilon) / (1 + epsilon))
     other: Mapping[str, Any] = file["metadata/other"].attrs if "metadata/other" in file else {}
     times = shared["times"][:]
     seconds = shared["seconds"][:] if "seconds" in shared else times - times[0]
@@ -198,6 +201,7 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         columns=columns,
         intervals=_intervals(file, times, seconds),
         weather=_weather(a),
+        hwp_angle=shared["hwp_angle"][:] if "hwp_angle" in shared else None,
         metadata={k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()},
         offsets=np.array([table[k][rows] for k in OFFSETS]).T if {*OFFSETS} <= set(table.colnames) else None,
     )

@@ -27,13 +27,16 @@ from .halves import halves_of
 from .map_layout import grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
+from .stokes_map import stokes_binnings
+from .stokes_product import StokesSums
+from .stokes_sums import StokesBinning
 from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, WEIGHT, Binning, Sums, add_image, add_list
 
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""
 
 LIGHTEST = 2.0**-10
-"""Smallest window of samples that are mapped: smaller ones have weights that are lost in rounding (`sums`)."""
+"""Least window of a sample that is in a map: the weights of all that are, of every detector, are more than rounding (`sums`)."""
 
 LIGHT = "instants that count as flagged: a window leaves less than 1/1024 of their weight"
 """A count of the log."""
@@ -54,7 +57,7 @@ class _Linear:
 
 
 class BinMap(MapParameters):
-    """Weighted mean of the samples in each pixel, equation (1), as a FITS image (TAN) or a HEALPix map."""
+    """Weighted mean of the samples in each pixel, equation (1), as a FITS image or a HEALPix map; or I, Q and U (`stokes`)."""
 
     requires: ClassVar[Any] = _Requires()
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -85,27 +88,27 @@ class BinMap(MapParameters):
             raise PipelineError("no grid: observe() was not called", place=self.label, cure="run it in a Pipeline")
         return self._grid
 
-    def prepare(self, observation: Observation) -> list[Binning]:
+    def prepare(self, observation: Observation) -> list[Binning] | list[StokesBinning]:
         """Pointing, weights and empty sums for one observation: one for all signals, or one for each with noise of its own."""
         return binnings(self, observation, self._layout["variance"], self._spare)
 
-    def exec(self, block: Block, state: list[Binning]) -> None:
+    def exec(self, block: Block, state: list[Any]) -> None:
         """Add one block to this thread's sums."""
         add_signals(self, block, state, self._layout["variance"])
 
-    def collect(self, data: Data, observation: Observation, state: list[Binning]) -> None:
+    def collect(self, data: Data, observation: Observation, state: list[Any]) -> None:
         """Add this observation to the even or the odd scans' sums."""
         add_scan(self, data, observation, state)
 
     def finalize(self, data: Data) -> None:
         """Turn the sums into one `MapProduct` for each signal, under the name `product`."""
         self._spare.clear()
-        sums: MapSums | None = data.take(self.label)
+        sums: MapSums | StokesSums | None = data.take(self.label)
         if sums is not None:
             finish(self, data, self.grid, self._layout, sums)
 
 
-def binnings(step: BinMap, observation: Observation, reference: float, spare: list[Sums]) -> list[Binning]:
+def binnings(step: BinMap, observation: Observation, reference: float, spare: list[Sums]) -> list[Binning] | list[StokesBinning]:
     """What `BinMap.prepare` makes: of each half (`halves_of`), one for all signals or one for each. ``reference``: unit of the
     variance, K^2; ``spare``: see `Binning`.
 
@@ -124,6 +127,8 @@ def binnings(step: BinMap, observation: Observation, reference: float, spare: li
         observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
     if "white" not in observation.components and step.noise == "net" and step.contents == "all":
         observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
+    if step.stokes == "IQU":
+        return stokes_binnings(step, observation, step.grid, (weight, noise, window), seen, spare)
     alike = step.noise == "net" and not window.size and bool((weight == weight[0]).all() and (noise == noise[0]).all())
     pointing = step.grid.pointing(observation)
     signals = 1 if step.contents == "hits" else len(observation.signals)
@@ -161,7 +166,7 @@ def weights_of(step: BinMap, observation: Observation, reference: float) -> tupl
     return weight, weight**2 * variance
 
 
-def add_signals(step: BinMap, block: Block, state: list[Binning], reference: float) -> None:
+def add_signals(step: BinMap, block: Block, state: list[Any], reference: float) -> None:
     """Add all signals of a block to this thread's sums; zeros where only the hits are wanted."""
     if step.contents == "hits":
         nothing = block.buffer("nothing", block.shape)
@@ -175,6 +180,10 @@ def add_signals(step: BinMap, block: Block, state: list[Binning], reference: flo
             signals = [
                 signal * window if name in unfiltered else signal for name, signal in zip(block.signals, signals, strict=True)
             ]
+    if step.stokes == "IQU":
+        for binning in state:
+            binning.add(tuple(signals), block)
+        return
     for binnings in halves(step, state):
         left = signals
         for binning in binnings:
@@ -183,8 +192,10 @@ def add_signals(step: BinMap, block: Block, state: list[Binning], reference: flo
             left = left[count:]
 
 
-def halves(step: BinMap, state: list[Binning]) -> list[list[Binning]]:
+def halves(step: BinMap, state: list[Any]) -> list[Any]:
     """The binnings of either half; of scans, which are a half each, all together."""
+    if step.stokes == "IQU":
+        return state
     middle = len(state) // 2
     return [state] if step.split == "scans" else [state[:middle], state[middle:]]
 
@@ -208,11 +219,14 @@ def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], binning: Bin
         add_list(signals, start - begin, index, *how)
 
 
-def add_scan(step: BinMap, data: Data, observation: Observation, state: list[Binning]) -> None:
+def add_scan(step: BinMap, data: Data, observation: Observation, state: list[Any]) -> None:
     """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples that are too large."""
     if step.label not in data.partial:
         signals = () if step.contents == "hits" else observation.signals
-        data.add(step.label, MapSums(step.grid.n_pixels, signals, step.noise == "scatter", step.split == "scans"))
+        n, of_scans = step.grid.n_pixels, step.split == "scans"
+        polarized = step.stokes == "IQU"
+        made = StokesSums(n, signals, of_scans) if polarized else MapSums(n, signals, step.noise == "scatter", of_scans)
+        data.add(step.label, made)
     sums: Any = data.partial[step.label]
     binned, dropped = sums.add(observation, halves(step, state), step.label)
     sums.unknown_variance |= step.weights == "inverse_variance" and not (observation.focalplane.net > 0).all()

@@ -21,20 +21,23 @@ from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES
 from .map_sums import MapSums
 from .parameters import MapParameters
+from .stokes_map import UNSOLVED, stokes_map_of
+from .stokes_product import StokesSums
 from .sums import DATA, HITS, NOISE, VALUE, WEIGHT, WEIGHTS, Sums
 
 AT_ONCE = 1 << 15
 """Pixels whose maps are made at a time: what is only used for a moment stays in the cache."""
 
 
-def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any], sums: MapSums) -> None:
+def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any], sums: MapSums | StokesSums) -> None:
     """Add the map of each signal to the products. Raises PipelineError where another step has made one of this name."""
     for stream in sums.signals or (MAIN,):
         key = product_name(stream, step.product)
         if key in data.products:
             text = f"two steps make the product {step.product!r}"
             raise PipelineError(text, place=step.label, cure="give one of them another product name")
-        product = map_of(step, grid, layout, sums, stream)
+        polarized = isinstance(sums, StokesSums)
+        product = (stokes_map_of if polarized else map_of)(step, grid, layout, sums, stream)  # type: ignore[arg-type]
         product.band = data.scene.instrument.band
         if stream == MAIN:
             state_choices(step, product, sums, data.tally)
@@ -82,8 +85,11 @@ def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: Map
     )  # fmt: skip
 
 
-def state_choices(step: MapParameters, product: MapProduct, sums: MapSums, tally: Tally) -> None:
+def state_choices(step: MapParameters, product: MapProduct, sums: MapSums | StokesSums, tally: Tally) -> None:
     """Tell how the map was made, and what is approximate about it."""
+    if (found := product.polarization) is not None:
+        hit = int(np.count_nonzero(found.hits))
+        tally.count(step.label, UNSOLVED, hit - int(np.count_nonzero(product.hits)), hit)
     if step.noise == "scatter":
         alone = int(np.count_nonzero(product.hits == 1))
         tally.count(step.label, "pixels with one sample, whose scatter is unknown: noise NaN", alone)

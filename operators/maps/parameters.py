@@ -43,6 +43,11 @@ class MapParameters(MapMaker):
     noise: Literal["net", "scatter"] = "net"
     """Noise of each pixel: from the detectors' NET, or from the scatter of its samples. From the NET also where the scene has no
     white noise; the log then says so."""
+    stokes: Literal["I", "IQU"] = "I"
+    """`IQU`: solve for I, Q and U in each pixel (polarized detectors are needed). Q and U are COSMO's, from the meridians of
+    `frame`."""
+    condition_limit: float = Field(1000.0, ge=2.0, le=1e7)
+    """Of I, Q and U: pixels in which the condition number of the samples' angles (2 at best) is larger are NaN, and counted."""
     contents: Literal["all", "hits"] = "all"
     """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
     half_difference: bool | Split = True
@@ -82,6 +87,21 @@ class MapParameters(MapMaker):
         if isinstance(value, float) and value > WIDEST_SMOOTH:
             raise ValueError(f"smooth must be at most {WIDEST_SMOOTH:g} rad (5.7 deg): the kernel would be wider than any map")
         return value
+
+    @model_validator(mode="after")
+    def _polarized(self) -> MapParameters:
+        if self.stokes == "I":
+            if "condition_limit" in self.model_fields_set:
+                raise ValueError("condition_limit belongs to stokes: IQU")
+            return self
+        if self.noise == "scatter":
+            raise ValueError("noise: scatter is for maps of I; with stokes: IQU noise follows from the NET")
+        if self.contents == "hits":
+            raise ValueError("contents: hits needs no stokes: IQU; leave that out")
+        if self.half_difference == "detectors":
+            cure = "set half_difference to scans, halves, directions or radii"
+            raise ValueError(f"even and odd detectors of pairs see one polarization each, which determines no I, Q and U; {cure}")
+        return self
 
     @model_validator(mode="after")
     def _one_grid(self) -> MapParameters:

@@ -27,9 +27,13 @@ class BinMapPlanning(Planning[BinMap]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         n = self.operator.grid.n_pixels
+        if self.operator.stokes == "IQU":
+            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, 6e-8 if self.operator.nside else 2.4e-8))
         return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9))
 
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, two halves, the products of all signals; and the pointing, twice while it is laid out."""
         others = len(observation.signals) - 1
+        if self.operator.stokes == "IQU":  # hits, six sums and three for each signal, in two threads and two halves
+            return (32 * (7 + 3 * (1 + others)) + 240 * (1 + others)) * self.operator.grid.n_pixels + 250 * observation.n_samples
         return (128 + 72 * others) * self.operator.grid.n_pixels + 150 * observation.n_samples

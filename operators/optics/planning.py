@@ -12,6 +12,8 @@ from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency
 from .ground_pickup import GroundPickup
+from .half_wave_plate import HalfWavePlate
+from .leakage import Leakage
 from .quotient import AT_ONCE
 
 
@@ -60,3 +62,29 @@ class GroundPlanning(Planning[GroundPickup]):
         elevation = observation.elevation
         ends = np.array([elevation.min(), elevation.max()]) / (np.pi / 4)
         return step.rms * (1 + 3 * step.scatter) * float(np.max(ends**step.power)) * calibration(observation)
+
+
+class HalfWavePlatePlanning(Planning[HalfWavePlate]):
+    """Angles of one plate; what they do is done where the sky is sampled and mapped."""
+
+    of = HalfWavePlate
+    cost = Cost(0.001, 3e-8, 0.0)
+
+    def memory(self, observation: Observation) -> int:
+        """The angles."""
+        return 8 * observation.n_samples
+
+
+class LeakagePlanning(Planning[Leakage]):
+    """Exact: it has no coarser form."""
+
+    of = Leakage
+
+    def memory(self, observation: Observation) -> int:
+        """The plate's angles."""
+        return 8 * observation.n_samples if observation.hwp_angle is not None else 0
+
+    def estimate(self, context: Context) -> Estimate:
+        """A product of whole streams, or with a plate one of their own."""
+        plate = context.first.hwp_angle is not None
+        return Estimate((), Cost(0.001, 3e-8, 8e-9 if plate else 5e-9))

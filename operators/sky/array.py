@@ -33,8 +33,11 @@ _STRUCTURE = frozenset(
 )
 """Keys that say how an array lies in a file, or nothing about the map."""
 
+STOKES = Cards([("CTYPE3", "STOKES"), ("CRPIX3", 1.0), ("CRVAL3", 1.0), ("CDELT3", 1.0)])
+"""Three images without a header are I, Q and U."""
+
 _TYPES = [np.dtype(kind) for kind in ("u1", "i2", "i4", "i8", "f4", "f8")]
-"""Types of numbers that FITS has."""
+"""Those that FITS knows."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,6 +91,8 @@ class ArrayMap:
             raise mistake(f"expected an image (ny, nx), got an array of shape {values.shape}; {cure}")
         if values.ndim < 2 or not values.size:
             raise mistake(f"expected an image (ny, nx), got an array of shape {values.shape}")
+        if values.ndim == 3 and len(values) == 3:
+            header.add(STOKES)
         return cls._image(values, header)
 
     @classmethod

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from zonda.core.maps.image import Image
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
 
 from .grid import Grid
@@ -82,9 +83,18 @@ def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
     With H its inverse, a pixel p = (x, y, 1) looks along H p, and dOmega = |det H| / |H p|^3 dx dy.
     """
     inverse = np.linalg.inv(matrix)
+    return np.asarray(abs(np.linalg.det(inverse)) / np.linalg.norm(_rays(inverse, shape), axis=2) ** 3)
+
+
+def tangent_directions(matrix: Floats, shape: tuple[int, int]) -> Floats:
+    """ICRS directions (ny, nx, 3) of the pixels of a TAN grid with `pixel_matrix` ``matrix``."""
+    rays = _rays(np.linalg.inv(matrix), shape)
+    return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
+
+
+def _rays(inverse: Any, shape: tuple[int, int]) -> Floats:
     y, x = np.mgrid[0.0 : shape[0], 0.0 : shape[1]]
-    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ inverse.T
-    return np.asarray(abs(np.linalg.det(inverse)) / np.linalg.norm(rays, axis=2) ** 3)
+    return np.asarray(np.stack([x, y, np.ones_like(x)], axis=2) @ inverse.T)
 
 
 @dataclass(frozen=True)
@@ -101,6 +111,8 @@ class Brightness:
         (ny, nx), or (0, 0): everywhere.
     notes, counts
         What was chosen, and what was taken for something else, for the tally.
+    polarization
+        (2, ny, nx) Q and U from the meridians through `Grid.axis`; 0 where nothing is known. None: there are none.
     """
 
     key: tuple[Hashable, ...]
@@ -109,10 +121,11 @@ class Brightness:
     wcs: Any
     notes: dict[str, str]
     counts: dict[str, int]
+    polarization: Floats | None = None
 
     @property
     def nbytes(self) -> int:
-        return self.values.nbytes + self.covered.nbytes
+        return self.values.nbytes + self.covered.nbytes + (0 if self.polarization is None else self.polarization.nbytes)
 
     def image(self, label: str) -> Image:
         """As a product for pictures and comparisons; NaN where nothing is known. ``label``: the operator's."""
@@ -133,7 +146,12 @@ def on_own_pixels(grid: Grid, found: Conversion, scale: float, place: str) -> Br
         "input map": f"TAN, {grid.shape[1]} x {grid.shape[0]} pixels of {pixel[0]:.6g} x {pixel[1]:.6g} arcsec",
         "conversion": found.text,
     }
-    return Brightness(grid.key, values, np.zeros((0, 0), bool), grid.wcs, notes, {ZEROED: source.zeroed})
+    polarization = None
+    if source.polarization is not None and grid.pole is not None:
+        turn = between_meridians(tangent_directions(pixel_matrix(grid.wcs), grid.shape), grid.pole, grid.axis)
+        polarization = turned_by(source.polarization * (found.factor * scale), turn)
+        check_brightness(polarization, place)
+    return Brightness(grid.key, values, np.zeros((0, 0), bool), grid.wcs, notes, {ZEROED: source.zeroed}, polarization)
 
 
 def interpolated(grid: Grid, found: Conversion, scale: float, outside: float, place: str, progress: Progress) -> Brightness:
@@ -141,13 +159,13 @@ def interpolated(grid: Grid, found: Conversion, scale: float, outside: float, pl
     source, wcs = grid.source, grid.wcs
     least_and_largest = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
     check_brightness(least_and_largest * (found.typical * scale), place)
-    counts = {ZEROED: source.zeroed}
+    counts, axis = {ZEROED: source.zeroed}, None if source.polarization is None else grid.axis
     if isinstance(source, HealpixMap):
         kind = f"HEALPix of nside {source.nside}"
-        values, covered, counts[POOR] = resample_healpix(source, wcs, grid.tiles, progress)
+        values, covered, counts[POOR] = resample_healpix(source, wcs, grid.tiles, progress, axis)
     else:
         kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
-        values, covered = resample_image(source, wcs, grid.tiles, progress, found.per_area)
+        values, covered = resample_image(source, wcs, grid.tiles, progress, found.per_area, axis)
         counts[LOST] = _lost(source)
     progress(0, 0)
     step = abs(float(wcs.wcs.cdelt[1])) * 3600
@@ -159,7 +177,10 @@ def interpolated(grid: Grid, found: Conversion, scale: float, outside: float, pl
         "conversion": found.text,
     }
     mask = np.zeros((0, 0), bool) if covered.all() else covered
-    return Brightness(grid.key, np.where(covered, values * (found.factor * scale), outside), mask, wcs, notes, counts)
+    polarization = None if axis is None else values[1:] * (found.factor * scale)
+    values = values if axis is None else values[0]
+    bright = np.where(covered, values * (found.factor * scale), outside)
+    return Brightness(grid.key, bright, mask, wcs, notes, counts, polarization)
 
 
 def _lost(image: WcsMap) -> int:

@@ -42,8 +42,9 @@ def grid_of(step: SkyParameters, observation: Observation) -> Grid:
     """Where the map will be convolved: nothing is convolved or interpolated yet."""
     widths, _ = beam_widths(step, observation)
     beam = REACH * SIGMA * float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)) / step.pixels_per_fwhm
-    identity = _identity(step)
-    source: WcsMap | HealpixMap = step._cache.get(identity, lambda: read_of(step))
+    polarized = observation.focalplane.polarized
+    identity = (*_identity(step), *(["polarized"] if polarized else []))
+    source: WcsMap | HealpixMap = step._cache.get(identity, lambda: read_of(step, polarized))
     band = observation.instrument.band
     key = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
     if isinstance(source, WcsMap):
@@ -52,7 +53,9 @@ def grid_of(step: SkyParameters, observation: Observation) -> Grid:
             centre = observation.centre
         wcs = placed(source, centre)
         if wcs is not None:
-            return own_pixels(source, wcs, key)
+            moved = centre is not None and source.wcs is not None and source.polarization is not None
+            turn = turned(source, centre, step.place).turn if centre is not None and moved else None
+            return own_pixels(source, wcs, key, turn)
         if centre is not None:
             return tangent_grid(turned(source, centre, step.place), observation, beam, (*key, centre), step.place)
     return tangent_grid(source, observation, beam, key, step.place)
@@ -80,7 +83,9 @@ def with_beam(sky: Brightness, step: SkyParameters, fwhm: float) -> Beam:
         convolved = convolve(sky.values, jacobian, fwhm, step.outside, step.pixels_per_fwhm, linear)
         if text := too_bright(float(np.abs(convolved.coefficients["float64"]).max(initial=0.0)), sky.notes["conversion"]):
             warnings.warn(f"{step.label}: {step.file or step.source}: {text}", stacklevel=2)
-        return Beam.of(sky, fwhm, convolved)
+        more = () if sky.polarization is None else sky.polarization
+        others = [convolve(values, jacobian, fwhm, 0.0, step.pixels_per_fwhm, linear) for values in more]
+        return Beam.of(sky, fwhm, convolved, tuple(other.coefficients for other in others))
 
     return cast(Beam, step._cache.get((*sky.key, "beam", step.pixels_per_fwhm, step.interpolation, fwhm), make))
 
@@ -94,10 +99,11 @@ def _identity(step: SkyParameters) -> tuple[Hashable, ...]:
     return ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
 
 
-def read_of(step: SkyParameters) -> WcsMap | HealpixMap:
-    """The map as its file, or the array, has it."""
+def read_of(step: SkyParameters, polarized: bool = False) -> WcsMap | HealpixMap:
+    """The map as its file, or the array, has it; with Q and U where the camera is ``polarized``."""
     given = {name: getattr(step, name) for name in ("unit", "pixel_size", "missing", "input_beam", "coordsys")}
     given |= {"plane": (step.plane,) if isinstance(step.plane, int) else step.plane, "centred": step.centre is not None}
+    given |= {"polarized": polarized, "convention": step.polarization_convention}
     if (array := step.array()) is not None:
         source = read_array(array, step.place, **given)
     else:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, frame_rotation, pixel_matrix, rotation_matrices, wcs_frame_rotation
-from zonda.core.numerics.sphere import angle_between
+from zonda.core.numerics.sphere import angle_between, local_axes
 from zonda.core.types import Floats
 
 from .beam import REACH, SIGMA
@@ -49,6 +49,8 @@ class Grid:
         False: on the pixels of the file.
     points
         How many are filled.
+    pole
+        ICRS direction (3,) of the pole of the meridians from which the input's Q and U are counted; None: it has none.
     """
 
     key: tuple[Hashable, ...]
@@ -58,12 +60,22 @@ class Grid:
     tiles: NDArray[np.bool_] | None
     resampled: bool
     points: int
+    pole: Floats | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes of the map there, and of what is kept of the file where that is another."""
         ny, nx = self.shape
-        return 8 * ny * nx + (ny * nx if self.resampled else 0)
+        return (8 if self.pole is None else 24) * ny * nx + (ny * nx if self.resampled else 0)
+
+    @property
+    def axis(self) -> Floats:
+        """ICRS direction (3,) of the pole of the meridians from which Q and U are counted on the grid: north of the tangent
+        point, 90 deg from it, so that no point of the grid is near.
+        """
+        x, y, z = pixel_matrix(self.wcs)[2]
+        north: Floats = local_axes(float(np.arctan2(y, x)), float(np.arctan2(z, np.hypot(x, y))))[2]
+        return north
 
     def reached(self, observation: Observation, widest: float) -> bool:
         """Whether any detector of an observation comes within a beam of FWHM ``widest`` [rad] of the map."""
@@ -95,10 +107,11 @@ class Grid:
         return (PER_VALUE * size if size > LARGE else 0.0) + self.interpolation
 
 
-def own_pixels(source: WcsMap, wcs: Any, key: tuple[Hashable, ...]) -> Grid:
-    """The grid of a TAN image."""
+def own_pixels(source: WcsMap, wcs: Any, key: tuple[Hashable, ...], turn: Floats | None = None) -> Grid:
+    """The grid of a TAN image. ``turn``: from ICRS directions to the frame of its Q and U, where it is not that of ``wcs``."""
     shape = (source.values.shape[0], source.values.shape[1])
-    return Grid((*key, "image", tuple(wcs.wcs.crval)), source, wcs, shape, None, False, source.values.size)
+    pole = None if source.polarization is None else (wcs_frame_rotation(wcs) if turn is None else turn)[2]
+    return Grid((*key, "image", tuple(wcs.wcs.crval)), source, wcs, shape, None, False, source.values.size, pole)
 
 
 def tangent_grid(
@@ -115,7 +128,21 @@ def tangent_grid(
     ra, dec = observation.centre
     wcs = tangent_wcs(ra, dec, found.box, step)
     tiles = None if found.tiles is None else found.tiles.tobytes()
-    return Grid((*key, "grid", ra, dec, step, found.box, tiles), source, wcs, found.shape, found.tiles, True, found.points)
+    pole = None if source.polarization is None else _frame(source, place)[2]
+    return Grid((*key, "grid", ra, dec, step, found.box, tiles), source, wcs, found.shape, found.tiles, True, found.points, pole)
+
+
+def _frame(source: WcsMap | HealpixMap, place: str) -> Floats:
+    """From ICRS directions to those of a map's frame (3, 3). Raises InputError where it is no rotation of ICRS (FK4)."""
+    if isinstance(source, HealpixMap):
+        return frame_rotation(source.frame)
+    if source.turn is not None:
+        return source.turn
+    try:
+        return wcs_frame_rotation(source.wcs)
+    except InputError:
+        cure = "convert the map to ICRS, or set plane to that of I"
+        raise InputError("Q and U in FK4 coordinates are not turned to ICRS", place=place, cure=cure) from None
 
 
 def _disc(source: WcsMap | HealpixMap) -> Disc | None:

@@ -41,20 +41,31 @@ def read_healpix(hdu: Any, place: str, wanted: Wanted) -> HealpixMap:
     notes |= stokes.of_columns(names, int(explicit), place)
     unit, factor = unit_of(place, header, f"TUNIT{1 + int(explicit)}", wanted.unit, notes)
     beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
-    values = np.array(hdu.data.field(int(explicit)), np.float64).ravel()
+    columns, polarized = [int(explicit)], stokes.q_and_u(names) if wanted.polarized else None
+    if polarized is not None:
+        _check_same_unit(header, columns + polarized, place, wanted)
+        columns += polarized
+    values = np.stack([np.array(hdu.data.field(k), np.float64).ravel() for k in columns])
     pixels = np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else None
-    nside = _nside(place, header, nested, len(values), pixels)
+    nside = _nside(place, header, nested, values.shape[1], pixels)
     if pixels is not None:
         order = np.argsort(pixels, kind="stable")
-        pixels, values = pixels[order], values[order]
+        pixels, values = pixels[order], values[:, order]
         if len(pixels) and (pixels[0] < 0 or pixels[-1] >= 12 * nside * nside or (np.diff(pixels) == 0).any()):
             raise InputError(
                 "the pixel numbers are out of range or twice there", place=place, cure="check NSIDE and the PIXEL column"
             )
     pixels, values = _seen(pixels, values)
-    zeroed = filled(place, values, wanted.missing, "entry {} of those that are seen (counted from 1)")
+    if len(columns) > 1:
+        notes.pop(stokes.STOKES, None)
+        stokes.in_cosmo(values[1:], header, wanted.convention, False, place, notes)
+    where = "entry {} of those that are seen (counted from 1)"
+    zeroed = filled(place, values[0], wanted.missing, where)
+    if len(columns) > 1:
+        zeroed += filled(place, values[1:], wanted.missing, f"plane {{}} of Q and U, {where}")
     values *= factor
-    return HealpixMap(values, pixels, nside, nested, frame, unit, beam, notes, zeroed)
+    q_and_u = values[1:] if len(columns) > 1 else None
+    return HealpixMap(values[0], pixels, nside, nested, frame, unit, beam, notes, zeroed, q_and_u)
 
 
 def _check_wanted(place: str, wanted: Wanted) -> None:
@@ -108,13 +119,25 @@ def _nside(place: str, header: Any, nested: bool, n_values: int, pixels: Any) ->
     return nside
 
 
+def _check_same_unit(header: Any, columns: list[int], place: str, wanted: Wanted) -> None:
+    """Raise InputError where Q or U is in another unit than I."""
+    units = [str(header.get(f"TUNIT{1 + k}", "") or "").strip() for k in columns]
+    if wanted.unit is None and any(unit not in ("", units[0]) for unit in units[1:]):
+        raise InputError(
+            f"its columns of I, Q and U are in {', '.join(unit or '(none)' for unit in units)}",
+            place=place,
+            cure="write all three in one unit, or set the operator's parameter unit, which then holds for all",
+        )
+
+
 def _seen(pixels: NDArray[np.int64] | None, values: Floats) -> tuple[NDArray[np.int64] | None, Floats]:
-    """The pixels that are not marked as unseen; None as pixels: all."""
+    """The pixels whose first values of (n_planes, n) are not marked as unseen, and where others are, NaN; None as pixels: all."""
     import healpy
 
-    unseen = healpy.mask_bad(values) if len(values) else np.zeros(0, bool)
+    unseen = healpy.mask_bad(values) if values.size else np.zeros(values.shape, bool)
     unseen &= np.isfinite(values)
-    if not unseen.any():
+    values[1:][unseen[1:]] = np.nan
+    if not unseen[0].any():
         return pixels, values
-    seen = ~unseen
-    return (np.flatnonzero(seen) if pixels is None else pixels[seen]), values[seen]
+    seen = ~unseen[0]
+    return (np.flatnonzero(seen) if pixels is None else pixels[seen]), values[:, seen]

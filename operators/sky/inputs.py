@@ -24,6 +24,10 @@ class Wanted:
         True where the caller says where the map's centre lies: then the header's position is not needed.
     plane
         Of a cube, counted from 1; one number for each axis that is longer than one. None: the only one, or that of Stokes I.
+    polarized
+        True where Q and U are read, too.
+    convention
+        Of them: `SkyMap.polarization_convention`.
     """
 
     unit: str | None = None
@@ -34,6 +38,8 @@ class Wanted:
     coordsys: Literal["icrs", "galactic", "ecliptic"] | None = None
     plane: tuple[int, ...] | None = None
     hdu: int | str | None = None
+    polarized: bool = False
+    convention: Literal["cosmo", "iau"] | None = None
 
 
 @dataclass
@@ -58,6 +64,8 @@ class WcsMap:
         Missing pixels set to zero on request.
     turn
         (3, 3) a direction on the sky (ICRS) to the one in the frame of `wcs` at which the image is looked up; None: the same one.
+    polarization
+        (2, ny, nx) Q and U in `unit`, COSMO, from the meridians of the frame of `wcs`; None: there are none, or none are wanted.
     """
 
     values: Floats
@@ -68,10 +76,11 @@ class WcsMap:
     notes: dict[str, str] = field(default_factory=dict)
     zeroed: int = 0
     turn: Floats | None = None
+    polarization: Floats | None = None
 
     @property
     def nbytes(self) -> int:
-        return self.values.nbytes
+        return self.values.nbytes + (0 if self.polarization is None else self.polarization.nbytes)
 
 
 @dataclass
@@ -90,7 +99,8 @@ class HealpixMap:
     beam_solid_angle: float | None = None
     notes: dict[str, str] = field(default_factory=dict)
     zeroed: int = 0
+    polarization: Floats | None = None
 
     @property
     def nbytes(self) -> int:
-        return self.values.nbytes + (0 if self.pixels is None else self.pixels.nbytes)
+        return self.values.nbytes + sum(0 if part is None else part.nbytes for part in (self.pixels, self.polarization))

@@ -30,7 +30,8 @@ class SkyParameters(Operator):
     file: InputPath | None = None
     """FITS image (with or without a celestial WCS) or HEALPix table. A relative path starts at the pipeline file's folder."""
     map: ArrayMap | None = None
-    """In Python, in place of `file`: a numpy array (ny, nx), an astropy Quantity, or an HDU. Row 0 is the southern one."""
+    """In Python, in place of `file`: a numpy array (ny, nx), or (3, ny, nx) of I, Q and U, an astropy Quantity, or an HDU. Row 0
+    is the southern one."""
     wcs: WorldCoordinates | None = None
     """World coordinates of `map`: an astropy WCS, or FITS keywords. Without: give pixel_size and centre."""
     unit: str | None = None
@@ -45,6 +46,9 @@ class SkyParameters(Operator):
     """Coordinates of a HEALPix map. Default: its header's COORDSYS."""
     plane: int | tuple[int, ...] | None = None
     """Plane of a cube, counted from 1; of several further axes a list: [12, 1]. Default: the only one, or Stokes I."""
+    polarization_convention: Literal["cosmo", "iau"] | None = None
+    """Sign of U in a map of I, Q, U: `cosmo` (angles from south to east) or `iau` (from north to east). Default: its header's
+    POLCCONV; where there is none, `cosmo` for HEALPix maps. Read for polarized cameras only."""
     hdu: int | str | None = None
     """Extension of the file by number (0: the primary one) or name. Default: the first image or HEALPix table."""
     missing: Literal["error", "zero"] = "error"

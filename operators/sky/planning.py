@@ -54,7 +54,8 @@ class SkyPlanning(Planning[SkyMap]):
         """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""
         widths, _ = beam_widths(self.operator, observation)
         grid = grid_of(self.operator, observation)
-        return (5 + 2 * len(widths)) * grid.nbytes + (grid.source.nbytes if grid.resampled else 0)
+        angles = 0 if grid.pole is None else 40 * observation.n_samples
+        return (5 + 2 * len(widths)) * grid.nbytes + (grid.source.nbytes if grid.resampled else 0) + angles
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
@@ -80,8 +81,10 @@ class SkyPlanning(Planning[SkyMap]):
         points = 2.0 * size
         convolution = CONVOLUTION * sum(float(np.prod(g.shape)) for g in distinct.values())
         made = grid.seconds + sum(g.interpolation for k, g in distinct.items() if k != grid.key)
-        cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8, per_sample=5e-9 if reached else 0.3e-9,
-                    once=made + (convolution if reached else 0.0))  # fmt: skip
+        planes = 1 if grid.pole is None else 3
+        per_sample = (5e-9 if planes == 1 else 1.5e-8) if reached else 0.3e-9
+        cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8 * planes, per_sample=per_sample,
+                    once=made + (planes * convolution if reached else 0.0))  # fmt: skip
         what = "Gaussian" if fwhm else "none" if reached else "not convolved: no detector reaches the map"
         choices = [full(what), *self._without_beam(context, fwhm, convolution)]
         effects = (

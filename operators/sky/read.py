@@ -57,10 +57,14 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
         if is_healpix(hdu):
             found: WcsMap | HealpixMap = read_healpix(hdu, place, wanted)
         else:
+            q_and_u = None
             if wanted.hdu is None:
                 notes |= stokes.of_extensions(hdu.name, [other.name for other in hdus if other.is_image], place)
-            found = _image(place, np.asarray(hdu.data), hdu.header, wanted)
+                q_and_u = _extensions(path, hdus, hdu, place) if wanted.polarized else None
+            found = _image(place, np.asarray(hdu.data), hdu.header, wanted, q_and_u)
         found.notes = notes | found.notes
+        if found.polarization is not None:
+            found.notes.pop(stokes.STOKES, None)
         return _told(found, hdu.header.get(GIVEN))
 
 
@@ -80,16 +84,38 @@ def _told(found: T, text: object) -> T:
     return found
 
 
-def _image(place: str, values: Floats, header: Any, wanted: Wanted) -> WcsMap:
+def _extensions(path: Path, hdus: Any, first: Any, place: str) -> Floats | None:
+    """(2, ny, nx) Q and U of a file that has them as extensions beside its ``first`` image; None where it has none."""
+    images = [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2]
+    found = stokes.q_and_u([hdu.name for hdu in images])
+    if found is None:
+        return None
+    for k in found:
+        check_size(path, images[k], place)
+    planes = [np.asarray(images[k].data, np.float64) for k in found]
+    if any(plane.shape != first.data.shape for plane in planes):
+        raise InputError("its images of I, Q and U differ in size", place=place, cure="give three images of one grid")
+    return np.stack(planes)
+
+
+def _image(place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Floats | None = None) -> WcsMap:
     if values.ndim < 2 or values.size == 0:
         raise InputError("the image has no pixels", place=place, cure="give a two-dimensional image")
     if wanted.coordsys is not None:
         raise InputError("coordsys is for HEALPix maps", place=place, cure="remove coordsys: CTYPE says what an image's are")
     plane, notes = plane_of_cube(header, values.shape, wanted.plane, place)
+    planes = stokes.planes_of_q_and_u(header, values.shape, plane) if wanted.polarized else None
+    if planes is not None:
+        q_and_u = np.stack([np.array(values[k], np.float64) for k in planes])
     values = np.array(values[plane], np.float64)
     unit, factor = unit_of(place, header, "BUNIT", wanted.unit, notes)
     beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
     zeroed = filled(place, values, wanted.missing, "row {}, column {} (counted from 1)")
     values *= factor
+    if q_and_u is not None:
+        notes.pop(stokes.STOKES, None)
+        q_and_u = stokes.in_cosmo(q_and_u, header, wanted.convention, True, place, notes)
+        zeroed += filled(place, q_and_u, wanted.missing, "plane {} of Q and U, row {}, column {} (counted from 1)")
+        q_and_u *= factor
     wcs, scale = geometry(place, header, wanted.pixel_size, wanted.centred, notes)
-    return WcsMap(values, unit, wcs, scale, beam, notes, zeroed)
+    return WcsMap(values, unit, wcs, scale, beam, notes, zeroed, polarization=q_and_u)

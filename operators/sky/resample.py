@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.numerics.projection import frame_rotation, pixel_matrix, wcs_frame_rotation
 from zonda.core.numerics.sphere import angles, unit_vectors
+from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
 
 from .inputs import HealpixMap, WcsMap
@@ -70,7 +71,12 @@ def no_progress(done: int, total: int) -> None:
 
 
 def resample_image(
-    image: WcsMap, target: Any, tiles: NDArray[np.bool_] | None = None, progress: Progress = no_progress, per_area: bool = False
+    image: WcsMap,
+    target: Any,
+    tiles: NDArray[np.bool_] | None = None,
+    progress: Progress = no_progress,
+    per_area: bool = False,
+    axis: Floats | None = None,
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """(values, covered) of an image on the TAN grid ``target``, by cubic B-splines. NaN-free: not covered is 0.
 
@@ -82,11 +88,14 @@ def resample_image(
         `region.Region.tiles`: where False nothing is worked on, and not covered.
     per_area
         Divide each pixel by its solid angle [sr]; one beyond the projection, which has none, counts as 0.
+    axis
+        ICRS direction (3,) of a pole: values are (3, ny, nx) I, Q and U, and each pixel's Q and U are turned to the meridians
+        through that pole before they are interpolated. None: I alone, (ny, nx).
     """
     from scipy.ndimage import map_coordinates, spline_filter
 
     nx, ny = target.pixel_shape
-    values, covered = np.zeros((ny, nx)), np.zeros((ny, nx), bool)
+    planes, covered = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool)
     coordinates = _coordinates(image)
     for block in _blocks(target, tiles, progress):
         x, y, inside = _on_image(image, coordinates, block.d)
@@ -94,16 +103,31 @@ def resample_image(
             continue
         x, y = x[inside], y[inside]
         rows, columns = _under(image, x, y)
-        source = image.values[np.ix_(rows, columns % image.values.shape[1])]
+        sources = [image.values[np.ix_(rows, columns % image.values.shape[1])]]
+        if axis is not None:
+            sources += _turned(image, rows, columns, axis)
         if per_area:
             areas = pixel_areas(image.wcs, rows, columns)
             with np.errstate(divide="ignore", invalid="ignore"):
-                source = np.where(np.isfinite(areas) & (areas > 0), source / areas, 0.0)
+                sources = [np.where(np.isfinite(areas) & (areas > 0), source / areas, 0.0) for source in sources]
         at = np.array([y - rows[0], x - columns[0]])
-        found = map_coordinates(spline_filter(source, 3, mode="mirror"), at, order=3, prefilter=False, mode="mirror")
-        values[block.y[inside], block.x[inside]] = found
+        for values, source in zip(planes, sources, strict=True):
+            found = map_coordinates(spline_filter(source, 3, mode="mirror"), at, order=3, prefilter=False, mode="mirror")
+            values[block.y[inside], block.x[inside]] = found
         covered[block.y[inside], block.x[inside]] = True
-    return values, covered
+    return planes if axis is not None else planes[0], covered
+
+
+def _turned(image: WcsMap, rows: NDArray[np.int64], columns: NDArray[np.int64], axis: Floats) -> list[Floats]:
+    """Q and U of some rows and columns of an image, from the meridians through the ICRS direction ``axis``; 0 beyond the sky."""
+    assert image.polarization is not None  # asked for only where there are Q and U
+    lon, lat = from_pixels(image.wcs, *np.meshgrid(columns.astype(np.float64), rows.astype(np.float64)))
+    d = unit_vectors(*np.radians((lon, lat)))
+    known = np.asarray(np.isfinite(d).all(axis=-1))
+    to = (wcs_frame_rotation(image.wcs) if image.turn is None else image.turn) @ axis
+    turn = between_meridians(np.where(known[..., None], d, 0.0), np.array([0.0, 0.0, 1.0]), to)
+    found = image.polarization[:, rows][:, :, columns % image.values.shape[1]]
+    return list(turned_by(np.where(known, found, 0.0), turn))
 
 
 def _on_image(
@@ -202,21 +226,26 @@ def from_pixels(wcs: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def resample_healpix(
-    sky: HealpixMap, target: Any, tiles: NDArray[np.bool_] | None = None, progress: Progress = no_progress
+    sky: HealpixMap,
+    target: Any,
+    tiles: NDArray[np.bool_] | None = None,
+    progress: Progress = no_progress,
+    axis: Floats | None = None,
 ) -> tuple[Floats, NDArray[np.bool_], int]:
     """(values, covered, poor) of a HEALPix map on the TAN grid ``target``. A grid point is covered where its HEALPix pixel is.
 
     Each value comes from the polynomial of third degree that best fits the `NEIGHBOURS` nearest covered pixel centres in the
     tangent plane, with weights 1 / distance^4 (moving least squares): it passes through the pixel values, whatever the
     orientation of the pixels. Where the neighbours do not determine it, it is their weighted mean: ``poor`` counts those.
-    ``tiles`` as of `resample_image`.
+    ``tiles`` and ``axis`` as of `resample_image`.
     """
     import healpy
     from scipy.spatial import cKDTree
 
     to_frame, matrix = frame_rotation(sky.frame), pixel_matrix(target)
     nx, ny = target.pixel_shape
-    values, covered, poor = np.zeros((ny, nx)), np.zeros((ny, nx), bool), 0
+    planes, covered, poor = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool), 0
+    values = planes if axis is not None else planes[0]
     if len(sky.values) < NEIGHBOURS:
         return values, covered, poor
     for block in _blocks(target, tiles, progress):
@@ -226,13 +255,17 @@ def resample_healpix(
         if len(near) < NEIGHBOURS:
             continue
         numbers = near if sky.pixels is None else sky.pixels[near]
-        projected = np.stack(healpy.pix2vec(sky.nside, numbers, nest=sky.nest), axis=1) @ to_frame @ matrix.T
+        d = np.stack(healpy.pix2vec(sky.nside, numbers, nest=sky.nest), axis=1)
+        projected = d @ to_frame @ matrix.T
         front = projected[:, 2] > 0
-        points, data = projected[front, :2] / projected[front, 2:], sky.values[near[front]]
+        points, data = projected[front, :2] / projected[front, 2:], sky.values[None, near[front]]
+        if axis is not None and sky.polarization is not None:
+            turn = between_meridians(d[front], np.array([0.0, 0.0, 1.0]), to_frame @ axis)
+            data = np.concatenate([data, turned_by(sky.polarization[:, near[front]], turn)])
         tree = cKDTree(points)
         at = np.stack([block.x[seen], block.y[seen]], axis=1).astype(np.float64)
         parts = [_local_fit(tree, points, data, at[k : k + AT_ONCE]) for k in range(0, len(at), AT_ONCE)]
-        values[block.y[seen], block.x[seen]] = np.concatenate([found for found, _ in parts])
+        planes[:, block.y[seen], block.x[seen]] = np.concatenate([found for found, _ in parts], axis=1)
         covered[block.y[seen], block.x[seen]] = True
         poor += sum(undetermined for _, undetermined in parts)
     return values, covered, poor
@@ -263,9 +296,9 @@ def _near(sky: HealpixMap, d: Floats) -> NDArray[np.int64]:
 
 
 def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Floats, int]:
-    """Moving least squares of third degree at ``at`` (n, 2) from scattered ``data`` (m,) at ``points`` (m, 2).
+    """Moving least squares of third degree at ``at`` (n, 2) from scattered ``data`` (k, m) at ``points`` (m, 2).
 
-    The values (n,), and how many of them are weighted means because the fit is not determined.
+    The values (k, n), and at how many points they are weighted means because the fit is not determined.
     """
     distance, index = tree.query(at, NEIGHBOURS)
     scale = distance[:, -1:]
@@ -274,12 +307,15 @@ def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Flo
     cubic = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=2)
     q, r = np.linalg.qr(cubic * weight[:, :, None])
     pivots = np.abs(np.diagonal(r, axis1=1, axis2=2))
-    value = np.linalg.solve(r + 1e-300 * np.eye(10), np.einsum("nkj,nk->nj", q, weight * data[index])[:, :, None])[:, 0, 0]
     poor = pivots.min(axis=1) < 1e-6 * pivots.max(axis=1)
-    if poor.any():
-        w2 = weight[poor] ** 2
-        value[poor] = np.sum(w2 * data[index[poor]], axis=1) / np.sum(w2, axis=1)
-    return value, int(poor.sum())
+    found = np.empty((len(data), len(at)))
+    for value, plane in zip(found, data, strict=True):
+        right = np.einsum("nkj,nk->nj", q, weight * plane[index])[:, :, None]
+        value[:] = np.linalg.solve(r + 1e-300 * np.eye(10), right)[:, 0, 0]
+        if poor.any():
+            w2 = weight[poor] ** 2
+            value[poor] = np.sum(w2 * plane[index[poor]], axis=1) / np.sum(w2, axis=1)
+    return found, int(poor.sum())
 
 
 # ----------------------------------------------------------------------------------------------------------- extremes

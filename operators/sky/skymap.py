@@ -10,6 +10,7 @@ import numpy as np
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.maps.image import Image
+from zonda.core.polarization import PolarizationAngles
 from zonda.core.product import Product
 from zonda.core.storage.fits_image import Cards
 
@@ -43,6 +44,9 @@ class SkyMap(SkyParameters):
     A TAN image is used on its own pixels; other projections and HEALPix maps are first interpolated (third order) onto a
     TAN grid about the observation. The smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at
     least `pixels_per_fwhm` points per FWHM: with 4 within 0.3 % of the peak of a point source; or linear (`interpolation`).
+
+    Polarized detectors see I + p (Q cos 2 psi + U sin 2 psi) of maps of I, Q and U (`core.polarization`), whose Q and U are
+    turned to common axes before they are convolved and interpolated.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -54,7 +58,8 @@ class SkyMap(SkyParameters):
         if not grid.reached(observation, float(widths.max(initial=0.0))):
             observation.tally.state(self.label, f"{observation.name}: not convolved", "no detector reaches the input map")
             return SkyState(grid, sky, [], index)
-        state = SkyState(grid, sky, [with_beam(sky, self, float(fwhm)) for fwhm in widths], index)
+        angles = None if sky.polarization is None else PolarizationAngles.of(observation, grid.axis)
+        state = SkyState(grid, sky, [with_beam(sky, self, float(fwhm)) for fwhm in widths], index, angles)
         state.tell(observation.tally, self.label)
         return state
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Block
 from zonda.core.numerics.projection import pixel_matrix
+from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 
 from .beam import Convolved
@@ -18,6 +19,8 @@ from .cache import Cache
 from .grid import Grid
 from .linear import add_lines
 from .sampling import Chunks, Rows, add_splines, pointing, sample
+
+Coefficients = dict[str, NDArray[np.floating[Any]]]
 
 if TYPE_CHECKING:
     from zonda.core.data import Tally
@@ -35,21 +38,26 @@ class Beam:
         (3, 3) from ICRS directions to the points of the convolved grid.
     covered
         `Brightness.covered` on those points.
+    polarization
+        Coefficients of Q and of U, as those of ``convolved``; none where there are no such.
     """
 
     fwhm: float
     convolved: Convolved
     matrix: Floats
     covered: NDArray[np.uint8]
+    polarization: tuple[Coefficients, ...] = ()
 
     @classmethod
-    def of(cls, sky: Brightness, fwhm: float, convolved: Convolved) -> Beam:
+    def of(cls, sky: Brightness, fwhm: float, convolved: Convolved, polarization: tuple[Coefficients, ...] = ()) -> Beam:
         """``convolved``: ``sky`` with the beam of ``fwhm`` [rad]."""
-        return cls(fwhm, convolved, convolved.to_grid @ pixel_matrix(sky.wcs), _on_grid(sky.covered, convolved))
+        matrix = convolved.to_grid @ pixel_matrix(sky.wcs)
+        return cls(fwhm, convolved, matrix, _on_grid(sky.covered, convolved), polarization)
 
     @property
     def nbytes(self) -> int:
-        return self.covered.nbytes + sum(c.nbytes for c in self.convolved.coefficients.values())
+        kept = (self.convolved.coefficients, *self.polarization)
+        return self.covered.nbytes + sum(c.nbytes for coefficients in kept for c in coefficients.values())
 
     def tell(self, tally: Tally, label: str) -> None:
         """State its width and how finely it is sampled."""
@@ -93,12 +101,15 @@ class SkyState:
         None where no detector reaches the map.
     index
         (n_det,) number of each detector's beam.
+    angles
+        Of the detectors on the sky, from the meridians of the grid's Q and U; None: there are no Q and U.
     """
 
     grid: Grid
     sky: Brightness
     beams: list[Beam]
     index: NDArray[np.int64]
+    angles: PolarizationAngles | None = None
     _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     _chunks: Cache = field(default_factory=lambda: Cache(2**22))
 
@@ -119,16 +130,34 @@ class SkyState:
         beyond = behind = 0
         if not self.beams:
             beyond, behind = out.size, self.grid.behind(block.observation.boresight_radec[block.samples], xi, eta)
+        kernel = add_lines if linear else add_splines
         for number, beam in enumerate(self.beams):
             rows = np.flatnonzero(index == number)
             if rows.size:
                 coefficients = beam.convolved.coefficients[out.dtype.name]
                 chunks = self._pointing(block, number, out.dtype.type)
                 detectors = Rows(rows, xi[rows], eta[rows])
-                found = sample(add_lines if linear else add_splines, chunks, detectors, coefficients, beam.covered, out, over)
+                found = sample(kernel, chunks, detectors, coefficients, beam.covered, out, over)
                 beyond, behind = beyond + found[0], behind + found[1]
+                if self.angles is not None:
+                    self._polarize(block, kernel, chunks, beam, detectors, out)
         if not block.again:  # a block that is made again is counted once
             self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
+
+    def _polarize(self, block: Block, kernel: Any, chunks: Chunks, beam: Beam, detectors: Rows, out: AnyFloats) -> None:
+        """Add p (Q cos 2 psi + U sin 2 psi) of the detectors that are polarized, equation (1) of `core.polarization`."""
+        efficiency = block.observation.focalplane.polarization_efficiency[block.detectors][detectors.numbers]
+        seeing = efficiency > 0
+        rows = Rows(detectors.numbers[seeing], detectors.xi[seeing], detectors.eta[seeing])
+        if not rows.numbers.size or self.angles is None:
+            return
+        own = Rows(np.arange(rows.numbers.size), rows.xi, rows.eta)
+        planes = []
+        for name, coefficients in zip("QU", beam.polarization, strict=True):
+            planes.append(block.buffer(f"sky {name}", (rows.numbers.size, out.shape[1])))
+            sample(kernel, chunks, own, coefficients[out.dtype.name], beam.covered, planes[-1], True)
+        which = rows.numbers + block.detectors.start
+        self.angles.add(which, block.samples.start, efficiency[seeing], (planes[0], planes[1]), rows.numbers, out)
 
     def _pointing(self, block: Block, number: int, kind: Any) -> Chunks:
         """`pointing` of a block for a beam, which blocks of other detectors share."""

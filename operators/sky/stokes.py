@@ -1,12 +1,15 @@
-"""Maps of Stokes parameters: I is read. Streams have no polarization, so Q, U and V are not used, and a note says so."""
+"""Maps of Stokes parameters: I is read, and for a polarized camera Q and U. Of others a note says that they are not used."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.types import Floats
 
 STOKES = "Stokes parameters"
 """Key of the note about them."""
@@ -58,8 +61,7 @@ def plane(header: Any, axis: int, length: int, wanted: int | None, place: str) -
     InputError
         There is no I on the axis.
     """
-    first, step, pixel = (float(header.get(f"{key}{axis}", 1.0)) for key in ("CRVAL", "CDELT", "CRPIX"))
-    found = [_NAMES.get(round(first + (n + 1 - pixel) * step), "a correlation") for n in range(length)]
+    found = _along(header, axis, length)
     if "I" not in found and wanted is None:
         message = f"its axis STOKES has {', '.join(found)} and no I"
         raise InputError(message, place=place, cure=f"give a map of I, or correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}")
@@ -69,6 +71,70 @@ def plane(header: Any, axis: int, length: int, wanted: int | None, place: str) -
         return number, {}
     as_what = found[number - 1] + ("" if found[number - 1] == "I" else " as I")
     return number, {STOKES: f"plane {number} of {length} is read, {as_what}; {_not_used(unused)}"}
+
+
+def _along(header: Any, axis: int, length: int) -> list[str]:
+    """What each plane along the FITS axis STOKES is."""
+    first, step, pixel = (float(header.get(f"{key}{axis}", 1.0)) for key in ("CRVAL", "CDELT", "CRPIX"))
+    return [_NAMES.get(round(first + (n + 1 - pixel) * step), "a correlation") for n in range(length)]
+
+
+def q_and_u(names: Sequence[str]) -> list[int] | None:
+    """Which of the columns or extensions of these names hold Q and U; None where they are not both there."""
+    letters = [_letter(name) for name in names]
+    return [letters.index("Q"), letters.index("U")] if {"Q", "U"} <= set(letters) else None
+
+
+def _letter(name: str) -> str:
+    return re.sub(r"^STOKES[ _-]?", "", name.strip().upper())[:1] if is_polarized(name) else ""
+
+
+def planes_of_q_and_u(header: Any, shape: Sequence[int], plane: tuple[int, ...]) -> list[tuple[int, ...]] | None:
+    """Indices of the planes of Q and U beside that of I, ``plane``, in a cube; None where there are none.
+
+    Someone who names the plane of Q as if it were I has no others.
+    """
+    for k, length in enumerate(shape[:-2]):
+        axis = len(shape) - k
+        if str(header.get(f"CTYPE{axis}", "")).strip().upper() == "STOKES":
+            found = _along(header, axis, length)
+            if found[plane[k]] == "I" and {"Q", "U"} <= set(found):
+                return [(*plane[:k], found.index(name), *plane[k + 1 :]) for name in ("Q", "U")]
+    return None
+
+
+def in_cosmo(
+    values: Floats, header: Any, given: Literal["cosmo", "iau"] | None, image: bool, place: str, notes: dict[str, str]
+) -> Floats:
+    """Q and U (2, ...), which are changed, in COSMO's convention: that of IAU has U of the other sign.
+
+    Raises
+    ------
+    InputError
+        The header has an unknown POLCCONV; an image has none, and none is ``given``.
+    """
+    written = str(header.get("POLCCONV", "") or "").strip().upper()
+    if given is None and written not in ("COSMO", "IAU", ""):
+        raise InputError(
+            f"POLCCONV = '{written}' is neither COSMO nor IAU",
+            place=place,
+            cure="correct it, or set the operator's parameter polarization_convention to cosmo or iau",
+        )
+    if given is None and not written and image:
+        raise InputError(
+            "its header does not say in which convention U is (no POLCCONV)",
+            place=place,
+            cure="set the header key POLCCONV to COSMO or IAU, or the operator's parameter polarization_convention: cosmo "
+            "(angles from south to east, as in HEALPix) or iau (from north to east)",
+        )
+    found = given.upper() if given else written or "COSMO"
+    why = "as given" if given else "POLCCONV" if written else "as in all HEALPix maps that do not say so"
+    notes["polarization"] = f"Q and U are read, convention {found} ({why})"
+    if given and written and written != found:
+        notes["polarization"] += f"; POLCCONV = '{written}' is overridden"
+    if found == "IAU":
+        np.negative(values[1], out=values[1])
+    return values
 
 
 def _not_used(names: Sequence[str]) -> str:

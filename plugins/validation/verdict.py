@@ -61,7 +61,7 @@ class Values:
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the mean."""
+        """Of the mean."""
         return self.scatter / math.sqrt(len(self.values)) if self.values else math.nan
 
 

@@ -69,6 +69,7 @@ ACTING = {
     "HighpassFilter": {"frequency": "0.5 Hz"},
     "CommonModeFilter": {},
     "Detrend": {},
+    "Leakage": {},
     "Crosstalk": {},
     "GainDrift": {},
     "TimeConstant": {"tau": "0 s"},

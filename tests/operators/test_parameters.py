@@ -74,15 +74,15 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         image.writeto(folder / f"{name}.fits")
     header = fits.getheader(folder / "map.fits")
     fits.PrimaryHDU(np.array([values, values**2]), header).writeto(folder / "cube.fits")
+    stokes = header.copy()
+    stokes.update(CTYPE3="STOKES", CRPIX3=1, CRVAL3=1, CDELT3=1)
+    fits.PrimaryHDU(np.array([values, values**2, values / 2]), stokes).writeto(folder / "iqu.fits")
     fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(values, header), fits.ImageHDU(values**2, header, "SECOND")]).writeto(
         folder / "two.fits"
     )
     header["BUNIT"] = "Jy/beam"
     fits.PrimaryHDU(values, header).writeto(folder / "beam.fits")
     healpy.write_map(folder / "sphere.fits", np.arange(12.0 * 64**2), coord="C", column_units="uK_CMB", dtype=np.float64)
-    for name, minute in (("night", "00"), ("later", "05")):
-        row = f"2024-11-25 07:{minute}:00 | 2024-11-25 07:{minute}:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
-        (folder / f"{name}.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
     a, b, *_ = instrument().focalplane().names
     (folder / "shares.csv").write_text(f"detector,source,share\n{a},{b},0.01\n")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
@@ -210,19 +210,6 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "axes": ({}, {"axes": "horizontal"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
     },
-    "PointingSchedule": {
-        "schedule": ({}, {"schedule": "later.txt"}),
-        "speed": ({}, {"speed": "0.2 deg/s"}),
-        "acceleration": ({}, {"acceleration": "0.5 deg/s2"}),
-        "turnaround": ({}, {"turnaround": "constant_acceleration"}),
-        "flag_turnarounds": ({}, {"flag_turnarounds": False}),
-        "elevation_nods": ({}, {"elevation_nods": ["1 deg", "0 deg"]}),
-        "elevation_speed": ({"elevation_nods": ["1 deg"]}, {"elevation_speed": "0.5 deg/s"}),
-        "elevation_acceleration": ({"elevation_nods": ["1 deg"]}, {"elevation_acceleration": "0.5 deg/s2"}),
-        "sample_rate": ({}, {"sample_rate": "40 Hz"}),
-        "check_limits": ({}, {"check_limits": "error"}),
-        "interpolation_error": ({}, {"interpolation_error": 1e-9}),
-    },
     "PointingRecorded": {
         "file": ({}, {"file": "other.csv"}),
         "clock": ({}, {"clock": "scene"}),
@@ -242,6 +229,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "input_beam": ({"file": "beam.fits", "input_beam": "9 arcsec"}, {"input_beam": "12 arcsec"}),
         "coordsys": ({"file": "sphere.fits"}, {"coordsys": "galactic"}),
         "plane": ({"file": "cube.fits", "plane": 1}, {"plane": 2}),
+        "polarization_convention": ({"file": "iqu.fits", "polarization_convention": "cosmo"}, {"polarization_convention": "iau"}),
         "hdu": ({"file": "two.fits"}, {"hdu": "second"}),
         "beam": ({}, {"beam": "none"}),
         "fwhm": ({}, {"fwhm": "12 arcsec"}),
@@ -298,6 +286,14 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "scatter": ({}, {"scatter": "5 %"}),
         "calibration": ({}, {"calibration": "instantaneous"}),
         "calibration_error": ({}, {"calibration_error": "5 %"}),
+    },
+    "HalfWavePlate": {
+        "frequency": ({}, {"frequency": "3 Hz"}),
+        "angle": ({}, {"angle": "10 deg"}),
+    },
+    "Leakage": {
+        "share": ({}, {"share": "2 %"}),
+        "angle": ({}, {"angle": "10 deg"}),
     },
     "HighpassFilter": {
         "frequency": ({}, {"frequency": "0.2 Hz"}),
@@ -356,6 +352,8 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "ordering": ({"nside": 8192}, {"ordering": "nested"}),
         "weights": ({}, {"weights": "uniform"}),
         "noise": ({}, {"noise": "scatter"}),
+        "stokes": ({}, {"stokes": "IQU"}),
+        "condition_limit": ({"stokes": "IQU"}, {"condition_limit": 3.0}),
         "contents": ({}, {"contents": "hits"}),
         "half_difference": ({}, {"half_difference": False}),
         "smooth": ({}, {"smooth": "beam"}),
@@ -440,6 +438,8 @@ CHAINS = {
     "WhiteNoise": ["WhiteNoise"],
     "PinkNoise": ["PinkNoise"],
     "Efficiency": ["SkyMap", "AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency"],
+    "HalfWavePlate": ["HalfWavePlate", "WhiteNoise", "Efficiency", "Leakage"],
+    "Leakage": ["WhiteNoise", "Efficiency", "Leakage"],
     "HighpassFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "HighpassFilter"],
     "CommonModeFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "CommonModeFilter"],
     "Detrend": ["WhiteNoise", "PinkNoise", "Efficiency", "Detrend"],
@@ -481,6 +481,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "WhiteNoise": {},
     "BinMap": {"pixel": "4 arcsec"},
     "HighpassFilter": {"frequency": "0.1 Hz"},
+    "HalfWavePlate": {"frequency": "2 Hz"},
     "GroundFilter": {"bin": "0.01 deg"},
     "Glitches": {"rate": "0.5 Hz"},
     "GainDrift": {"fastest": "0.5 Hz"},
@@ -491,7 +492,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "CompareStreams": {"reference": "white"},
     "MeasureFigures": {"metrics": ["coverage", "central_rms"]},
     "PointingRecorded": {"file": "scan.csv"},
-    "PointingSchedule": {"schedule": "night.txt", "speed": "0.5 deg/s", "check_limits": "warn"},
 }
 
 
@@ -500,7 +500,8 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 
     def step(other: str) -> Any:
         values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
-        values = values | {key: maps / values[key] for key in ("file", "schedule") if values.get(key) is not None}
+        if values.get("file") is not None:
+            values = values | {"file": maps / values["file"]}
         if which == "BinMap" == other and "nside" in values:
             values.pop("pixel", None)
         return make(other, **values)
@@ -517,16 +518,18 @@ REFUSALS = {
     ("CompareMaps", "map"): "there is no map 'chart'",
     ("MapSpectrum", "maps"): "no TAN map 'chart'",
     ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
-    ("SaveMap", "overwrite"): "exists already",
+    ("SaveMap", "overwrite"): "is there already",
     ("PointingRecorded", "clock"): "is too large",
     ("PointingRecorded", "celestial"): "no boresight_radec",
     ("PointingDaisy", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingStare", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingRaster", "check_limits"): "dish's largest speed of the azimuth axis",
-    ("PointingSchedule", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingBackAndForth", "check_limits"): "dish's largest speed of the azimuth axis",
 }
 """What a changed parameter is answered with, where it is not another result."""
+
+POLARIZED = {"SkyMap.polarization_convention", "BinMap.stokes", "BinMap.condition_limit", "HalfWavePlate", "Leakage"}
+"""Steps and parameters that act on polarized detectors alone."""
 
 ALL = [pytest.param(name, field, id=f"{name}.{field}") for name, cases in CASES.items() for field in cases]
 
@@ -535,8 +538,10 @@ ALL = [pytest.param(name, field, id=f"{name}.{field}") for name, cases in CASES.
 def test_every_parameter_of_every_operator(name: str, field: str, maps: Path, tmp_path: Path, known: dict[str, Any]) -> None:
     needs, change = CASES[name][field]
     case = f"{name} {needs}"
-    slow = {"telescope": {"azimuth_speed_max": "1 arcsec/s"}} if field == "check_limits" else {}
-    where = scene(instrument=instrument(**slow))
+    camera: dict[str, Any] = {"telescope": {"azimuth_speed_max": "1 arcsec/s"}} if field == "check_limits" else {}
+    if f"{name}.{field}" in POLARIZED or name in POLARIZED:
+        case, camera = f"{case} polarized", {"polarization": "pairs", "detectors": 20}
+    where = scene(instrument=instrument(**camera))
     if case not in known or field == "overwrite":
         known[case] = outcome(chain(name, maps, **needs), where, tmp_path / "before")
     folder = tmp_path / ("before" if field == "overwrite" else "after")

@@ -39,7 +39,7 @@ class Plane:
     Attributes
     ----------
     name
-        Its name in messages and pictures.
+        Of it, in messages and pictures.
     values
         (ny, nx), NaN where nothing is known.
     header

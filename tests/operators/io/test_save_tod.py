@@ -27,12 +27,12 @@ from zonda.core.flags import (
     SUN_UP,
     TURNAROUND,
 )
+from zonda.core.numerics.quaternions import detector_quaternions
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.weather import GroundWeather
 from zonda.operators.io import fits_table, toast_reading
 from zonda.operators.io.save_tod import SaveTOD, load_tod, save_tod
-from zonda.operators.io.time_ordered_data import detector_quaternions
 
 
 def blocks(observation, streams, mean, detectors=16, samples=2048):

@@ -1,0 +1,158 @@
+"""Maps of I, Q and U from their sums: equations (1) and (2) of `stokes_sums`, solved in each pixel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from zonda.core.data import Observation
+from zonda.core.errors import PipelineError
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.polarized import Polarization
+from zonda.core.numerics.projection import frame_rotation
+from zonda.core.polarization import PolarizationAngles
+from zonda.core.types import Floats
+
+from .grid import Grid, HealpixGrid
+from .halves import DIFFERENCES, halves_of
+from .parameters import MapParameters
+from .stokes_product import StokesSums
+from .stokes_sums import HIT, PLACES, StokesBinning
+from .sums import VALUE, WEIGHT, Sums
+
+AT_ONCE = 1 << 14
+"""Pixels that are solved at a time."""
+TRIANGLE = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+"""Rows and columns of the elements of a symmetric matrix: ii, iq, iu, qq, qu, uu."""
+SINGULAR = 1e-8
+"""Of the smallest eigenvalue, as a share of the largest: below it is the rounding of the sums."""
+UNSOLVED = "pixels whose samples do not determine I, Q and U: NaN"
+"""A count of the log."""
+
+
+def stokes_binnings(
+    step: MapParameters, observation: Observation, grid: Grid, levels: tuple[Floats, Floats, Floats], good: Any, spare: list[Sums]
+) -> list[StokesBinning]:
+    """Empty sums for one observation, one for each half of its samples.
+
+    ``levels``: weights and noise of the detectors (`bin_map.weights_of`), and the window (n_samp,) or (0,); ``good`` (n_samp,):
+    which samples count. Raises PipelineError where no detector is polarized.
+    """
+    plane, (weight, noise, window) = observation.focalplane, levels
+    if not plane.polarized:
+        raise PipelineError(
+            f"stokes: IQU needs polarized detectors, and none of {observation.instrument.name} is",
+            place=step.label,
+            cure="set polarization: pairs of the instrument, or stokes: I",
+        )
+    own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
+    angles = PolarizationAngles.of(observation, frame_rotation(step.frame)[2])
+    pointing, signals = grid.pointing(observation), len(observation.signals)
+    return [
+        StokesBinning(
+            grid, pointing, angles, use, (good & samples).astype(np.uint8), window, weight, noise,
+            plane.polarization_efficiency, signals, own, spare,
+        )
+        for use, samples in halves_of(step.split, observation)
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """I, Q and U of some pixels.
+
+    Attributes
+    ----------
+    values, covariance
+        (n, 3) K; (n, 3, 3) K^2; NaN where they are not determined. ``spread``: (n, 3) diagonal of A^-1.
+    condition
+        (n,) NaN without hits.
+    """
+
+    values: Floats
+    covariance: Floats
+    spread: Floats
+    condition: Floats
+
+    @classmethod
+    def of(cls, sums: tuple[Sums, Sums, Sums], limit: float, variance: float, own_noise: bool) -> _Solved:
+        """``limit`` of the condition number, ``variance`` of the reference weight."""
+        counts, data, noise = sums
+        n = len(counts)
+        values, spread = np.full((2, n, 3), np.nan)
+        covariance, condition = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
+        hit = np.flatnonzero(counts[:, HIT])
+        a = counts[hit][:, PLACES].reshape(-1, 3, 3) / WEIGHT
+        low, axes = np.linalg.eigh(a)
+        with np.errstate(divide="ignore"):
+            condition[hit] = np.where(low[:, 0] > SINGULAR * low[:, 2], low[:, 2] / low[:, 0], np.inf)
+        fine = condition[hit] <= limit
+        pixels, axes, low = hit[fine], axes[fine], low[fine]
+        inverse = np.einsum("nij,nj,nkj->nik", axes, 1 / low, axes)
+        values[pixels] = np.einsum("nij,nj->ni", inverse, data[pixels] / VALUE)
+        values[pixels] += np.einsum("nij,nj->ni", inverse, _rest(a[fine], values[pixels], data[pixels] / VALUE))
+        spread[pixels] = np.einsum("nii->ni", inverse)
+        covariance[pixels] = inverse * variance
+        if own_noise:
+            middle = noise[pixels][:, [k - 1 for k in PLACES]].reshape(-1, 3, 3) / WEIGHT
+            covariance[pixels] = inverse @ middle @ inverse * variance
+        return cls(values, covariance, spread, condition)
+
+
+def _rest(a: Floats, values: Floats, data: Floats) -> Floats:
+    """What a solution leaves of b: one step of refinement."""
+    return np.asarray(data - np.einsum("nij,nj->ni", a, values))
+
+
+def stokes_map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: StokesSums, stream: str) -> MapProduct:
+    """The map of the signal ``stream``."""
+    n, variance = grid.n_pixels, layout["variance"]
+    unit = variance if step.weights == "inverse_variance" else 1.0
+    halves = bool(step.half_difference) and (len(sums.scans) >= 2 or not sums.of_scans)
+    hits = np.zeros(n, np.int64)
+    values, covariance, weights = np.empty((3, n)), np.empty((6, n)), np.zeros((3, n))
+    condition, half = np.empty(n), np.full((3, n), np.nan)
+    for start in range(0, n, AT_ONCE):
+        part = slice(start, start + AT_ONCE)
+        whole = sums.parts(stream, part)
+        found = _Solved.of(whole, step.condition_limit, variance, sums.noise is not None)
+        hits[part], condition[part], values[:, part] = whole[0][:, HIT], found.condition, found.values.T
+        covariance[:, part] = found.covariance[:, TRIANGLE[0], TRIANGLE[1]].T
+        weights[:, part] = np.nan_to_num(1 / found.spread.T / unit)
+        if halves:
+            one, two = (_Solved.of(sums.parts(stream, part, k), step.condition_limit, 1.0, False) for k in (0, 1))
+            share = found.spread / (one.spread + two.spread)
+            half[:, part] = ((one.values - two.values) * np.sqrt(share)).T
+    keep = hits > 0 if isinstance(grid, HealpixGrid) else slice(None)
+
+    def shaped(plane: Any) -> Any:
+        rest = (-1,) if isinstance(grid, HealpixGrid) else grid.shape
+        return plane[..., keep].reshape(*plane.shape[:-1], *rest)
+
+    solved = np.isfinite(values[0])
+    polarization = Polarization(
+        shaped(values[1]), shaped(values[2]), shaped(covariance), shaped(weights[1:]), shaped(condition), shaped(hits),
+        shaped(half[1:]) if halves else None,
+    )  # fmt: skip
+    return MapProduct(
+        shaped(values[0]), shaped(np.where(solved, hits, 0)), shaped(weights[0]), shaped(np.sqrt(covariance[0])),
+        shaped(half[0]) if halves else None, polarization=polarization, **_common(step, grid, layout, sums, keep),
+    )  # fmt: skip
+
+
+def _common(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: StokesSums, keep: Any) -> dict[str, Any]:
+    """What is said of the map beside its planes."""
+    found: dict[str, Any] = {
+        "frame": step.frame, "weighting": step.weights, "noise_from": step.noise, "fwhm": layout["fwhm"],
+        "scans": list(sums.scans), "centre": tuple(layout["middle"]), "difference": DIFFERENCES[step.split],
+        "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
+    }  # fmt: skip
+    if not isinstance(grid, HealpixGrid):
+        return found | {"header": grid.wcs.to_header(relax=True), "pixel": grid.pixel}
+    side = math.sqrt(4 * math.pi / (12 * grid.nside**2))
+    pixels = grid.pixels_covered[keep]
+    return found | {"header": None, "pixel": side, "nside": grid.nside, "nest": grid.nest, "pixels": pixels}

@@ -1,0 +1,173 @@
+"""`StokesSums`: the partial product of a map of I, Q and U."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Observation
+from zonda.core.errors import PipelineError
+from zonda.core.numerics.chunks import empty
+from zonda.core.product import Product
+
+from .map_sums import MOST
+from .stokes_sums import DATA, HIT, MATRIX, StokesBinning
+from .sums import FLAGGED, VALUE, Sums
+
+
+class StokesSums(Product):
+    """Sums of two halves of the samples (`map_sums.MapSums`), those of `stokes_sums`.
+
+    Attributes
+    ----------
+    matrix
+        (2, n_pixels, 7) hits and A.
+    data
+        By stream of a signal, (2, n_pixels, 3) b.
+    noise
+        (2, n_pixels, 6) N; None: it is A.
+    scans, rates, unknown_variance
+        As of `MapSums`.
+    """
+
+    def __init__(self, n_pixels: int, signals: Sequence[str], of_scans: bool = True) -> None:
+        self.signals = tuple(signals)
+        self.of_scans = of_scans
+        self.matrix = _zeros(n_pixels, DATA)
+        self.data = {name: _zeros(n_pixels, 3) for name in self.signals}
+        self.noise: NDArray[np.int64] | None = None
+        self.scans: list[str] = []
+        self.rates: set[float] = set()
+        self.unknown_variance = False
+        self._largest = 0.0
+        self._largest_of = dict.fromkeys(self.signals, 0.0)
+
+    def add(self, observation: Observation, halves: Sequence[StokesBinning], place: str) -> tuple[int, Sums]:
+        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.
+
+        ``halves``: the binning of either half of its samples, or one of all of them.
+        """
+        inside, dropped = 0, np.zeros(4, np.int64)
+        for k, binning in enumerate(halves, start=len(self.scans) % 2 if self.of_scans else 0):
+            if binning.own_noise:
+                self._with_noise()
+            for pixels, found, lost, largest in binning.taken():
+                self._add_part(k, pixels, found)
+                self._note(float(largest[0]), dict.fromkeys(self.signals, float(largest[1])))
+                inside, dropped = inside + int(found[:, HIT].sum()), dropped + lost
+        # what belongs to the other half counted as flagged
+        dropped[FLAGGED] -= (len(halves) - 1) * observation.n_detectors * observation.n_samples
+        self.scans.append(observation.name)
+        self.rates.add(float(observation.sample_rate))
+        self._check(f"{place}, {observation.name}")
+        return inside, dropped
+
+    def _add_part(self, k: int, pixels: NDArray[np.int64], found: Sums) -> None:
+        """Add sums of ``pixels``, columns as in `stokes_sums`, to the half ``k``."""
+        self.matrix[k][pixels] += found[:, :DATA]
+        for n, name in enumerate(self.signals):
+            self.data[name][k][pixels] += found[:, DATA + 3 * n : DATA + 3 * n + 3]
+        if self.noise is not None:
+            end = DATA + 3 * len(self.signals)
+            self.noise[k][pixels] += found[:, end:] if found.shape[1] > end else found[:, MATRIX]
+
+    def _with_noise(self) -> NDArray[np.int64]:
+        """N, which so far was A."""
+        if self.noise is None:
+            self.noise = self.matrix[..., MATRIX].copy()
+        return self.noise
+
+    def parts(self, stream: str, pixels: slice, half: int | None = None) -> tuple[Sums, Sums, Sums]:
+        """(hits and A (n, 7), b (n, 3), N (n, 6)) in some pixels of a signal; of one half, or of both together."""
+        noise = self.matrix[..., MATRIX] if self.noise is None else self.noise
+        found = [array[:, pixels] for array in (self.matrix, self.data[stream], noise)]
+        a, b, n = (x[0] + x[1] if half is None else x[half] for x in found)
+        return a, b, n
+
+    def __iadd__(self, other: StokesSums) -> StokesSums:
+        """Add sums whose scans follow those that are here: exact."""
+        shift = len(self.scans) % 2 if self.of_scans else 0
+        if other.noise is not None:
+            self._with_noise()
+        for k in range(2):
+            half, pixels = (k + shift) % 2, np.flatnonzero(other.matrix[k, :, HIT])
+            self.matrix[half][pixels] += other.matrix[k].take(pixels, axis=0)
+            for name, mine in self.data.items():
+                mine[half][pixels] += other.data[name][k].take(pixels, axis=0)
+            if self.noise is not None:
+                theirs = other.matrix[k][:, MATRIX] if other.noise is None else other.noise[k]
+                self.noise[half][pixels] += theirs.take(pixels, axis=0)
+        self._note(other._largest, other._largest_of)
+        self.scans += other.scans
+        self.rates |= other.rates
+        self.unknown_variance |= other.unknown_variance
+        self._check("the sum of the maps of all tasks")
+        return self
+
+    def arrays(self) -> dict[str, Any]:
+        """Numbers of the pixels with hits, and their sums."""
+        found: dict[str, Any] = {
+            "signals": list(self.signals), "n_pixels": self.matrix.shape[1], "scans": list(self.scans),
+            "rates": sorted(self.rates), "largest": self._largest, "largest_of": dict(self._largest_of),
+            "unknown_variance": self.unknown_variance, "of_scans": self.of_scans, "own_noise": self.noise is not None,
+        }  # fmt: skip
+        for k in range(2):
+            pixels = np.flatnonzero(self.matrix[k, :, HIT])
+            found |= {f"pixels_{k}": pixels, f"matrix_{k}": self.matrix[k].take(pixels, axis=0)}
+            found |= {f"data_{k}_{n}": data[k].take(pixels, axis=0) for n, data in enumerate(self.data.values())}
+            if self.noise is not None:
+                found[f"noise_{k}"] = self.noise[k].take(pixels, axis=0)
+        return found
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any]) -> StokesSums:
+        """See `Product.of`."""
+        made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), bool(arrays["of_scans"]))
+        made.scans, made.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
+        made.unknown_variance = bool(arrays["unknown_variance"])
+        made._note(float(arrays["largest"]), {name: float(high) for name, high in arrays["largest_of"].items()})
+        if arrays["own_noise"]:
+            made._with_noise()
+        for k in range(2):
+            pixels = arrays[f"pixels_{k}"]
+            made.matrix[k][pixels] = arrays[f"matrix_{k}"]
+            for n, name in enumerate(made.signals):
+                made.data[name][k][pixels] = arrays[f"data_{k}_{n}"]
+            if made.noise is not None:
+                made.noise[k][pixels] = arrays[f"noise_{k}"]
+        return made
+
+    def subtract(self, stream: str, parts: Sequence[str]) -> None:
+        """b is subtracted, exactly. Its largest term is at most the sum of theirs."""
+        rest = self.data[self.signals[0]].copy()
+        for part in parts:
+            rest -= self.data[part]
+        self.data[stream] = rest
+        self._largest_of[stream] = self._largest_of[self.signals[0]] + sum(self._largest_of[part] for part in parts)
+        self.signals += (stream,)
+        self._check(stream)
+
+    def _note(self, largest: float, largest_of: Mapping[str, float]) -> None:
+        """Largest terms: of A and N, and of b of each signal."""
+        self._largest = max(self._largest, largest)
+        for name, high in largest_of.items():
+            self._largest_of[name] = max(self._largest_of[name], high)
+
+    def _check(self, place: str) -> None:
+        """No sum can have overflowed."""
+        highest = max(self._largest_of.values())
+        deepest = float(self.matrix[:, :, HIT].sum(axis=0).max(initial=0))
+        if deepest * max(self._largest, highest) >= MOST:
+            raise PipelineError(
+                f"{deepest:.0f} samples in one pixel, each up to {highest / VALUE:.3g} K, overflow the map's fixed-point sums",
+                place=place,
+                cure="make smaller pixels, or put a HighpassFilter before",
+            )
+
+
+def _zeros(n_pixels: int, columns: int) -> NDArray[np.int64]:
+    """(2, n_pixels, columns) zeros that take no memory until they are written."""
+    return empty((2 * n_pixels, columns), np.int64).reshape(2, n_pixels, columns)

@@ -1,0 +1,53 @@
+"""Intensity that the telescope's optics turn into polarization."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from zonda.core.block import Block
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Angle, Fraction
+from zonda.core.observation import Observation
+from zonda.core.operator import Operator
+from zonda.core.types import Floats
+
+
+class Leakage(Operator):
+    """Instrumental polarization: optics in front of the detectors and of a half-wave plate polarize a share of the intensity.
+
+        d = I + p l I cos(2 (gamma - beta)),   with a half-wave plate   d = I + p l I cos(4 chi - 2 gamma - 2 beta)        (1)
+
+    with the share l, its direction beta, a detector's angle gamma and the plate's chi, all in the focal plane, and the
+    polarization efficiency p. It is the monopole leakage gamma_1 + i gamma_2 = l exp(2 i beta) of Hu, Hedman & Zaldarriaga
+    (2003, Phys. Rev. D 67, 043004), constant over the field. All of the signal leaks, the atmosphere and its mean too (and
+    noise, by as much): put it right behind what forms the signal.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    linear: ClassVar[bool] = True
+
+    share: Fraction = quantity("1 %", ge=0, le=0.5)
+    """l, the share of the intensity that becomes polarized."""
+    angle: Angle = quantity("0 deg")
+    """beta, its direction in the focal plane, counted as the detectors' polarization angles."""
+
+    def prepare(self, observation: Observation) -> tuple[Floats, Floats]:
+        """p l exp(-2 i (beta - gamma)) of each detector, or with a plate p l exp(-2 i (beta + gamma)) and 4 chi."""
+        plane, chi = observation.focalplane, observation.hwp_angle
+        turn = self.angle - plane.polarization_angle if chi is None else self.angle + plane.polarization_angle
+        size = self.share * plane.polarization_efficiency
+        if not plane.polarized:
+            observation.tally.state(self.label, "no effect", "no detector is polarized")
+        return np.stack([size * np.cos(2 * turn), size * np.sin(2 * turn)]), np.zeros(0) if chi is None else 4 * chi
+
+    def exec(self, block: Block, state: tuple[Floats, Floats]) -> None:
+        """Equation (1): a gain of each detector, which the plate modulates."""
+        (cosine, sine), turn = state
+        cosine, sine = cosine[block.detectors, None], sine[block.detectors, None]
+        if turn.size:
+            plate = turn[block.samples]
+            cosine = cosine * np.cos(plate) + sine * np.sin(plate)
+        block.detdata["signal"] *= (1 + cosine).astype(block.dtype)
