@@ -32,25 +32,25 @@ SLOWEST = 1e-4
 """m/s: what is slower does not fluctuate."""
 NODES = 1500
 """Of the integral over q in equation (2)."""
-
-
-KNOTS = 48
-"""Frequencies at which a long spectrum is evaluated."""
+KNOTS = 160
+"""Frequencies at which a longer spectrum is evaluated; between them it is linear in log-log. Behind a Gaussian beam of 100 m that
+errs by 0.2 % where the power is 1e-4 of the largest, by 0.4 % at 1e-6."""
 
 
 def layer_spectrum(layer: Layer, frequency: Floats, speeds: Floats) -> Floats:
     """Mean of equation (1) or (2) over ``speeds`` [m/s], of a layer of unit variance before the beam: (n,) 1/Hz."""
-    total = np.zeros(frequency.size)
+    along, total = _along(layer), np.zeros(frequency.size)
     for speed in np.maximum(speeds, SLOWEST):
-        total += 2 / speed * _along(layer, 2 * np.pi * frequency / speed)
+        total += 2 / speed * along(2 * np.pi * frequency / speed)
     return np.asarray(total / len(speeds), np.float64)
 
 
-def _along(layer: Layer, k: Floats) -> Floats:
-    """The layer's spectrum along a line, int C(r) cos(k r) dr: (n,) m, k in rad/m."""
+def _along(layer: Layer) -> Callable[[Floats], Floats]:
+    """The layer's spectrum along a line, int C(r) cos(k r) dr: (n,) m of k (n,) in rad/m."""
     if layer.aperture is None:
-        e, w = mixture(layer.outer_scale, layer.sigma)
-        return np.asarray(np.exp(-np.multiply.outer(k * k, e)) @ (w * np.sqrt(4 * np.pi * e)), np.float64)
+        e, w = mixture(layer.outer_scale, layer.sigma, 0.5, 1e-6)
+        weights = w * np.sqrt(4 * np.pi * e)
+        return lambda k: np.asarray(np.exp(-np.multiply.outer(k * k, e)) @ weights, np.float64)
     known = np.geomspace(1e-3 / layer.outer_scale, 400 / layer.aperture.diameter, 200)
     q = np.concatenate([[0.0], np.geomspace(1e-4 / layer.outer_scale, 400 / layer.aperture.diameter, NODES)])
     table = np.empty(known.size)
@@ -58,8 +58,12 @@ def _along(layer: Layer, k: Floats) -> Floats:
         square = own**2 + q * q
         power = 4 * np.pi * NU * layer.outer_scale ** (-2 * NU) * (square + layer.outer_scale**-2) ** (-NU - 1)
         table[n] = np.trapezoid(power * layer.aperture.transform(np.sqrt(square)) ** 2, q) / np.pi
-    found = np.exp(np.interp(np.log(np.maximum(k, known[0])), np.log(known), np.log(table)))
-    return np.where(k <= known[-1], found, 0.0)
+
+    def along(k: Floats) -> Floats:
+        found = np.exp(np.interp(np.log(np.maximum(k, known[0])), np.log(known), np.log(table)))
+        return np.where(k <= known[-1], found, 0.0)
+
+    return along
 
 
 def closed_form(model: AtmosphereModel, observation: Observation) -> Callable[[Floats], Floats] | None:
@@ -72,15 +76,22 @@ def closed_form(model: AtmosphereModel, observation: Observation) -> Callable[[F
     simulated = [k for k in range(len(model.layers)) if k not in model.parameters.omit]
 
     def spectrum(frequency: Floats) -> Floats:
-        if frequency.size > 2 * KNOTS:  # smooth in log-log: evaluated at knots, interpolated
-            nodes = np.geomspace(frequency[0], frequency[-1], KNOTS)
-            law = np.log(np.maximum(spectrum(nodes), np.finfo(np.float64).tiny))
-            return np.asarray(np.exp(np.interp(np.log(frequency), np.log(nodes), law)))
         speeds = layer_speeds(observation, model.plane, model.layers)
         parts = (model.layers[k].amplitude ** 2 * layer_spectrum(model.layers[k], frequency, speeds[k]) for k in simulated)
         return np.asarray(_emission_per_fluctuation(model, observation) ** 2 * model.fluctuation.scale**2 * sum(parts))
 
-    return spectrum
+    return lambda frequency: between_knots(spectrum, frequency)
+
+
+def between_knots(law: Callable[[Floats], Floats], frequency: Floats) -> Floats:
+    """A spectrum that is smooth in log-log at frequencies (n,) >= 0 [Hz], evaluated at `KNOTS` of them where there are more."""
+    positive = frequency[frequency > 0]
+    if positive.size <= KNOTS:
+        return law(frequency)
+    knots = np.geomspace(positive.min(), positive.max(), KNOTS)
+    values = np.log(np.maximum(law(knots), np.finfo(np.float64).tiny))
+    found = np.exp(np.interp(np.log(np.maximum(frequency, knots[0])), np.log(knots), values))
+    return np.where(frequency > 0, found, law(np.zeros(1))) if positive.size < frequency.size else np.asarray(found)
 
 
 def _emission_per_fluctuation(model: AtmosphereModel, observation: Observation) -> float:

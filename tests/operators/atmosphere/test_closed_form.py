@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.operators.atmosphere.closed_form import layer_spectrum
+from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.operators.atmosphere.closed_form import KNOTS, between_knots, layer_spectrum
 from zonda.operators.atmosphere.turbulence.beams import Aperture
-from zonda.operators.atmosphere.turbulence.covariance import beam_correlation
+from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, mixture
 from zonda.operators.atmosphere.turbulence.nodes import Layer
 from zonda.operators.diagnostics.series import Spectrum
 from zonda.plugins.checks import scenes
@@ -39,6 +40,91 @@ def test_faster_winds_move_it_to_higher_frequencies():
     """S(f; V) = S(f / c; V / c) / c."""
     slow, fast = layer_spectrum(layer(), F, np.array([5.0])), layer_spectrum(layer(), 3 * F, np.array([15.0]))
     assert fast == pytest.approx(slow / 3, rel=1e-12)
+
+
+def test_its_sum_of_gaussians_is_fine_enough():
+    """The shorter sum agrees with the one of 1e-14 until the power is 1e-12 of the largest."""
+    f, speed = np.geomspace(1e-4, 0.3, 200), 10.0
+    e, w = mixture(500.0, 40.0)
+    fine = 2 / speed * np.exp(-np.multiply.outer((2 * np.pi * f / speed) ** 2, e)) @ (w * np.sqrt(4 * np.pi * e))
+    seen = fine > 1e-12 * fine[0]
+    assert f[seen].max() > 0.15
+    np.testing.assert_allclose(layer_spectrum(layer(), f[seen], np.array([speed])), fine[seen], rtol=1e-6)
+
+
+# ---- between knots
+
+
+def law_of(f):
+    """A layer behind a 100 m beam: it falls by more than any power."""
+    return layer_spectrum(layer(), f, np.array([8.0, 20.0]))
+
+
+def test_between_knots_it_is_the_law_itself():
+    f = np.geomspace(0.004, 50, 4000)
+    direct, found = law_of(f), between_knots(law_of, f)
+    # P = exp(-x^2), x proportional to f: h^2 / 8 |d^2 ln P / d(ln f)^2| = h^2 x^2 / 2 = 0.8, 1.6, 2.4 % at most with h = 0.059;
+    # half of that, since the Kolmogorov spectrum in front of it falls without a curvature
+    for depth, error in ((1e-2, 0.004), (1e-4, 0.008), (1e-6, 0.012)):
+        seen = direct > depth * direct[0]
+        np.testing.assert_allclose(found[seen], direct[seen], rtol=error)
+    assert not np.array_equal(found, direct)
+    few = f[:: f.size // KNOTS + 1]
+    assert np.array_equal(between_knots(law_of, few), law_of(few))
+
+
+def test_between_knots_the_frequency_zero_and_the_order_do_not_matter():
+    f = np.linspace(0.0, 2.0, 801)
+    found = between_knots(law_of, f)
+    assert np.isfinite(found).all()
+    assert found[0] == law_of(np.zeros(1))[0]
+    assert found[1:] == pytest.approx(between_knots(law_of, f[1:]))
+    assert np.array_equal(between_knots(law_of, f[::-1]), found[::-1])
+
+
+# ---- beside simulated streams
+
+
+def through_hann(law, number, step):
+    """Expectation of Welch's periodogram at k ``step``, k = 1 ... ``number`` - 1: the law convolved with the window's |W|^2."""
+    fine, length = 4, 2 * number
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
+    kernel = np.abs(np.fft.fft(window, fine * length)) ** 2
+    at = law(np.arange(fine * number + 1) * step / fine)
+    both = np.concatenate([at, at[-2:0:-1]])  # of negative frequencies, too
+    smooth = np.fft.ifft(np.fft.fft(both) * np.fft.fft(kernel / kernel.sum())).real
+    return smooth[fine : fine * number : fine]
+
+
+@pytest.mark.parametrize("radius", [0.0, 4.0])
+def test_an_ensemble_of_streams_has_it(radius):
+    """Ten layers, a stare and a scan, 12 atmospheres. Each band's mean is within 4 standard errors, as they scatter (t of 11
+    degrees of freedom exceeds 4 once in 500)."""
+    camera = Instrument(
+        name="camera", telescope=Telescope(name="dish", diameter="6 m"), band=Band(name="band", low="78 GHz", high="108 GHz"),
+        detectors=1, field_of_view="0 deg", main_beam_efficiency=0.3, illumination_efficiency=0.8, net="1 mK s(1/2)",
+        knee="0.5 Hz", sample_rate="100 Hz",
+    )  # fmt: skip
+    steps = [
+        zonda.AtmosphereLayers(pwv="5 mm", pwv_rms="1 %"),
+        zonda.Efficiency(),
+        zonda.PowerSpectrum(segment="20 s", streams=["atmosphere"]),
+    ]
+    ratios = []
+    for seed in range(12):
+        scan = scenes.scan(1, 10_000, radius=radius, instrument=camera)
+        scan.seed = seed
+        spectrum = scenes.run(steps, scan).products["spectrum"]
+        if not ratios:
+            f = spectrum.frequency
+            expected = through_hann(lambda x, scan=scan: scan.closed_forms["atmosphere"][0](x), f.size, f[0])
+        ratios.append(spectrum.psd["atmosphere"][:31] / expected[:31])
+    for low, high in ((4, 8), (8, 16), (16, 32)):  # 0.2 to 1.6 Hz, where the power falls by a factor of 2000
+        band = np.array(ratios)[:, low - 1 : high - 1].mean(axis=1)
+        error = band.std(ddof=1) / np.sqrt(band.size)
+        assert error < 0.15
+        assert band.mean() == pytest.approx(1, abs=4 * error)
+    assert expected[3] > 100 * expected[31]
 
 
 def test_pink_noise_and_the_mean_over_scans():
