@@ -9,24 +9,35 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
+from zonda.core.numerics.chunks import chunks
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
+
+from .baseline import ROWS
+
+MEAN = "samples with mean emission under the window: put a Detrend before it"
+"""A count of the log."""
 
 
 class Taper(Operator):
     """Multiply each scan by Tukey's window, equation (1), so that a filter behind it finds no jump at its ends.
 
-    A map weighs samples by the window: it is the sum of w W d over that of w W, W d what the filters made of the windowed signal.
-    So a source keeps its brightness, the ends of scans count less, and the noise of a pixel follows. It is what the mapper of
-    maria 1.0.0 does, behind a linear `Detrend`, which should stand before: the window acts on the mean emission too.
+    A map weighs samples by the window: it is the sum of w W d over that of w W, W d what filters made of the windowed signal. So a
+    source keeps its brightness, the ends of scans count less, and the noise of a pixel follows. What steps behind the window add
+    there, e.g. the transient of a filter, the window does not lessen, and the division by W raises it: what W < 1/10 leaves is in
+    no map. It is what the mapper of maria 1.0.0 does (without that limit), behind a linear `Detrend`, which should stand before:
+    the window acts on the mean emission too, tens of kelvin, and what it takes off is rounded as a part of it. The log says so.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     linear: ClassVar[bool] = True
+    knows_means: ClassVar[bool] = True
 
     share: Fraction = quantity("10 %", ge=0, le=1)
     """Share of the scan in which the window is not 1, half of it at either end."""
@@ -40,5 +51,19 @@ class Taper(Operator):
         return window
 
     def exec(self, block: Block, state: Floats) -> None:
-        """Multiply the block's rows in place."""
-        block.detdata["signal"] *= state[block.samples]
+        """Multiply the block's rows in place. Beside a mean M that stands beside x, W (x + M) - M takes the place of x."""
+        window, signal, mean = state[block.samples], block.detdata["signal"], block.means.get("signal")
+        if mean is None:
+            signal *= window
+            return
+        largest = 0.0
+        for part in chunks(len(signal), ROWS):
+            detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
+            level = mean.evaluate(detectors, block.samples).astype(np.float64)
+            signal[part] = window * signal[part] - (1 - window) * level
+            largest = max(largest, float(np.abs(level).max(initial=0.0)))
+        tally = block.observation.tally
+        tally.count(self.label, MEAN, int((window < 1).sum()) * len(signal), signal.size)
+        if largest:
+            step = largest * float(np.finfo(signal.dtype).eps) / 2
+            tally.state(self.label, "rounding of the mean emission", f"up to {step * 1e6:.2g} µK in a sample")

@@ -35,10 +35,11 @@ from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, WEIGHT, Binning, Sums
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""
 
-LIGHTEST = 2.0**-10
-"""Least window of a sample that is in a map: the weights of all that are, of every detector, are more than rounding (`sums`)."""
+LIGHTEST = 0.1
+"""Least window of a sample that is in a map. What steps behind the window added is divided by it, and the noise does not know it:
+with transients, pixels that the ends of scans alone reach were up to 100 times their noise without this limit."""
 
-LIGHT = "instants that count as flagged: a window leaves less than 1/1024 of their weight"
+LIGHT = "instants that count as flagged: a window leaves less than a tenth of their weight"
 """A count of the log."""
 
 

@@ -11,8 +11,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.pipeline import Pipeline
 from zonda.core.scene import Scene
 from zonda.operators.filters.highpass import HighpassFilter
-from zonda.operators.filters.taper import Taper
-from zonda.operators.maps.bin_map import LIGHT, BinMap
+from zonda.operators.filters.taper import MEAN, Taper
+from zonda.operators.maps.bin_map import LIGHT, LIGHTEST, BinMap
 from zonda.plugins.checks import scenes
 
 N = 6000
@@ -35,8 +35,8 @@ def test_a_map_of_a_constant_is_that_constant(bench):
     for product, w in ((once, window), (twice, window * tukey(N, 0.3))):
         seen = product.weights > 1e-3 * product.weights.max()  # elsewhere fixed-point steps of the weights show
         np.testing.assert_allclose(product.signal[seen], 0.25, rtol=1e-5)
-        assert product.weights.sum() / plain.weights.sum() == pytest.approx(w[w >= 2**-10].sum() / N, rel=1e-6)
-        assert product.hits.sum() == 7 * np.count_nonzero(w >= 2**-10)
+        assert product.weights.sum() / plain.weights.sum() == pytest.approx(w[w >= LIGHTEST].sum() / N, rel=1e-6)
+        assert product.hits.sum() == 7 * np.count_nonzero(w >= LIGHTEST)
 
 
 def test_the_noise_of_a_pixel_is_that_of_weighted_samples(bench):
@@ -80,4 +80,37 @@ def test_where_the_window_leaves_nothing_there_is_no_map(bench, before):
     for product in (run.map, run.map.smoothed(1e-5)):
         np.testing.assert_array_equal(np.isfinite(product.signal), product.hits > 0)
     assert (run.map.weights[run.map.hits > 0] > 0).all()
-    assert int(run.tally["BinMap", LIGHT]) == np.count_nonzero(tukey(3000, 1.0) < 2**-10)
+    assert int(run.tally["BinMap", LIGHT]) == np.count_nonzero(tukey(3000, 1.0) < LIGHTEST)
+
+
+def test_what_is_added_behind_the_window_is_raised_by_ten_at_most(bench):
+    """A step behind the window leaves r everywhere: maps divide it by W, and hold nothing of W < 1/10."""
+    behind = zonda.operator(lambda block: block.detdata["signal"].__iadd__(1e-3), name="Behind")
+    steps = [Taper(share="100 %"), behind, BinMap(pixel="2 arcsec")]
+    product = bench.run(steps, bench.observation(5, N), {"signal": np.zeros((5, N))}).map
+    largest = np.nanmax(np.abs(product.signal))
+    assert 5e-3 < largest <= 1e-3 / LIGHTEST * (1 + 1e-4)  # W 1/5 or less is in pixels of its own; weights are in fixed point
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_mean_beside_the_signal_is_multiplied_and_told(precision):
+    """W (x + M) whether M stands beside x or in it; the log tells of it, and nothing behind a Detrend."""
+
+    def steps(*before):
+        return [zonda.AtmosphereLayers(pwv="5 mm", pwv_rms="1 %"), zonda.Efficiency(), *before, Taper(share="40 %")]
+
+    whole = zonda.operator(lambda block: block.detdata["signal"].__imul__(1.0), name="Whole")  # it does not know of means
+    made = [
+        scenes.run(chain, scenes.scan(3, 2000), keep=("signal",), precision=precision)
+        for chain in (steps(), [*steps(), whole], steps(zonda.Detrend()))
+    ]
+    eps = float(np.finfo(precision).eps)
+    one, other = (data.tod("signal") for data in made[:2])
+    level = float(np.abs(one).max())
+    assert level > 10
+    np.testing.assert_allclose(one, other, rtol=0, atol=4 * level * eps)
+    assert abs(one[:, 0]).max() < 4 * level * eps  # the window is zero there
+    told = [(str(what), text) for who, what, text in made[0].tally if who == "Taper"]
+    assert any(what == MEAN for what, _ in told)
+    assert any("rounding" in what and "µK" in text for what, text in told)
+    assert not any(what == MEAN for who, what, _ in made[2].tally if who == "Taper")

@@ -1,0 +1,95 @@
+"""Figures of comparisons and radial spectra against analytic answers."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydantic_core import PydanticCustomError
+
+import zonda
+from zonda.core.errors import InputError
+from zonda.core.figures import Choice, measure
+from zonda.operators.diagnostics.comparison.planes import Plane
+from zonda.operators.diagnostics.comparison.radial import RadialSpectra
+from zonda.operators.diagnostics.comparison.statistics import Settings, compare
+from zonda.operators.diagnostics.map_spectra import MapSpectra
+from zonda.plugins.checks import scenes
+
+ARCSEC = np.pi / 648000
+SIDE, PIXEL = 64, 4.0
+
+
+def data(**products):
+    return SimpleNamespace(products=products, provenance={"runs": {}}, observations=[])
+
+
+def plane(values, name):
+    from astropy.wcs import WCS
+
+    w = WCS(naxis=2)
+    w.wcs.ctype, w.wcs.crval, w.wcs.crpix = ["RA---TAN", "DEC--TAN"], [75, 20], [SIDE / 2 + 0.5] * 2
+    w.wcs.cdelt, w.wcs.cunit = [-PIXEL / 3600, PIXEL / 3600], ["deg", "deg"]
+    return Plane(name, np.asarray(values, float), w.to_header(), "K_RJ", fwhm=12 * ARCSEC)
+
+
+def blob():
+    y, x = (np.indices((SIDE, SIDE)) - (SIDE - 1) / 2) * PIXEL
+    return -np.exp(-(x**2 + y**2) / 2 / 30.0**2)
+
+
+@pytest.mark.parametrize(("gain", "at_peak"), [(0.5, 2.0), (2 / 3, 3.0), (0.8, 5.0), (1.25, 4.0)])
+def test_fidelity_of_a_fainter_source(gain, at_peak):
+    """1 / |1 - g|: at the peak, and wherever the difference exceeds the threshold (0.7 times its rms, here 18 % of the peak)."""
+    found = data(comparison=compare(plane(blob(), "a"), plane(gain * blob(), "b"), Settings(12 * ARCSEC)))
+    assert measure(found, "fidelity", least="100 %").value == pytest.approx(at_peak, rel=1e-6)
+    assert measure(found, "fidelity", least="50 %").value == pytest.approx(at_peak, rel=1e-6)
+    assert "peak" in measure(found, "fidelity", least="100 %").description
+
+
+def test_fidelity_names_what_is_missing():
+    with pytest.raises(InputError, match="there is no comparison 'other'"):
+        measure(data(), "fidelity", comparison="other")
+    empty = compare(plane(0 * blob(), "a"), plane(blob(), "b"), Settings(12 * ARCSEC))
+    with pytest.raises(InputError, match="the reference is empty"):
+        measure(data(comparison=empty), "fidelity")
+
+
+def rings():
+    """Three rings at 100, 20 and 10 arcsec with 1, 4 and 16 modes; power 9, 2, 1 over a level of 1."""
+    k = 1 / (np.array([100.0, 20.0, 10.0]) * ARCSEC)
+    edges = np.array([0.7, 1.4, 1.4, 1.4]) * np.append(k[0], k)
+    power = {"map": np.array([9.0, 2.0, 1.0]), "noise": np.ones(3)}
+    found = RadialSpectra(edges, k, power, np.array([1.0, 4.0, 16.0]), {"map": np.ones(3)}, np.ones(3))
+    return data(map_spectra=MapSpectra(found, {}, 8.5 * ARCSEC))
+
+
+def test_map_power_weighs_rings_by_their_modes():
+    found = measure(rings(), "map_power", of="map", smallest="9 arcsec", largest="25 arcsec")
+    assert found.value == pytest.approx((4 * 2 + 16) / 20)
+    assert found.error == pytest.approx(found.value / np.sqrt(20))
+    assert measure(rings(), "map_power", of="map", smallest="50 arcsec", largest="200 arcsec").value == pytest.approx(9)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"of": "noise"}, "no spectrum and white level of the map 'noise'"),
+        ({"of": "map", "smallest": "1 deg", "largest": "2 deg"}, "no ring lies"),
+        ({"spectra": "other"}, "there are no spectra 'other'"),
+    ],
+)
+def test_map_power_names_what_is_missing(parameters, message):
+    with pytest.raises(InputError, match=message):
+        measure(rings(), "map_power", **parameters)
+
+
+def test_scales_have_an_order():
+    with pytest.raises(PydanticCustomError, match="largest must be larger"):
+        Choice.parse("map_power(smallest=20 arcsec, largest=10 arcsec)")
+
+
+def test_a_map_of_white_noise_alone_has_its_level():
+    steps = [zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="4 arcsec"), zonda.MapSpectrum(maps=["map"])]
+    found = measure(scenes.run(steps, scenes.scan(37, 8000)), "map_power", of="map", smallest="10 arcsec", largest="40 arcsec")
+    assert found.value == pytest.approx(1, abs=5 * found.error)
+    assert found.error < 0.1
