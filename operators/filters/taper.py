@@ -27,11 +27,12 @@ MEAN = "samples with mean emission under the window: put a Detrend before it"
 class Taper(Operator):
     """Multiply each scan by Tukey's window, equation (1), so that a filter behind it finds no jump at its ends.
 
-    A map weighs samples by the window: it is the sum of w W d over that of w W, W d what filters made of the windowed signal. So a
-    source keeps its brightness, the ends of scans count less, and the noise of a pixel follows. What steps behind the window add
-    there, e.g. the transient of a filter, the window does not lessen, and the division by W raises it: what W < 1/10 leaves is in
-    no map. It is what the mapper of maria 1.0.0 does (without that limit), behind a linear `Detrend`, which should stand before:
-    the window acts on the mean emission too, tens of kelvin, and what it takes off is rounded as a part of it. The log says so.
+    A map weighs samples by the window: it is the sum of w W d over that of w W, W d what filters made of the windowed signal.
+    So a source keeps its brightness, the ends of scans count less, and the noise of a pixel follows. What steps behind the
+    window add there, e.g. the transient of a filter, the window does not lessen, and the division by W raises it: what W <
+    1/10 leaves is in no map. It is what the mapper of maria 1.0.0 does (without that limit), behind a linear `Detrend`, which
+    should stand before: the window acts on the mean emission too, tens of kelvin, and what it takes off is rounded as a part
+    of it. The log says so.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})

@@ -57,6 +57,12 @@ class Experiment(Parameters):
             raise ValueError("versus and statistic belong together")
         return self
 
+    def differs_from(self, other: Experiment) -> bool:
+        """Whether it finds another value than ``other`` apart from random numbers: not where seeds alone differ."""
+        if self.calculate is not None or other.calculate is not None:
+            return str(self.calculate) != str(other.calculate)
+        return any(getattr(self, key) != getattr(other, key) for key in Experiment.model_fields if key != "seeds")
+
 
 class Expected(Parameters):
     """What the result of a counter-experiment must satisfy: limits hold by two standard errors of the mean."""
@@ -148,6 +154,11 @@ class Claim(Experiment):
             raise ValueError("two counter-experiments have the same name")
         if self.because and not self.counter:
             raise ValueError("an explanation needs a counter-experiment")
+        for name, experiment in self.experiments():
+            if name and experiment.calculate is None and not (experiment.pipeline and experiment.metric):
+                raise ValueError(f"the counter-experiment {name} runs nothing: give calculate, or pipeline and metric")
+            if name and not experiment.differs_from(self):
+                raise ValueError(f"the counter-experiment {name} is the claim's own experiment")
         return self
 
     @property

@@ -68,6 +68,35 @@ def test_mistakes_are_named_with_their_place(tmp_path, change, message):
     assert caught.value.diagnostics[0].place.startswith(f"{path}:")
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"counter": "[{name: b, shows: x, calculate: {stated: {value: 1}}, expect: {agrees: true}}]"},
+            "the claim's own experiment",
+        ),
+        ({"counter": "[{name: b, shows: x, expect: {agrees: true}}]"}, "the counter-experiment b runs nothing"),
+        ({"counter": "[{name: b, shows: x, pipeline: p, expect: {agrees: true}}]"}, "the counter-experiment b runs nothing"),
+    ],
+)
+def test_a_counter_experiment_that_changes_nothing_explains_nothing(tmp_path, change, message):
+    with pytest.raises(ConfigurationError, match=message):
+        read(written(tmp_path, because="It is so.", **change))
+
+
+def test_other_seeds_alone_explain_nothing(tmp_path):
+    given = {"pipeline": "mustang2", "metric": "central_rms", "because": "It is so."}
+    for more, right in (("seeds: 9", False), ("change: {seed: 9}", True), ("metric: coverage", True)):
+        path = written(
+            tmp_path, leave_out=("calculate",), **given, counter=f"[{{name: b, shows: x, {more}, expect: {{above: 1 uK}}}}]"
+        )
+        if right:
+            assert read(path).claims[0].counter
+        else:
+            with pytest.raises(ConfigurationError, match="the claim's own experiment"):
+                read(path)
+
+
 def test_a_row_without_a_way_to_measure(tmp_path):
     with pytest.raises(ConfigurationError, match="give pipeline and metric, or calculate"):
         read(written(tmp_path, leave_out=("calculate",)))
