@@ -13,9 +13,9 @@ from zonda.core.types import Floats
 
 ACROSS = (4, 5, 3)
 """Panels in a row: what leaves the fewest places empty."""
-SIDE = 2.7
+SIDE = 3.1
 """Of a panel with its labels, in."""
-MARGINS = (0.62, 0.55, 0.45, 0.42)
+MARGINS = (0.72, 0.62, 0.84, 0.42)
 """Left, bottom, right and top of each panel, in."""
 COLOURS = "RdBu_r"
 
@@ -100,8 +100,8 @@ def sketches(name: str, found: Screens) -> list[Sketch]:
     for ax, second, pwv in zip(strip, found.seconds, found.pwv, strict=True):
         change = pwv - np.nanmean(pwv)
         _image(ax, change, half, f"{second:.3g} s, mean {np.nanmean(pwv) * 1e6:+.3g} µm")
-        ax.set_xlabel("xi [arcmin]", fontsize=8)
-        ax.set_ylabel("eta [arcmin]", fontsize=8)
+        ax.set_xlabel("xi [arcmin]", fontsize=9)
+        ax.set_ylabel("eta [arcmin]", fontsize=9)
     caption = (
         f"Fluctuation of the PWV along the line of sight [µm] over the field of view of {found.observation}, minus its mean over "
         f"the field, which each title states. Mean PWV {found.mean_pwv * 1e3:.3g} mm."
@@ -137,10 +137,11 @@ def _image(ax: Any, values: Any, half: float, title: str) -> None:
     box = ax.get_position()
     figure = ax.figure
     bar = figure.add_axes((box.x1 + 0.06 / figure.get_figwidth(), box.y0, 0.07 / figure.get_figwidth(), box.height))
-    figure.colorbar(picture, cax=bar)
-    bar.tick_params(labelsize=6, pad=1)
-    ax.tick_params(labelsize=7)
-    ax.set_title(title, fontsize=8.5, y=1.0)
+    figure.colorbar(picture, cax=bar).set_label("change of the PWV [µm]", fontsize=9, labelpad=5)
+    bar.tick_params(labelsize=8.5, pad=1)
+    ax.tick_params(labelsize=8.5)
+    ax.locator_params(nbins=5)
+    ax.set_title(title, fontsize=10, y=1.0)
 
 
 def _layer(ax: Any, layer: LayerScreen) -> None:
@@ -150,7 +151,7 @@ def _layer(ax: Any, layer: LayerScreen) -> None:
     half = n * layer.spacing / 2
     speed = math.hypot(*layer.wind)
     azimuth = math.degrees(math.atan2(*layer.wind)) % 360
-    _image(ax, layer.values, half, f"{layer.height:.0f} m, wind {speed:.3g} m/s towards {azimuth:.0f}° [µm]")
+    _image(ax, layer.values, half, f"{layer.height:.0f} m, wind {speed:.3g} m/s towards {azimuth:.0f}°")
     ax.plot(*layer.track.T, color="black", linewidth=0.6)
     here = layer.track[np.abs(layer.track).sum(axis=1).argmin()]
     ax.plot(*here, "x", color="black", markersize=5)
@@ -159,5 +160,5 @@ def _layer(ax: Any, layer: LayerScreen) -> None:
     ax.annotate("", (-0.86 * half, 0.9 * half), (-0.86 * half, 0.5 * half), arrowprops={"arrowstyle": "-|>", "linewidth": 1.4})
     ax.set_xlim(-half, half)
     ax.set_ylim(-half, half)
-    ax.set_xlabel("across the wind [m]", fontsize=8)
-    ax.set_ylabel("along the wind [m]", fontsize=8)
+    ax.set_xlabel("across the wind [m]", fontsize=9)
+    ax.set_ylabel("along the wind [m]", fontsize=9)

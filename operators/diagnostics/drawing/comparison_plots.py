@@ -67,7 +67,8 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
     plot_plain(planes["fidelity"], where, (0.0, most), "viridis", "fidelity", ax=axes[0], title="Fidelity")
     caption = "Fidelity: |reference| / max(|difference|, threshold times its rms)."
     if snr is not None:
-        top = float(np.nanpercentile(np.abs(snr), 99.9)) or 1.0
+        reached = [abs(level) for level in levels if (snr * np.sign(level) >= abs(level)).any()]
+        top = float(math.ceil(max(float(np.nanpercentile(np.abs(snr), 99.9)), *reached, 1.0)))
         plot_plain(
             snr, where, (-top, top), "RdBu_r", "signal-to-noise ratio", ax=axes[1], title="Signal-to-noise ratio of the map"
         )

@@ -75,7 +75,7 @@ def draw_map(file: str, signal: str, key: str, product: FlatMap, style: Style, s
         "noiseless": "The sky alone through the same pointing, filters and binning: what the processing leaves of it.",
     }.get(signal, "A part of the components, filtered and binned.")
     limit = shown.limit("signal", shown.hits, SHOWN if signal == "noiseless" else 99.7)
-    ax = _panels([(shown, _titled(title, how))], style, limit)
+    ax = _panels([(shown, _titled(title, shown))], style, limit)
     text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
     if snr is not None:
         plot_contours(ax, np.where(shown.covered(style.least_coverage), snr[window], np.nan), style.contours)
@@ -92,7 +92,7 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Ske
         words.setdefault(of, source.difference)
         shown, how = _shown(source.cropped(window), style)
         plane = next(iter(shown.planes))
-        panels.append((shown, _titled(f"Noise: {words[of]}", how)))
+        panels.append((shown, _titled(f"Noise: {words[of]}", shown)))
         limits.append(shown.limit(plane, panels[0][0].hits, 99.7))
         rms = shown.central_rms(plane, style.central_diameter / 2)
         if math.isfinite(rms):
@@ -207,8 +207,11 @@ def _resolution(shown: FlatMap) -> str:
     return f" Resolution {whole} FWHM: the beam's {beam} and the smoothing's {smoothing}, added in quadrature."
 
 
-def _titled(title: str, how: str) -> str:
-    return f"{title}, {how.removesuffix(' for this picture')}"
+def _titled(title: str, shown: FlatMap) -> str:
+    """With the resolution, which the circle in the map's corner shows: beam and smoothing together."""
+    if not shown.smoothed_by:
+        return f"{title}, not smoothed"
+    return f"{title}, smoothed to {angle_text(math.hypot(shown.fwhm, shown.smoothed_by))}"
 
 
 def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | None, circle: bool = False) -> Any:

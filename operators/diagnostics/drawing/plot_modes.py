@@ -23,7 +23,7 @@ def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
     share = modes.shares[modes.shares > 0]
     left.loglog(np.arange(1, share.size + 1), share, "o-", color=SEQUENCE[0], markersize=3.5, linewidth=0.9)
     for k, value in enumerate(share[:2]):
-        place: dict[str, Any] = {"xytext": (7, -1), "textcoords": "offset points", "fontsize": 9}
+        place: dict[str, Any] = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 9}
         left.annotate(f"{100 * value:.3g} %", (k + 1, value), **place)
     left.set_xlabel("mode")
     left.set_ylabel("share of the variance")

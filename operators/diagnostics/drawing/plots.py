@@ -110,7 +110,7 @@ def _mark_regimes(ax: Any, regimes: Sequence[tuple[str, float, float]]) -> None:
     low, high = np.log10(ax.get_xlim())
     for name, start, stop in regimes:
         ax.axvspan(start, stop, color=COLOURS[name], alpha=0.07, linewidth=0, zorder=0)
-        if (np.log10(stop / start)) / (high - low) > 0.02 * len(words[name]):
+        if (np.log10(stop / start)) / (high - low) > 0.015 * len(words[name]):
             place: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom", "fontsize": 8.5}
             ax.annotate(words[name], (np.sqrt(start * stop), 0.012), color=COLOURS[name], bbox=PALE, zorder=4, **place)
 
@@ -144,7 +144,7 @@ def _legend(ax: Any, **style: Any) -> None:
 def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer function") -> Axes:
     """Share of each angular scale that the filters leave: T with its standard error, and S, the ratio of amplitudes.
 
-    S grows without bound where the beam leaves no sky: above 2 it leaves the picture, so that T can be read.
+    S grows without bound where the beam leaves no sky: above 2 it is not drawn, so that T can be read; the legend says where.
     Horizontal bars are the rings. The dotted line is the beam's FWHM; the upper axis counts wavelengths.
     """
     ax = new_axes(ax, (7.2, 4.8), top=0.86)
@@ -153,12 +153,15 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
     error = np.where(np.isfinite(r.error), r.error, 0.0)
     ax.errorbar(scale, r.transfer, yerr=error, xerr=width, fmt="o", color=SEQUENCE[0], markersize=4, label="T: share in phase")
-    ax.plot(scale, r.amplitude, "--", color=SEQUENCE[1], linewidth=1.2, label="S: ratio of amplitudes")
+    high = scale[r.amplitude > 2].max(initial=0.0)
+    label = "S: ratio of amplitudes" + (f" (above 2 from {high:.2g} arcsec down)" if high else "")
+    shown = np.where(r.amplitude > 2, np.nan, r.amplitude)
+    ax.plot(scale, shown, "--", color=SEQUENCE[1], linewidth=1.2, label=label)
     ax.set_xscale("log")
     ax.set_xlim(edges[0], edges[-1])
     log_labels(ax.xaxis, edges[-1], edges[0])
-    top = float(np.nanmax(np.append(np.minimum(r.amplitude, 2.0), r.transfer), initial=1.0))
-    ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.05 * top)
+    top = float(np.nanmax(np.append(shown, r.transfer), initial=1.0))
+    ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.15 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
         ax.axvline(transfer.fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
