@@ -212,3 +212,21 @@ def test_a_product_name_that_a_band_takes_is_refused() -> None:
     made = pipeline(zonda.BinMap(pixel="1 arcmin", product="map_f150_f090"), zonda.BinMap(pixel="1 arcmin", product="map_f150"))
     data = made.run(scene("f090", "f150"), threads=1)
     assert isinstance(data["map_f150_f090_f090"], MapProduct)
+
+
+def test_a_campaign_adds_up_each_band(tmp_path: Path) -> None:
+    """Tasks of one scan each: the maps have the bits of one run, and the report knows both bands."""
+    steps = pipeline(zonda.SaveMap(), zonda.MeasureFigures(metrics=["central_rms"]), zonda.Report())
+    steps = zonda.Pipeline(steps.operators)
+    both = scene("f090", "f150")
+    zonda.campaign(steps, both, output=tmp_path / "campaign", realizations=1, engine="serial")
+    once = steps.run(both, output=tmp_path / "once", threads=1)
+    for name in BANDS:
+        with fits.open(tmp_path / "campaign" / f"map_{name}.fits") as found:
+            for plane in ("signal", "hits", "noise", "half_difference"):
+                hdu = found[0] if plane == "signal" else found[plane.upper()]
+                np.testing.assert_array_equal(hdu.data, getattr(once[f"map_{name}"], plane))
+            assert found[0].header["NSCANS"] == 2
+    page = (tmp_path / "campaign" / "report.html").read_text(encoding="utf-8")
+    assert f"central_rms {name}" in page
+    assert "scan-001-f090" in page
