@@ -22,6 +22,7 @@ freedom in N_samples for each mode, and for terms of order sigma_2 / sigma_1.
 
 from __future__ import annotations
 
+import copy
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -63,6 +64,25 @@ class CommonModeFilter(CommonModeParameters):
 
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
         """Find the modes; given those of the complete signal (``model``), their times in this one."""
+        wafers = np.unique(stream.observation.focalplane.wafer).tolist() if self.group == "wafer" else []
+        if len(wafers) < 2:
+            return self._of_all(stream, model)
+        models = model.parts if model is not None else (None,) * len(wafers)
+        return Modes.joined([self._of_wafer(stream, number, one) for number, one in zip(wafers, models, strict=True)])
+
+    def _of_wafer(self, stream: Stream, wafer: int, model: Modes | None) -> Modes:
+        """The modes of one wafer's detectors; all others count as flagged."""
+        whole, part = stream.observation, copy.copy(stream)
+        others = whole.focalplane.wafer != wafer
+        part.observation = copy.copy(whole)
+        part.observation.name = f"{whole.name}, wafer {wafer}"
+        part.observation.detector_flags = whole.detector_flags | np.where(others, DEAD, 0).astype(np.uint8)
+        found = self._of_all(part, model)
+        whole.detector_flags[~others] |= part.observation.detector_flags[~others]
+        return found
+
+    def _of_all(self, stream: Stream, model: Modes | None) -> Modes:
+        """The modes of all detectors that are not flagged."""
         inside = self.mask.of(stream.observation) if self.mask else None
         if model is not None:
             return Modes(model.detectors, _times(stream, model, self.method, inside), model.scale)
@@ -88,7 +108,8 @@ class CommonModeFilter(CommonModeParameters):
             signal += mean.evaluate(block.detectors, block.samples)
             del block.means["signal"]
         for u, v in zip(state.detectors, state.times, strict=True):
-            _remove(signal, u[block.detectors], v[block.samples])
+            if not state.parts or u[block.detectors].any():
+                _remove(signal, u[block.detectors], v[block.samples])
 
 
 def _singular_modes(step: CommonModeFilter, stream: Stream, inside: Inside | None) -> tuple[Usable, Ritz]:
@@ -200,6 +221,13 @@ class Modes:
     detectors: Floats
     times: Floats
     scale: Floats | None = None
+    parts: tuple[Modes, ...] = ()
+    """Those of each wafer, where modes are found wafer by wafer."""
+
+    @classmethod
+    def joined(cls, parts: list[Modes]) -> Modes:
+        """The modes of all wafers."""
+        return cls(np.concatenate([p.detectors for p in parts]), np.concatenate([p.times for p in parts]), None, tuple(parts))
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})

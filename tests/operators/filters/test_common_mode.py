@@ -288,3 +288,37 @@ def test_a_sky_that_no_detector_sees_is_a_map_of_zeros(method):
     np.testing.assert_array_equal(companion.hits, main.hits)
     assert (companion.signal[companion.hits > 0] == 0).all()
     assert data.tally.get("CommonModeFilter", "detectors flagged: signal constant") == 0
+
+
+@pytest.mark.parametrize("parameters", [{"on_undetermined": "remove", "residual": 1e-10}, {"method": "mean"}])
+def test_wafer_by_wafer_each_is_filtered_as_if_it_were_alone(bench, parameters):
+    one, two = atmosphere_like(0.3, 0.03, 0.017), atmosphere_like(0.5, 0.01, 0.017, seed=1)
+    a, wafer = np.empty((2 * N_DET, N)), np.arange(2 * N_DET) % 2
+    a[wafer == 0], a[wafer == 1] = one, two
+    a[4] = np.nan  # dead
+    observation = bench.observation(*a.shape)
+    observation.focalplane.wafer = wafer
+    found = run(bench, a, observation=observation, group="wafer", **parameters)
+    for number, alone in enumerate((one, two)):
+        alone = np.delete(alone, 2, 0) if number == 0 else alone
+        expected = alone - alone.mean(0) if "method" in parameters else numpy_removed(alone, 1)
+        rows = np.flatnonzero((wafer == number) & np.isfinite(a[:, 0]))
+        assert np.linalg.norm(found.signal[rows] - expected) < 1e-7 * np.linalg.norm(expected)
+    assert found.tally["CommonModeFilter", "scan0, wafer 1: modes removed"].startswith("1 ")
+    assert found.tally["CommonModeFilter", "detectors flagged: signal not finite"] in (1, "1")
+
+
+def test_wafers_take_the_modes_of_the_complete_signal(bench):
+    """Equation (3), wafer by wafer: what is removed of a part B of the data is u (B^T u)^T."""
+    from zonda.core.stream import Stream
+
+    a, b = atmosphere_like(0.3, 0.03, 0.017), atmosphere_like(0.01, 0.02, 0.003, seed=2)
+    observation = bench.observation(*a.shape)
+    observation.focalplane.wafer = np.arange(N_DET) // 20
+    step = CommonModeFilter(group="wafer", on_undetermined="remove")
+    of_all = step.measure(Stream("signal", observation, a, {}, 1))
+    of_part = step.measure(Stream("signal", observation, b, {}, 1, signal="signal/noiseless"), of_all)
+    for wafer, part in enumerate(of_part.parts):
+        rows = observation.focalplane.wafer == wafer
+        np.testing.assert_allclose(part.times[0], b[rows].T @ part.detectors[0, rows], rtol=1e-9, atol=1e-12)
+        assert not part.detectors[0, ~rows].any()
