@@ -64,41 +64,7 @@ class CommonModeFilter(CommonModeParameters):
 
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
         """Find the modes; given those of the complete signal (``model``), their times in this one."""
-        wafers = np.unique(stream.observation.focalplane.wafer).tolist() if self.group == "wafer" else []
-        if len(wafers) < 2:
-            return self._of_all(stream, model)
-        models = model.parts if model is not None else (None,) * len(wafers)
-        return Modes.joined([self._of_wafer(stream, number, one) for number, one in zip(wafers, models, strict=True)])
-
-    def _of_wafer(self, stream: Stream, wafer: int, model: Modes | None) -> Modes:
-        """The modes of one wafer's detectors; all others count as flagged."""
-        whole, part = stream.observation, copy.copy(stream)
-        others = whole.focalplane.wafer != wafer
-        part.observation = copy.copy(whole)
-        part.observation.name = f"{whole.name}, wafer {wafer}"
-        part.observation.detector_flags = whole.detector_flags | np.where(others, DEAD, 0).astype(np.uint8)
-        found = self._of_all(part, model)
-        whole.detector_flags[~others] |= part.observation.detector_flags[~others]
-        return found
-
-    def _of_all(self, stream: Stream, model: Modes | None) -> Modes:
-        """The modes of all detectors that are not flagged."""
-        inside = self.mask.of(stream.observation) if self.mask else None
-        if model is not None:
-            return Modes(model.detectors, _times(stream, model, self.method, inside), model.scale)
-        place = f"{self.label}, {stream.observation.name}"
-        if stream.means.get("signal") is not None and stream.dtype != np.float64:
-            raise PipelineError(
-                "the mean emission, tens of kelvin, is still part of the signal and float32 cannot carry it",
-                place=place,
-                cure="put a HighpassFilter before, or set precision: float64",
-            )
-        find = _mean_mode if self.method == "mean" else _singular_modes
-        detectors, found = find(self, stream, inside)
-        _tell(self, stream, detectors, found, inside)
-        _check_precision(found, detectors, stream, place)
-        scale = np.ones(detectors.use.size) if detectors.scale is None else detectors.scale
-        return Modes(found.detectors[: found.count] * scale, found.times[: found.count], detectors.scale)
+        return _wafer_by_wafer(self, stream, model) if self.group == "wafer" else _modes(self, stream, model)
 
     def exec(self, block: Block, state: Modes) -> None:
         """Equation (1) on one block."""
@@ -110,6 +76,40 @@ class CommonModeFilter(CommonModeParameters):
         for u, v in zip(state.detectors, state.times, strict=True):
             if not state.parts or u[block.detectors].any():
                 _remove(signal, u[block.detectors], v[block.samples])
+
+
+def _wafer_by_wafer(step: CommonModeFilter, stream: Stream, model: Modes | None) -> Modes:
+    """The modes of each wafer's detectors: all others count as flagged."""
+    whole, parts = stream.observation, []
+    for k, wafer in enumerate(np.unique(whole.focalplane.wafer).tolist()):
+        part, others = copy.copy(stream), whole.focalplane.wafer != wafer
+        part.observation = copy.copy(whole)
+        part.observation.name = f"{whole.name}, wafer {wafer}"
+        part.observation.detector_flags = whole.detector_flags | np.where(others, DEAD, 0).astype(np.uint8)
+        parts.append(_modes(step, part, model.parts[k] if model else None))
+        whole.detector_flags[~others] |= part.observation.detector_flags[~others]
+    detectors, times = (np.concatenate(found) for found in zip(*((p.detectors, p.times) for p in parts), strict=True))
+    return Modes(detectors, times, None, tuple(parts))
+
+
+def _modes(step: CommonModeFilter, stream: Stream, model: Modes | None) -> Modes:
+    """The modes of all detectors that are not flagged; see `CommonModeFilter.measure`."""
+    inside = step.mask.of(stream.observation) if step.mask else None
+    if model is not None:
+        return Modes(model.detectors, _times(stream, model, step.method, inside), model.scale)
+    place = f"{step.label}, {stream.observation.name}"
+    if stream.means.get("signal") is not None and stream.dtype != np.float64:
+        raise PipelineError(
+            "the mean emission, tens of kelvin, is still part of the signal and float32 cannot carry it",
+            place=place,
+            cure="put a HighpassFilter before, or set precision: float64",
+        )
+    find = _mean_mode if step.method == "mean" else _singular_modes
+    detectors, found = find(step, stream, inside)
+    _tell(step, stream, detectors, found, inside)
+    _check_precision(found, detectors, stream, place)
+    scale = np.ones(detectors.use.size) if detectors.scale is None else detectors.scale
+    return Modes(found.detectors[: found.count] * scale, found.times[: found.count], detectors.scale)
 
 
 def _singular_modes(step: CommonModeFilter, stream: Stream, inside: Inside | None) -> tuple[Usable, Ritz]:
@@ -223,11 +223,6 @@ class Modes:
     scale: Floats | None = None
     parts: tuple[Modes, ...] = ()
     """Those of each wafer, where modes are found wafer by wafer."""
-
-    @classmethod
-    def joined(cls, parts: list[Modes]) -> Modes:
-        """The modes of all wafers."""
-        return cls(np.concatenate([p.detectors for p in parts]), np.concatenate([p.times for p in parts]), None, tuple(parts))
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
