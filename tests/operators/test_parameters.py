@@ -22,6 +22,7 @@ from astropy.wcs import WCS
 import zonda
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
+from zonda.core.figures import Figures
 from zonda.core.registry import noise_models, operators
 from zonda.core.site import Site
 from zonda.operators.io.save_tod import load_tod
@@ -138,7 +139,7 @@ def contents(product: Any) -> Any:
         return {f: contents(getattr(product, f)) for f in fields}
     if isinstance(product, Mapping):
         return {k: contents(v) for k, v in product.items()}
-    if isinstance(product, list | tuple):
+    if isinstance(product, list | tuple | Figures):
         return [contents(v) for v in product]
     if isinstance(product, np.ndarray | np.generic | bytes | int | float | str | None):
         return product
