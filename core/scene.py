@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationInfo, field_validator
@@ -59,6 +60,18 @@ class Scene(Parameters):
     def replace(self, **changes: Any) -> Scene:
         """The scene with other values, checked: ``scene.replace(seed=8)``. Raises `ParameterError`."""
         return type(self)(**({name: getattr(self, name) for name in self.model_fields_set} | changes))
+
+
+@runtime_checkable
+class WithScene(Protocol):
+    """A step with recorded data, whose instrument, site and time a pipeline file need not give."""
+
+    def own_scene(self, given: Instrument | None) -> Mapping[str, Any]:
+        """``site``, ``instrument`` and ``time`` of the data; what they do not state of the instrument is that of ``given``.
+
+        Raises InputError where the data cannot be read, or do not state what a scene needs.
+        """
+        ...
 
 
 def site_at(location: Any) -> Site:

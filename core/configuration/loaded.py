@@ -100,11 +100,13 @@ class PipelineFile:
         scene = self._scene.model_dump(mode="json")
         for kind in ("site", "instrument"):  # each as its own class, with all its fields
             scene[kind] = getattr(self._scene, kind).model_dump(mode="json")
+        given = {kind: self.parameters.get(kind) for kind in ("site", "instrument")}  # None: recorded data bring it
         named = {
-            k: scene[k] for k in ("site", "instrument") if isinstance(self.parameters[k], str) or is_variant(self.parameters[k])
+            kind: scene[kind] for kind, value in given.items() if value is None or isinstance(value, str) or is_variant(value)
         }
-        values = header | scene | {kind: self.parameters[kind] for kind in named}
-        if is_variant(self.parameters["instrument"]):
+        values = header | scene | {kind: given[kind] for kind in named}
+        values = {key: value for key, value in values.items() if key not in given or value is not None}
+        if is_variant(given["instrument"]):
             values["instrument"] = written(self.parameters["instrument"], self._scene.instrument)
         tree = {key: values[key] for key in KEYS if key in values}
         tree["operators"] = [{step.key: _filled(step.operator)} for step in self.steps]

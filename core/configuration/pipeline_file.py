@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
 from ..run.order import check_order
-from ..scene import Scene
+from ..scene import Scene, WithScene
 from ..signal import Signal, can_be_named
+from ..site import Site
 from ..variants import LIKE, one_of
 from ..weather import WeatherSource, resolve
 from . import overrides as settings
@@ -36,6 +38,12 @@ EXAMPLE = "write at least: site, instrument, time, and operators (a list of step
 
 MOST_STEPS = 1000
 """Longer pipelines are refused before they are looked at."""
+
+OWN = frozenset({"site", "instrument"})
+"""Keys of the scene that a step with recorded data brings (`scene.WithScene`)."""
+
+UNKNOWN = {"site": Site(name="", latitude="0 deg", longitude="0 deg"), "time": "2000-01-01"}
+"""What stands in the scene until recorded data say it."""
 
 
 def load(path_or_name: str | Path, overrides: Iterable[str] = ()) -> PipelineFile:
@@ -92,8 +100,9 @@ class _Check(Mistakes):
         header = self.validate(kind, head, (), "the pipeline", KEYS)
         self.sizes()
         self.requirements()
-        scene = self.scene()
         steps = read_steps(self)
+        recorded = next((s.operator for s in steps if s is not None and isinstance(s.operator, WithScene)), None)
+        scene = self.scene(recorded)
         if header is not None:
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
@@ -108,7 +117,8 @@ class _Check(Mistakes):
         stem = re.sub(r"[^\w.+-]", "_", Path(self.name).stem).lstrip("_.+-") or "pipeline"
         name = header.name or stem
         header = header.model_copy(update={"name": name, "outputs": header.outputs or Path("out") / name})
-        parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree}
+        own = OWN if recorded is not None else frozenset[str]()
+        parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree and k not in own}
         return PipelineFile(header, parameters, tuple(s for s in steps if s is not None), self.name, scene)
 
     def sizes(self) -> None:
@@ -175,8 +185,11 @@ class _Check(Mistakes):
                 if not requirement.specifier.contains(have, prereleases=True):
                     self.wrong(f"this pipeline needs {text}", at, f"{have} is installed", f"pip install '{text}'")
 
-    def scene(self) -> Scene | None:
-        """The scene; names are looked up one by one, so that each is reported at its own place."""
+    def scene(self, recorded: Any = None) -> Scene | None:
+        """The scene; names are looked up one by one, so that each is reported at its own place.
+
+        ``recorded``: a step that brings its own site and instrument, which stand above those of the file.
+        """
         given = {key: self.tree[key] for key in SCENE_KEYS if key in self.tree and not (key == "target" and self.target_of_map)}
         lost = set()
         for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
@@ -195,6 +208,8 @@ class _Check(Mistakes):
                 given["instrument"]["band"] = {"name": "", "low": "1 Hz", "high": "2 Hz"}  # goes on to find the other mistakes
         if given.get("weather") is not None:
             given["weather"] = self.weather(given["weather"])
+        if recorded is not None and not lost:
+            return self.recorded(recorded, given)
         before = len(self.found)
         stand_in = {kind: self.tree[kind] for kind in lost}
         given = {key: value for key, value in given.items() if key not in lost}
@@ -202,6 +217,26 @@ class _Check(Mistakes):
         missing = tuple(f"the pipeline needs '{kind}'" for kind in stand_in)
         self.found[before:] = [m for m in self.found[before:] if m.message not in missing]
         return scene
+
+    def recorded(self, step: Any, given: dict[str, Any]) -> Scene | None:
+        """The scene with the instrument and the site that a step brings; its time, where none is given."""
+        told = self.validate(Scene, {**UNKNOWN, **given}, (), "the pipeline", KEYS) if "instrument" in given else None
+        if told is None and "instrument" in given:
+            return None
+        try:
+            own = dict(step.own_scene(None if told is None else told.instrument))
+        except ZondaError as err:
+            self.refused(err, self.document.mark(("operators",)).start)
+            return None
+        scene = self.validate(Scene, {**own, **given}, (), "the pipeline", KEYS)
+        if scene is None:
+            return None
+        above = {key: own[key] for key in OWN}
+        for key in sorted(OWN & given.keys()):
+            if getattr(scene, key).name != above[key].name:
+                text = f"{step.label}: {key} is that of the recorded data, {above[key].name}"
+                warnings.warn(f"{text}; {getattr(scene, key).name} of this file is not used", stacklevel=2)
+        return scene.model_copy(update=above)
 
     def weather(self, value: Any) -> WeatherSource | None:
         """The weather, checked as the source that it names."""
