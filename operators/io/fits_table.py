@@ -296,6 +296,8 @@ def _read(file: Any) -> TimeOrderedData:
     fixed = {"NAME", "QUAT", "XI", "ETA", "FLAGS"}
     about = file["SAMPLES"].header
     flags, detector_flags = _native(samples["FLAGS"]), _native(detectors["FLAGS"])
+    if "FLAGBITS" in about and "INTERVALS" not in file:
+        raise KeyError("there is no table INTERVALS")
     if "FLAGBITS" not in about:
         flags, detector_flags = of_before(flags, samples=True), of_before(detector_flags, samples=False)
     intervals: Intervals = {}

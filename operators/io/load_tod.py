@@ -27,7 +27,7 @@ from zonda.core.signal import Component
 from .noise_table import NoiseTable, read_noise
 from .recorded_pointing import boresights, middle, state_celestial
 from .recorded_scan import instrument_of, rows_of_band, site_of
-from .recorded_stream import RecordedStream, level_of
+from .recorded_stream import RecordedStream, levels
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 
@@ -177,6 +177,19 @@ class LoadTOD(Operator):
 
     def prepare(self, observation: Observation) -> RecordedStream | None:
         """Open the file, and find each detector's level. None: nothing of this scan is read."""
+        stream = self.open(observation)
+        if stream is None:
+            return None
+        try:
+            stream.level, _ = levels(stream, observation.n_detectors, observation.n_samples)
+        except BaseException:
+            stream.file.close()
+            raise
+        stream.mean = SmoothField.constant(stream.level, observation.n_samples)
+        return stream
+
+    def open(self, observation: Observation) -> RecordedStream | None:
+        """The stream of an observation, to be read; None: it is not of these files, or none is wanted."""
         scan = self._scans.get(observation.index)
         if scan is None or self.signal is None:
             return None
@@ -184,23 +197,18 @@ class LoadTOD(Operator):
         rows = np.array([order[name] for name in observation.focalplane.names], np.intp)
         opened = reader(scan.path)
         try:
-            stream = RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask))
-            level = level_of(stream, observation)
+            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask))
         except BaseException:
             opened.close()
             raise
-        stream.mean, stream.level = SmoothField.constant(level, observation.n_samples), level
-        return stream
 
     def exec(self, block: Block, state: RecordedStream | None) -> None:
         """Read a block; add it to ``recorded``."""
         out = block.new(RECORDED)
         if state is None:
             return
-        values, spoilt = state.read(block.detectors, block.samples)
-        values -= state.level[block.detectors, None]
-        out += values.astype(out.dtype)
         block.means[RECORDED] = state.mean
+        spoilt = state.add(block.detectors, block.samples, out)
         block.observation.tally.count(self.label, "samples of single detectors that the file flags", spoilt)
 
     def collect(self, data: Data, observation: Observation, state: RecordedStream | None) -> None:

@@ -1,11 +1,16 @@
-"""Planning of the steps that write files: what they read and what they cost."""
+"""Planning of the steps that read and write files: what they read and what they cost."""
 
 from __future__ import annotations
 
+import numpy as np
+
+from zonda.core.observation import Observation
 from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Estimate
+from zonda.core.plan.estimate import Cost, Estimate, Traits
 from zonda.core.plan.planning import Planning
 
+from .load_tod import LoadTOD
+from .recorded_stream import levels
 from .save_map import SaveMap
 from .save_tod import SaveTOD
 
@@ -31,3 +36,32 @@ class SaveTODPlanning(Planning[SaveTOD]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         return Estimate((), Cost(0.1, 0.0, 6e-9 * len(self.operator.streams)))
+
+
+class LoadTODPlanning(Planning[LoadTOD]):
+    """What the recorded stream brings into the map: the noise that the file states, fluctuations as they are in parts of it."""
+
+    of = LoadTOD
+
+    def traits(self, observation: Observation) -> Traits:
+        """The white noise of the file's NET; the rms of parts of the first scan's stream."""
+        stream = self.operator.open(observation)
+        if stream is None:
+            return Traits()
+        try:
+            _, spread = levels(stream, observation.n_detectors, observation.n_samples)
+        finally:
+            stream.file.close()
+        use = observation.good_detectors
+        each = observation.focalplane.net[use] * np.sqrt(observation.sample_rate)
+        rms = float(spread[use].max(initial=0.0))
+        known = bool(each.size and (each > 0).all())
+        return Traits(noise=float(each.min()) if known else 0.0, each=each if known else None, rms=rms)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost: the file is opened, and each sample read once."""
+        return Estimate((), Cost(0.3, 0.5e-6, 8e-9 if self.operator.signal is not None else 0.0))
+
+    def memory(self, observation: Observation) -> int:
+        """What the library that reads the file holds, and the parts in which it is read."""
+        return 100_000_000

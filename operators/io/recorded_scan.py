@@ -105,7 +105,11 @@ def instrument_of(tod: TimeOrderedData, rows: NDArray[np.intp], given: Instrumen
     made = RecordedInstrument(
         name=tod.telescope or "recorded",
         description=f"as {tod.name} was recorded",
-        telescope=Telescope(name=tod.telescope or "recorded", diameter=f"{float(diameter)!r} m", elevation_min="0 deg"),
+        telescope=Telescope(
+            name=str(tod.metadata.get("telescope", tod.telescope or "recorded")),
+            diameter=f"{float(diameter)!r} m",
+            elevation_min="0 deg",
+        ),
         band=band,
         detectors=len(plane),
         field_of_view=f"{2 * float(np.arctan(plane.radius))!r} rad",

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.configuration.units import read_unit
 from zonda.core.errors import InputError
+from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.numerics.tiles import TILE_DETECTORS
-from zonda.core.types import Floats
+from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.types import AnyFloats, Floats
 
-if TYPE_CHECKING:
-    from zonda.core.observation import Observation
+AT_ONCE = 4 * TILE_SAMPLES
+"""Samples of `TILE_DETECTORS` detectors that are read at once."""
 
 STRETCHES, LENGTH = 5, 64
 """Parts of a scan, and samples of each, of which a detector's level is the median."""
@@ -49,6 +50,19 @@ class RecordedStream:
     def __post_init__(self) -> None:
         self._factor = _kelvin(self.file.streams[self.name], self.name, self.file.place)
 
+    def add(self, detectors: slice, samples: slice, out: AnyFloats) -> int:
+        """Add what stands above `level` to ``out`` (n, m), in parts of a few megabytes; how many samples are flagged."""
+        spoilt = 0
+        for rows in chunks(detectors.stop - detectors.start, TILE_DETECTORS):
+            for part in chunks(samples.stop - samples.start, AT_ONCE):
+                first, begin = detectors.start + rows.start, samples.start + part.start
+                absolute = slice(first, detectors.start + rows.stop), slice(begin, samples.start + part.stop)
+                values, bad = self.read(*absolute)
+                values -= self.level[absolute[0], None]
+                np.add(out[rows, part], values, out=out[rows, part], casting="same_kind")
+                spoilt += bad
+        return spoilt
+
     def read(self, detectors: slice, samples: slice) -> tuple[Floats, int]:
         """(n, m) float64 K at absolute detectors and samples, NaN where the file flags one; how many these are."""
         rows = self.rows[detectors]
@@ -63,20 +77,19 @@ class RecordedStream:
         return values, int(np.count_nonzero(bad & ~bad.all(axis=1, keepdims=True)))
 
 
-def level_of(stream: RecordedStream, observation: Observation) -> Floats:
-    """(n_det,) K, about the mean of each detector: the median of a few hundred finite samples, 0 where there is none.
+def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Floats, Floats]:
+    """Median and standard deviation (n_detectors,) [K] of a few hundred finite samples of each detector, 0 where there is none.
 
-    It depends on the file alone. Any number would do: it is subtracted in float64 and added again.
+    They depend on the file alone. For the level any number would do: it is subtracted in float64 and added again.
     """
-    n, found = observation.n_samples, np.zeros(observation.n_detectors)
-    begins = np.unique(np.linspace(0, max(n - LENGTH, 0), STRETCHES).astype(int))
-    for first in range(0, len(found), TILE_DETECTORS):
-        rows = slice(first, min(first + TILE_DETECTORS, len(found)))
-        parts = np.hstack([stream.read(rows, slice(int(b), min(int(b) + LENGTH, n)))[0] for b in begins])
-        for number, values in enumerate(parts, first):
+    found = np.zeros((2, n_detectors))
+    begins = np.unique(np.linspace(0, max(n_samples - LENGTH, 0), STRETCHES).astype(int))
+    for rows in chunks(n_detectors, TILE_DETECTORS):
+        parts = np.hstack([stream.read(rows, slice(int(b), min(int(b) + LENGTH, n_samples)))[0] for b in begins])
+        for number, values in enumerate(parts, rows.start):
             finite = values[np.isfinite(values)]
-            found[number] = np.median(finite) if finite.size else 0.0
-    return found
+            found[:, number] = (np.median(finite), np.std(finite)) if finite.size else (0.0, 0.0)
+    return found[0], found[1]
 
 
 def _kelvin(unit: str, name: str, place: str) -> float:

@@ -184,6 +184,7 @@ class TimeOrderedData:
                 "observation_index": o.index,
                 "centre_ra": o.centre[0],
                 "centre_dec": o.centre[1],
+                "telescope": instrument.telescope.name,
                 "telescope_diameter": instrument.telescope.diameter,
                 **(metadata or {}),
             },

@@ -1,0 +1,377 @@
+"""Recorded data: a saved run gives its map again; skies are injected, twins simulated beside it; bad files are refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import zonda
+import zonda.testing
+from zonda.core.configuration.pipeline_file import parse
+from zonda.core.errors import InputError, ZondaError
+from zonda.core.flags import SUN_UP, TURNAROUND
+from zonda.core.made_up import Given, Points, made_up_scene
+from zonda.operators.io.save_tod import load_tod, save_tod
+from zonda.plugins.checks.scenes import sky_file
+
+pytestmark = pytest.mark.filterwarnings("ignore:Pointing")
+
+SCENE = {
+    "site": "green_bank",
+    "instrument": {"like": "mustang2", "detectors": 19},
+    "time": "2024-11-25T07:00",
+    "target": "05h00m00s +20d00m00s",
+    "seed": 3,
+}
+SCAN = {"radius": "1 arcmin", "scan_duration": "40 s", "sample_rate": "50 Hz"}
+AIR = [zonda.AtmosphereLayers(pwv="5 mm", layers=2), zonda.WhiteNoise(), zonda.PinkNoise(), zonda.Efficiency()]
+MAP = zonda.BinMap(pixel="5 arcsec")
+PLANES = ("hits", "weights", "noise")
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: Any) -> dict[str, Any]:
+    """A run of two scans whose streams are saved behind the filters, in both formats, and as they were before."""
+    folder = tmp_path_factory.mktemp("saved")
+    steps = [
+        zonda.PointingDaisy(scans=2, **SCAN),
+        *AIR,
+        zonda.SaveTOD(name="Raw"),
+        zonda.HighpassFilter(frequency="0.1 Hz"),
+        zonda.CommonModeFilter(),
+        zonda.SaveTOD(name="Filtered"),
+        zonda.SaveTOD(name="Fits", format="fits"),
+        MAP,
+    ]
+    data = zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=folder, threads=1)
+    files = {name: sorted(folder.glob(f"tod_{name}_*")) for name in ("Raw", "Filtered", "Fits")}
+    return {"data": data, "map": data["map"], **files}
+
+
+def load(files: Any, *steps: Any, **more: Any) -> Any:
+    step = zonda.LoadTOD(file=files, **more.pop("load", {}))
+    settings = {k: more.pop(k) for k in ("precision", "runs") if k in more}
+    return zonda.Pipeline([step, *steps], **settings).run(step.scene(seed=3), threads=more.pop("threads", 1), **more)
+
+
+@pytest.mark.parametrize("name", ["Filtered", "Fits"])
+def test_the_saved_map_comes_back(saved: Any, name: str) -> None:
+    found, expected = load(saved[name], MAP)["map"], saved["map"]
+    for plane in PLANES:
+        np.testing.assert_array_equal(getattr(found, plane), getattr(expected, plane), err_msg=plane)
+    assert found.wcs.to_header_string() == expected.wcs.to_header_string()
+    # filtered samples are some mK: float32 keeps them to 1e-9 K
+    np.testing.assert_allclose(found.signal, expected.signal, rtol=0, atol=1e-8)
+    assert np.nanstd(expected.signal) > 1e-4
+
+
+def test_tens_of_kelvin_keep_their_nanokelvins(saved: Any) -> None:
+    data = load(saved["Raw"][0], MAP, precision="float64", keep=["signal"])
+    tod = load_tod(saved["Raw"][0])
+    assert tod.streams["signal"].min() > 20
+    np.testing.assert_allclose(data.tod("signal"), tod.streams["signal"], rtol=0, atol=1e-13)  # one rounding of 30 K
+    single = load(saved["Raw"][0], MAP)["map"].signal
+    # float32 holds what stands above each detector's level, below 0.5 K, to 2^-25 of it
+    np.testing.assert_allclose(single, data["map"].signal, rtol=0, atol=0.5 * 2**-24)
+
+
+def test_the_file_is_the_scene(saved: Any) -> None:
+    data = load(saved["Filtered"], MAP)
+    first, original = data.observations[0], saved["data"].observations[0]
+    for name in ("seconds", "boresight_azel", "boresight_radec", "flags", "detector_flags"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(original, name), err_msg=name)
+    for name in ("xi", "eta", "net", "knee", "slope", "main_beam_efficiency"):
+        np.testing.assert_array_equal(getattr(first.focalplane, name), getattr(original.focalplane, name), err_msg=name)
+    assert first.focalplane.names == original.focalplane.names
+    assert first.start == original.start
+    assert first.centre == original.centre
+    assert first.intervals == original.intervals
+    assert first.weather == load_tod(saved["Filtered"][0]).weather
+    scene = data.scene
+    assert (scene.site.latitude, scene.site.climatology) == (original.site.latitude, "green_bank")
+    assert scene.instrument.telescope.diameter == 100
+    assert scene.instrument.band.centre == pytest.approx(original.instrument.band.centre, rel=1e-12)
+
+
+@pytest.mark.parametrize(("threads", "memory"), [(2, 1 << 30), (3, 8_000_000), (1, 5_000_000)])
+def test_same_bits_for_all_blocks_and_threads(saved: Any, threads: int, memory: int) -> None:
+    steps = [zonda.HighpassFilter(frequency="0.1 Hz"), zonda.CommonModeFilter(), MAP]
+    one = load(saved["Raw"], *steps)["map"]
+    other = load(saved["Raw"], *steps, threads=threads, memory=memory)["map"]
+    for plane in ("signal", *PLANES):
+        np.testing.assert_array_equal(getattr(one, plane), getattr(other, plane), err_msg=plane)
+
+
+def test_a_filter_acts_on_the_stream_that_was_saved(saved: Any) -> None:
+    """The level that stands beside the stream is constant: removing it analytically is what the filter does to it."""
+    tod = load_tod(saved["Raw"][0])
+    data = load(saved["Raw"][0], zonda.HighpassFilter(frequency="0.1 Hz"), MAP, precision="float64", keep=["signal"])
+    shifted = tod.streams["signal"] - 25.0
+    tod.streams["signal"] = shifted
+    path = save_tod(saved["Raw"][0].with_name("shifted.h5"), tod)
+    other = load(path, zonda.HighpassFilter(frequency="0.1 Hz"), MAP, precision="float64", keep=["signal"])
+    np.testing.assert_allclose(data.tod("signal"), other.tod("signal"), rtol=0, atol=1e-11)  # transforms of 40 s of 0.1 K
+
+
+def test_a_sky_is_injected(saved: Any) -> None:
+    """The map with a sky in the real stream, minus the map without it, is the map of the sky alone; filters are linear."""
+    y, x = np.mgrid[-40:40, -40:40]
+    with sky_file(1e-2 * np.exp(-(x**2 + y**2) / 200), pixel=2.0) as path:
+        sky = zonda.SkyMap(file=path)
+        steps = [sky, zonda.HighpassFilter(frequency="0.1 Hz"), zonda.CommonModeFilter(), MAP]
+        data = load(saved["Raw"], *steps, runs={"sky": {"only": ["sky"], "modes": "full"}, "real": {"only": ["recorded"]}})
+        both = load(saved["Raw"], *steps, runs={"rest": {"without": ["sky"], "modes": "full"}})
+    alone, rest, total = data["sky/map"].signal, both["rest/map"].signal, both["map"].signal
+    assert np.nanmax(alone) > 1e-3
+    np.testing.assert_allclose(total - rest, alone, rtol=0, atol=2e-7)  # float32 streams of up to 1 K behind the filters
+    assert np.nanmax(np.abs(data["real/map"].signal - rest)) < np.nanmax(np.abs(alone))  # other modes, the same data
+
+
+def test_a_twin_on_the_real_pointing(saved: Any) -> None:
+    """White noise of the file's NET: map noise is sigma / sqrt(hits), to the standard error of as many pixels."""
+    step = zonda.LoadTOD(file=saved["Raw"], signal="none")
+    data = zonda.Pipeline([step, zonda.WhiteNoise(), zonda.Efficiency(), MAP]).run(step.scene(seed=8), threads=1)
+    found = data["map"]
+    np.testing.assert_array_equal(found.hits, saved["map"].hits)
+    good = found.hits > 20
+    ratio = found.signal[good] / found.noise[good]
+    assert abs(ratio.var() - 1) < 5 * np.sqrt(2 / good.sum())
+
+
+def test_the_real_data_and_the_twin_in_one_pass(saved: Any) -> None:
+    step = zonda.LoadTOD(file=saved["Raw"])
+    steps = [step, *AIR, MAP]
+    runs = {"real": {"only": ["recorded"]}, "twin": {"without": ["recorded"]}}
+    data = zonda.Pipeline(steps, runs=runs).run(step.scene(seed=3), threads=1)
+    np.testing.assert_array_equal(data["real/map"].signal, load(saved["Raw"], MAP)["map"].signal)
+    twin, real = (np.nanmedian(data[f"{name}/map"].signal) for name in ("twin", "real"))
+    assert real > 20
+    assert abs(twin / real - 1) < 0.02, (twin, real)  # the same weather seen in a flat band of the same width
+
+
+@pytest.mark.parametrize("celestial", [None, "recomputed"])
+def test_directions_on_the_sky(saved: Any, celestial: Any) -> None:
+    data = load(saved["Filtered"], MAP, load={"celestial": celestial})
+    expected = saved["data"].observations[1].boresight_radec
+    assert turned(data.observations[1].boresight_radec, expected) < (4.4e-8 if celestial else 1e-30)
+
+
+def turned(a: Any, b: Any) -> float:
+    """Largest angle between rotations (n, 4), rad. Both may be interpolated to 1e-3 of a beam of 9 arcsec, 4.4e-8 rad."""
+    return 2 * float(np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)).max())
+
+
+def changed(path: Path, to: Path, change: Any) -> Path:
+    to.write_bytes(path.read_bytes())
+    with h5py.File(to, "a") as file:
+        change(file)
+    return to
+
+
+def test_a_rotated_boresight_and_what_only_one_frame_has(saved: Any, tmp_path: Path) -> None:
+    def turn(file: Any) -> None:
+        half = 0.3 / 2
+        for name in ("boresight_azel", "boresight_radec"):
+            x, y, z, w = file[f"shared/{name}"][:].T
+            c, s = np.cos(half), np.sin(half)
+            file[f"shared/{name}"][...] = np.stack([x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s], axis=1)
+
+    path = changed(saved["Filtered"][0], tmp_path / "turned.h5", turn)
+    whole = load(path, MAP).observations[0]
+    for name in ("boresight_azel", "boresight_radec"):
+        part = changed(path, tmp_path / f"without_{name}.h5", lambda file, name=name: file["shared"].__delitem__(name))
+        found = load(part, MAP).observations[0]
+        for frame in ("boresight_azel", "boresight_radec"):
+            assert turned(getattr(found, frame), getattr(whole, frame)) < 4.4e-8, (name, frame)
+
+
+def test_flags_and_their_masks(saved: Any, tmp_path: Path) -> None:
+    def flag(file: Any) -> None:
+        file["shared/flags"][:100] = SUN_UP
+        file["shared/flags"][100:150] = TURNAROUND
+        flags = file["detdata/flags"][:]
+        flags[3, 500:510], flags[4, 500:520] = 1, 64
+        file["detdata/flags"][...] = flags
+        file.attrs.modify("observation_detector_flags", json.dumps({f"d{k:02d}": 1 if k == 6 else 0 for k in range(19)}))
+
+    path = changed(saved["Filtered"][0], tmp_path / "flagged.h5", flag)
+    with h5py.File(path) as file:
+        names = json.loads(file.attrs["observation_detectors"])
+        n = file["shared/times"].size
+    assert names == [f"d{k:02d}" for k in range(19)]
+    data = load(path, MAP)
+    assert data["map"].hits.sum() == 18 * (n - 50) - 10
+    assert ("LoadTOD", "samples of single detectors that the file flags", "10") in [
+        (a, b, c.split()[0]) for a, b, c in data.tally
+    ]
+    every = load(path, MAP, load={"flag_mask": 4 | 32, "detector_mask": 64 | 7})
+    assert every["map"].hits.sum() == 18 * (n - 50) - 30
+    assert load(path, MAP, load={"flag_mask": 0, "detector_mask": 0})["map"].hits.sum() == 19 * n
+
+
+def test_other_units_are_kelvin(saved: Any, tmp_path: Path) -> None:
+    def milli(file: Any) -> None:
+        file["detdata/signal"][...] = 1e3 * file["detdata/signal"][:]
+        file["detdata/signal"].attrs["units"] = "mK"
+
+    path = changed(saved["Filtered"][0], tmp_path / "mk.h5", milli)
+    one, other = (load(p, MAP)["map"].signal for p in (saved["Filtered"][0], path))
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-8)
+    volts = changed(path, tmp_path / "v.h5", lambda file: file["detdata/signal"].attrs.__setitem__("units", "pW"))
+    with pytest.raises(InputError, match="in 'pW', not in kelvin"):
+        load(volts, MAP)
+
+
+def test_a_compressed_stream(saved: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    flacarray = pytest.importorskip("flacarray", reason="flacarray is not installed (the extra flac)")
+    from flacarray.hdf5 import write_array
+
+    original = load_tod(saved["Filtered"][0]).streams["signal"]
+
+    def compress(file: Any) -> None:
+        del file["detdata/signal"]
+        group = file.create_group("detdata/signal")
+        write_array(original, group, quanta=1e-9, use_threads=False)
+        group.attrs.update(units="K", dtype="float64")
+
+    path = changed(saved["Filtered"][0], tmp_path / "flac.h5", compress)
+    one, other = (load(p, MAP)["map"] for p in (saved["Filtered"][0], path))
+    np.testing.assert_array_equal(one.hits, other.hits)
+    np.testing.assert_allclose(one.signal, other.signal, rtol=0, atol=5e-9)  # samples of 0.05 K, rounded to 1e-9 K and to float32
+    again = load(path, MAP, threads=2, memory=5_000_000)["map"]
+    np.testing.assert_array_equal(other.signal, again.signal)
+    monkeypatch.setitem(__import__("sys").modules, "flacarray.hdf5", None)
+    with pytest.raises(InputError, match="compressed with FLAC") as caught:
+        load(path, MAP)
+    assert caught.value.cure == "pip install flacarray"
+    assert flacarray
+
+
+# ---- what is wrong with files
+
+
+def without(name: str) -> Any:
+    return lambda file: file.__delitem__(name)
+
+
+def second_name(file: Any) -> None:
+    names = json.loads(file.attrs["observation_detectors"])
+    file.attrs.modify("observation_detectors", json.dumps([names[0], names[0], *names[2:]]))
+
+
+def put(name: str, index: Any, value: float) -> Any:
+    def change(file: Any) -> None:
+        values = file[name][:]
+        values[index] = value
+        file[name][...] = values
+
+    return change
+
+
+def table(name: str, value: float) -> Any:
+    def change(file: Any) -> None:
+        rows = file["instrument/focalplane"][:]
+        rows[name][2] = value
+        file["instrument/focalplane"][...] = rows
+
+    return change
+
+
+BAD = {
+    "no focal plane": (without("instrument/focalplane"), "there is no focal plane"),
+    "no times": (without("shared/times"), "there is no times of the samples"),
+    "no stream": (without("detdata/signal"), "has no stream 'signal'"),
+    "older": (lambda file: file.attrs.modify("toast_format_version", 1), "toast_format_version is 1, not 2"),
+    "twice": (second_name, "detector 'd00' is there twice"),
+    "NaN times": (put("shared/seconds", 7, np.nan), "NaN or impossible values in seconds"),
+    "NaN pointing": (put("shared/boresight_radec", (7, 1), np.nan), "NaN or impossible values in boresight_radec"),
+    "no rotation": (put("shared/boresight_azel", (7, slice(None)), 0.0), "boresight_azel is no rotation at sample 7"),
+    "back in time": (put("shared/seconds", 7, 0.0), "the times do not increase at sample 7"),
+    "NaN beam": (table("fwhm", np.nan), "fwhm of detector d02 is nan"),
+    "no beam": (table("fwhm", 0.0), "fwhm of detector d02 is 0"),
+    "NaN noise": (table("psd_net", np.nan), "net of detector d02 is nan"),
+    "NaN position": (table("quat", np.nan), "NaN or impossible values in quats"),
+    "impossible band": (table("bandwidth", 1e9), None),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_files_are_named_with_a_cure(saved: Any, tmp_path: Path, what: str) -> None:
+    change, message = BAD[what]
+    path = changed(saved["Filtered"][0], tmp_path / "bad.h5", change)
+    if message is None:  # the median of all detectors is what counts
+        load(path, MAP)
+        return
+    with pytest.raises(InputError, match=message) as caught:
+        load(path, MAP)
+    assert "bad.h5" in caught.value.place
+    assert caught.value.cure
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".fits"])
+@pytest.mark.parametrize("share", [0.1, 0.6, 0.99])
+def test_truncated_files(saved: Any, tmp_path: Path, suffix: str, share: float) -> None:
+    whole = saved["Filtered" if suffix == ".h5" else "Fits"][0].read_bytes()
+    path = tmp_path / f"short{suffix}"
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(InputError) as caught:
+        load(path, MAP)
+    assert path.name in caught.value.place
+    assert caught.value.cure
+
+
+def test_nan_in_a_stream_is_dropped_and_counted(saved: Any, tmp_path: Path) -> None:
+    path = changed(saved["Filtered"][0], tmp_path / "nan.h5", put("detdata/signal", (3, slice(20, 31)), np.nan))
+    data, whole = load(path, MAP), load(saved["Filtered"][0], MAP)
+    assert whole["map"].hits.sum() - data["map"].hits.sum() == 11
+
+
+def test_two_scans_of_one_name_and_two_instruments(saved: Any, tmp_path: Path) -> None:
+    data = load([saved["Filtered"][0]] * 2, MAP)
+    assert [o.name for o in data.observations] == ["scan-000", "scan-000.2"]
+    other = changed(
+        saved["Filtered"][0], tmp_path / "o.h5", lambda file: file["instrument"].attrs.__setitem__("telescope_name", "other")
+    )
+    with pytest.raises(InputError, match="was recorded with other"):
+        load([saved["Filtered"][0], other], MAP)
+
+
+# ---- pipeline files
+
+LOADED = "operators:\n  - LoadTOD: {{file: {file}}}\n  - BinMap: {{pixel: 5 arcsec}}\n  - SaveMap\n"
+
+
+def test_a_pipeline_file_needs_neither_site_nor_instrument(saved: Any, tmp_path: Path) -> None:
+    text = LOADED.format(file=saved["Filtered"][0])
+    file = parse(text)
+    assert file.scene().instrument.telescope.diameter == 100
+    assert str(file.scene().time) == "2024-11-25T07:00:00Z"
+    again = parse(file.resolved_yaml())
+    assert again.scene().model_dump() == file.scene().model_dump()
+    data = file.pipeline().run(file.scene(), output=tmp_path, threads=1)
+    assert data["map"].hits.sum() == 19 * 2000
+    with pytest.warns(UserWarning, match="instrument is that of the recorded data, .*; atlast of this file is not used"):
+        other = parse("instrument: atlast\nsite: green_bank\n" + text)
+    assert other.scene().instrument.telescope.diameter == 100
+
+
+def test_mistakes_of_such_a_file_have_their_place(saved: Any, tmp_path: Path) -> None:
+    short = tmp_path / "short.h5"
+    short.write_bytes(saved["Filtered"][0].read_bytes()[:5000])
+    with pytest.raises(ZondaError, match=r"short.h5.*\n"):
+        parse(LOADED.format(file=short))
+    file = parse("time: 2024-11-26T07:00\n" + LOADED.format(file=saved["Filtered"][0]))
+    with pytest.raises(ZondaError, match="begins 2024-11-25T07:00:00Z, the scene 2024-11-26") as caught:
+        file.pipeline().run(file.scene(), output=tmp_path)
+    assert "nights" in str(caught.value)
+
+
+def test_it_keeps_the_contract(tmp_path: Path) -> None:
+    zonda.Pipeline([Points(), Given(), zonda.SaveTOD()]).run(made_up_scene(), output=tmp_path, threads=1)
+    (path,) = tmp_path.glob("tod_*.h5")
+    zonda.testing.check_operator(zonda.LoadTOD(file=path))
