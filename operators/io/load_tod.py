@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import warnings
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, field_validator
+from pydantic import PrivateAttr
 
 from zonda.core import flags
-from zonda.core.configuration.files import InputPath
-from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
-from zonda.core.configuration.units import Fraction
 from zonda.core.errors import InputError
-from zonda.core.numerics.smooth import SmoothField
-from zonda.core.operator import Operator
+from zonda.core.observation import Observation
 from zonda.core.signal import Component
 
-from .noise_table import NoiseTable, read_noise
+from .recorded_files import RecordedFiles, RecordedScan
 from .recorded_pointing import boresights, middle, state_celestial
-from .recorded_scan import instrument_of, rows_of_band, site_of
-from .recorded_stream import RecordedStream, levels
+from .recorded_stream import RecordedStream
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 
@@ -35,16 +25,15 @@ if TYPE_CHECKING:
     from zonda.core.block import Block
     from zonda.core.data import Data
     from zonda.core.instrument import Instrument
-    from zonda.core.observation import Observation
 
 RECORDED = Component("recorded", "calibrated")
 """The stream of a file: it enters the signal as it is, calibrated."""
 
+MOST_TOLD = 8
+"""Scans that `zonda check` tells one by one."""
+
 MOMENT = 1.0
 """s between the scene's time and the first file's from which the two are not the same."""
-
-NEW_SCANS = 64
-"""Files whose pointing is kept after it was read."""
 
 
 class _Provides:
@@ -54,18 +43,7 @@ class _Provides:
         return frozenset({"boresight"} if operator is not None and operator.signal is None else {"boresight", RECORDED})
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """A file, all but its streams; the rows of the band that is used; names of its streams."""
-
-    path: Path
-    tod: TimeOrderedData
-    rows: NDArray[np.intp]
-    instrument: Instrument
-    noise: str
-
-
-class LoadTOD(Operator):
+class LoadTOD(RecordedFiles):
     """Recorded scans with their streams, one from each file: TOAST's HDF5 (what `SaveTOD` writes, too) or `SaveTOD`'s FITS.
 
     Pointing, focal plane, flags, intervals, noise and weather are those of the file, and so are instrument and site: a pipeline
@@ -82,125 +60,25 @@ class LoadTOD(Operator):
     provides: ClassVar[Any] = _Provides()
     knows_means: ClassVar[bool] = True
 
-    file: InputPath | list[InputPath]
-    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files are the scans of one run, in this order."""
-    signal: str | None = "signal"
-    """Name of the stream; none: no stream is read, the file's pointing alone is used."""
-    band: str | None = None
-    """Centre of the band whose detectors are used, e.g. 93 GHz, where the file has detectors of several."""
-    noise: InputPath | None = None
-    """Table that `zonda noise` wrote: NET, knee and slope of each detector, above those of the file."""
-    celestial: Literal["recorded", "recomputed"] | None = None
-    """Where the boresight is on the sky: as recorded (``boresight_radec``), or recomputed from azimuth, elevation and time. Where
-    absent: as recorded where the file has it."""
-    flag_mask: int = Field(flags.SAMPLE_MASK, ge=0, le=255)
-    """Bits of the file's flags that exclude a sample; others do not (those of the Sun are kept)."""
-    detector_mask: int = Field(flags.DETECTOR_MASK, ge=0, le=255)
-    """Bits of the file's flags that exclude a detector, or a sample of one detector."""
-    target: Target | None = None
-    """Centre of the map; where absent the scene's target, that of the saved run, or the middle of the scan."""
-    interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
-    """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
-
-    _scans: dict[int, _Scan] = PrivateAttr(default_factory=dict)
-
-    @field_validator("file")
-    @classmethod
-    def _some_files(cls, value: Any) -> Any:
-        if isinstance(value, list) and not value:
-            raise ValueError("give at least one file")
-        return value
-
-    @field_validator("signal", mode="before")
-    @classmethod
-    def _none_in_words(cls, value: Any) -> Any:
-        return None if isinstance(value, str) and value.strip().lower() == "none" else value
-
-    # -- the scene
-
-    def own_scene(self, given: Instrument | None) -> Mapping[str, Any]:
-        """Instrument, site and start of the first file; what it does not state of the instrument is that of ``given``."""
-        scan = self._scan(self.files[0], given)
-        return {"site": site_of(scan.tod), "instrument": scan.instrument, "time": Instant.parse(scan.tod.start)}
-
-    def scene(self, **more: Any) -> Any:
-        """A `Scene` of the file, for `Pipeline.run`: its instrument, site and start, and ``more`` (seed, target, weather).
-
-        Raises InputError where the file cannot be read, or does not state what a scene needs.
-        """
-        from zonda.core.scene import Scene
-
-        return Scene(**{**self.own_scene(more.get("instrument")), **more})
-
-    @property
-    def files(self) -> list[Path]:
-        """The files in their order."""
-        return list(self.file) if isinstance(self.file, list) else [self.file]
-
-    # -- the steps of a pipeline
+    _scans: dict[int, RecordedScan] = PrivateAttr(default_factory=dict)
 
     def check(self, data: Data) -> list[str]:
         """What is in the files."""
-        first = len(data.observations)
-        with warnings.catch_warnings():  # observing says it again
-            warnings.simplefilter("ignore")
-            self.observe(data)
-        found = data.observations[first:]
-        lines = [_summary(o) for o in found[:8]]
-        return lines + ([f"and {len(found) - 8} more scans"] if len(found) > 8 else [])
+        return _look(self, data)
 
     def observe(self, data: Data) -> None:
         """Append an observation for each file; the scene's instrument and site become those of the files."""
-        first, given = len(data.observations), data.scene
-        own = self.own_scene(given.instrument)
-        early = Instant.parse(self._scan(self.files[0], given.instrument).tod.start)
-        if abs(given.time.seconds_since(early)) > MOMENT:
-            raise InputError(
-                f"begins {early}, the scene {given.time}: recorded data are of one night",
-                place=f"{self.label}, {self.files[0].name}",
-                cure="leave time out of the pipeline, and nights out of a campaign",
-            )
-        data.scene = given.model_copy(update={"site": own["site"], "instrument": own["instrument"]})
-        for path in self.files:
-            scan = self._scan(path, given.instrument)
-            _check_alike(scan, own["instrument"], f"{self.label}, {path.name}")
-            observation = _observation(self, data, scan)
-            self._scans[observation.index] = scan
-            data.observations.append(observation)
-        for observation in data.observations[first:]:
-            for what, one, other in (
-                ("instrument", own["instrument"].name, given.instrument.name),
-                ("site", own["site"].name, given.site.name),
-            ):
-                text = f"{one}, the file's" + ("" if one == other else f"; the scene's {other} is not used")
-                observation.tally.state(self.label, what, text)
+        self._scans.update(_append(self, data))
 
     def prepare(self, observation: Observation) -> RecordedStream | None:
         """Open the file, and find each detector's level. None: nothing of this scan is read."""
         stream = self.open(observation)
-        if stream is None:
-            return None
-        try:
-            stream.level, _ = levels(stream, observation.n_detectors, observation.n_samples)
-        except BaseException:
-            stream.file.close()
-            raise
-        stream.mean = SmoothField.constant(stream.level, observation.n_samples)
-        return stream
+        return stream and stream.levelled(observation.n_detectors, observation.n_samples)
 
     def open(self, observation: Observation) -> RecordedStream | None:
         """The stream of an observation, to be read; None: it is not of these files, or none is wanted."""
         scan = self._scans.get(observation.index)
-        if scan is None or self.signal is None:
-            return None
-        order = {name: row for row, name in zip(scan.rows.tolist(), (scan.tod.names[r] for r in scan.rows), strict=True)}
-        rows = np.array([order[name] for name in observation.focalplane.names], np.intp)
-        opened = reader(scan.path)
-        try:
-            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask))
-        except BaseException:
-            opened.close()
-            raise
+        return None if scan is None or self.signal is None else _opened(self, scan, observation)
 
     def exec(self, block: Block, state: RecordedStream | None) -> None:
         """Read a block; add it to ``recorded``."""
@@ -221,52 +99,55 @@ class LoadTOD(Operator):
         if state is not None:
             state.file.close()
 
-    def _scan(self, path: Path, given: Instrument | None) -> _Scan:
-        place = f"{self.label}, {path}"
-        tod, streams = _head(path, _stamp(path))
-        if self.signal is not None and self.signal not in streams:
-            have = ", ".join(sorted(streams)) or "none"
-            cure = f"set signal to one of: {have}; or signal: none for the pointing alone"
-            raise InputError(f"has no stream {self.signal!r}", place=place, cure=cure)
-        rows = rows_of_band(tod, self.band, place)
-        table = read_noise(self.noise) if self.noise is not None else None
-        tod, noise = _with_noise(tod, table, rows, place)
-        return _Scan(path, tod, rows, instrument_of(tod, rows, given, place), noise)
+
+def _look(step: LoadTOD, data: Data) -> list[str]:
+    """What is in the first files, in words."""
+    first = len(data.observations)
+    with warnings.catch_warnings():  # observing says it again
+        warnings.simplefilter("ignore")
+        step.observe(data)
+    found = data.observations[first:]
+    lines = [_summary(o) for o in found[:MOST_TOLD]]
+    return lines + ([f"and {len(found) - MOST_TOLD} more scans"] if len(found) > MOST_TOLD else [])
 
 
-def _stamp(path: Path) -> tuple[int, int]:
+def _append(step: LoadTOD, data: Data) -> dict[int, RecordedScan]:
+    """Append the observations; the scans by the observations' numbers."""
+    given, found = data.scene, dict[int, RecordedScan]()
+    own = step.own_scene(given.instrument)
+    if abs(given.time.seconds_since(own["time"])) > MOMENT:
+        raise InputError(
+            f"begins {own['time']}, the scene {given.time}: recorded data are of one night",
+            place=f"{step.label}, {step.files[0].name}",
+            cure="leave time out of the pipeline, and nights out of a campaign",
+        )
+    data.scene = given.model_copy(update={"site": own["site"], "instrument": own["instrument"]})
+    for path in step.files:
+        scan = step.scan(path, given.instrument)
+        _check_alike(scan, own["instrument"], f"{step.label}, {path.name}")
+        observation = _observation(step, data, scan)
+        for what in ("instrument", "site"):
+            one, other = own[what].name, getattr(given, what).name
+            text = f"{one}, the file's" + ("" if one == other else f"; the scene's {other} is not used")
+            observation.tally.state(step.label, what, text)
+        found[observation.index] = scan
+        data.observations.append(observation)
+    return found
+
+
+def _opened(step: LoadTOD, scan: RecordedScan, observation: Observation) -> RecordedStream:
+    """The open stream, with the rows of the observation's detectors."""
+    order = {scan.tod.names[row]: row for row in scan.rows.tolist()}
+    rows = np.array([order[name] for name in observation.focalplane.names], np.intp)
+    opened = reader(scan.path)
     try:
-        stat = os.stat(path)
-    except OSError as err:
-        raise InputError(f"cannot be read: {err.strerror}", place=str(path), cure="was it moved or removed?") from None
-    return stat.st_size, stat.st_mtime_ns
+        return RecordedStream(opened, str(step.signal), rows, np.uint8(step.detector_mask))
+    except BaseException:
+        opened.close()
+        raise
 
 
-@lru_cache(maxsize=NEW_SCANS)
-def _head(path: Path, stamp: tuple[int, int]) -> tuple[TimeOrderedData, Mapping[str, str]]:
-    """All but the streams of a file, and the names of these with their units."""
-    opened = reader(path)
-    opened.close()
-    return opened.tod, opened.streams
-
-
-def _with_noise(
-    tod: TimeOrderedData, table: NoiseTable | None, rows: NDArray[np.intp], place: str
-) -> tuple[TimeOrderedData, str]:
-    """The file's data with the noise of a table, and where its noise comes from."""
-    from dataclasses import replace
-
-    if table is None:
-        what = "the file's" if "net" in tod.columns else "the scene's instrument's, or none: the file states none"
-        return tod, what
-    columns = dict(tod.columns)
-    for name, values in table.of([tod.names[row] for row in rows], place).items():
-        columns[name] = np.array(columns.get(name, np.full(tod.n_detectors, values[0])), np.float64)
-        columns[name][rows] = values
-    return replace(tod, columns=columns), str(table.path)
-
-
-def _check_alike(scan: _Scan, instrument: Instrument, place: str) -> None:
+def _check_alike(scan: RecordedScan, instrument: Instrument, place: str) -> None:
     """Refuse files of several instruments in one run."""
     own = scan.instrument
     same = own.name == instrument.name and np.isclose(own.band.centre, instrument.band.centre, rtol=1e-3)
@@ -277,9 +158,7 @@ def _check_alike(scan: _Scan, instrument: Instrument, place: str) -> None:
         raise InputError(f"was recorded with {what}, the first file with {first}", place=place, cure=cure)
 
 
-def _observation(step: LoadTOD, data: Data, scan: _Scan) -> Observation:
-    from zonda.core.observation import Observation
-
+def _observation(step: LoadTOD, data: Data, scan: RecordedScan) -> Observation:
     tod, scene, place = scan.tod, data.scene, f"{step.label}, {scan.path}"
     start, plane = Instant.parse(tod.start), scan.instrument.focalplane()
     if (np.diff(tod.seconds) <= 0).any():

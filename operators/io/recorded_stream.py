@@ -50,6 +50,16 @@ class RecordedStream:
     def __post_init__(self) -> None:
         self._factor = _kelvin(self.file.streams[self.name], self.name, self.file.place)
 
+    def levelled(self, n_detectors: int, n_samples: int) -> RecordedStream:
+        """Itself, with the level of each detector; where that cannot be read the file is closed."""
+        try:
+            self.level, _ = levels(self, n_detectors, n_samples)
+        except BaseException:
+            self.file.close()
+            raise
+        self.mean = SmoothField.constant(self.level, n_samples)
+        return self
+
     def add(self, detectors: slice, samples: slice, out: AnyFloats) -> int:
         """Add what stands above `level` to ``out`` (n, m), in parts of a few megabytes; how many samples are flagged."""
         spoilt = 0
