@@ -54,7 +54,7 @@ class Data:
 
     @property
     def n_scans(self) -> int:
-        """How many scans there are; where some of them are looked at (`Operator.check`), as the last one's number tells."""
+        """Number of scans; in `Operator.check`, which sees some of them, that of the last one and those before it."""
         return max(len(self.observations), self.observations[-1].index + 1) if self.observations else 0
 
     def check_scan(self, number: int, place: str) -> None:

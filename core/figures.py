@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Figure:
-    """One number that a run is judged by.
+    """A number that characterizes a run.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class FigureMetric(Metric, Parameters):
 
     @property
     def unit(self) -> str:
-        """Of the number; empty: a pure number."""
+        """Unit of the number; empty for a pure number."""
         return ""
 
     def needs(self) -> tuple[Signal, ...]:

@@ -17,7 +17,7 @@ DEFAULTS: dict[str, float] = {
     "polarization_angle": 0.0, "polarization_efficiency": 0.0, "band": 0, "wafer": 0, "knee": 0.0, "slope": 1.0,
     "minimum_frequency": 1e-3,
 }  # fmt: skip
-"""Of columns that are not given."""
+"""Values of columns that are not given."""
 
 WHOLE = ("band", "wafer")
 """Columns of whole numbers."""

@@ -81,7 +81,7 @@ class Instrument(Parameters):
     field_of_view: Angle = Field(ge=0, le=1.0)
     """Diameter of the circle that holds all detectors."""
     polarization: Literal["none", "pairs"] = "none"
-    """`pairs`: a pixel has two polarized detectors at right angles, A and B; A lies at 0 and 45 deg in turn."""
+    """`pairs`: each pixel has two detectors, A and B, polarized at right angles; A is at 0 and at 45 deg in alternate pixels."""
     fwhm: Angle | None = Field(None, gt=0)
     """Main-beam FWHM; where absent, the diffraction limit 1.22 lambda / D at the band centre."""
     main_beam_efficiency: Fraction = Field(gt=0, le=1)

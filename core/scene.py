@@ -25,7 +25,7 @@ EARTH = 6371e3
 NEAR = 1e3
 """m: what stands nearer than this stands at the same site."""
 HIGHER = 200.0
-"""m: what stands no higher or lower than this has the same climatology."""
+"""Largest difference of height to a site whose climatology is used, m."""
 
 
 class Scene(Parameters):

@@ -104,7 +104,7 @@ class Formed:
     own: frozenset[str] = frozenset()
 
     def takes_model(self, label: str) -> bool:
-        """Whether a filter takes from the complete signal what it measures for this one."""
+        """Whether filters use for this signal what they measure in the complete one."""
         return self.model and self.stream != MAIN and label not in self.own
 
     @property

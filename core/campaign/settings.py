@@ -57,7 +57,7 @@ class Campaign(Parameters):
     """Many observations of one pipeline, worked through as tasks on any engine. Keys are those of `--set`."""
 
     KEYS_BELONG_IN: ClassVar[str] = "grid"
-    """Where a pipeline's key belongs that stands beside these."""
+    """The key under which a key of the pipeline belongs that was written beside these."""
 
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
     """Every combination of these values, e.g. {site: [atacama, mauna_kea], PointingDaisy.radius: [2 arcmin, 4 arcmin]}."""
@@ -130,7 +130,7 @@ class Sweep(Parameters):
     seeds: int = Field(1, ge=1, le=100_000)
     """Realizations of each point, with the same random numbers at all points."""
     engine: Engine = "processes"
-    """What works on the runs."""
+    """The engine that executes the runs."""
     workers: int | None = Field(None, ge=1, le=100_000)
     """Worker processes of `processes`; where absent, one for each CPU."""
 
@@ -141,6 +141,6 @@ class Sweep(Parameters):
         return self
 
     KEYS_BELONG_IN: ClassVar[str] = "over"
-    """Where a pipeline's key belongs that stands beside these."""
+    """The key under which a key of the pipeline belongs that was written beside these."""
     CALLED: ClassVar[dict[str, str]] = {"over": "grid", "points": "observations", "seeds": "realizations"}
-    """What a campaign calls its keys."""
+    """The keys of a campaign that mean the same."""

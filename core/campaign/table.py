@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .job import Job
 
 FOLDER = "figures"
-"""Of the figures of each combination, by number."""
+"""Folder with the figures of each combination, in files named by its number."""
 LOGARITHMIC = 8.0
 """Ratio of the largest to the smallest swept value from which the axis is logarithmic."""
 
@@ -45,7 +45,7 @@ class Point:
 
     @property
     def mean(self) -> float:
-        """Of the realizations."""
+        """Mean over the realizations."""
         return float(np.mean(self.values))
 
     @property
@@ -55,7 +55,7 @@ class Point:
 
     @property
     def standard_error(self) -> float:
-        """Of the mean."""
+        """Standard error of the mean."""
         return self.scatter / math.sqrt(len(self.values))
 
 

@@ -59,5 +59,5 @@ def smoothing_width(given: Any, beam: float) -> float:
     except PydanticCustomError as err:
         raise InputError(err.message(), place="map.smooth", cure="write map.smooth('9 arcsec')") from None
     if not width > 0:
-        raise InputError(f"a width of {given} does not smooth", place="map.smooth", cure="write map.smooth('9 arcsec')")
+        raise InputError(f"{given} cannot be the width of a smoothing", place="map.smooth", cure="write map.smooth('9 arcsec')")
     return width

@@ -85,7 +85,7 @@ class MapArrays:
     polarization: Polarization | None = None
     """Q and U; ``signal`` and the others are of I then, and ``hits`` and ``weights`` 0 where I, Q and U are not determined."""
     band: Band | None = None
-    """Of the run: what `to` converts with; None: not known."""
+    """Band of the run, with which `to` converts units; None: not known."""
 
     @property
     def wcs(self) -> Any:

@@ -200,7 +200,7 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
     """`MapProduct.write`."""
     path = Path(path).expanduser()
     if path.exists() and not overwrite:
-        raise OutputError("is there already", place=str(path), cure="choose another name, or write overwrite=True")
+        raise OutputError("exists already", place=str(path), cure="choose another name, or write overwrite=True")
     return MapFile.of("map", product).write(path, Provenance.of_a_map(product))
 
 

@@ -213,7 +213,7 @@ class Signals:
 
 
 def acting_steps(operators: Sequence[Operator]) -> list[Operator]:
-    """Of these, the operators that act on observations; with one that adds up what is calibrated, where none forms a signal."""
+    """The operators that act on observations, and a `CalibratedSignal` where none of them forms a signal."""
     return with_calibrated_signal([o for o in operators if acts(o)])
 
 

@@ -29,7 +29,7 @@ from .turbulence.covariance import NU, mixture
 from .turbulence.nodes import Layer
 
 SLOWEST = 1e-4
-"""m/s: what is slower does not fluctuate."""
+"""Lowest speed of a layer whose spectrum is computed, m/s."""
 NODES = 1500
 """Of the integral over q in equation (2)."""
 KNOTS = 160

@@ -45,9 +45,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 FIGURES = ("rms", "rms_reference", "rms_difference", "correlation", "gain")
-"""Of each detector."""
+"""Figures of each detector."""
 ERRORS = ("correlation", "gain")
-"""Those with a standard error."""
+"""Figures that have a standard error."""
 SHARED = 35 / 18
 """Neighbouring frequencies behind a Hann window: 1 + 2 (2/3)^2 + 2 (1/6)^2."""
 

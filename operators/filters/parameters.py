@@ -14,16 +14,16 @@ from .source_mask import SourceMask
 
 
 class HighpassParameters(Operator):
-    """What is removed of each detector's scan."""
+    """The parameters of `HighpassFilter`."""
 
     frequency: Hertz = quantity("0.08 Hz", gt=0)
-    """Cutoff: everything slower is removed (`brick_wall`), or lessened by its fourth power (`bessel`)."""
+    """Cutoff: lower frequencies are removed (`brick_wall`), or attenuated as the fourth power of the frequency (`bessel`)."""
     response: Literal["brick_wall", "bessel"] = "brick_wall"
     """Brick wall without phase, or a causal Bessel filter with four poles."""
     degree: int | None = Field(3, ge=0, le=3)
     """Degree of the polynomial fitted to each detector's scan and removed first (1: a line; null: none, for `bessel` alone)."""
     trim: Seconds = quantity("0 s", ge=0)
-    """Flag this long at either end of each scan."""
+    """Time at either end of each scan that is flagged."""
     oversampling: float = Field(24.0, ge=8, le=1000)
     """Of the brick wall: coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut is about oversampling^-4."""
     mask: SourceMask | None = None
@@ -39,14 +39,14 @@ class HighpassParameters(Operator):
 
 
 class CommonModeParameters(Operator):
-    """What the detectors have in common, and how it is found."""
+    """The parameters of `CommonModeFilter`."""
 
     modes: int = Field(1, ge=1, le=100)
     """How many modes to remove."""
     group: Literal["band", "wafer"] = "band"
     """Whose modes are found together: those of all detectors of a band, or of each wafer of it. (Bands do not share modes.)"""
     method: Literal["svd", "mean"] = "svd"
-    """Singular modes, or the plain mean of all detectors at each instant (one mode), which streams of any size allow."""
+    """Singular modes, or the mean of all detectors at each instant (one mode), which needs little memory."""
     residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
     """Largest residual of a removed mode, equation (2)."""
     gap: float = Field(0.9, gt=0, lt=1)

@@ -60,7 +60,7 @@ class SaveMap(Output):
             for path in files:
                 if path.exists():
                     cure = "remove it, choose another output folder or set overwrite: true"
-                    raise OutputError("is there already", place=str(path), cure=cure)
+                    raise OutputError("exists already", place=str(path), cure=cure)
         about = Provenance.of(data)
         at_once = 1 if any(product.header is None for product in maps.values()) else MOST_AT_ONCE  # a table is copied
         with ThreadPoolExecutor(at_once, "SaveMap") as pool:  # the disk takes most of the time

@@ -41,7 +41,7 @@ Angles = Annotated[
 
 
 RASTER = ": raster"
-"""How the entry of the tally ends that states it."""
+"""End of the log entry that states the raster of a scan."""
 
 
 class RasterParameters(Pointing):
@@ -63,8 +63,8 @@ class RasterParameters(Pointing):
     """Whether the acceleration in turnarounds is continuous (they take twice as long) or constant; where absent, it is continuous
     for a telescope with a limit of jerk."""
     position_angle: Angle = quantity("90 deg")
-    """Of the rows, from north through east: 90 deg is along right ascension. In horizontal axes from the zenith through larger
-    azimuth: 90 deg is along azimuth."""
+    """Position angle of the rows, from north through east: 90 deg is along right ascension. In horizontal axes from the zenith
+    through larger azimuth: 90 deg is along azimuth."""
     angles: Angles = "same"
     """What is added to `position_angle` in the scans in turn: nothing; `cross_hatch`, every second scan crosses the same field at
     right angles; or a list of angles."""

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 WIDEST = math.radians(5.0)
 """Largest side of a raster that follows from the field of view."""
 BEAMS = 6
-"""Beams that such a raster measures at least."""
+"""Smallest side of such a raster, in beams."""
 SHARE = 0.3
-"""Of the telescope's limits that such a raster uses: the azimuth axis turns 1 / cos(elevation) times as fast as the beam."""
+"""Fraction of the telescope's limits that it uses: the azimuth axis turns 1 / cos(elevation) times as fast as the beam."""
 ROW_TIME, TURN_TIME = 5.0, 2.0
 """Shortest time for a row and a turnaround whose speed and acceleration are not given, s."""
 

@@ -37,7 +37,7 @@ STOKES = Cards([("CTYPE3", "STOKES"), ("CRPIX3", 1.0), ("CRVAL3", 1.0), ("CDELT3
 """Three images without a header are I, Q and U."""
 
 _TYPES = [np.dtype(kind) for kind in ("u1", "i2", "i4", "i8", "f4", "f8")]
-"""Those that FITS knows."""
+"""Types of numbers that FITS has."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

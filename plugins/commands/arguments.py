@@ -54,7 +54,7 @@ def checked(what: str, make: Any) -> Any:
 
 
 LIMITS = {"latitude": "-90 to 90 deg", "longitude": "-360 to 360 deg", "altitude": "-500 to 9000 m"}
-"""Of a place, in the units a user writes."""
+"""Limits of the coordinates of a place, in the units of the command line."""
 
 
 def _fault(error: Any) -> str:

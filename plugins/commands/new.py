@@ -52,7 +52,7 @@ def pipeline(name: str, instrument: str, site: str | None, target: str | None) -
 
     path = Path(name if name.endswith((".yaml", ".yml")) else f"{name}.yaml")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", path.stem):
-        raise OutputError(f"{path.stem!r} is no name for a pipeline", cure="use letters, digits, - and _")
+        raise OutputError(f"{path.stem!r} cannot be the name of a pipeline", cure="use letters, digits, - and _")
     _check_free(path)
     text = pipeline_text(path, instrument, site, target)
     write_text(path, text)
@@ -72,7 +72,7 @@ def plugin(name: str) -> None:
     package = re.sub(r"[-.]", "_", name).lower()
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*([-_.][A-Za-z0-9]+)*", name) or keyword.iskeyword(package) or package == "zonda":
         cure = "use letters, digits and hyphens, e.g. zonda-mycamera"
-        raise OutputError(f"{name!r} is no name for a plugin", place="zonda new plugin", cure=cure)
+        raise OutputError(f"{name!r} cannot be the name of a plugin", place="zonda new plugin", cure=cure)
     if importlib.util.find_spec(package):
         cure = f"choose another name, e.g. zonda-{name}"
         raise OutputError(f"a Python module {package!r} is installed already", place="zonda new plugin", cure=cure)
@@ -93,7 +93,7 @@ def _check_free(path: Path) -> None:
     from zonda.core.errors import OutputError
 
     if path.exists() or path.is_symlink():
-        raise OutputError("is there already", place=str(path), cure="choose another name")
+        raise OutputError("exists already", place=str(path), cure="choose another name")
     if not path.parent.is_dir():
         raise OutputError("there is no such folder", place=str(path.parent), cure="make it, or choose another")
 

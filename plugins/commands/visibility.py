@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from zonda.core.site import Site
 
 PLANETS = {"mercury": 1, "venus": 2, "mars": 4, "jupiter": 5, "saturn": 6, "uranus": 7, "neptune": 8}
-"""By their number in plan94."""
+"""Planets, with their numbers in ERFA's plan94."""
 BODIES = ("sun", "moon", *PLANETS)
 LIGHT = 173.14463267424
 """Speed of light, au/day (IAU 2012)."""

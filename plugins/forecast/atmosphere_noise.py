@@ -27,11 +27,12 @@ from zonda.operators.atmosphere.turbulence.geometry import ScanPlane, axes, cros
 from .survey import Survey, Track
 
 WAVES = 320
-"""Waves: 96 left the rms wrong by half where the atmosphere is a small part of the noise (AtLAST), 1280 change it by 8 %."""
+"""Number of waves: with 96 the rms is wrong by half where the atmosphere is a small part of the noise (AtLAST); 1280 change it
+by 8 %."""
 POINTS, DETECTORS = 8, 64
-"""Probes; detectors whose mean is A."""
+"""Number of probes, and of the detectors that A is averaged over."""
 MOST = 12
-"""Scans that are followed: the first ones. Later ones are taken to average down as 1 / time."""
+"""Number of scans that are followed, the first ones. The variance of later ones is taken to fall as 1 / time."""
 PER_CUT, LEAST, LARGEST = 4.0, 3.0, 30.0
 """Instants per cycle of the cut, and per second, at least and at most."""
 WAVE_NUMBERS = np.linspace(math.log(2e-4), math.log(3.0), 240)

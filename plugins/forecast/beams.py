@@ -21,7 +21,7 @@ NEAR = 8.0
 FAR = 12.0
 """-ln K up to which a sample counts."""
 STEP = (0.7548776662466927, 0.5698402909980532)
-"""Of an even sequence in the plane (Roberts 2018)."""
+"""Steps of a low-discrepancy sequence in the plane (Roberts 2018)."""
 
 
 @dataclass(frozen=True)

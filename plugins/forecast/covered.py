@@ -130,7 +130,7 @@ def _check_together(steps: Steps, name: str) -> None:
     order = [o for o in steps.operators if isinstance(o, HighpassFilter | CommonModeFilter)]
     if len(order) == 2 and isinstance(order[0], CommonModeFilter):
         raise PipelineError(
-            "the forecast covers a CommonModeFilter behind the HighpassFilter only", place=name, cure="exchange them"
+            "the forecast covers a CommonModeFilter only after the HighpassFilter", place=name, cure="exchange the two"
         )
     if steps.of(AtmosphereLayers) and steps.highpass is None:
         text = "without a HighpassFilter the mean emission of the atmosphere, tens of kelvin, is in the map"

@@ -37,13 +37,13 @@ ELEVATION = math.radians(60)
 LONGEST, MOST = 600.0, 6
 """Seconds of a scan, and number of scans that are followed, at most: a longer observation averages down as time^-1/2."""
 ACCELERATION, SPEED, PERIOD, SAMPLED, CUT = 0.35, 0.5, 1.0, 0.2, 2.5
-"""Of equations (1) and (2)."""
+"""Constants of equations (1) and (2)."""
 TURN, CYCLES = 20.0, 5.0
 """A scan lasts at least this many radius / speed, one turn of the petals, and this many cycles of the cut."""
 WIDEST = math.radians(20)
 """Largest area where none is given."""
 YEAR = 2024
-"""Of the date: the climatology is that of any year, and the Earth's orientation is known."""
+"""Year of the observation: the climatology does not depend on it, and the Earth's orientation is known."""
 DAY, GRID = 86400.0, 300.0
 """Seconds in which a target's culmination is looked for, and steps."""
 PLACE = "zonda sensitivity"

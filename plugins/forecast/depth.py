@@ -30,7 +30,7 @@ PER_DECADE = (1.0, 2.0, 5.0)
 
 
 def factors(band: Band, fwhm: float) -> dict[str, float]:
-    """By unit what a depth in K_RJ behind the beam is multiplied by.
+    """Factors by which a depth in K_RJ (after smoothing with the beam) is multiplied, by unit.
 
     The spectrum of the source is flat over the band in S_nu, and that of CMB anisotropy for K_CMB (`core.numerics.radiation`).
     ``Jy/beam`` and ``MJy/sr`` are surface brightness, for the solid angle Omega = pi FWHM^2 / (4 ln 2) of the beam. ``Jy`` is the
@@ -44,7 +44,7 @@ def factors(band: Band, fwhm: float) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Depth:
-    """Rms of the noise behind the beam in a circle, K_RJ.
+    """Rms of the noise in a circle after smoothing with the beam, K_RJ.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Depth:
         Raises InputError for what is not positive.
         """
         if not rms > 0:
-            raise InputError(f"a depth of {rms:g} K is reached by no observation", place="--reach", cure="give a positive depth")
+            raise InputError(f"no observation reaches a depth of {rms:g} K", place="--reach", cure="give a positive depth")
         end = float(self.seconds[-1])
         if float(self.total(end)) >= rms:
             return end * (float(self.total(end)) / rms) ** 2
@@ -95,7 +95,7 @@ class Depth:
 
 
 def depth_of(survey: Survey, radius: float) -> Depth:
-    """Forecast the noise behind the beam, averaged over a circle of ``radius`` [rad] about the map's centre.
+    """Forecast the noise after smoothing with the beam, averaged over a circle of ``radius`` [rad] about the map's centre.
 
     Raises PipelineError where the circle is not on the map, or not observed.
     """

@@ -1,4 +1,4 @@
-"""White and 1/f noise of a filtered, binned map behind the beam, without its time streams.
+"""White and 1/f noise of a filtered, binned and beam-smoothed map, without its time streams.
 
 Samples i = (detector d, time t) at x_i have weights a_i in the map and noise of rms sigma_i; K is the beam. At a point x of the
 map that is smoothed with K, the sample i has the weight
@@ -26,7 +26,7 @@ from .beams import Comb, combs, kernel_series, kernel_sums
 from .survey import Noise, Survey
 
 PROBES, DETECTORS = 16, 24
-"""Probes in the circle, and detectors whose series stand for all."""
+"""Number of probes in the circle, and of the detectors whose series represent all."""
 SIGNS = 16
 """How often the signs are drawn, all combs together: probes that a detector passes one after the other have noise in common."""
 SAMPLES, INSTANTS = 3e7, 4000

@@ -30,7 +30,7 @@ def read_depth(text: str, factors: Mapping[str, float]) -> float:
     size, unit = known[match["unit"]]
     value = float(match["number"]) * size / factors[unit]
     if not (math.isfinite(value) and value > 0):
-        raise InputError(f"a depth of {text} is reached by no observation", place="--reach", cure="give a positive depth")
+        raise InputError(f"no observation reaches a depth of {text}", place="--reach", cure="give a positive depth")
     return value
 
 

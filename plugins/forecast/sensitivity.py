@@ -120,7 +120,8 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
         return default_pipeline.make(default_pipeline.Asked(**given), settings)
     if beside := sorted(given.keys() - {"time"}):
         cure = f"change the pipeline with --set, or leave it or --{beside[0]} out"
-        raise InputError(f"a pipeline says itself what --{beside[0]} is", place=default_pipeline.PLACE, cure=cure)
+        text = f"--{beside[0]} is part of a pipeline, and cannot be given beside one"
+        raise InputError(text, place=default_pipeline.PLACE, cure=cure)
     if isinstance(pipeline, PipelineFile):
         if settings:
             cure = "give them to zonda.load"

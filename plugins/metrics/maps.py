@@ -179,7 +179,7 @@ class PeakSnr(_OfSmoothMap):
             near = (product.distance() <= self.radius) & np.isfinite(product.noise)
             if not near.any():
                 cure = "add a WhiteNoise and leave BinMap.noise at its default"
-                raise InputError("the map does not know its white noise", place="peak_snr", cure=cure)
+                raise InputError("the white noise of the map is not known", place="peak_snr", cure=cure)
             if not found > 0:
                 cure = "add a step that makes noise, or choose noise: white"
                 raise InputError("the noise map is zero: the ratio is infinite", place="peak_snr", cure=cure)

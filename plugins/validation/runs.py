@@ -32,7 +32,7 @@ SECONDS = "seconds"
 """The metric that is the wall time of the run itself, s."""
 
 DRAWN = "drawn.txt"
-"""In a folder with pictures: the key of their simulation."""
+"""File in a folder with pictures that holds the key of their simulation."""
 
 Say = Callable[[str], None]
 
@@ -237,7 +237,7 @@ class Runs:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    """Those of a run: not the claim's own."""
+    """The pictures of a run, without the claim's own."""
     return [path for path in sorted(folder.glob("*.png")) if path.name not in ("values.png", "atmosphere.png")]
 
 

@@ -61,7 +61,7 @@ class Values:
 
     @property
     def standard_error(self) -> float:
-        """Of the mean."""
+        """Standard error of the mean."""
         return self.scatter / math.sqrt(len(self.values)) if self.values else math.nan
 
 

@@ -519,7 +519,7 @@ REFUSALS = {
     ("CompareMaps", "map"): "there is no map 'chart'",
     ("MapSpectrum", "maps"): "no TAN map 'chart'",
     ("AtmosphereLayers", "spectra"): "unknown spectra 'none such'",
-    ("SaveMap", "overwrite"): "is there already",
+    ("SaveMap", "overwrite"): "exists already",
     ("PointingRecorded", "clock"): "is too large",
     ("PointingRecorded", "celestial"): "no boresight_radec",
     ("PointingDaisy", "check_limits"): "dish's largest speed of the azimuth axis",

@@ -39,7 +39,7 @@ class Plane:
     Attributes
     ----------
     name
-        Of it, in messages and pictures.
+        Its name in messages and pictures.
     values
         (ny, nx), NaN where nothing is known.
     header

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..map_spectra import MapSpectra
 
 CONTOURS = (-8.0, -4.0, -2.0, 2.0, 4.0)
-"""Of SNR maps where no others are wanted."""
+"""Default levels of the contours on SNR maps."""
 DEPTH = 1e-5
 """Least power spectral density that is shown, as a share of the largest."""
 MOST_FIDELITY = 100.0

@@ -6,7 +6,7 @@ import io
 from typing import Any
 
 LEAST_DPI = 300.0
-"""Of images inside a page, per inch."""
+"""Lowest resolution of images inside a page, dots per inch."""
 SETTINGS = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "zonda"}
 """Text stays text: PDF carries its TrueType fonts, SVG names them. Names inside an SVG file do not change from run to run."""
 METADATA = {

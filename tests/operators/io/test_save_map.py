@@ -199,7 +199,7 @@ def test_no_output_folder_and_no_map(data):
 def test_an_earlier_file_is_kept_on_request(run, data):
     run(map=wcs_map(20, 20))
     before = (data.output / "map.fits").read_bytes()
-    with pytest.raises(OutputError, match="is there already"):
+    with pytest.raises(OutputError, match="exists already"):
         SaveMap(overwrite=False).finalize(data)
     assert (data.output / "map.fits").read_bytes() == before
 

@@ -55,11 +55,11 @@ def test_the_pipeline_runs(here, capsys):
 def test_nothing_is_overwritten(here, capsys):
     (here / "mine.yaml").write_text("precious")
     assert cli.main(["new", "pipeline", "mine"]) == 2
-    assert "mine.yaml: is there already" in capsys.readouterr().err
+    assert "mine.yaml: exists already" in capsys.readouterr().err
     assert (here / "mine.yaml").read_text() == "precious"
     (here / "zonda-mine").mkdir()
     assert cli.main(["new", "plugin", "zonda-mine"]) == 2
-    assert "zonda-mine: is there already" in capsys.readouterr().err
+    assert "zonda-mine: exists already" in capsys.readouterr().err
     assert list((here / "zonda-mine").iterdir()) == []
     assert sorted(p.name for p in here.iterdir()) == ["mine.yaml", "zonda-mine"]
 
@@ -67,20 +67,20 @@ def test_nothing_is_overwritten(here, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["pipeline", "a b"], "'a b' is no name for a pipeline"),
-        (["pipeline", ".hidden"], "is no name for a pipeline"),
+        (["pipeline", "a b"], "'a b' cannot be the name of a pipeline"),
+        (["pipeline", ".hidden"], "cannot be the name of a pipeline"),
         (["pipeline", "nowhere/x"], "there is no such folder"),
         (["pipeline", "x", "--instrument", "mustng2"], "did you mean 'mustang2'"),
         (["pipeline", "x", "--site", "gren_bank"], "green_bank"),
         (["pipeline", "x", "--target", "mars"], "Invalid value for --target: cannot read 'mars' as a position"),
         (["pipeline", "x", "--target", "nonsense"], "cannot read 'nonsense' as a position"),
         (["pipeline", "x", "--target", "05h -80d"], "it never rises"),
-        (["plugin", "3x"], "is no name for a plugin"),
-        (["plugin", "../x"], "is no name for a plugin"),
-        (["plugin", "class"], "is no name for a plugin"),
-        (["plugin", "zonda"], "is no name for a plugin"),
+        (["plugin", "3x"], "cannot be the name of a plugin"),
+        (["plugin", "../x"], "cannot be the name of a plugin"),
+        (["plugin", "class"], "cannot be the name of a plugin"),
+        (["plugin", "zonda"], "cannot be the name of a plugin"),
         (["plugin", "numpy"], "a Python module 'numpy' is installed already"),
-        (["plugin", "a--b"], "is no name for a plugin"),
+        (["plugin", "a--b"], "cannot be the name of a plugin"),
     ],
 )
 def test_mistakes_write_nothing(here, capsys, arguments, said):

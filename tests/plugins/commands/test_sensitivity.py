@@ -132,7 +132,7 @@ def test_in_python():
     [
         ((), "neither a pipeline nor --instrument"),
         (("--instrument", "mustang2"), "--site"),
-        (("mustang2_cluster", "--pwv", "3 mm"), "a pipeline says itself what --pwv is"),
+        (("mustang2_cluster", "--pwv", "3 mm"), "--pwv is part of a pipeline, and cannot be given beside one"),
         (("no_such_pipeline",), "no_such_pipeline"),
         ((*M2, "--target", "nowhere"), "--target"),
         ((*M2, "--quantile", "2"), "--quantile"),
@@ -141,7 +141,7 @@ def test_in_python():
         (("mustang2_cluster", *SHORT, "--set", "CommonModeFilter.modes=3"), "the forecast does not cover modes: 3"),
         (("mustang2_cluster", *SHORT, "--reach", "10 apples"), "'apples' is no unit of a depth"),
         (("mustang2_cluster", *SHORT, "--reach", "deep"), "cannot read 'deep' as a depth"),
-        (("mustang2_cluster", *SHORT, "--reach", "0 uK"), "reached by no observation"),
+        (("mustang2_cluster", *SHORT, "--reach", "0 uK"), "no observation reaches"),
         (("mustang2_cluster", *SHORT, "--radius", "1 deg"), "is not on the map"),
         (("mustang2_cluster", *SHORT, "--audit", "1"), "--audit"),
     ],

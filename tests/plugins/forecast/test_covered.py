@@ -58,7 +58,7 @@ def test_parameters_that_are_not_covered(step, text, words):
         (["WhiteNoise", "Efficiency"], "there is no map"),
         (["WhiteNoise", "Efficiency", "BinMap", "BinMap: {product: other}"], "there are 2 maps"),
         (["WhiteNoise", "Efficiency", "HighpassFilter", "HighpassFilter", "BinMap"], "there are 2 of them"),
-        (["WhiteNoise", "Efficiency", "CommonModeFilter", "HighpassFilter", "BinMap"], "behind the HighpassFilter only"),
+        (["WhiteNoise", "Efficiency", "CommonModeFilter", "HighpassFilter", "BinMap"], "only after the HighpassFilter"),
         (["AtmosphereLayers", "WhiteNoise", "Efficiency", "BinMap"], "tens of kelvin"),
         (["WhiteNoise", "PinkNoise: {shared: 0.5}", "Efficiency", "HighpassFilter", "BinMap"], "adds up coherently"),
         (["Efficiency", "BinMap"], "nothing in this pipeline makes noise"),
