@@ -11,12 +11,13 @@ from ..configuration.diagnostics import Diagnostic
 from ..configuration.header import KEYS, Header
 from ..configuration.mistakes import Mistakes
 from ..configuration.section import Section
-from ..registry import makers, operators
+from ..registry import makers, operators, operators_that
 from .entries import setting
 from .settings import MOST_TASKS, Campaign, Sweep
 
 if TYPE_CHECKING:
     from ..configuration.yaml_places import Document
+    from ..operator import Operator
 
 
 class CampaignHeader(Header):
@@ -33,6 +34,20 @@ class CampaignSection(Section):
     """What pipeline files ask about their key ``campaign``."""
 
     header = CampaignHeader
+
+    @staticmethod
+    def rewrite(document: Document) -> list[Diagnostic]:
+        """See `Section.rewrite`. A schedule becomes a parameter of the pointing step that takes one."""
+        value, path = document.value["campaign"], ("campaign", "schedule")
+        if not isinstance(value, dict) or value.get("schedule") is None:
+            return []
+        given, at = document.sub(path), document.mark(path).start
+        del value["schedule"]
+        step = next((name for name in _names(document) if name in operators and _takes_schedule(operators.get(name))), None)
+        if step is None:
+            have = " or ".join(operators_that(_takes_schedule)) or "a step that does"
+            return [Diagnostic("no step takes the schedule", at, "", f"put {have} in the place of the pointing step")]
+        return overrides.put(document, f"{step}.schedule", given, at, KEYS)
 
     @staticmethod
     def too_large(value: Any) -> bool:
@@ -81,9 +96,20 @@ class SweepSection(Section):
 
 def _measures(document: Document) -> bool:
     """Whether a step of a document without mistakes makes figures."""
-    items = document.value["operators"]
-    names = [item if isinstance(item, str) else next(iter(item)) for item in items]
-    return any("figures" in operators.get(name).provides for name in names)
+    return any("figures" in operators.get(name).provides for name in _names(document))
+
+
+def _names(document: Document) -> list[str]:
+    """The names of the steps that are written as they should be."""
+    items = document.value.get("operators")
+    each = [item if isinstance(item, str) else next(iter(item), "") for item in items or () if isinstance(item, str | dict)]
+    return [str(name) for name in each]
+
+
+def _takes_schedule(step: type[Operator]) -> bool:
+    """Whether an operator's class makes scans of a schedule."""
+    provides = step.provides if isinstance(step.provides, frozenset) else frozenset()
+    return "schedule" in step.model_fields and "boresight" in provides
 
 
 def _mistakes(document: Document, campaign: Campaign, check: Callable[[Document], list[Diagnostic]]) -> list[Diagnostic]:

@@ -63,6 +63,8 @@ class Campaign(Parameters):
     """Every combination of these values, e.g. {site: [atacama, mauna_kea], PointingDaisy.radius: [2 arcmin, 4 arcmin]}."""
     observations: list[Annotated[dict[str, Any], Field(min_length=1)]] = Field(default_factory=list)
     """One after the other, e.g. [{time: 2024-11-25T07:00}, {time: 2024-11-26T07:00, target: 06h +20d}]."""
+    schedule: str | None = None
+    """File of an observing schedule (TOAST's): the `schedule` of the pipeline's pointing step, whose rows are the scans."""
     nights: Nights | None = None
     """Repeat each on several nights at the same hour angle: a number, or {start: 2024-11-25, stop: 2024-12-25}."""
     realizations: int = Field(1, ge=1, le=100_000)

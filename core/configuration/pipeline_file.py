@@ -93,8 +93,9 @@ class _Check(Mistakes):
         self.tree: dict[Any, Any] = document.value
 
     def run(self) -> PipelineFile:
-        if self.tree.get("sweep") is not None:
-            self.found += registry.sections.get("sweep").rewrite(self.document)
+        for key in ("sweep", "campaign"):
+            if self.tree.get(key) is not None:
+                self.found += registry.sections.get(key).rewrite(self.document)
         kind: type[Header] = Header if self.tree.get("campaign") is None else registry.sections.get("campaign").header
         head = {k: v for k, v in self.tree.items() if k not in (*SCENE_KEYS, "operators") and not str(k).startswith("x-")}
         header = self.validate(kind, head, (), "the pipeline", KEYS)

@@ -28,6 +28,7 @@ from .limits import LargestMotion, check_elevation, excess, what_fits
 from .motion import POINTS, LargestDerivative, Quantity, motion
 from .observed import Samples, centre_of, observed, report, state_times
 from .samples_per_beam import SamplesPerBeam
+from .sun_and_moon import distances
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -198,6 +199,7 @@ class Pointing(Operator):
         lines = [f"{self.number} scan{'s' if self.number > 1 else ''}{several} from {made[0].start}{part}"]
         lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
         motion = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
+        lines += distances(made)
         return lines + [f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(motion)]
 
     def _observe(self, data: Data, which: Sequence[int], rate: float) -> None:

@@ -22,6 +22,7 @@ from .base import Pointing
 from .limits import LargestMotion
 from .recorded import PointingRecorded
 from .samples_per_beam import SamplesPerBeam
+from .schedule import PointingSchedule
 
 MOTION = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
 """How entries of the tally begin that are about the telescope's motion."""
@@ -39,7 +40,7 @@ ABERRATION = 1.0e-4
 """v / c of the Earth's orbit and rotation."""
 
 
-class PointingPlanning(Planning[Pointing | PointingRecorded]):
+class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule]):
     """Refraction, aberration, rotation of the field, sampling in time, precision."""
 
     of: ClassVar[type[Operator]] = Pointing
@@ -83,6 +84,12 @@ class RecordedPlanning(PointingPlanning):
     """As of other pointing steps."""
 
     of: ClassVar[type[Operator]] = PointingRecorded
+
+
+class SchedulePlanning(PointingPlanning):
+    """As of other pointing steps."""
+
+    of: ClassVar[type[Operator]] = PointingSchedule
 
 
 def _bend(context: Context) -> float:

@@ -84,6 +84,9 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     header["BUNIT"] = "Jy/beam"
     fits.PrimaryHDU(values, header).writeto(folder / "beam.fits")
     healpy.write_map(folder / "sphere.fits", np.arange(12.0 * 64**2), coord="C", column_units="uK_CMB", dtype=np.float64)
+    for name, minute in (("night", "00"), ("later", "05")):
+        row = f"2024-11-25 07:{minute}:00 | 2024-11-25 07:{minute}:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
+        (folder / f"{name}.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
     a, b, *_ = instrument().focalplane().names
     (folder / "shares.csv").write_text(f"detector,source,share\n{a},{b},0.01\n")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
@@ -210,6 +213,19 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "angles": ({}, {"angles": "cross_hatch"}),
         "axes": ({}, {"axes": "horizontal"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
+    },
+    "PointingSchedule": {
+        "schedule": ({}, {"schedule": "later.txt"}),
+        "speed": ({}, {"speed": "0.2 deg/s"}),
+        "acceleration": ({}, {"acceleration": "0.5 deg/s2"}),
+        "turnaround": ({}, {"turnaround": "constant_acceleration"}),
+        "flag_turnarounds": ({}, {"flag_turnarounds": False}),
+        "elevation_nods": ({}, {"elevation_nods": ["1 deg", "0 deg"]}),
+        "elevation_speed": ({"elevation_nods": ["1 deg"]}, {"elevation_speed": "0.5 deg/s"}),
+        "elevation_acceleration": ({"elevation_nods": ["1 deg"]}, {"elevation_acceleration": "0.5 deg/s2"}),
+        "sample_rate": ({}, {"sample_rate": "40 Hz"}),
+        "check_limits": ({}, {"check_limits": "error"}),
+        "interpolation_error": ({}, {"interpolation_error": 1e-9}),
     },
     "PointingRecorded": {
         "file": ({}, {"file": "other.csv"}),
@@ -493,6 +509,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "CompareStreams": {"reference": "white"},
     "MeasureFigures": {"metrics": ["coverage", "central_rms"]},
     "PointingRecorded": {"file": "scan.csv"},
+    "PointingSchedule": {"schedule": "night.txt", "speed": "0.5 deg/s", "check_limits": "warn"},
 }
 
 
@@ -501,8 +518,7 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 
     def step(other: str) -> Any:
         values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
-        if values.get("file") is not None:
-            values = values | {"file": maps / values["file"]}
+        values = values | {key: maps / values[key] for key in ("file", "schedule") if values.get(key) is not None}
         if which == "BinMap" == other and "nside" in values:
             values.pop("pixel", None)
         return make(other, **values)
@@ -525,6 +541,7 @@ REFUSALS = {
     ("PointingDaisy", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingStare", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingRaster", "check_limits"): "dish's largest speed of the azimuth axis",
+    ("PointingSchedule", "check_limits"): "dish's largest speed of the azimuth axis",
     ("PointingBackAndForth", "check_limits"): "dish's largest speed of the azimuth axis",
 }
 """What a changed parameter is answered with, where it is not another result."""

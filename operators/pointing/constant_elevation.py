@@ -1,0 +1,117 @@
+"""The track of a constant-elevation scan between two azimuths of the mount, and of a nod in elevation.
+
+The scan begins at the lesser azimuth, towards larger ones. It crosses the width w at the constant rate v; outside the limits the
+mount turns round within T, u seconds after it began to:
+
+    A = v u - a u^2 / 2,                          T = 2 v / a   (constant acceleration, TOAST's `SimGround`),      (1)
+    A = v T [u/T - (u/T)^2 + (1 - cos(2 pi u / T)) / (2 pi^2)],   T = 4 v / a   (smooth, equation (1) of `azimuth_scan`).   (2)
+
+A nod goes from one elevation to the next from rest to rest: constant acceleration, constant speed, constant deceleration.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.intervals import Intervals, runs
+from zonda.core.types import Floats
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Back and forth over ``width`` [rad] of azimuth at ``rate`` [rad/s], turned round with ``acceleration`` [rad/s^2], all of
+    the mount; ``smooth``: equation (2)."""
+
+    width: float
+    rate: float
+    acceleration: float
+    smooth: bool
+
+    @property
+    def leg(self) -> float:
+        """Duration of the part at constant speed, s."""
+        return self.width / self.rate
+
+    @property
+    def turnaround(self) -> float:
+        """T, s."""
+        return (4 if self.smooth else 2) * self.rate / self.acceleration
+
+    @property
+    def beyond(self) -> float:
+        """How far a turnaround reaches beyond the limits, rad."""
+        factor = 1 / 4 + 1 / np.pi**2 if self.smooth else 1 / 4
+        return self.rate * self.turnaround * float(factor)
+
+    def path(self, seconds: Floats) -> Floats:
+        """(n,) azimuth from the lesser limit, rad."""
+        if self.width == 0:
+            return np.zeros(len(seconds))
+        count, within = np.divmod(seconds, self.leg + self.turnaround)
+        u = np.clip((within - self.leg) / self.turnaround, 0.0, 1.0)
+        beyond = u - u * u
+        if self.smooth:
+            beyond += (1 - np.cos(2 * np.pi * u)) / (2 * np.pi**2)
+        x = self.rate * np.minimum(within, self.leg) + self.rate * self.turnaround * beyond
+        return np.where(count % 2 == 0, x, self.width - x)
+
+    def turning(self, seconds: Floats) -> NDArray[np.bool_]:
+        """(n,) True in turnarounds."""
+        if self.width == 0:
+            return np.zeros(len(seconds), bool)
+        return np.asarray(np.mod(seconds, self.leg + self.turnaround) > self.leg)
+
+    def intervals(self, seconds: Floats, inside: NDArray[np.bool_]) -> Intervals:
+        """TOAST's intervals of the samples ``inside`` (n,); a throw goes from the middle of a turnaround to that of the next."""
+        if self.width == 0:
+            return {"scanning": runs(inside, seconds)}
+        cycle, turning = self.leg + self.turnaround, self.turning(seconds)
+        first, throw = (np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + self.turnaround / 2))
+        found: Intervals = {}
+        for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
+            found[f"throw_{way}"] = runs(inside & going, seconds)
+            found[f"scan_{way}"] = runs(inside & ~turning & after, seconds)
+            found[f"turn_{way}"] = runs(inside & turning & after, seconds)
+        for name, part in (("throw", "throw"), ("scanning", "scan"), ("turnaround", "turn")):
+            found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
+        return found
+
+
+@dataclass(frozen=True)
+class Nod:
+    """From 0 to the ``stops`` [rad] in turn, at most at ``rate`` [rad/s], with ``acceleration`` [rad/s^2]."""
+
+    stops: tuple[float, ...]
+    rate: float
+    acceleration: float
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return sum(2 * ramp + coast for _, _, ramp, coast in self._moves())
+
+    def path(self, seconds: Floats) -> Floats:
+        """(n,) elevation from where it begins, rad; at the last stop afterwards."""
+        found, begin = np.zeros(len(seconds)), 0.0
+        for start, way, ramp, coast in self._moves():
+            u, v = np.clip(seconds - begin, 0.0, 2 * ramp + coast), self.acceleration * ramp
+            up, down = np.minimum(u, ramp), np.maximum(u - ramp - coast, 0.0)
+            gone = self.acceleration * up**2 / 2 + v * np.clip(u - ramp, 0.0, coast) + v * down - self.acceleration * down**2 / 2
+            found = np.where(seconds >= begin, start + way * gone, found)
+            begin += 2 * ramp + coast
+        return found
+
+    def _moves(self) -> list[tuple[float, float, float, float]]:
+        """(from, direction, time of acceleration, time at constant speed) of each move."""
+        moves, at = [], 0.0
+        for stop in self.stops:
+            far = abs(stop - at)
+            ramp = min(self.rate / self.acceleration, math.sqrt(far / self.acceleration))
+            coast = max(far / self.rate - ramp, 0.0) if ramp * self.acceleration >= self.rate * (1 - 1e-12) else 0.0
+            moves.append((at, math.copysign(1.0, stop - at), ramp, coast))
+            at = stop
+        return moves

@@ -1,0 +1,262 @@
+"""Schedules: azimuths and times of their rows, turnarounds, boresight rotation, nods, what is wrong with files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zonda
+import zonda.testing
+from zonda.core.configuration.diagnostics import ConfigurationError
+from zonda.core.configuration.pipeline_file import parse
+from zonda.core.data import Data
+from zonda.core.errors import InputError, PointingError
+from zonda.core.flags import IRREGULAR, TURNAROUND
+from zonda.core.intervals import samples_in
+from zonda.core.numerics.quaternions import conjugate, from_angles, multiply
+from zonda.core.scene import Scene
+from zonda.operators.pointing.constant_elevation import Nod, Sweep
+from zonda.operators.pointing.schedule import PointingSchedule
+from zonda.operators.pointing.schedule_files import read_schedule
+
+ROWS = [
+    ("2025-03-01T06:00:00+00:00", "2025-03-01T06:02:00+00:00", 0.0, "patch", 120.0, 150.0, 50.0, 0, 0),
+    ("2025-03-01T06:02:47+00:00", "2025-03-01T06:04:00+00:00", 45.0, "patch", 345.0, 15.0, 55.0, 0, 1),
+]
+HEAD = """# %ECSV 1.0
+# ---
+# datatype:
+# - {name: start_time, datatype: string}
+# - {name: stop_time, datatype: string}
+# - {name: boresight_angle, unit: deg, datatype: float64}
+# - {name: name, datatype: string}
+# - {name: azmin, unit: deg, datatype: float64}
+# - {name: azmax, unit: deg, datatype: float64}
+# - {name: el, unit: deg, datatype: float64}
+# - {name: scan_index, datatype: int64}
+# - {name: subscan_index, datatype: int64}
+# meta: !!omap
+# - {site_name: atacama}
+# - site_lat: !astropy.units.Quantity
+#     unit: &id001 !astropy.units.Unit {unit: deg}
+#     value: -22.96
+# schema: astropy-2.0
+start_time stop_time boresight_angle name azmin azmax el scan_index subscan_index
+"""
+SITE_LINE = "# Site | Telescope | Latitude [deg] | Longitude [deg] | Elevation [m]\natacama | LAT | -22.960 | -67.790 | 5200.0\n"
+FAST = {"speed": "1.2 deg/s", "acceleration": "0.8 deg/s2", "sample_rate": "40 Hz", "check_limits": "warn"}
+SITE = {"name": "a", "latitude": "-22.96 deg", "longitude": "-67.79 deg", "altitude": "5200 m"}
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*samples per FWHM")
+
+
+def version_5(path, rows=ROWS):
+    path.write_text(HEAD + "\n".join(" ".join(map(str, row)) for row in rows) + "\n")
+    return path
+
+
+def version_4(path, bar=" | "):
+    rows = [bar.join([r[0][:19].replace("T", " "), r[1][:19].replace("T", " "), *map(str, r[2:])]) for r in ROWS]
+    path.write_text(SITE_LINE + "\n".join(rows) + "\n")
+    return path
+
+
+def scans(path, **more):
+    data = Data(Scene(site=SITE, instrument="act_150ghz", time="2025-03-01T06:00", seed=1))
+    PointingSchedule(schedule=path, **{**FAST, **more}).observe(data)
+    return data.observations
+
+
+def test_both_versions_are_the_same(tmp_path):
+    five, four = read_schedule(version_5(tmp_path / "a.ecsv")), read_schedule(version_4(tmp_path / "a.txt"))
+    assert five == four
+    assert [row.label for row in five] == ["patch-0-0", "patch-0-1"]
+    assert five[1].azimuth == (pytest.approx(np.radians(345)), pytest.approx(np.radians(375)))
+    assert five[0].duration == 120
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_turnarounds_are_continuous_and_as_fast_as_asked_for(smooth):
+    """Position and speed are continuous; the largest acceleration is the one that is given; the reach beyond is `beyond`."""
+    sweep = Sweep(0.5, 0.03, 0.02, smooth)
+    t = np.arange(0, 2.2 * (sweep.leg + sweep.turnaround), 1e-3)
+    x = sweep.path(t)
+    v, a = np.diff(x) / 1e-3, np.diff(x, 2) / 1e-6
+    assert np.abs(a).max() == pytest.approx(0.02, rel=1e-4)
+    assert np.abs(v).max() == pytest.approx(0.03, rel=1e-9)
+    np.testing.assert_allclose(np.abs(v[~sweep.turning(t[:-1]) & ~sweep.turning(t[1:])]), 0.03, rtol=1e-9)
+    assert x.max() - 0.5 == pytest.approx(sweep.beyond, rel=1e-5)
+    assert -x.min() == pytest.approx(sweep.beyond, rel=1e-5)
+
+
+def test_rows_are_scanned_between_their_limits(tmp_path):
+    """Times from the start, azimuths of the mount, constant speed on the sky, 345 to 15 deg through north."""
+    one, two = scans(version_5(tmp_path / "a.ecsv"), turnaround="constant_acceleration")
+    assert str(one.start) == "2025-03-01T06:00:00Z"
+    assert str(two.start) == "2025-03-01T06:02:47Z"
+    assert (one.n_samples, two.n_samples) == (4800, 2920)
+    for o, (low, high), elevation in ((one, (120, 150), 50), (two, (345, 375), 55)):
+        azimuth = np.degrees(np.unwrap(o.azimuth))
+        rate = 1.2 / np.cos(np.radians(elevation))
+        inside = samples_in(o.intervals["scanning"], o.seconds)
+        assert azimuth[0] == pytest.approx(low, abs=1e-9)
+        assert azimuth[inside].min() >= low - 1e-9
+        assert azimuth[inside].max() <= high + 1e-9
+        beyond = rate**2 / (2 * 0.8)
+        assert azimuth.max() == pytest.approx(high + beyond, abs=1e-3)
+        speed = np.diff(azimuth) * 40
+        moving = inside[1:] & inside[:-1]
+        np.testing.assert_allclose(np.abs(speed[moving]), rate, rtol=1e-6)
+        np.testing.assert_allclose(np.degrees(o.elevation), elevation, atol=1e-9)
+        np.testing.assert_array_equal(o.flags == TURNAROUND, ~inside)
+
+
+def test_intervals_of_either_direction(tmp_path):
+    one, _ = scans(version_5(tmp_path / "a.ecsv"))
+    right = np.diff(np.unwrap(one.azimuth)) > 0
+    for name, going in (("scan_leftright", True), ("scan_rightleft", False)):
+        inside = samples_in(one.intervals[name], one.seconds)
+        assert (right[inside[1:] & inside[:-1]] == going).all()
+    throw = samples_in(one.intervals["throw"], one.seconds)
+    assert throw.all()
+
+
+def test_the_focal_plane_is_turned_about_the_boresight(tmp_path):
+    """TOAST's bore_azel = q(az, el) Rz(angle); celestial ones likewise, and the direction stays."""
+    turned, plain = (
+        scans(version_5(tmp_path / "a.ecsv"))[1],
+        scans(version_5(tmp_path / "b.ecsv", [ROWS[0], (*ROWS[1][:2], 0.0, *ROWS[1][3:])]))[1],
+    )
+    about = np.array([0, 0, np.sin(np.pi / 8), np.cos(np.pi / 8)])
+    np.testing.assert_allclose(
+        multiply(conjugate(plain.boresight_azel), turned.boresight_azel), np.tile(about, (2920, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        multiply(conjugate(plain.boresight_radec), turned.boresight_radec), np.tile(about, (2920, 1)), atol=1e-12
+    )
+    upright = from_angles(-turned.azimuth, turned.elevation)
+    same = np.abs((upright * plain.boresight_azel).sum(axis=1))
+    np.testing.assert_allclose(same, 1, atol=1e-12)
+
+
+def test_nods_come_before_the_scan(tmp_path):
+    nods = {"elevation_nods": ["1 deg", "-1 deg", "0 deg"], "elevation_speed": "0.5 deg/s", "elevation_acceleration": "1 deg/s2"}
+    one, _ = scans(version_5(tmp_path / "a.ecsv"), **nods)
+    # from rest to rest over d at most v: d / v + v / a
+    ahead = int((2.5 + 4.5 + 2.5) * 40)
+    assert one.n_samples == 4800 + ahead
+    assert one.start.seconds_since(scans(tmp_path / "a.ecsv")[0].start) == pytest.approx(-ahead / 40)
+    elevation = np.degrees(one.elevation)
+    np.testing.assert_array_equal(one.flags[:ahead], IRREGULAR)
+    assert not (one.flags[ahead:] & IRREGULAR).any()
+    np.testing.assert_allclose(elevation[ahead:], 50, atol=1e-9)
+    assert elevation[:ahead].max() == pytest.approx(51, abs=1e-6)
+    assert elevation[:ahead].min() == pytest.approx(49, abs=1e-6)
+    assert np.abs(np.diff(elevation)).max() * 40 <= 0.5 * (1 + 1e-9)
+    assert samples_in(one.intervals["elnod"], one.seconds)[: ahead - 1].all()
+    assert not samples_in(one.intervals["scanning"], one.seconds)[:ahead].any()
+
+
+def test_a_nod_that_never_reaches_its_speed():
+    nod = Nod((0.01,), 1.0, 0.04)
+    assert nod.duration == pytest.approx(1.0)  # 2 sqrt(d / a)
+    t = np.linspace(0, 1.2, 25)
+    np.testing.assert_allclose(nod.path(t)[t >= 1], 0.01, rtol=1e-12)
+    assert nod.path(np.array([0.5]))[0] == pytest.approx(0.005)
+
+
+def test_it_keeps_the_contract(tmp_path):
+    rows = [("2024-11-25T07:00:00", "2024-11-25T07:01:00", 10.0, "patch", 120.0, 124.0, 50.0, 0, 0)]
+    zonda.testing.check_operator(PointingSchedule(schedule=version_5(tmp_path / "a.ecsv", rows), speed="0.2 deg/s"))
+
+
+def change(number, **values):
+    names = ["start_time", "stop_time", "boresight_angle", "name", "azmin", "azmax", "el", "scan_index", "subscan_index"]
+    rows = [list(row) for row in ROWS]
+    for name, value in values.items():
+        rows[number][names.index(name)] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("rows", "match"),
+    [
+        (change(1, stop_time=ROWS[1][0]), r"row 2 \(patch-0-1\): stop_time is not later than start_time"),
+        (change(0, el=91.0), "el is 91 deg, not between 0 and 90 deg"),
+        (change(0, azmax=600.0), "more than a turn apart"),
+        (change(0, azmin="nan"), "azmin of row 1 is 'nan', not a finite number"),
+        (change(0, start_time="yesterday"), "start_time of row 1: cannot read 'yesterday' as a time"),
+        ([], "has no rows"),
+    ],
+)
+def test_bad_rows(tmp_path, rows, match):
+    with pytest.raises(InputError, match=match) as caught:
+        read_schedule(version_5(tmp_path / "bad.ecsv", rows))
+    assert "bad.ecsv" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "hello\n", SITE_LINE, SITE_LINE + "2025 | 2026 | 0\n"])
+def test_files_that_are_no_schedule(tmp_path, text):
+    path = tmp_path / "bad.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"is no schedule|fields, not 9"):
+        read_schedule(path)
+
+
+def test_an_elevation_that_the_telescope_cannot_reach(tmp_path):
+    with pytest.raises(PointingError, match=r"goes to elevation 2.00 deg; .* reaches"):
+        scans(version_5(tmp_path / "a.ecsv", change(0, el=2.0)))
+
+
+FILE = """\
+site: atacama
+instrument: {{like: act_150ghz, detectors: 7}}
+time: 2025-03-01T06:00
+seed: 1
+operators:
+  - {pointing}
+  - WhiteNoise
+  - Efficiency
+  - BinMap: {{pixel: 6 arcmin}}
+  - SaveMap
+campaign: {{schedule: a.ecsv, engine: serial}}
+"""
+
+
+def test_the_schedule_of_a_campaign_is_that_of_its_pointing_step(tmp_path):
+    path = version_5(tmp_path / "a.ecsv")
+    file = parse(FILE.format(pointing="PointingSchedule: {speed: 1.2 deg/s}"), folder=tmp_path)
+    assert file.operators[0].schedule == path
+    again = parse(file.resolved_yaml(tmp_path), folder=tmp_path)
+    assert again.operators[0] == file.operators[0]
+    with pytest.raises(ConfigurationError, match="no step takes the schedule"):
+        parse(FILE.format(pointing="PointingStare"), folder=tmp_path)
+    with pytest.raises(ConfigurationError, match=r"no such file: .none\.ecsv"):
+        parse(FILE.format(pointing="PointingSchedule").replace("a.ecsv", "none.ecsv"), folder=tmp_path)
+
+
+def test_check_says_where_sun_and_moon_are(tmp_path):
+    """Against astropy's positions of the Sun and the Moon at the first sample, to the 0.1 deg that is printed."""
+    import astropy.units as u
+    from astropy.coordinates import AltAz, EarthLocation, get_body
+    from astropy.time import Time
+    from astropy.utils import iers
+
+    step = PointingSchedule(schedule=version_5(tmp_path / "a.ecsv", [ROWS[0]]), **FAST)
+    data = Data(Scene(site=SITE, instrument="act_150ghz", time="2025-03-01T06:00", seed=1))
+    lines = step.check(data)
+    assert lines[0].startswith("1 scan from 2025-03-01T06:00:00Z to 2025-03-01T06:02:00")
+    found = {line.split()[3].rstrip(":"): line for line in lines if line.startswith("distance of the")}
+    place = EarthLocation.from_geodetic(-67.79 * u.deg, -22.96 * u.deg, 5200 * u.m)
+    o = data.observations[0]
+    with iers.conf.set_temp("auto_download", False):
+        when = Time(o.start.posix + o.seconds[[0, -1]], format="unix")
+        frame = AltAz(obstime=when, location=place)
+        for body in ("sun", "moon"):
+            there = get_body(body, when, place).transform_to(frame)
+            look = AltAz(az=o.azimuth[[0, -1]] * u.rad, alt=o.elevation[[0, -1]] * u.rad, obstime=when, location=place)
+            apart = there.separation(look).deg
+            low, high = (float(x) for x in (found[body.title()].split()[4], found[body.title()].split()[6]))
+            assert low - 0.06 <= apart.min()
+            assert apart.max() <= high + 0.06
+    assert "below the horizon" in found["Sun"]
