@@ -1,0 +1,154 @@
+"""Scans of an observing schedule: what a pointing step knows of them, and the observation of each row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import Field
+
+from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed, Fraction, Hertz
+from zonda.core.errors import PointingError
+from zonda.core.flags import IRREGULAR, TURNAROUND
+from zonda.core.intervals import runs
+from zonda.core.numerics.celestial import CelestialTransform
+from zonda.core.numerics.quaternions import multiply
+from zonda.core.numerics.sphere import angles, unit_vectors
+from zonda.core.operator import Operator
+from zonda.core.types import Floats
+
+from .constant_elevation import Nod, Sweep
+from .limits import LargestMotion, excess
+from .motion import POINTS, motion
+from .observed import Samples, observed
+from .schedule_files import Row
+
+if TYPE_CHECKING:
+    from zonda.core.data import Data, Observation
+    from zonda.core.instrument import Telescope
+
+Track = Callable[[Floats], Floats]
+"""Directions (n, 3) at seconds (n,)."""
+
+
+class ScheduleParameters(Operator):
+    """What all scans of a schedule have in common."""
+
+    schedule: InputPath
+    """Version 5 (ECSV) or version 4 (text) of TOAST's schedules."""
+    speed: AngularSpeed = quantity("1 deg/s", gt=0)
+    """Constant speed on the sky between the limits."""
+    acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)
+    """Acceleration of the mount's azimuth in turnarounds (the largest, where they are smooth)."""
+    turnaround: Literal["smooth", "constant_acceleration"] = "smooth"
+    """Continuous acceleration (4 speed / acceleration long), or a constant one as in TOAST (half as long)."""
+    flag_turnarounds: bool = True
+    """Flag the samples in turnarounds, so that no map uses them."""
+    elevation_nods: list[Angle] = Field(default_factory=list, max_length=100)
+    """Offsets in elevation to which the telescope goes in turn before each scan, e.g. [1 deg, -1 deg, 0 deg]; flagged
+    irregular."""
+    elevation_speed: AngularSpeed = quantity("1 deg/s", gt=0)
+    """Largest speed of nods."""
+    elevation_acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)
+    """Acceleration of nods."""
+    sample_rate: Hertz | None = Field(None, gt=0, le=1e6)
+    """Read-out rate; the instrument's where absent."""
+    check_limits: Literal["error", "warn"] = "error"
+    """Whether a scan beyond the telescope's largest speed, acceleration or jerk is an error, or a warning."""
+    interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
+    """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
+
+
+def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: LargestMotion) -> Observation:
+    """The observation of a row, sampled at ``rate`` [Hz]."""
+    scene, place = data.scene, f"{step.label}, {step.schedule}, {row.label}"
+    mount = step.speed / math.cos(row.elevation)
+    sweep = Sweep(row.azimuth[1] - row.azimuth[0], mount, step.acceleration, step.turnaround == "smooth")
+    nod = Nod(tuple(step.elevation_nods), step.elevation_speed, step.elevation_acceleration)
+    ahead = int(nod.duration * rate)
+    seconds = np.arange(ahead + max(int(row.duration * rate * (1 + 1e-12)), 1)) / rate
+    delay = ahead / rate
+    start = row.start.shifted(-delay)
+
+    def track(at: Floats) -> Floats:
+        azimuth = row.azimuth[0] + np.where(at >= delay, sweep.path(np.maximum(at - delay, 0.0)), 0.0)
+        elevation = row.elevation + np.where(at < delay, nod.path(at), 0.0)
+        return unit_vectors(-azimuth, elevation)
+
+    horizontal = track(seconds)
+    _check_elevation(horizontal, scene.instrument.telescope, place)
+    beam = float(scene.instrument.focalplane().fwhm.min())
+    transform = CelestialTransform(scene.site, start, seconds[-1], step.interpolation_error * beam)
+    _, azel, radec = transform.boresight(horizontal, seconds)
+    boresight = (_turned(azel, row.rotation), _turned(radec, row.rotation))
+    scanning = seconds >= delay
+    intervals = sweep.intervals(seconds - delay, scanning)
+    intervals = {name: [(a + delay, b + delay) for a, b in spans] for name, spans in intervals.items()}
+    flags = np.where(scanning, 0, IRREGULAR).astype(np.uint8)
+    if ahead:
+        intervals["elnod"] = runs(~scanning, seconds)
+    turning = sweep.turning(seconds - delay) & scanning
+    if step.flag_turnarounds:
+        flags |= np.where(turning, TURNAROUND, 0).astype(np.uint8)
+    centre = _centre(data, row, transform, delay)
+    samples = Samples(seconds, rate, boresight, flags, intervals)
+    observation = observed(step.label, scene, len(data.observations), transform, centre, samples)
+    _check_motion(step, observation, track, place, moved)
+    observation.tally.state(step.label, f"{observation.name}: row of the schedule", row.label)
+    what = "samples in turnarounds" + (", flagged" if step.flag_turnarounds else ", used")
+    observation.tally.count(step.label, what, int(turning.sum()), len(seconds))
+    if ahead:
+        observation.tally.count(step.label, "samples in elevation nods, flagged", ahead, len(seconds))
+    return observation
+
+
+def _centre(data: Data, row: Row, transform: CelestialTransform, delay: float) -> tuple[float, float]:
+    """ICRS (ra, dec) of the scene's target; of the middle of the scan where it has none, or one fixed on the ground."""
+    target = data.scene.target
+    if target is not None and target.frame != "horizontal":
+        return target.icrs()
+    middle = unit_vectors([-sum(row.azimuth) / 2], [row.elevation])
+    ra, dec = angles(transform.icrs(middle, np.array([delay + row.duration / 2]))[0])
+    return float(ra % (2 * math.pi)), float(dec)
+
+
+def _check_elevation(horizontal: Floats, telescope: Telescope, place: str) -> None:
+    """Refuse directions (n, 3) that the telescope cannot reach."""
+    low, high = telescope.elevation_min, telescope.elevation_max
+    _, elevation = angles(horizontal[[horizontal[:, 2].argmin(), horizontal[:, 2].argmax()]])
+    if elevation.min() < low - 1e-9 or elevation.max() > high + 1e-9:
+        worst = elevation.min() if elevation.min() < low - 1e-9 else elevation.max()
+        raise PointingError(
+            f"the scan goes to elevation {np.degrees(worst):.2f} deg; {telescope.name} reaches "
+            f"{np.degrees(low):g} deg to {np.degrees(high):g} deg",
+            place=place,
+            cure="change the row of the schedule, the elevation_nods, or the telescope's limits",
+        )
+
+
+def _check_motion(step: ScheduleParameters, observation: Observation, track: Track, place: str, moved: LargestMotion) -> None:
+    """Compare the track with the telescope's limits."""
+    length = observation.n_samples / observation.sample_rate
+    coarse = min(observation.sample_rate, POINTS / length)
+
+    def at(step: float) -> Floats:
+        return track(np.arange(max(round(length / step), 1), dtype=np.float64) * step)
+
+    found = motion(at(1 / coarse), coarse, moved.limits, at)
+    over = excess(found, moved.limits)
+    if over and step.check_limits == "error":
+        cure = "lower speed or acceleration, or set check_limits: warn"
+        raise PointingError(moved.too_fast(next(iter(over)), found), place=place, cure=cure)
+    moved.add(observation.name, found)
+
+
+def _turned(quaternions: Floats, angle: float) -> Floats:
+    """Boresights (n, 4) with the focal plane turned about them."""
+    if angle == 0:
+        return quaternions
+    about = np.array([[0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)]])
+    return multiply(quaternions, about)
