@@ -61,6 +61,8 @@ class Observation:
         Hz; of the comb that comes nearest to ``seconds``.
     boresight_azel, boresight_radec
         (n_samp, 4) float64 quaternions (x, y, z, w), exactly TOAST's: Rz(lon) Ry(pi/2 - lat) Rz(psi), lon = -az for azel.
+    pointed_radec
+        (n_samp, 4) where the boresight in fact is on the sky, where a step makes that differ from what is recorded; else None.
     centre
         ICRS (ra, dec) [rad] of the scan's target without its per-scan offset: the default map centre.
     flags, detector_flags
@@ -130,6 +132,7 @@ class Observation:
     unfiltered: frozenset[str] = frozenset()
     windows: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     hwp_angle: NDArray[np.float64] | None = None
+    pointed_radec: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if not self.flags.size:
@@ -188,6 +191,11 @@ class Observation:
         """`seconds` at sample numbers, which go on at `sample_rate` beyond the ends of the scan."""
         inside = np.clip(index, 0, self.n_samples - 1)
         return np.asarray(self.seconds[inside] + (index - inside) / self.sample_rate, np.float64)
+
+    @property
+    def sky_boresight(self) -> NDArray[np.float64]:
+        """(n_samp, 4) as `boresight_radec`: where the telescope in fact looks on the sky."""
+        return self.boresight_radec if self.pointed_radec is None else self.pointed_radec
 
     def key(self, *names: str | int) -> NDArray[np.uint32]:
         """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""

@@ -19,6 +19,7 @@ from zonda.core.plan.estimate import Cost, Effect, Estimate, full, not_simulated
 from zonda.core.plan.planning import Planning
 
 from .base import Pointing
+from .error import PointingError
 from .limits import LargestMotion
 from .recorded import PointingRecorded
 from .samples_per_beam import SamplesPerBeam
@@ -90,6 +91,24 @@ class SchedulePlanning(PointingPlanning):
     """As of other pointing steps."""
 
     of: ClassVar[type[Operator]] = PointingSchedule
+
+
+class ErrorPlanning(Planning[PointingError]):
+    """It has no coarser form."""
+
+    of: ClassVar[type[Operator]] = PointingError
+
+    def memory(self, observation: Observation) -> int:
+        """The true boresight, and what it is made from."""
+        return 100 * observation.n_samples
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size by the shift of the beam, three standard deviations."""
+        step, fwhm = self.operator, float(context.first.focalplane.fwhm.min())
+        delta = math.hypot(*step.offset) + 3 * math.hypot(step.scan_rms, step.jitter_rms)
+        size = context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
+        text = "1.43 / FWHM x (offset + 3 rms)"
+        return Estimate((Effect("pointing error", (full("exact"),), size, text),), Cost(fixed=0.001, per_time=1.5e-7))
 
 
 def _bend(context: Context) -> float:

@@ -84,7 +84,7 @@ class Grid:
         rays = np.column_stack([corners, np.ones(5)]) @ np.linalg.inv(pixel_matrix(self.wcs)).T
         *rim, centre = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         radius = float(angle_between(np.array(rim), centre).max())
-        boresight = observation.boresight_radec
+        boresight = observation.sky_boresight
         cosine = max(float((centre @ boresights(boresight[chunk])).max()) for chunk in chunks(observation.n_samples))
         nearest = float(np.arccos(np.clip(cosine, -1, 1))) - float(np.arctan(observation.focalplane.radius))
         return bool(nearest <= radius + REACH * SIGMA * widest)

@@ -12,10 +12,12 @@ from zonda.core.knobs import Knob
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full, not_simulated
 from zonda.core.plan.planning import Planning
+from zonda.core.types import Floats
 
 from .brightness import conversion
 from .convolved import beam_widths, brightness_on, grid_of
 from .grid import Grid
+from .point_sources import Catalogue, PointSources, Sources
 from .resample import extremes
 from .skymap import SkyMap
 
@@ -129,3 +131,40 @@ class SkyPlanning(Planning[SkyMap]):
         bound = context.sky_error(LINEAR / n**2)
         choices.append(Choice("coarse", "linear", {"interpolation": "linear"}, bound=bound, formula=text, seconds=saved))
         return Effect("sampling order", tuple(choices), bound, text)
+
+
+class SourcesPlanning(Planning[PointSources]):
+    """Exact but for the beam, which is one for the band."""
+
+    of = PointSources
+
+    def traits(self, observation: Observation) -> Traits:
+        """Brightness of the brightest source in the smallest beam."""
+        power, _ = self._seen(observation)
+        area = math.pi * float(observation.focalplane.fwhm.min()) ** 2 / (4 * math.log(2))
+        return Traits(peak=float(np.abs(power).max(initial=0.0)) / area)
+
+    def memory(self, observation: Observation) -> int:
+        """The catalogue, and lists of what is in view."""
+        _, entries = self._seen(observation)
+        return 8 * entries + 200 * observation.n_detectors + 100 * self._catalogue_size()
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost: sources in view, for every detector and sample."""
+        o = context.first
+        _, entries = self._seen(o)
+        in_view = entries / max(-(-o.n_samples // 256), 1)
+        cost = Cost(fixed=0.01, per_time=1e-7, per_sample=0.5e-9 + 2e-9 * in_view)
+        effect = not_simulated("beam chromaticity", "one beam for the band", context.sky_error(chromaticity(o.instrument.band)),
+                               "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak")  # fmt: skip
+        return Estimate((effect,), cost)
+
+    def _catalogue_size(self) -> int:
+        return len(Catalogue.read(self.operator).flux)
+
+    def _seen(self, observation: Observation) -> tuple[Floats, int]:
+        """Power of the sources that come into view, K_RJ sr; and how long the lists of them are."""
+        catalogue = Catalogue.read(self.operator)
+        power = catalogue.brightness(observation.instrument.band, self.operator.scale)
+        found = Sources.of(catalogue, power, observation)
+        return power[np.unique(found.number)], len(found.number)

@@ -114,7 +114,7 @@ def region(observation: Observation, step: float, reach: float, disc: Disc | Non
 
 def _on_plane(observation: Observation, axes: Floats, disc: Disc | None, around: float) -> Any:
     """Chunks of (x, y, theta) [tan rad west, tan rad north, rad] of the boresight where it comes ``around`` the map."""
-    boresight = observation.boresight_radec
+    boresight = observation.sky_boresight
     for chunk in chunks(observation.n_samples):
         d = boresights(boresight[chunk])
         if disc is not None:

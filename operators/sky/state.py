@@ -129,7 +129,7 @@ class SkyState:
         xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
         beyond = behind = 0
         if not self.beams:
-            beyond, behind = out.size, self.grid.behind(block.observation.boresight_radec[block.samples], xi, eta)
+            beyond, behind = out.size, self.grid.behind(block.observation.sky_boresight[block.samples], xi, eta)
         kernel = add_lines if linear else add_splines
         for number, beam in enumerate(self.beams):
             rows = np.flatnonzero(index == number)
@@ -163,7 +163,7 @@ class SkyState:
         """`pointing` of a block for a beam, which blocks of other detectors share."""
 
         def make() -> _Held:
-            quaternions = np.ascontiguousarray(block.observation.boresight_radec[block.samples], np.float64)
+            quaternions = np.ascontiguousarray(block.observation.sky_boresight[block.samples], np.float64)
             beam = self.beams[number]
             shape = beam.convolved.coefficients["float64"].shape
             return _Held(pointing(quaternions, beam.matrix, shape, beam.convolved.bounds, kind))

@@ -87,6 +87,8 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, minute in (("night", "00"), ("later", "05")):
         row = f"2024-11-25 07:{minute}:00 | 2024-11-25 07:{minute}:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
         (folder / f"{name}.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
+    for name, flux in (("sources", 1.0), ("others", 2.0)):
+        (folder / f"{name}.csv").write_text(f"ra [deg],dec [deg],flux [Jy],spectral_index\n75,20,{flux},-0.7\n")
     a, b, *_ = instrument().focalplane().names
     (folder / "shares.csv").write_text(f"detector,source,share\n{a},{b},0.01\n")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
@@ -213,6 +215,17 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "angles": ({}, {"angles": "cross_hatch"}),
         "axes": ({}, {"axes": "horizontal"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
+    },
+    "PointingError": {
+        "offset": ({}, {"offset": ["5 arcsec", "0 arcsec"]}),
+        "scan_rms": ({}, {"scan_rms": "5 arcsec"}),
+        "jitter_rms": ({}, {"jitter_rms": "5 arcsec"}),
+        "jitter_time": ({"jitter_rms": "5 arcsec"}, {"jitter_time": "2 s"}),
+    },
+    "PointSources": {
+        "catalogue": ({}, {"catalogue": "others.csv"}),
+        "frequency": ({"catalogue": "sources.csv"}, {"frequency": "30 GHz"}),
+        "scale": ({}, {"scale": 2.0}),
     },
     "PointingSchedule": {
         "schedule": ({}, {"schedule": "later.txt"}),
@@ -450,6 +463,8 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
 CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
+    "PointSources": ["PointSources"],
+    "PointingError": ["PointingDaisy", "PointingError", "SkyMap"],
     "AtmosphereLayers": ["AtmosphereLayers"],
     "AtmosphereScreens": ["AtmosphereLayers", "AtmosphereScreens"],
     "WhiteNoise": ["WhiteNoise"],
@@ -494,6 +509,7 @@ CHAINS = {
 }
 DEFAULTS: dict[str, dict[str, Any]] = {
     "SkyMap": {"file": "map.fits"},
+    "PointSources": {"catalogue": "sources.csv"},
     "AtmosphereLayers": {"pwv": "7.7 mm"},
     "WhiteNoise": {},
     "BinMap": {"pixel": "4 arcsec"},
@@ -518,11 +534,13 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 
     def step(other: str) -> Any:
         values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
-        values = values | {key: maps / values[key] for key in ("file", "schedule") if values.get(key) is not None}
+        values = values | {key: maps / values[key] for key in ("file", "schedule", "catalogue") if values.get(key) is not None}
         if which == "BinMap" == other and "nside" in values:
             values.pop("pixel", None)
         return make(other, **values)
 
+    if which == "PointingError":  # stands behind a pointing step
+        return [step(other) for other in CHAINS[which]]
     pointing = which if which.startswith("Pointing") else "PointingDaisy"
     return [step(pointing), *(step(other) for other in CHAINS.get(which, []))]
 

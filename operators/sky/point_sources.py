@@ -1,0 +1,174 @@
+"""Point sources of a catalogue, seen through each detector's Gaussian beam.
+
+A source of flux S at the angle theta from where a detector of FWHM w looks gives
+
+    T = S <c^2 (nu / nu_0)^alpha / (2 k nu^2)> / Omega exp(-4 ln 2 theta^2 / w^2),   Omega = pi w^2 / (4 ln 2),        (1)
+
+averaged over the band (equation (1) of `core.numerics.radiation`). No grid lies between catalogue and samples: the flux in a map
+is the source's within the share of the beam beyond `REACH` standard deviations, 2e-8.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from zonda.core.block import Block
+from zonda.core.compilation.jit import nb
+from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.units import Hertz
+from zonda.core.errors import InputError
+from zonda.core.instrument import Band
+from zonda.core.numerics.projection import boresights, rotation_matrices
+from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.numerics.sphere import unit_vectors
+from zonda.core.observation import Observation
+from zonda.core.operator import Operator
+from zonda.core.storage.ecsv import read_table
+from zonda.core.types import Floats
+
+REACH = 6.0
+"""Standard deviations of the beam beyond which a source is not seen."""
+
+PIECE = 256
+"""Samples for which the sources in view are found together."""
+
+
+class PointSources(Operator):
+    """Point sources of a catalogue above the atmosphere (K_RJ), equation (1): part of the component ``sky``.
+
+    The catalogue is a table (ECSV or CSV) with the columns `ra` and `dec` (ICRS) and `flux`, with units, and where it has them
+    `spectral_index` (S ~ frequency^index; otherwise 0) and `frequency` (of the flux).
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+
+    catalogue: InputPath
+    """Table of the sources."""
+    frequency: Hertz | None = Field(None, gt=0)
+    """Frequency of the fluxes, where the catalogue has no column of it. Default: the band's centre."""
+    scale: float = Field(1.0, ge=-1e30, le=1e30)
+    """Factor on all fluxes."""
+
+    def prepare(self, observation: Observation) -> Sources:
+        """The sources with their brightness, and which of them are in view when."""
+        catalogue = Catalogue.read(self)
+        found = Sources.of(catalogue, catalogue.brightness(observation.instrument.band, self.scale), observation)
+        observation.tally.state(self.label, f"{observation.name}: sources", f"{found.in_view} of {len(catalogue.flux)} in view")
+        return found
+
+    def exec(self, block: Block, state: Sources) -> None:
+        """Add the sources to ``sky``."""
+        stream, at = block.new("sky"), block.detectors
+        matrices = rotation_matrices(np.asarray(block.observation.sky_boresight[block.samples], np.float64))
+        beams = state.rays[at], state.width[at], state.per_area[at]
+        _add_sources(matrices, block.samples.start, *beams, state.towards, state.power, state.first, state.number, stream)
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """Sources: directions (n, 3), fluxes [Jy] at `frequency` [Hz] (NaN: the band's centre), spectral indices; each (n,)."""
+
+    directions: Floats
+    flux: Floats
+    index: Floats
+    frequency: Floats
+
+    @classmethod
+    def read(cls, step: PointSources) -> Catalogue:
+        """Raises InputError for a table without the columns, or with a declination that there is not."""
+        table = read_table(step.catalogue)
+        ra, dec, flux = table.numbers("ra", "rad"), table.numbers("dec", "rad"), table.numbers("flux", "Jy")
+        if (np.abs(dec) > np.pi / 2 + 1e-12).any():
+            row = int(np.argmax(np.abs(dec) > np.pi / 2)) + 1
+            raise InputError(f"dec of row {row} is {np.degrees(dec[row - 1]):g} deg", place=table.place, cure="mend that row")
+        index = table.numbers("spectral_index") if "spectral_index" in table.columns else np.zeros(len(flux))
+        if "frequency" in table.columns:
+            if step.frequency is not None:
+                raise InputError(
+                    "has a column frequency", place=table.place, cure=f"remove {step.label}.frequency, or the column"
+                )
+            frequency = table.numbers("frequency", "Hz")
+        else:
+            frequency = np.full(len(flux), math.nan if step.frequency is None else step.frequency)
+        return cls(unit_vectors(ra, dec), flux, index, frequency)
+
+    def brightness(self, band: Band, scale: float) -> Floats:
+        """(n,) S <...> of equation (1), K_RJ sr."""
+        at_centre = np.where(np.isnan(self.frequency), 1.0, band.centre / self.frequency) ** self.index
+        factors = {alpha: to_kelvin_rj("Jy/beam", band, None, alpha, 1.0) for alpha in np.unique(self.index).tolist()}
+        return np.asarray(scale * self.flux * at_centre * np.array([factors[alpha] for alpha in self.index.tolist()]))
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What `exec` needs for one scan.
+
+    Attributes
+    ----------
+    rays, width, per_area
+        Of the detectors: (n_det, 3) unit vectors in the boresight's frame, (n_det,) 4 ln 2 / w^2, (n_det,) 1 / Omega.
+    towards, power
+        Of the sources: (n, 3) ICRS, (n,) K_RJ sr.
+    first, number
+        (n_piece + 1,) where the list of sources of each `PIECE` begins, and the lists.
+    """
+
+    rays: Floats
+    width: Floats
+    per_area: Floats
+    towards: Floats
+    power: Floats
+    first: NDArray[np.int64]
+    number: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, catalogue: Catalogue, power: Floats, observation: Observation) -> Sources:
+        """Those that come into the field, widened by the beam."""
+        plane, n = observation.focalplane, observation.n_samples
+        rays = np.stack([-plane.eta, -plane.xi, np.ones(len(plane))], axis=1)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        widest = float(plane.fwhm.max(initial=0.0))
+        field = math.atan(plane.radius) + REACH * widest / math.sqrt(8 * math.log(2))
+        lists, first = [np.zeros(0, np.int64)], [0]
+        for begin in range(0, n, PIECE):
+            looks = boresights(observation.sky_boresight[begin : begin + PIECE])
+            middle = looks[:, looks.shape[1] // 2]
+            reach = float(np.arccos(np.clip(middle @ looks, -1, 1)).max()) + field + 1e-9
+            lists.append(np.flatnonzero(catalogue.directions @ middle >= math.cos(min(reach, math.pi))))
+            first.append(first[-1] + len(lists[-1]))
+        area = np.pi * plane.fwhm**2 / (4 * math.log(2))
+        lines = 4 * math.log(2) / plane.fwhm**2
+        return cls(rays, lines, 1 / area, catalogue.directions, power, np.array(first), np.concatenate(lists))
+
+    @property
+    def in_view(self) -> int:
+        """How many sources come near the field at any time."""
+        return len(np.unique(self.number))
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _add_sources(matrices, start, rays, width, per_area, towards, power, first, number, out):  # type: ignore[no-untyped-def]
+    """Add equation (1) to ``out`` (n_det, n) from sample ``start`` on: each sample sums over the sources in their order."""
+    farthest = REACH * REACH / 2  # of the exponent
+    seen = np.empty(3)
+    for t in range(out.shape[1]):
+        piece = (start + t) // PIECE
+        for k in range(first[piece], first[piece + 1]):
+            s = number[k]
+            for i in range(3):  # the source in the boresight's frame
+                seen[i] = (
+                    matrices[t, 0, i] * towards[s, 0] + matrices[t, 1, i] * towards[s, 1] + matrices[t, 2, i] * towards[s, 2]
+                )
+            for d in range(out.shape[0]):
+                x, y, z = seen[0] - rays[d, 0], seen[1] - rays[d, 1], seen[2] - rays[d, 2]
+                chord = x * x + y * y + z * z
+                exponent = width[d] * chord * (1 + chord / 12)  # theta^2 = chord^2 (1 + chord^2 / 12 + ...)
+                if exponent < farthest:
+                    out[d, t] += power[s] * per_area[d] * np.exp(-exponent)

@@ -1,0 +1,102 @@
+"""Pointing errors: the sky is seen elsewhere than recorded; their rms and correlation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zonda
+from zonda.core.data import Data
+from zonda.core.numerics.projection import boresights
+from zonda.operators.pointing.error import PointingError, beside
+from zonda.plugins.checks import scenes
+
+ARCSEC = np.radians(1 / 3600)
+
+
+def test_rms_and_correlation(bench_scan):
+    """Variances over scans of offset, scan and jitter, and the jitter's correlation exp(-t / tau)."""
+    step = PointingError(scan_rms="3 arcsec", jitter_rms="2 arcsec", jitter_time="0.5 s")
+    n = 1500
+    errors = np.array([step.errors(bench_scan(k, 200)) for k in range(n)]) / ARCSEC  # (n, 2, 200)
+    for at in (0, 100):
+        x = errors[:, :, at]
+        assert (np.abs(x.var(axis=0) - 13) < 4 * 13 * np.sqrt(2 / n)).all()
+        assert abs((x[:, 0] * x[:, 1]).mean()) < 4 * 13 / np.sqrt(n)
+    lag = 40  # 0.4 s at 100 Hz
+    expected = 9 + 4 * np.exp(-0.8)
+    found = (errors[:, :, 50] * errors[:, :, 50 + lag]).mean(axis=0)
+    assert (np.abs(found - expected) < 4 * np.sqrt((13**2 + expected**2) / n)).all()
+
+
+@pytest.fixture
+def bench_scan():
+    def make(index, samples):
+        observation = scenes.scan(3, samples)
+        observation.index = index
+        return observation
+
+    return make
+
+
+def test_it_turns_towards_azimuth_and_elevation():
+    """A detector at (xi, eta) looks where the boresight with the error (atan xi, atan eta) does, small angles."""
+    from zonda.core.numerics.projection import directions
+
+    observation = scenes.scan(1, 50)
+    n = observation.n_samples
+    turned = beside(observation.boresight_radec, np.full(n, 30 * ARCSEC), np.full(n, -20 * ARCSEC))
+    there = directions(observation.boresight_radec, np.array([30 * ARCSEC]), np.array([-20 * ARCSEC])).reshape(n, 3)
+    np.testing.assert_allclose(boresights(turned).T, there, atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1, rtol=1e-12)
+
+
+def test_a_source_is_mapped_beside_its_place(tmp_path):
+    """The telescope looks 6 arcsec beside and 8 above where it says that it looks: the source is mapped by that much to the other
+    side; maps and files keep the recorded pointing. With psi = 0 the frame's eta is north, and xi west.
+    """
+    path = tmp_path / "c.csv"
+    path.write_text("ra [deg],dec [deg],flux [Jy]\n75,20,1\n")
+    side = (np.arange(-40, 40) + 0.5) * 1.5 * ARCSEC  # detectors so dense that the map holds all of the beam
+    xi, eta = (g.ravel() for g in np.meshgrid(side, side))
+    for steps, expected in (([], (0, 0)), ([PointingError(offset=("6 arcsec", "8 arcsec"))], (6, -8))):
+        observation = scenes.scan(6400, 20, radius=0.0, offsets=(xi, eta), instrument=scenes.camera(6400))
+        recorded = observation.boresight_radec.copy()
+        chain = [*steps, zonda.PointSources(catalogue=path), zonda.BinMap(pixel="3 arcsec", width="2 arcmin")]
+        data = scenes.run(chain, observation)
+        map = data.products["map"]
+        np.testing.assert_array_equal(data.observations[0].boresight_radec, recorded)
+        y, x = np.indices(map.signal.shape)
+        ra, dec = map.wcs.wcs_pix2world(x, y, 0)
+        weight = np.nan_to_num(map.signal) / np.nansum(map.signal)
+        centre = 3600 * np.array([((ra - 75) * np.cos(np.radians(20)) * weight).sum(), ((dec - 20) * weight).sum()])
+        np.testing.assert_allclose(centre, expected, atol=0.02)
+
+
+def test_the_jitter_widens_the_beam(tmp_path):
+    """A fast jitter: a Gaussian beam of sigma^2 + rms^2 in the map, and so a lower peak by the ratio."""
+    path = tmp_path / "c.csv"
+    path.write_text("ra [deg],dec [deg],flux [Jy]\n75,20,1\n")
+    pointing = zonda.PointingDaisy(scan_duration="120 s", radius="40 arcsec", speed="60 arcsec/s", scans=2)
+    sigma, peaks = 8.5 / np.sqrt(8 * np.log(2)), []
+    for rms in ("0 arcsec", "3 arcsec"):
+        error = PointingError(jitter_rms=rms, jitter_time="20 ms")
+        steps = [pointing, error, zonda.PointSources(catalogue=path), zonda.BinMap(pixel="1 arcsec")]
+        map = zonda.Pipeline(steps).run(scenes.scene(scenes.camera(37)), threads=1).products["map"]
+        y, x = np.indices(map.signal.shape)
+        ra, dec = map.wcs.wcs_pix2world(x, y, 0)
+        near = np.hypot((ra - 75) * np.cos(np.radians(20)), dec - 20) * 3600 < 2
+        peaks.append(np.average(map.signal[near], weights=map.hits[near]))
+    assert peaks[1] / peaks[0] == pytest.approx(sigma**2 / (sigma**2 + 9), rel=0.05)
+
+
+def test_each_scan_has_an_error_of_its_own():
+    scene = scenes.scene(scenes.camera(3))
+    data = Data(scene)
+    zonda.PointingDaisy(scan_duration="5 s", scans=2).observe(data)
+    PointingError(scan_rms="5 arcsec").observe(data)
+    a, b = (
+        np.linalg.norm(boresights(o.sky_boresight) - boresights(o.boresight_radec), axis=0) / ARCSEC for o in data.observations
+    )
+    assert np.ptp(a) < 1e-3
+    assert abs(a[0] - b[0]) > 0.1

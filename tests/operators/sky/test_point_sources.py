@@ -1,0 +1,92 @@
+"""Point sources: the flux in a map is that of the catalogue; catalogues that are wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zonda
+import zonda.testing
+from zonda.core.errors import InputError
+from zonda.core.instrument import SPEED_OF_LIGHT
+from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.numerics.radiation import BOLTZMANN, to_kelvin_rj
+from zonda.operators.sky.point_sources import Catalogue, PointSources
+from zonda.plugins.checks import scenes
+
+ARCSEC = np.radians(1 / 3600)
+
+
+def catalogue(path, rows, heading="ra [deg],dec [deg],flux [mJy]"):
+    path.write_text("\n".join([heading, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def test_it_keeps_the_contract(tmp_path):
+    path = catalogue(tmp_path / "c.csv", [(75.0, 20.0, 500.0), (75.05, 20.02, 100.0)])
+    zonda.testing.check_operator(PointSources(catalogue=path))
+
+
+@pytest.mark.parametrize("index", [0.0, -0.8])
+def test_the_flux_in_a_map(tmp_path, index):
+    """Sum over a map, T dOmega, against S <c^2 (nu / nu_0)^alpha / 2 k nu^2>: to 1e-3.
+
+    Detectors on a square of 1.5 arcsec, so that every pixel of 3 arcsec holds four at the corners of a square: the sum is a
+    quadrature of the Gaussian (FWHM 8.5 arcsec), exact but for exp(-2 pi^2 (sigma / 1.5 arcsec)^2).
+    """
+    side = (np.arange(-40, 40) + 0.5) * 1.5 * ARCSEC
+    xi, eta = (g.ravel() for g in np.meshgrid(side, side))
+    observation = scenes.scan(6400, 20, radius=0.0, offsets=(xi, eta), instrument=scenes.camera(6400))
+    heading = "ra [deg],dec [deg],flux [Jy],spectral_index"
+    path = catalogue(tmp_path / "c.csv", [(75.0014, 20.0011, 0.3, index), (75.4, 20.0, 5.0, index)], heading)
+    found = scenes.run([PointSources(catalogue=path), zonda.BinMap(pixel="3 arcsec", width="2 arcmin")], observation).products[
+        "map"
+    ]
+    flux = np.nansum(found.signal) * (3 * ARCSEC) ** 2
+    band = observation.instrument.band
+    assert flux == pytest.approx(0.3 * to_kelvin_rj("Jy/beam", band, None, index, 1.0), rel=1e-3)
+
+
+def test_the_stream_is_the_beam_itself(tmp_path, bench):
+    """At every sample of every detector: T = S c^2 / (2 k nu^2 Omega) exp(-4 ln 2 theta^2 / w^2), narrow band."""
+    observation = scenes.scan(7, 3000, radius=0.8, instrument=scenes.camera(7, low="89.9 GHz", high="90.1 GHz"))
+    path = catalogue(tmp_path / "c.csv", [(75.01, 20.01, 200.0), (74.99, 20.02, -50.0), (180.0, 20.0, 1e6)])
+    found = scenes.run([PointSources(catalogue=path)], observation, keep=("sky",)).observations[0].detdata["sky"]
+    plane = observation.focalplane
+    rays = np.stack([-plane.eta, -plane.xi, np.ones(7)]) / np.sqrt(1 + plane.xi**2 + plane.eta**2)
+    looks = np.moveaxis(rotation_matrices(observation.boresight_radec) @ rays, 0, 2)  # (3, n_det, n)
+    fwhm = float(observation.focalplane.fwhm[0])
+    area = np.pi * fwhm**2 / (4 * np.log(2))
+    expected = np.zeros((7, 3000))
+    for ra, dec, flux in ((75.01, 20.01, 0.2), (74.99, 20.02, -0.05)):
+        a, d = np.radians([ra, dec])
+        source = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
+        theta = 2 * np.arcsin(np.linalg.norm(looks - source[:, None, None], axis=0) / 2)
+        peak = flux * 1e-26 * SPEED_OF_LIGHT**2 / (2 * BOLTZMANN * 90e9**2) / area
+        expected += peak * np.exp(-4 * np.log(2) * theta**2 / fwhm**2)
+    assert np.abs(expected).max() > 1e-3
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
+
+
+def test_fluxes_at_another_frequency(tmp_path):
+    path = catalogue(tmp_path / "c.csv", [(75.0, 20.0, 100.0, 2.0)], "ra [deg],dec [deg],flux [mJy],spectral_index")
+    band = scenes.camera().band
+    here, there = (Catalogue.read(PointSources(catalogue=path, frequency=f)).brightness(band, 1.0) for f in (None, "46.5 GHz"))
+    assert there / here == pytest.approx((band.centre / 46.5e9) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("heading", "row", "match"),
+    [
+        ("ra [deg],dec [deg]", (75, 20), "has no column 'flux'"),
+        ("ra [deg],dec [deg],flux", (75, 20, 1), "flux has no unit"),
+        ("ra [deg],dec [deg],flux [K]", (75, 20, 1), "flux has the unit 'K'"),
+        ("ra [deg],dec [deg],flux [Jy]", (75, 95, 1), "dec of row 1 is 95 deg"),
+        ("ra [deg],dec [deg],flux [Jy]", (75, 20, "nan"), "not a finite number"),
+    ],
+)
+def test_catalogues_that_are_wrong(tmp_path, heading, row, match):
+    path = catalogue(tmp_path / "bad.csv", [row], heading)
+    with pytest.raises(InputError, match=match) as caught:
+        Catalogue.read(PointSources(catalogue=path))
+    assert "bad.csv" in str(caught.value)
