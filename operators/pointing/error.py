@@ -18,7 +18,6 @@ import math
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Seconds
@@ -41,8 +40,8 @@ class PointingError(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
 
-    offset: tuple[Angle, Angle] = Field(default_factory=lambda: (0.0, 0.0))
-    """Constant error towards increasing azimuth (on the sky) and elevation."""
+    offset: tuple[Angle, Angle] | None = None
+    """Constant error towards increasing azimuth (on the sky) and elevation; none where absent."""
     scan_rms: Angle = quantity("0 arcsec", ge=0, le=0.1)
     """Rms of an error that is constant in each scan."""
     jitter_rms: Angle = quantity("0 arcsec", ge=0, le=0.1)
@@ -63,7 +62,8 @@ class PointingError(Operator):
         """(x, y), (n_samp,) each, rad."""
         key, n = observation.key(self.label), observation.n_samples
         whole = self.scan_rms * normals(key, 0, 2, stream=0).astype(np.float64)
-        found = [np.full(n, self.offset[k] + whole[k]) for k in (0, 1)]
+        offset = self.offset or (0.0, 0.0)
+        found = [np.full(n, offset[k] + whole[k]) for k in (0, 1)]
         if self.jitter_rms > 0:
             rho = math.exp(-1 / (self.jitter_time * observation.sample_rate))
             for k in (0, 1):

@@ -105,7 +105,7 @@ class ErrorPlanning(Planning[PointingError]):
     def estimate(self, context: Context) -> Estimate:
         """Its size by the shift of the beam, three standard deviations."""
         step, fwhm = self.operator, float(context.first.focalplane.fwhm.min())
-        delta = math.hypot(*step.offset) + 3 * math.hypot(step.scan_rms, step.jitter_rms)
+        delta = math.hypot(*(step.offset or (0.0, 0.0))) + 3 * math.hypot(step.scan_rms, step.jitter_rms)
         size = context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
         text = "1.43 / FWHM x (offset + 3 rms)"
         return Estimate((Effect("pointing error", (full("exact"),), size, text),), Cost(fixed=0.001, per_time=1.5e-7))
