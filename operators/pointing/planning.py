@@ -19,8 +19,8 @@ from zonda.core.plan.estimate import Cost, Effect, Estimate, full, not_simulated
 from zonda.core.plan.planning import Planning
 
 from .base import Pointing
-from .error import PointingError
 from .limits import LargestMotion
+from .mispointing import Mispointing
 from .recorded import PointingRecorded
 from .samples_per_beam import SamplesPerBeam
 from .schedule import PointingSchedule
@@ -93,10 +93,10 @@ class SchedulePlanning(PointingPlanning):
     of: ClassVar[type[Operator]] = PointingSchedule
 
 
-class ErrorPlanning(Planning[PointingError]):
+class MispointingPlanning(Planning[Mispointing]):
     """It has no coarser form."""
 
-    of: ClassVar[type[Operator]] = PointingError
+    of: ClassVar[type[Operator]] = Mispointing
 
     def memory(self, observation: Observation) -> int:
         """The true boresight, and what it is made from."""
@@ -108,7 +108,7 @@ class ErrorPlanning(Planning[PointingError]):
         delta = math.hypot(*(step.offset or (0.0, 0.0))) + 3 * math.hypot(step.scan_rms, step.jitter_rms)
         size = context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
         text = "1.43 / FWHM x (offset + 3 rms)"
-        return Estimate((Effect("pointing error", (full("exact"),), size, text),), Cost(fixed=0.001, per_time=1.5e-7))
+        return Estimate((Effect("mispointing", (full("exact"),), size, text),), Cost(fixed=0.001, per_time=1.5e-7))
 
 
 def _bend(context: Context) -> float:

@@ -216,7 +216,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "axes": ({}, {"axes": "horizontal"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
     },
-    "PointingError": {
+    "Mispointing": {
         "offset": ({}, {"offset": ["5 arcsec", "0 arcsec"]}),
         "scan_rms": ({}, {"scan_rms": "5 arcsec"}),
         "jitter_rms": ({}, {"jitter_rms": "5 arcsec"}),
@@ -464,7 +464,7 @@ CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
     "PointSources": ["PointSources"],
-    "PointingError": ["PointingDaisy", "PointingError", "SkyMap"],
+    "Mispointing": ["PointingDaisy", "Mispointing", "SkyMap"],
     "AtmosphereLayers": ["AtmosphereLayers"],
     "AtmosphereScreens": ["AtmosphereLayers", "AtmosphereScreens"],
     "WhiteNoise": ["WhiteNoise"],
@@ -539,7 +539,7 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
             values.pop("pixel", None)
         return make(other, **values)
 
-    if which == "PointingError":  # stands behind a pointing step
+    if which == "Mispointing":  # stands behind a pointing step
         return [step(other) for other in CHAINS[which]]
     pointing = which if which.startswith("Pointing") else "PointingDaisy"
     return [step(pointing), *(step(other) for other in CHAINS.get(which, []))]

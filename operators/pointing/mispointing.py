@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
 
 
-class PointingError(Operator):
+class Mispointing(Operator):
     """The true boresight differs from the recorded one by an offset, an error per scan and a jitter, equation (1).
 
     The sky is seen where the telescope looks in fact; maps, filters and files take the recorded pointing. Atmosphere and ground,

@@ -8,7 +8,7 @@ import pytest
 import zonda
 from zonda.core.data import Data
 from zonda.core.numerics.projection import boresights
-from zonda.operators.pointing.error import PointingError, beside
+from zonda.operators.pointing.mispointing import Mispointing, beside
 from zonda.plugins.checks import scenes
 
 ARCSEC = np.radians(1 / 3600)
@@ -16,7 +16,7 @@ ARCSEC = np.radians(1 / 3600)
 
 def test_rms_and_correlation(bench_scan):
     """Variances over scans of offset, scan and jitter, and the jitter's correlation exp(-t / tau)."""
-    step = PointingError(scan_rms="3 arcsec", jitter_rms="2 arcsec", jitter_time="0.5 s")
+    step = Mispointing(scan_rms="3 arcsec", jitter_rms="2 arcsec", jitter_time="0.5 s")
     n = 1500
     errors = np.array([step.errors(bench_scan(k, 200)) for k in range(n)]) / ARCSEC  # (n, 2, 200)
     for at in (0, 100):
@@ -59,7 +59,7 @@ def test_a_source_is_mapped_beside_its_place(tmp_path):
     path.write_text("ra [deg],dec [deg],flux [Jy]\n75,20,1\n")
     side = (np.arange(-40, 40) + 0.5) * 1.5 * ARCSEC  # detectors so dense that the map holds all of the beam
     xi, eta = (g.ravel() for g in np.meshgrid(side, side))
-    for steps, expected in (([], (0, 0)), ([PointingError(offset=("6 arcsec", "8 arcsec"))], (6, -8))):
+    for steps, expected in (([], (0, 0)), ([Mispointing(offset=("6 arcsec", "8 arcsec"))], (6, -8))):
         observation = scenes.scan(6400, 20, radius=0.0, offsets=(xi, eta), instrument=scenes.camera(6400))
         recorded = observation.boresight_radec.copy()
         chain = [*steps, zonda.PointSources(catalogue=path), zonda.BinMap(pixel="3 arcsec", width="2 arcmin")]
@@ -80,7 +80,7 @@ def test_the_jitter_widens_the_beam(tmp_path):
     pointing = zonda.PointingDaisy(scan_duration="120 s", radius="40 arcsec", speed="60 arcsec/s", scans=2)
     sigma, peaks = 8.5 / np.sqrt(8 * np.log(2)), []
     for rms in ("0 arcsec", "3 arcsec"):
-        error = PointingError(jitter_rms=rms, jitter_time="20 ms")
+        error = Mispointing(jitter_rms=rms, jitter_time="20 ms")
         steps = [pointing, error, zonda.PointSources(catalogue=path), zonda.BinMap(pixel="1 arcsec")]
         map = zonda.Pipeline(steps).run(scenes.scene(scenes.camera(37)), threads=1).products["map"]
         y, x = np.indices(map.signal.shape)
@@ -94,7 +94,7 @@ def test_each_scan_has_an_error_of_its_own():
     scene = scenes.scene(scenes.camera(3))
     data = Data(scene)
     zonda.PointingDaisy(scan_duration="5 s", scans=2).observe(data)
-    PointingError(scan_rms="5 arcsec").observe(data)
+    Mispointing(scan_rms="5 arcsec").observe(data)
     a, b = (
         np.linalg.norm(boresights(o.sky_boresight) - boresights(o.boresight_radec), axis=0) / ARCSEC for o in data.observations
     )
