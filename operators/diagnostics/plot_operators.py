@@ -203,8 +203,11 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
     for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
         if not name.startswith("source_free/") and maps[name].contents == "all":
             yield Drawing(f"map {name}", draw_map, partial(_map, name, maps[name], style))
+    for name, product in data.products.items():
+        if isinstance(product, MapProduct) and product.polarization is not None and not name.startswith(("source_free/", "_")):
+            yield Drawing(f"map {name}_P", draw_map, partial(_map, f"{name}_P", product.stokes("P"), style))
     for name, product in maps.items():
-        if "/" not in name:
+        if "/" not in name and name in data.products:  # Q and U have the hits of I
             yield Drawing(f"coverage {name}", draw_coverage, partial(_coverage, name, product))
         if sources := noise_sources(maps, name):
             yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style))

@@ -52,7 +52,7 @@ def results(data: Data, diameter: float) -> str:
     for figure in noise_figures(maps, diameter):
         cards += _noise(figure, maps[figure.product], diameter)
     main = [(name, product) for name, product in maps.items() if "/" not in name]
-    cards += [card for name, product in main for card in _depth(name, product, diameter)]
+    cards += [card for name, product in main if name in data.products for card in _depth(name, product, diameter)]
     if has_white_noise(data):
         cards += [card for name, product in main for card in expected(name, product, diameter)]
     strongest = {"input": getattr(data.products.get("input"), "values", None)}
