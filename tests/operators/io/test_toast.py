@@ -12,6 +12,7 @@ import zonda
 from zonda.core.flags import DEAD, OPAQUE, SUN_UP
 from zonda.core.intervals import samples_in
 from zonda.core.operator import Operator
+from zonda.core.polarization import PolarizationAngles
 from zonda.operators.io.save_tod import SaveTOD, load_tod
 
 pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
@@ -276,3 +277,84 @@ def test_zonda_looks_where_toast_looked(simulated):
         for interval in theirs.intervals[name]:
             inside[interval.first : interval.last] = True
         np.testing.assert_array_equal(samples_in(o.intervals[name], o.seconds), inside)
+
+
+class Imperfect(Operator):
+    """Detectors of polarization efficiencies of their own."""
+
+    def configure(self, observation):
+        plane = observation.focalplane
+        plane.polarization_efficiency[:] = np.linspace(0.6, 1, len(plane))
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["no plate", "half-wave plate"])
+def polarized(request, tmp_path_factory):
+    """Pairs at 0 and 45 deg over a sky of I, Q and U with noise, with and without a half-wave plate."""
+    folder = tmp_path_factory.mktemp("polarized")
+    camera = INSTRUMENT | {"polarization": "pairs", "detectors": 12, "field_of_view": "3 deg"}
+    values = np.random.default_rng(5).normal(size=(3, 256, 256))
+    header = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg", "CDELT1": -0.05, "CDELT2": 0.05}
+    sky = zonda.SkyMap(map=values, wcs=header, centre="target", unit="mK_RJ", polarization_convention="iau", fwhm="0.2 deg")
+    steps = [
+        zonda.PointingBackAndForth(**SCAN, flag_turnarounds=True),
+        Imperfect(),
+        *([zonda.HalfWavePlate(frequency="2 Hz", angle="20 deg")] if request.param else []),
+        sky,
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.BinMap(nside=128, stokes="IQU"),
+        SaveTOD(),
+    ]
+    data = zonda.Pipeline(steps).run(zonda.Scene(**(SCENE | {"instrument": camera})), output=folder, threads=1)
+    return folder / "tod_scan-000.h5", data, request.param
+
+
+def iqu_steps(plate):
+    where = toast.ops.PixelsHealpix(nside=128, nest=False, detector_pointing=toast.ops.PointingDetectorSimple())
+    plate = {"hwp_angle": "hwp_angle"} if plate else {}
+    return where, toast.ops.StokesWeights(mode="IQU", detector_pointing=where.detector_pointing, **plate)
+
+
+def test_weights_are_those_of_toasts_compiled_kernel(polarized):
+    path, data, plate = polarized
+    (o,) = data.observations
+    loaded = toast_data(path)
+    assert ("hwp_angle" in loaded.obs[0].shared) == plate
+    _, weights = iqu_steps(plate)
+    weights.apply(loaded)
+    found = loaded.obs[0].detdata["weights"]
+    theirs = np.array([found[name] for name in o.focalplane.names])
+    ours = np.empty((2, o.n_detectors, o.n_samples))
+    PolarizationAngles.of(o, np.array([0.0, 0.0, 1.0])).fill(np.arange(o.n_detectors), 0, *ours)
+    ours *= o.focalplane.polarization_efficiency[:, None]
+    np.testing.assert_array_equal(theirs[..., 0], 1.0)
+    # rounding of angles up to 4 chi, 25 rad, in TOAST's kernel
+    np.testing.assert_allclose(theirs[..., 1], ours[0], rtol=0, atol=3e-14)
+    np.testing.assert_allclose(theirs[..., 2], ours[1], rtol=0, atol=3e-14)
+
+
+def test_toasts_map_of_i_q_u_is_zondas(polarized):
+    path, data, plate = polarized
+    loaded, (where, weights) = toast_data(path), iqu_steps(plate)
+    toast.ops.CovarianceAndHits(
+        pixel_dist="dist", covariance="cov", hits="hits", rcond="rcond", pixel_pointing=where, stokes_weights=weights,
+        rcond_threshold=1e-3,
+    ).apply(loaded)  # fmt: skip
+    toast.ops.BinMap(pixel_dist="dist", covariance="cov", pixel_pointing=where, stokes_weights=weights, binned="map").apply(loaded)
+    product = data.products["map"]
+    own = product.polarization
+    hits = np.zeros(12 * 128**2)
+    hits[product.pixels] = own.hits
+    np.testing.assert_array_equal(full_sky(loaded["hits"]), hits)
+    solved = product.hits > 0
+    assert solved.sum() > 20
+    local = loaded["map"]
+    theirs, size = np.zeros((12 * 128**2, 3)), local.distribution.n_pix_submap
+    for k, submap in enumerate(local.distribution.local_submaps):
+        theirs[submap * size : (submap + 1) * size] = local.data[k]
+    theirs = theirs[product.pixels[solved]]
+    scale = np.abs(theirs).max()
+    # TOAST's noise weights are float32 (6e-8 of the data, which noise makes differ), times condition numbers of some tens
+    for k, plane in enumerate((product.signal, own.q, own.u)):
+        np.testing.assert_allclose(plane[solved], theirs[:, k], rtol=0, atol=1e-5 * scale)
+    assert np.median(np.abs(own.q[solved] - theirs[:, 1])) < 1e-7 * scale
