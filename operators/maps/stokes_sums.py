@@ -33,7 +33,7 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import Floats
 
 from .grid import Grid
-from .sums import FLAGGED, LARGEST, NOT_FINITE, OUTSIDE, TOO_LARGE, VALUE, WEIGHT, Sums
+from .sums import FLAGGED, LARGEST, MAGIC, NOT_FINITE, OUTSIDE, TOO_LARGE, VALUE, WEIGHT, Sums
 
 HIT = 0
 MATRIX = slice(1, 7)
@@ -154,29 +154,29 @@ def add_stokes(signals, first, rows, cells, cosine, sine, good, window, weight, 
                 continue
             high = max(high, size)
             row = sums[pixel]
-            c = np.rint(p[k] * cosine[k, t] * WEIGHT) / WEIGHT
-            q = np.rint(p[k] * sine[k, t] * WEIGHT) / WEIGHT
+            c = ((p[k] * cosine[k, t] * WEIGHT + MAGIC) - MAGIC) / WEIGHT
+            q = ((p[k] * sine[k, t] * WEIGHT + MAGIC) - MAGIC) / WEIGHT
             share = window[t] if window.size else 1.0
             w = w0 * share * WEIGHT
             row[HIT] += 1
-            row[1] += np.int64(np.rint(w))
-            row[2] += np.int64(np.rint(w * c))
-            row[3] += np.int64(np.rint(w * q))
-            row[4] += np.int64(np.rint(w * c * c))
-            row[5] += np.int64(np.rint(w * c * q))
-            row[6] += np.int64(np.rint(w * q * q))
+            row[1] += np.int64((w + MAGIC) - MAGIC)
+            row[2] += np.int64((w * c + MAGIC) - MAGIC)
+            row[3] += np.int64((w * q + MAGIC) - MAGIC)
+            row[4] += np.int64((w * c * c + MAGIC) - MAGIC)
+            row[5] += np.int64((w * c * q + MAGIC) - MAGIC)
+            row[6] += np.int64((w * q * q + MAGIC) - MAGIC)
             for s in range(m):
                 value = np.float64(signals[s][d, first + t]) * factor
                 at = DATA + 3 * s
-                row[at] += np.int64(np.rint(value))
-                row[at + 1] += np.int64(np.rint(value * c))
-                row[at + 2] += np.int64(np.rint(value * q))
+                row[at] += np.int64((value + MAGIC) - MAGIC)
+                row[at + 1] += np.int64((value * c + MAGIC) - MAGIC)
+                row[at + 2] += np.int64((value * q + MAGIC) - MAGIC)
             if own:
                 w = noise[k] * share * share * WEIGHT
-                row[end] += np.int64(np.rint(w))
-                row[end + 1] += np.int64(np.rint(w * c))
-                row[end + 2] += np.int64(np.rint(w * q))
-                row[end + 3] += np.int64(np.rint(w * c * c))
-                row[end + 4] += np.int64(np.rint(w * c * q))
-                row[end + 5] += np.int64(np.rint(w * q * q))
+                row[end] += np.int64((w + MAGIC) - MAGIC)
+                row[end + 1] += np.int64((w * c + MAGIC) - MAGIC)
+                row[end + 2] += np.int64((w * q + MAGIC) - MAGIC)
+                row[end + 3] += np.int64((w * c * c + MAGIC) - MAGIC)
+                row[end + 4] += np.int64((w * c * q + MAGIC) - MAGIC)
+                row[end + 5] += np.int64((w * q * q + MAGIC) - MAGIC)
         largest[1] = max(largest[1], high * factor + 1.0)
