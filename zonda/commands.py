@@ -10,6 +10,7 @@ COMMANDS = {
     "compare": "zonda.plugins.commands.compare:compare",
     "doctor": "zonda.plugins.commands.doctor:doctor",
     "new": "zonda.plugins.commands.new:new",
+    "noise": "zonda.plugins.commands.noise:noise",
     "pipelines": "zonda.core.cli.listing:pipelines",
     "plan": "zonda.core.plan.command:plan",
     "plugins": "zonda.core.cli.listing:plugins",

@@ -1,0 +1,172 @@
+"""White level, knee and slope of the noise of a stream, from its power spectrum.
+
+The one-sided power spectral density is taken to be
+
+    P(f) = 2 NET^2 (1 + (f_knee / f)^slope).                                                              (1)
+
+It is estimated by Welch's method (1967, IEEE Trans. Audio Electroacoust. 15, 70) with Hann windows that overlap by half, a line
+removed from each; of the K segments without a flagged sample the *median* is taken, divided by the median of the mean of
+exponential deviates (Allen et al. 2012, Phys. Rev. D 85, 122006, appendix B). Segments with a glitch are left out: those whose power
+in the upper half of the band is more than `OUTLYING` robust standard deviations from their median.
+Frequencies are averaged in logarithmic bins of n each, and ln P is fitted by least squares with the standard deviation
+
+    sigma = sqrt(1.056 v / (K n')) ,   v = 1 / ln(2)^2                                                    (2)
+
+v the variance of the median of K exponential deviates over that of a mean of K, in the limit of large K; 1.056 for what Hann
+windows that overlap by half have in common; n' = n / 1.944, for the powers of frequencies of a Hann window that are one or two
+apart are correlated by 4/9 and 1/36: 1 + 2 (4/9 + 1/36).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.errors import InputError
+from zonda.core.types import Floats
+
+SEGMENTS = 24
+"""Windows without overlap that a scan is cut into, where the length of a segment is not given."""
+FEWEST = 8
+"""Segments without a flagged sample that an estimate needs."""
+BINS = 12
+"""Frequency bins per decade."""
+OUTLYING = 6.0
+"""Robust standard deviations: 1.4826 times the median distance from the median."""
+HIGHEST = 0.9
+"""Of the Nyquist frequency: what lies above is not fitted (filters before the read-out)."""
+OVERLAP, CORRELATED, MEDIAN = 1.056, 1 + 2 * (4 / 9 + 1 / 36), 1 / math.log(2) ** 2
+"""Factors of equation (2)."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Equation (1) with standard errors.
+
+    Attributes
+    ----------
+    net, knee, slope
+        K sqrt(s); Hz, 0: none was found, and ``knee_error`` is the lowest frequency that was looked at; exponent.
+    segments
+        Those that were used.
+    chi_square
+        Of the fit, over its degrees of freedom: far above 1 where equation (1) does not describe the spectrum.
+    """
+
+    net: float
+    net_error: float
+    knee: float
+    knee_error: float
+    slope: float
+    slope_error: float
+    segments: int
+    chi_square: float
+
+
+def segment_length(n_samples: int, rate: float, seconds: float | None, place: str) -> int:
+    """Samples of a segment: those of ``seconds``, or a power of two such that there are `SEGMENTS`.
+
+    Raises InputError for a scan that is too short.
+    """
+    length = 2 ** int(math.log2(max(n_samples / SEGMENTS, 1))) if seconds is None else round(seconds * rate)
+    if length < 64 or 2 * n_samples // max(length, 1) - 1 < FEWEST:
+        text = f"{n_samples} samples make no {FEWEST} segments of at least 64"
+        raise InputError(text, place=place, cure="give a longer scan, or a shorter --segment")
+    return length
+
+
+def median_bias(segments: int) -> float:
+    """The expected median of so many exponential deviates, over their mean: 1 - 1/2 + 1/3 ... (odd numbers of terms)."""
+    terms = np.arange(1, segments + 1 - (segments + 1) % 2)
+    return float(np.sum((-1.0) ** (terms + 1) / terms))
+
+
+def spectrum(row: Floats, good: NDArray[np.bool_], rate: float, length: int) -> tuple[Floats, Floats, int]:
+    """Frequencies [Hz] without zero, one-sided power spectral density [K^2 / Hz], number of segments used (0: too few are good).
+
+    ``row`` (n,) K; ``good`` (n,): samples that may be used.
+    """
+    step = length // 2
+    begins = np.arange(0, len(row) - length + 1, step)
+    spoilt = np.r_[0, np.cumsum(~(good & np.isfinite(row)))]
+    begins = begins[spoilt[begins + length] == spoilt[begins]]
+    frequency = np.fft.rfftfreq(length, 1 / rate)[1:]
+    if len(begins) < FEWEST:
+        return frequency, np.full(len(frequency), np.nan), 0
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
+    line = np.linspace(-1.0, 1.0, length)
+    parts = np.stack([row[b : b + length] for b in begins])
+    parts = parts - parts.mean(axis=1, keepdims=True)
+    parts -= (parts @ line / (line @ line))[:, None] * line
+    power = np.abs(np.fft.rfft(parts * window, axis=1)[:, 1:]) ** 2 * (2 / (rate * (window @ window)))
+    level = power[:, power.shape[1] // 2 :].mean(axis=1)
+    away = np.abs(level - np.median(level))
+    power = power[away <= OUTLYING * 1.4826 * np.median(away)]
+    return frequency, np.median(power, axis=0) / median_bias(len(power)), len(power)
+
+
+def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
+    """Equation (1) fitted to a spectrum of `spectrum`; None: there is none to fit, or it is zero."""
+    use = (frequency <= HIGHEST * frequency[-1]) & (np.arange(len(frequency)) >= 1)  # the line takes the lowest
+    if not segments or not (power[use] > 0).all():
+        return None
+    every, bins = frequency[use], _Bins.of(frequency[use])
+    f, p, n = bins.mean(every), bins.mean(power[use]), bins.number
+    sigma = np.sqrt(OVERLAP * MEDIAN / (segments * np.maximum(n / CORRELATED, 1.0)))
+    log_p = np.log(p) + sigma**2 / 2  # the mean of a logarithm lies below the logarithm of the mean
+    start = math.log(float(np.median(p[f > f[-1] / 3])))
+    middle = math.sqrt(f[0] * f[-1])
+
+    log_f = np.log(every / middle)
+
+    def residual(x: Any) -> Any:
+        return (np.log(bins.mean(np.exp(x[0]) + np.exp(x[1] - x[2] * log_f))) - log_p) / sigma
+
+    from scipy.optimize import least_squares
+
+    low = float(log_p[0])
+    limits = [-np.inf, start - 40, 0.2], [np.inf, np.inf, 4.0]
+    guesses = [[start, max(low, start - 2.0) - slope * math.log(middle / f[0]), slope] for slope in (1.0, 2.0)]
+    found = min((least_squares(residual, guess, bounds=limits) for guess in guesses), key=lambda tried: float(tried.cost))
+    white_cost = 0.5 * float(np.sum(((np.average(log_p, weights=1 / sigma**2) - log_p) / sigma) ** 2))
+    if white_cost - found.cost < 3.0:  # two more parameters would do as much by chance in one of twenty cases
+        level, variance = float(np.average(log_p, weights=1 / sigma**2)), float(1 / np.sum(1 / sigma**2))
+        net = math.sqrt(math.exp(level) / 2)
+        chi = 2 * white_cost / max(len(f) - 1, 1)
+        return Noise(net, net * math.sqrt(variance) / 2, 0.0, float(f[0]), 1.0, 0.0, segments, chi)
+    white, red, slope = found.x
+    covariance = np.linalg.pinv(np.asarray(found.jac).T @ np.asarray(found.jac))
+    net, knee = math.sqrt(math.exp(white) / 2), middle * math.exp((red - white) / slope)
+    gradient = np.array([-1.0, 1.0, -(red - white) / slope]) / slope  # of ln knee
+    return Noise(
+        net,
+        net * math.sqrt(covariance[0, 0]) / 2,
+        knee,
+        knee * math.sqrt(float(gradient @ covariance @ gradient)),
+        float(slope),
+        math.sqrt(covariance[2, 2]),
+        segments,
+        2 * found.cost / max(len(f) - 3, 1),
+    )
+
+
+@dataclass(frozen=True)
+class _Bins:
+    """Logarithmic bins of frequencies: where each begins, and how many are in it."""
+
+    first: NDArray[np.intp]
+    number: Floats
+
+    @classmethod
+    def of(cls, f: Floats) -> _Bins:
+        edge = np.floor(BINS * np.log10(f / f[0]) + 1e-9).astype(int)
+        _, first, number = np.unique(edge, return_index=True, return_counts=True)
+        return cls(first, number.astype(np.float64))
+
+    def mean(self, values: Floats) -> Floats:
+        """Mean in each bin."""
+        return np.asarray(np.add.reduceat(values, self.first) / self.number, np.float64)

@@ -1,0 +1,76 @@
+"""Noise of single streams: Welch's spectra, their median, and the fit of white level, knee and slope."""
+
+import numpy as np
+import pytest
+
+from zonda.core.errors import InputError
+from zonda.operators.noise.estimate import fit, median_bias, segment_length, spectrum
+
+RATE, N = 100.0, 60000
+
+
+def made(rng, net, knee, slope):
+    """(N,) noise of the one-sided density 2 NET^2 (1 + (knee / f)^slope), cut out of four times as much."""
+    f = np.fft.rfftfreq(4 * N, 1 / RATE)
+    density = 2 * net**2 * (1 + (knee / np.maximum(f, 1e-3)) ** slope)
+    waves = np.sqrt(density * RATE * N) * (rng.normal(size=f.size) + 1j * rng.normal(size=f.size))
+    waves[0] = 0
+    return np.fft.irfft(waves, 4 * N)[:N]
+
+
+def estimate(row, good=None):
+    return fit(*spectrum(row, np.ones(N, bool) if good is None else good, RATE, segment_length(N, RATE, None, "here")))
+
+
+@pytest.mark.parametrize(("knee", "slope"), [(0.5, 1.0), (2.0, 1.5)])
+def test_estimates_lie_within_their_errors(knee, slope):
+    rng = np.random.default_rng(2)
+    found = [estimate(made(rng, 1e-3, knee, slope)) for _ in range(60)]
+    for name, truth, bias in (("net", 1e-3, 0.5), ("knee", knee, 0.6), ("slope", slope, 1.2)):
+        pulls = np.array([(getattr(n, name) - truth) / getattr(n, f"{name}_error") for n in found])
+        # of 60 pulls of standard deviation 1: the mean to 0.13, the standard deviation to 0.09, five times that; beside the bias
+        # of the median of steep spectra, which the documentation states
+        assert abs(pulls.mean()) < bias + 5 * 0.13, name
+        assert 0.6 < pulls.std() < 1.45, name
+    assert 0.5 < np.mean([n.chi_square for n in found]) < 1.5
+
+
+def test_white_noise_has_no_knee():
+    rng = np.random.default_rng(3)
+    found = [estimate(made(rng, 1e-3, 0.0, 1.0)) for _ in range(40)]
+    assert sum(n.knee == 0 for n in found) >= 34  # at most one of twenty by chance, to three standard deviations
+    net = np.array([n.net for n in found])
+    assert abs(net.mean() - 1e-3) < 5 * net.std() / np.sqrt(40)
+
+
+def test_glitches_and_flags_do_not_matter():
+    rng = np.random.default_rng(4)
+    row, clean = made(rng, 1e-3, 0.0, 1.0), made(np.random.default_rng(4), 1e-3, 0.0, 1.0)
+    row[[10_000, 31_000]] += 1.0  # a thousand times the NET, in 4 of 57 segments
+    robust, truth = estimate(row), estimate(clean)
+    assert abs(robust.net - truth.net) < 3 * truth.net_error
+    good = np.ones(N, bool)
+    good[20_000:20_500] = False
+    row = clean.copy()
+    row[20_000:20_500] = np.nan
+    part = estimate(row, good)
+    assert part.segments < truth.segments
+    assert abs(part.net - truth.net) < 3 * truth.net_error
+    assert estimate(np.where(np.arange(N) % 1000 == 0, np.nan, clean)) is None
+    assert estimate(np.zeros(N)) is None
+
+
+def test_the_median_of_few_deviates():
+    assert median_bias(1) == 1
+    rng = np.random.default_rng(5)
+    for k in (3, 9):
+        medians = np.median(rng.exponential(size=(100_000, k)), axis=1)
+        assert abs(medians.mean() - median_bias(k)) < 5 * medians.std() / np.sqrt(100_000)
+
+
+def test_short_scans_are_refused():
+    with pytest.raises(InputError, match="make no 8 segments"):
+        segment_length(200, RATE, None, "here")
+    with pytest.raises(InputError, match="make no 8 segments"):
+        segment_length(N, RATE, 300.0, "here")
+    assert segment_length(N, RATE, 20.0, "here") == 2000
