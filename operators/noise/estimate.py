@@ -6,8 +6,8 @@ The one-sided power spectral density is taken to be
 
 It is estimated by Welch's method (1967, IEEE Trans. Audio Electroacoust. 15, 70) with Hann windows that overlap by half, a line
 removed from each; of the K segments without a flagged sample the *median* is taken, divided by the median of the mean of
-exponential deviates (Allen et al. 2012, Phys. Rev. D 85, 122006, appendix B). Segments with a glitch are left out: those whose power
-in the upper half of the band is more than `OUTLYING` robust standard deviations from their median.
+exponential deviates (Allen et al. 2012, Phys. Rev. D 85, 122006, appendix B). Segments with a glitch are left out: those
+whose power in the upper half of the band is more than `OUTLYING` robust standard deviations from their median.
 Frequencies are averaged in logarithmic bins of n each, and ln P is fitted by least squares with the standard deviation
 
     sigma = sqrt(1.056 v / (K n')) ,   v = 1 / ln(2)^2                                                    (2)
@@ -94,7 +94,7 @@ def spectrum(row: Floats, good: NDArray[np.bool_], rate: float, length: int) -> 
     begins = np.arange(0, len(row) - length + 1, step)
     spoilt = np.r_[0, np.cumsum(~(good & np.isfinite(row)))]
     begins = begins[spoilt[begins + length] == spoilt[begins]]
-    frequency = np.fft.rfftfreq(length, 1 / rate)[1:]
+    frequency = np.asarray(np.fft.rfftfreq(length, 1 / rate)[1:], np.float64)
     if len(begins) < FEWEST:
         return frequency, np.full(len(frequency), np.nan), 0
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
@@ -106,7 +106,7 @@ def spectrum(row: Floats, good: NDArray[np.bool_], rate: float, length: int) -> 
     level = power[:, power.shape[1] // 2 :].mean(axis=1)
     away = np.abs(level - np.median(level))
     power = power[away <= OUTLYING * 1.4826 * np.median(away)]
-    return frequency, np.median(power, axis=0) / median_bias(len(power)), len(power)
+    return frequency, np.asarray(np.median(power, axis=0) / median_bias(len(power)), np.float64), len(power)
 
 
 def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
