@@ -216,11 +216,12 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
     early = {p.product: p for p in data.partial.values() if isinstance(p, TimeStream)}
     for name, product in (data.products | early).items():
         file = product_path("", name).name
+        band = next((f"_{b.name}" for b in data.scene.instrument.bands if name.endswith(f"_{b.name}")), "")
         if isinstance(product, Spectrum):
-            file = "power_spectra" if name == "spectrum" else f"power_spectra_{file}"
+            file = f"power_spectra{band}" if name == f"spectrum{band}" else f"power_spectra_{file}"
             yield Drawing(f"spectra {name}", draw_spectra, partial(tuple, (file, product, before.get(product.label, ""))))
         elif isinstance(product, TimeStream):
-            file = "tod" if name == "time_streams" else f"tod_{file}"
+            file = f"tod{band}" if name == f"time_streams{band}" else f"tod_{file}"
             yield Drawing(f"streams {name}", draw_streams, partial(_streams, file, product, before), True)
         elif isinstance(product, Modes):
             yield Drawing(f"modes {name}", draw_modes, partial(tuple, (file, product, before.get(product.label, ""))))

@@ -86,7 +86,7 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float, known: M
     parts = [
         ("results", "Results", known["results"]),
         ("figures", "Figures", _figures(data)),
-        ("pictures", "Pictures", _pictures(shown)),
+        ("pictures", "Pictures", _pictures(shown, [band.name for band in data.scene.instrument.bands])),
         ("scene", "Scene", known["scene"]),
         ("scans", "Scans", known["scans"]),
         ("steps", "Steps", known["steps"]),
@@ -124,14 +124,16 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float, known: M
 """
 
 
-def _pictures(shown: Sequence[Picture]) -> str:
+def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> str:
     figures = []
     for picture in shown:
+        band = next((f" ({name})" for name in bands if picture.name.endswith(f"_{name}") and name not in picture.title), "")
+        title = picture.title + band
         width = int.from_bytes(picture.png[16:20], "big")
         image = base64.b64encode(picture.png).decode()
         style = ' class="wide"' if width > _WIDE else ""
-        alt = escape(f"{picture.title}: {picture.caption}", quote=True)
-        caption = f"<figcaption><b>{escape(picture.title)}.</b> {escape(picture.caption)}</figcaption>"
+        alt = escape(f"{title}: {picture.caption}", quote=True)
+        caption = f"<figcaption><b>{escape(title)}.</b> {escape(picture.caption)}</figcaption>"
         figures.append(f'<figure{style}><img alt="{alt}" src="data:image/png;base64,{image}">{caption}</figure>')
     return f'<div class="pictures">{"".join(figures)}</div>' if figures else ""
 
