@@ -113,6 +113,8 @@ def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
         raise click.UsageError("--verify measures the whole pipeline: leave --only out")
     if request.only:
         file = load(pipeline, settings, request.only)
+    if request.verify:
+        file.scene().instrument.check_one_band("zonda run --verify")
     first_look(file.pipeline(), file.scene())  # minutes of work must not come before a mistake that is seen at once
     if file.header.accuracy is not None:
         settings = (*settings, *_knobs(file, file.header.accuracy))

@@ -23,6 +23,7 @@ import zonda
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.figures import Figures
+from zonda.core.focalplane import Focalplane
 from zonda.core.registry import noise_models, operators
 from zonda.core.site import Site
 from zonda.operators.io.save_tod import load_tod
@@ -42,12 +43,21 @@ def scene(**more: Any) -> Any:
     )
 
 
-def instrument(band: Any = None, telescope: Any = None, **more: Any) -> Any:
+class OfTwoWafers(zonda.Instrument):
+    """Every second detector is on the second wafer."""
+
+    def focalplane(self) -> Focalplane:
+        plane = super().focalplane()
+        plane.wafer = np.arange(len(plane)) % 2
+        return plane
+
+
+def instrument(band: Any = None, telescope: Any = None, kind: Any = zonda.Instrument, **more: Any) -> Any:
     dish = {"name": "dish", "diameter": "100 m", "elevation_max": "88 deg"} | (telescope or {})
     values = {
         "name": "camera",
         "telescope": zonda.Telescope(**dish),
-        "band": zonda.Band(**({"name": "b", "low": "78 GHz", "high": "108 GHz"} | (band or {}))),
+        "band": None if "bands" in more else zonda.Band(**({"name": "b", "low": "78 GHz", "high": "108 GHz"} | (band or {}))),
         "detectors": 19,
         "field_of_view": "2 arcmin",
         "fwhm": "8.5 arcsec",
@@ -57,7 +67,7 @@ def instrument(band: Any = None, telescope: Any = None, **more: Any) -> Any:
         "knee": "0.5 Hz",
         "sample_rate": "50 Hz",
     }
-    return zonda.Instrument(**(values | more))
+    return kind(**(values | more))
 
 
 @pytest.fixture(scope="module")
@@ -369,6 +379,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "gap": ({"gap": 0.99}, {"gap": 1e-3}),
         "on_undetermined": ({"gap": 1e-3}, {"on_undetermined": "skip"}),
         "scale": ({}, {"scale": "rms"}),
+        "group": ({}, {"group": "wafer"}),
         "mask": ({}, {"mask": {"radius": "20 arcsec"}}),
     },
     "BinMap": {
@@ -575,6 +586,8 @@ def test_every_parameter_of_every_operator(name: str, field: str, maps: Path, tm
     needs, change = CASES[name][field]
     case = f"{name} {needs}"
     camera: dict[str, Any] = {"telescope": {"azimuth_speed_max": "1 arcsec/s"}} if field == "check_limits" else {}
+    if field == "group":
+        case, camera = f"{case} wafers", {"kind": OfTwoWafers}
     if f"{name}.{field}" in POLARIZED or name in POLARIZED:
         case, camera = f"{case} polarized", {"polarization": "pairs", "detectors": 20}
     where = scene(instrument=instrument(**camera))
@@ -668,6 +681,14 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "instrument": {
         "telescope": {"telescope": {"diameter": "50 m"}},
         "band": {"band": {"high": "112 GHz"}},
+        "bands": {
+            "bands": [{"name": "b", "low": "78 GHz", "high": "108 GHz"}, {"name": "c", "low": "130 GHz", "high": "170 GHz"}]
+        },
+        "pixels": {
+            "pixels": "separate",
+            "bands": [{"name": "b", "low": "78 GHz", "high": "108 GHz", "detectors": 7}, "so_93ghz"],
+        },
+        "polarization": {"polarization": "pairs", "detectors": 20},
         "detectors": {"detectors": 7},
         "field_of_view": {"field_of_view": "3 arcmin"},
         "fwhm": {"fwhm": None},
