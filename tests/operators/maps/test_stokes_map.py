@@ -299,3 +299,34 @@ def test_flagged_and_not_finite_samples_are_dropped_and_counted():
     assert count["samples binned"] == product.polarization.hits.sum()
     solved = product.hits > 0
     np.testing.assert_allclose(product.polarization.q[solved], Q, rtol=0, atol=1e-5)
+
+
+def test_a_campaign_of_two_workers_gives_the_bits_of_one_run(tmp_path):
+    """With everything that a map of I, Q and U consists of."""
+    camera = zonda.Instrument(
+        name="pairs", telescope=zonda.Telescope(name="dish", diameter="6 m"), detectors=24, field_of_view="6 arcmin",
+        band=zonda.Band(name="b", low="130 GHz", high="170 GHz"), fwhm="1.4 arcmin", polarization="pairs", net="1 mK s(1/2)",
+        main_beam_efficiency=0.7, illumination_efficiency=0.9, sample_rate="20 Hz",
+    )  # fmt: skip
+    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=3)
+    found = []
+    for how in ({}, {"engine": "processes", "workers": 2}):
+        steps = [
+            zonda.PointingDaisy(radius="5 arcmin", speed="60 arcsec/s", scan_duration="20 s", scans=3, offsets="none"),
+            zonda.HalfWavePlate(frequency="1 Hz"),
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+            zonda.BinMap(pixel="60 arcsec", stokes="IQU"),
+            zonda.SaveMap(),
+        ]
+        folder = tmp_path / how.get("engine", "one")
+        if how:
+            zonda.campaign(zonda.Pipeline(steps), scene, output=folder, **how)
+        else:
+            zonda.Pipeline(steps).run(scene, output=folder)
+        with fits.open(next(folder.rglob("map.fits"))) as file:
+            found.append({hdu.name: np.array(hdu.data) for hdu in file if hdu.is_image})
+    assert {"I", "Q", "U", "COV_QU", "HALF_DIFFERENCE_U"} <= found[0].keys()
+    assert np.isfinite(found[0]["Q"]).sum() > 20
+    for name, values in found[0].items():
+        np.testing.assert_array_equal(values, found[1][name], err_msg=name)
