@@ -73,21 +73,24 @@ def test_a_source_is_mapped_beside_its_place(tmp_path):
         np.testing.assert_allclose(centre, expected, atol=0.02)
 
 
-def test_the_jitter_widens_the_beam(tmp_path):
-    """A fast jitter: a Gaussian beam of sigma^2 + rms^2 in the map, and so a lower peak by the ratio."""
+def test_the_jitter_dims_a_source(tmp_path):
+    """A detector that stares at it sees on average sigma^2 / (sigma^2 + rms^2) of its peak, sigma that of the beam.
+
+    A sample has the variance sigma^2 / (sigma^2 + 2 rms^2) less that share squared; with a correlation rho of the jitter from
+    sample to sample at most, N samples count as N (1 - rho) / (1 + rho).
+    """
     path = tmp_path / "c.csv"
     path.write_text("ra [deg],dec [deg],flux [Jy]\n75,20,1\n")
-    pointing = zonda.PointingDaisy(scan_duration="120 s", radius="40 arcsec", speed="60 arcsec/s", scans=2)
-    sigma, peaks = 8.5 / np.sqrt(8 * np.log(2)), []
-    for rms in ("0 arcsec", "3 arcsec"):
-        error = Mispointing(jitter_rms=rms, jitter_time="20 ms")
-        steps = [pointing, error, zonda.PointSources(catalogue=path), zonda.BinMap(pixel="1 arcsec")]
-        map = zonda.Pipeline(steps).run(scenes.scene(scenes.camera(37)), threads=1).products["map"]
-        y, x = np.indices(map.signal.shape)
-        ra, dec = map.wcs.wcs_pix2world(x, y, 0)
-        near = np.hypot((ra - 75) * np.cos(np.radians(20)), dec - 20) * 3600 < 2
-        peaks.append(np.average(map.signal[near], weights=map.hits[near]))
-    assert peaks[1] / peaks[0] == pytest.approx(sigma**2 / (sigma**2 + 9), rel=0.05)
+    n, rms, sigma, seen = 20000, 3.0, 8.5 / np.sqrt(8 * np.log(2)), []
+    for jitter in ("0 arcsec", f"{rms} arcsec"):
+        steps = [Mispointing(jitter_rms=jitter, jitter_time="20 ms"), zonda.PointSources(catalogue=path)]
+        data = scenes.run(steps, scenes.scan(1, n, radius=0.0), keep=("sky",))
+        seen.append(data.observations[0].detdata["sky"][0])
+    share = sigma**2 / (sigma**2 + rms**2)
+    variance = sigma**2 / (sigma**2 + 2 * rms**2) - share**2
+    rho = np.exp(-0.5)  # 10 ms between samples
+    error = np.sqrt(variance / (n * (1 - rho) / (1 + rho)))
+    assert abs(seen[1].mean() / seen[0].mean() - share) < 4 * error
 
 
 def test_each_scan_has_an_error_of_its_own():
