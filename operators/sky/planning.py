@@ -15,6 +15,7 @@ from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
 from .brightness import conversion
+from .cmb import CMB, read_spectrum
 from .convolved import beam_widths, brightness_on, grid_of
 from .grid import Grid
 from .point_sources import Catalogue, PointSources, Sources
@@ -168,3 +169,24 @@ class SourcesPlanning(Planning[PointSources]):
         power = catalogue.brightness(observation.instrument.band, self.operator.scale)
         found = Sources.of(catalogue, power, observation)
         return power[np.unique(found.number)], len(found.number)
+
+
+class CMBPlanning(Planning[CMB]):
+    """It has no coarser form. The map is not drawn for it."""
+
+    of = CMB
+
+    def traits(self, observation: Observation) -> Traits:
+        """Four and a half standard deviations of the sky, which is larger than 1 K_RJ per K_CMB nowhere."""
+        spectra = read_spectrum(str(self.operator.spectrum))
+        ell = np.arange(spectra.shape[1])
+        return Traits(peak=4.5 * math.sqrt(float(((2 * ell + 1) * spectra[0]).sum()) / (4 * math.pi)))
+
+    def memory(self, observation: Observation) -> int:
+        """Maps and their multipoles."""
+        return 12 * self.operator.nside**2 * 8 * 12
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost: maps from multipoles, and what `SkyMap` does with them."""
+        once = 1.2e-10 * self.operator.nside**3 + 3e-7 * 12 * self.operator.nside**2
+        return Estimate((), Cost(fixed=0.05, per_time=5e-8, per_sample=5e-9, once=once))

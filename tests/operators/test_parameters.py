@@ -97,6 +97,9 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, minute in (("night", "00"), ("later", "05")):
         row = f"2024-11-25 07:{minute}:00 | 2024-11-25 07:{minute}:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
         (folder / f"{name}.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
+    multipoles = np.arange(2, 1500)
+    np.savetxt(folder / "theory.txt", np.stack([multipoles, 1e6 / multipoles], axis=1))
+    np.savetxt(folder / "flat.txt", np.stack([multipoles, np.full(len(multipoles), 1e3)], axis=1))
     for name, flux in (("sources", 1.0), ("others", 2.0)):
         (folder / f"{name}.csv").write_text(f"ra [deg],dec [deg],flux [Jy],spectral_index\n75,20,{flux},-0.7\n")
     a, b, *_ = instrument().focalplane().names
@@ -231,6 +234,11 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "scan_rms": ({}, {"scan_rms": "5 arcsec"}),
         "jitter_rms": ({}, {"jitter_rms": "5 arcsec"}),
         "jitter_time": ({"jitter_rms": "5 arcsec"}, {"jitter_time": "2 s"}),
+    },
+    "CMB": {
+        "spectrum": ({}, {"spectrum": "flat.txt"}),
+        "nside": ({}, {"nside": 512}),
+        "realization": ({}, {"realization": 1}),
     },
     "PointSources": {
         "catalogue": ({}, {"catalogue": "others.csv"}),
@@ -475,6 +483,7 @@ CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
     "PointSources": ["PointSources"],
+    "CMB": ["CMB"],
     "Mispointing": ["PointingDaisy", "Mispointing", "SkyMap"],
     "AtmosphereLayers": ["AtmosphereLayers"],
     "AtmosphereScreens": ["AtmosphereLayers", "AtmosphereScreens"],
@@ -521,6 +530,7 @@ CHAINS = {
 DEFAULTS: dict[str, dict[str, Any]] = {
     "SkyMap": {"file": "map.fits"},
     "PointSources": {"catalogue": "sources.csv"},
+    "CMB": {"spectrum": "theory.txt", "nside": 256},
     "AtmosphereLayers": {"pwv": "7.7 mm"},
     "WhiteNoise": {},
     "BinMap": {"pixel": "4 arcsec"},
@@ -545,7 +555,9 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 
     def step(other: str) -> Any:
         values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
-        values = values | {key: maps / values[key] for key in ("file", "schedule", "catalogue") if values.get(key) is not None}
+        values = values | {
+            key: maps / values[key] for key in ("file", "schedule", "catalogue", "spectrum") if values.get(key) is not None
+        }
         if which == "BinMap" == other and "nside" in values:
             values.pop("pixel", None)
         return make(other, **values)

@@ -1,0 +1,149 @@
+"""The cosmic microwave background, drawn from its power spectra.
+
+    a^T = sqrt(C^TT) g_T,   a^E = C^TE / sqrt(C^TT) g_T + sqrt(C^EE - (C^TE)^2 / C^TT) g_E,   a^B = sqrt(C^BB) g_B,      (1)
+
+for every l and m, g complex normal deviates of unit variance (real for m = 0); healpy makes maps of them (Gorski et al. 2005). A
+deviate belongs to its l and m, so that another `nside` shows the same sky with more or less detail. K_CMB become K_RJ over the
+band as in any map of `SkyMap`, which does everything else.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field, PrivateAttr, field_validator
+
+from zonda.core.block import Block
+from zonda.core.configuration.files import InputPath
+from zonda.core.data import Data
+from zonda.core.errors import InputError
+from zonda.core.numerics.random import normals, stream_key
+from zonda.core.observation import Observation
+from zonda.core.operator import Operator
+from zonda.core.storage.files import reading
+from zonda.core.types import Floats
+
+from .skymap import SkyMap
+
+HIGHEST = 30_000
+"""Multipole above which a spectrum is not read."""
+CURE = "give columns of text: ell, TT or ell, TT, EE, BB, TE, as ell (ell + 1) C_l / (2 pi) in uK^2 (what CAMB and CLASS write)"
+
+
+class CMB(Operator):
+    """Cosmic microwave background of a given power spectrum, equation (1): part of the component ``sky``.
+
+    No spectrum comes with zonda: give a file of a theory code. With TT alone it is not polarized.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+
+    spectrum: InputPath
+    """Text: columns l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2; # begins a remark."""
+    nside: int = Field(2048, ge=16, le=8192)
+    """Of the HEALPix map that is drawn; a pixel should be smaller than half of the beam."""
+    realization: int | None = Field(None, ge=0)
+    """Number of the sky: the same for every seed. Where absent the seed draws it, and in a campaign every entry has another."""
+
+    _skies: dict[int, SkyMap] = PrivateAttr(default_factory=dict)
+
+    @field_validator("nside")
+    @classmethod
+    def _power_of_two(cls, value: int) -> int:
+        if value & (value - 1):
+            raise ValueError(f"nside is a power of two, not {value}")
+        return value
+
+    def prepare(self, observation: Observation) -> Any:
+        """See `SkyMap`."""
+        rms = float(np.std(self.sky(observation.seed).map.table.data["I"]))  # type: ignore[union-attr]
+        observation.tally.state(self.label, "rms of the sky before the beam", f"{1e6 * rms:.4g} uK_CMB, nside {self.nside}")
+        return self.sky(observation.seed).prepare(observation)
+
+    def exec(self, block: Block, state: Any) -> None:
+        """See `SkyMap`."""
+        self.sky(block.observation.seed).exec(block, state)
+
+    def collect(self, data: Data, observation: Observation, state: Any) -> None:
+        """See `SkyMap`."""
+        self.sky(observation.seed).collect(data, observation, state)
+
+    def finalize(self, data: Data) -> None:
+        """See `SkyMap`."""
+        self.sky(data.scene.seed).finalize(data)
+
+    def sky(self, seed: int) -> SkyMap:
+        """The step that samples the map of a seed."""
+        number = seed if self.realization is None else self.realization
+        if number not in self._skies:
+            key = stream_key(number, "CMB", self.label)
+            maps = draw(read_spectrum(str(self.spectrum)), self.nside, key)
+            found = SkyMap(map=_table(maps, self.nside))
+            found._label = self.label
+            self._skies.clear()
+            self._skies[number] = found
+        return self._skies[number]
+
+
+def read_spectrum(place: str) -> Floats:
+    """C_l [K^2], (4, lmax + 1): TT, EE, BB, TE from l = 0; zero where the file has none. Raises InputError."""
+    with reading(place, "a power spectrum", CURE):
+        table = np.loadtxt(place, ndmin=2)
+    if table.shape[1] not in (2, 5):
+        raise InputError(f"has {table.shape[1]} columns, not 2 or 5", place=place, cure=CURE)
+    ell = table[:, 0]
+    if (
+        not np.isfinite(table).all()
+        or (ell != np.round(ell)).any()
+        or (np.diff(ell) <= 0).any()
+        or ell[0] < 0
+        or ell[-1] > HIGHEST
+    ):
+        raise InputError(f"the first column is no rising series of multipoles up to {HIGHEST}", place=place, cure=CURE)
+    if (ell[-1] - max(ell[0], 2)) + 1 != np.count_nonzero(ell >= 2):
+        raise InputError("multipoles are missing between the first and the last", place=place, cure="give every l")
+    spectra, at = np.zeros((4, int(ell[-1]) + 1)), ell.astype(int)
+    flat = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0.0) * 1e-12
+    for k, column in enumerate(table.T[1:]):
+        spectra[k, at] = column * flat
+    tt, ee, bb, te = spectra
+    if min(tt.min(), ee.min(), bb.min()) < 0 or (te**2 > tt * ee * (1 + 1e-6)).any():
+        raise InputError("no sky has this spectrum: TT, EE or BB is negative, or TE^2 exceeds TT EE", place=place, cure=CURE)
+    return spectra
+
+
+def draw(spectra: Floats, nside: int, key: Any) -> Floats:
+    """Equation (1): maps (1 or 3, n_pix) of I, or I, Q and U in COSMO's convention, K_CMB, ring order."""
+    import healpy
+
+    lmax = min(spectra.shape[1] - 1, 3 * nside - 1)
+    ell, m = healpy.Alm.getlm(lmax)
+    number = ell * (ell + 1) // 2 + m
+    tt, ee, bb, te = spectra[:, : lmax + 1]
+
+    def deviates(stream: int) -> Any:
+        pairs = normals(key, 0, (lmax + 1) * (lmax + 2), stream=stream).astype(np.float64).reshape(-1, 2)[number]
+        return np.where(m == 0, pairs[:, 0], (pairs[:, 0] + 1j * pairs[:, 1]) / np.sqrt(2))
+
+    first = deviates(0)
+    root = np.sqrt(tt)
+    intensity = root[ell] * first
+    if not (ee.any() or bb.any()):
+        return np.asarray(healpy.alm2map(intensity, nside, lmax=lmax), np.float64)[None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shared = np.where(tt > 0, te / root, 0.0)
+    own = np.sqrt(np.maximum(ee - shared**2, 0.0))
+    polarized = [shared[ell] * first + own[ell] * deviates(1), np.sqrt(bb)[ell] * deviates(2)]
+    return np.asarray(healpy.alm2map([intensity, *polarized], nside, lmax=lmax, pol=True), np.float64)
+
+
+def _table(maps: Floats, nside: int) -> Any:
+    """The maps as a HEALPix table."""
+    from astropy.io import fits
+
+    columns = [fits.Column(name, "D", unit="K_CMB", array=values) for name, values in zip("IQU", maps, strict=False)]
+    table = fits.BinTableHDU.from_columns(columns)
+    table.header.update(PIXTYPE="HEALPIX", ORDERING="RING", NSIDE=nside, COORDSYS="C", INDXSCHM="IMPLICIT", POLCCONV="COSMO")
+    return table
