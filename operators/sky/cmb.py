@@ -31,7 +31,7 @@ HIGHEST = 30_000
 CURE = "give columns of text: ell, TT or ell, TT, EE, BB, TE, as ell (ell + 1) C_l / (2 pi) in uK^2 (what CAMB and CLASS write)"
 
 
-class CMB(Operator):
+class CMBSky(Operator):
     """Cosmic microwave background of a given power spectrum, equation (1): part of the component ``sky``.
 
     No spectrum comes with zonda: give a file of a theory code. With TT alone it is not polarized.
@@ -78,7 +78,7 @@ class CMB(Operator):
         """The step that samples the map of a seed."""
         number = seed if self.realization is None else self.realization
         if number not in self._skies:
-            key = stream_key(number, "CMB", self.label)
+            key = stream_key(number, "CMBSky", self.label)
             maps = draw(read_spectrum(str(self.spectrum)), self.nside, key)
             found = SkyMap(map=_table(maps, self.nside))
             found._label = self.label

@@ -15,7 +15,7 @@ from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
 from .brightness import conversion
-from .cmb import CMB, read_spectrum
+from .cmb import CMBSky, read_spectrum
 from .convolved import beam_widths, brightness_on, grid_of
 from .grid import Grid
 from .point_sources import Catalogue, PointSources, Sources
@@ -171,10 +171,10 @@ class SourcesPlanning(Planning[PointSources]):
         return power[np.unique(found.number)], len(found.number)
 
 
-class CMBPlanning(Planning[CMB]):
+class CMBPlanning(Planning[CMBSky]):
     """It has no coarser form. The map is not drawn for it."""
 
-    of = CMB
+    of = CMBSky
 
     def traits(self, observation: Observation) -> Traits:
         """Four and a half standard deviations of the sky, which is larger than 1 K_RJ per K_CMB nowhere."""

@@ -235,7 +235,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "jitter_rms": ({}, {"jitter_rms": "5 arcsec"}),
         "jitter_time": ({"jitter_rms": "5 arcsec"}, {"jitter_time": "2 s"}),
     },
-    "CMB": {
+    "CMBSky": {
         "spectrum": ({}, {"spectrum": "flat.txt"}),
         "nside": ({}, {"nside": 512}),
         "realization": ({}, {"realization": 1}),
@@ -483,7 +483,7 @@ CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
     "PointSources": ["PointSources"],
-    "CMB": ["CMB"],
+    "CMBSky": ["CMBSky"],
     "Mispointing": ["PointingDaisy", "Mispointing", "SkyMap"],
     "AtmosphereLayers": ["AtmosphereLayers"],
     "AtmosphereScreens": ["AtmosphereLayers", "AtmosphereScreens"],
@@ -530,7 +530,7 @@ CHAINS = {
 DEFAULTS: dict[str, dict[str, Any]] = {
     "SkyMap": {"file": "map.fits"},
     "PointSources": {"catalogue": "sources.csv"},
-    "CMB": {"spectrum": "theory.txt", "nside": 256},
+    "CMBSky": {"spectrum": "theory.txt", "nside": 256},
     "AtmosphereLayers": {"pwv": "7.7 mm"},
     "WhiteNoise": {},
     "BinMap": {"pixel": "4 arcsec"},

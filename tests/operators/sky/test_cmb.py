@@ -10,7 +10,7 @@ import zonda
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.random import stream_key
-from zonda.operators.sky.cmb import CMB, draw, read_spectrum
+from zonda.operators.sky.cmb import draw, read_spectrum
 from zonda.plugins.checks import scenes
 
 LMAX, NSIDE = 95, 64
@@ -51,7 +51,7 @@ def test_the_stream_is_the_map_in_the_bands_kelvin(tmp_path):
     """Where the detectors look: the multipoles summed with the beam, times K_RJ per K_CMB of the band."""
     path = theory(tmp_path / "t.txt", polarized=False)
     observation = scenes.scan(3, 2000, radius=60.0)
-    step = CMB(spectrum=path, nside=256)
+    step = CMBSky(spectrum=path, nside=256)
     found = scenes.run([step], observation, keep=("sky",)).observations[0].detdata["sky"]
     ell = np.arange(LMAX + 1)
     fwhm = float(observation.focalplane.fwhm[0])
@@ -66,16 +66,16 @@ def test_the_stream_is_the_map_in_the_bands_kelvin(tmp_path):
 
 def test_seeds_and_realizations(tmp_path):
     path = theory(tmp_path / "t.txt", polarized=False)
-    seeded = [CMB(spectrum=path, nside=16).sky(seed).map.table.data["I"] for seed in (1, 2, 1)]
+    seeded = [CMBSky(spectrum=path, nside=16).sky(seed).map.table.data["I"] for seed in (1, 2, 1)]
     assert not np.array_equal(seeded[0], seeded[1])
     np.testing.assert_array_equal(seeded[0], seeded[2])
-    fixed = [CMB(spectrum=path, nside=16, realization=4).sky(seed).map.table.data["I"] for seed in (1, 2)]
+    fixed = [CMBSky(spectrum=path, nside=16, realization=4).sky(seed).map.table.data["I"] for seed in (1, 2)]
     np.testing.assert_array_equal(*fixed)
 
 
 def test_without_a_spectrum_it_is_refused():
     with pytest.raises((ZondaError, ValueError), match="spectrum"):
-        zonda.CMB()
+        zonda.CMBSky()
 
 
 @pytest.mark.parametrize(
