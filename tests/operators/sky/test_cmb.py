@@ -10,7 +10,7 @@ import zonda
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.random import stream_key
-from zonda.operators.sky.cmb import draw, read_spectrum
+from zonda.operators.sky.cmb import CMBSky, draw, read_spectrum
 from zonda.plugins.checks import scenes
 
 LMAX, NSIDE = 95, 64
