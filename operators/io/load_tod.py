@@ -186,6 +186,7 @@ def _observation(step: LoadTOD, data: Data, scan: RecordedScan) -> Observation:
         detector_flags=dead,
         intervals=dict(tod.intervals),
         weather=tod.weather,
+        hwp_angle=tod.hwp_angle,
     )
     tally = observation.tally
     tally.state(step.label, "noise of the detectors", scan.noise)

@@ -110,3 +110,28 @@ def test_a_plate_goes_to_files_and_back(tmp_path):
         np.testing.assert_array_equal(tod.hwp_angle, o.hwp_angle)
         np.testing.assert_allclose(tod.hwp_angle, expected, atol=1e-12)
         np.testing.assert_array_equal(tod.columns["polarization_efficiency"], 0.8)
+
+
+def test_recorded_polarized_data_make_the_map_of_the_run_that_saved_them(tmp_path):
+    camera = zonda.Instrument(
+        name="pairs", telescope=zonda.Telescope(name="dish", diameter="6 m"), detectors=12, field_of_view="6 arcmin",
+        band=zonda.Band(name="b", low="130 GHz", high="170 GHz"), fwhm="1.4 arcmin", polarization="pairs", net="1 mK s(1/2)",
+        main_beam_efficiency=0.7, illumination_efficiency=0.9, sample_rate="20 Hz",
+    )  # fmt: skip
+    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="75 deg 20 deg", seed=3)
+    how = {"pixel": "60 arcsec", "width": "15 arcmin", "stokes": "IQU"}
+    steps = [
+        zonda.PointingDaisy(radius="5 arcmin", speed="60 arcsec/s", scan_duration="20 s"),
+        zonda.HalfWavePlate(frequency="1 Hz"),
+        uniform_sky(1.0, 0.3, -0.2),
+        zonda.BinMap(**how),
+        zonda.SaveTOD(),
+    ]
+    saved = zonda.Pipeline(steps, precision="float64").run(scene, output=tmp_path)
+    (path,) = saved.products["tod_file"]
+    again = zonda.Pipeline([zonda.LoadTOD(file=path), zonda.BinMap(**how)], precision="float64").run(scene)
+    one, other = saved.products["map"], again.products["map"]
+    np.testing.assert_array_equal(one.polarization.hits, other.polarization.hits)
+    assert (one.hits > 0).sum() > 20
+    np.testing.assert_allclose(other.polarization.q, one.polarization.q, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(other.signal, one.signal, rtol=0, atol=1e-8)
