@@ -39,6 +39,8 @@ OUTLYING = 6.0
 """Robust standard deviations: 1.4826 times the median distance from the median."""
 HIGHEST = 0.9
 """Of the Nyquist frequency: what lies above is not fitted (filters before the read-out)."""
+LEAST_SLOPE = 0.5
+"""A flatter spectrum cannot be told from white noise."""
 OVERLAP, CORRELATED, MEDIAN = 1.056, 1 + 2 * (4 / 9 + 1 / 36), 1 / math.log(2) ** 2
 """Factors of equation (2)."""
 
@@ -129,11 +131,14 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
     from scipy.optimize import least_squares
 
     low = float(log_p[0])
-    limits = [-np.inf, start - 40, 0.2], [np.inf, np.inf, 4.0]
+    limits = [-np.inf, start - 40, LEAST_SLOPE], [np.inf, np.inf, 4.0]
     guesses = [[start, max(low, start - 2.0) - slope * math.log(middle / f[0]), slope] for slope in (1.0, 2.0)]
     found = min((least_squares(residual, guess, bounds=limits) for guess in guesses), key=lambda tried: float(tried.cost))
     white_cost = 0.5 * float(np.sum(((np.average(log_p, weights=1 / sigma**2) - log_p) / sigma) ** 2))
-    if white_cost - found.cost < 3.0:  # two more parameters would do as much by chance in one of twenty cases
+    inside = float(found.x[1] - found.x[0]) < float(found.x[2]) * math.log(
+        f[-1] / middle
+    )  # the knee lies below the last frequency
+    if white_cost - found.cost < 3.0 or not inside:  # two more parameters do as much by chance in one of twenty cases
         level, variance = float(np.average(log_p, weights=1 / sigma**2)), float(1 / np.sum(1 / sigma**2))
         net = math.sqrt(math.exp(level) / 2)
         chi = 2 * white_cost / max(len(f) - 1, 1)

@@ -13,6 +13,7 @@ from zonda.core.flags import DEAD, OPAQUE, SUN_UP
 from zonda.core.intervals import samples_in
 from zonda.core.operator import Operator
 from zonda.core.polarization import PolarizationAngles
+from zonda.operators.io.load_tod import LoadTOD
 from zonda.operators.io.save_tod import SaveTOD, load_tod
 
 pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
@@ -22,9 +23,11 @@ if os.environ.get("ZONDA_TOAST") == "required":
 else:
     toast = pytest.importorskip("toast", reason="TOAST is not installed: .ci/toast makes an environment with it")
 
-from datetime import UTC
+from datetime import UTC, datetime, timedelta
 
+import astropy.units as u
 import toast.instrument
+import toast.instrument_sim
 import toast.io
 import toast.ops
 import toast.schedule
@@ -358,3 +361,31 @@ def test_toasts_map_of_i_q_u_is_zondas(polarized):
     # ours rounds cosines and weights to 2^-31, times condition numbers of some tens
     for k, plane in enumerate((product.signal, own.q, own.u)):
         np.testing.assert_allclose(plane[solved], theirs[:, k], rtol=0, atol=1e-7 * scale)
+
+
+@pytest.mark.parametrize("detdata", ["signal", ("signal", {"type": "flac", "level": 5, "quanta": 1e-9})])
+def test_toasts_own_file_gives_toasts_own_map(tmp_path, detdata):
+    """A constant-elevation scan of SimGround with SimNoise, saved by TOAST, mapped by both."""
+    band = {"bandcenter": 150 * u.GHz, "bandwidth": 30 * u.GHz, "fwhm": 10 * u.arcmin}
+    noise = {"psd_net": 0.3 * u.mK * np.sqrt(1 * u.s), "psd_fknee": 0.2 * u.Hz, "psd_fmin": 1e-4 * u.Hz}
+    plane = toast.instrument_sim.fake_hexagon_focalplane(n_pix=7, width=2 * u.deg, sample_rate=20 * u.Hz, **band, **noise)
+    place = {"lat": -22.958 * u.deg, "lon": -67.786 * u.deg, "alt": 5200 * u.m}
+    telescope = toast.instrument.Telescope("dish", focalplane=plane, site=toast.instrument.GroundSite("here", *place.values()))
+    begin = datetime(2024, 6, 25, 7, tzinfo=UTC)
+    scan = toast.schedule.GroundScan(
+        name="CES", start=begin, stop=begin + timedelta(minutes=3), el=50 * u.deg, az_min=170 * u.deg, az_max=190 * u.deg
+    )
+    where = {f"site_{name}": value for name, value in place.items()}
+    schedule = toast.schedule.GroundSchedule(scans=[scan], site_name="here", telescope_name="dish", **where)
+    data = toast.Data(toast.Comm())
+    toast.ops.SimGround(telescope=telescope, schedule=schedule, weather="atacama", detset_key="pixel").apply(data)
+    toast.ops.DefaultNoiseModel().apply(data)
+    toast.ops.SimNoise().apply(data)
+    path = toast.io.save_hdf5(data.obs[0], str(tmp_path), detdata=[detdata, "flags"], force_serial=True)
+    hits, found = toast_maps(path)
+    step = LoadTOD(file=path)
+    ours, signal = zonda_maps(zonda.Pipeline([step, zonda.BinMap(nside=NSIDE)]).run(step.scene(), threads=1)["map"])
+    np.testing.assert_array_equal(ours, hits)
+    # samples of a millikelvin, each rounded to float32 (6e-11 K); what FLAC has rounded, both have read
+    np.testing.assert_allclose(signal, found, rtol=0, atol=1e-9)
+    assert np.std(found[hits > 0]) > 1e-4
