@@ -147,5 +147,5 @@ def tell(step: CompareStreams, data: Data, found: StreamComparison) -> None:
     data.products[found.product] = found
     if data.output is not None:
         made = about(data, STREAM=found.stream, REFERENCE=found.reference, SCANS=found.observations, SEGMENTS=found.segments)
-        write_ecsv(product_path(data.output, found.product, ".ecsv"), found.columns(), made)
-        write_ecsv(product_path(data.output, f"{found.product}_detectors", ".ecsv"), found.detector_columns(), made)
+        write_ecsv(product_path(data.output, data.named(found.product), ".ecsv"), found.columns(), made)
+        write_ecsv(product_path(data.output, data.named(f"{found.product}_detectors"), ".ecsv"), found.detector_columns(), made)

@@ -86,8 +86,12 @@ class ModeSpectrum(Operator):
         data.products[found.product] = found
         if data.output is not None:
             made = about(data, SCAN=found.observation)
-            write_ecsv(product_path(data.output, found.product, ".ecsv"), found.columns(), {**made, "SCANS": len(found.values)})
-            write_ecsv(product_path(data.output, f"{found.product}_streams", ".ecsv"), found.stream_columns(), made)
+            write_ecsv(
+                product_path(data.output, data.named(found.product), ".ecsv"),
+                found.columns(),
+                {**made, "SCANS": len(found.values)},
+            )
+            write_ecsv(product_path(data.output, data.named(f"{found.product}_streams"), ".ecsv"), found.stream_columns(), made)
 
 
 def _find(step: ModeSpectrum, stream: Stream) -> Modes | None:

@@ -100,8 +100,7 @@ def test_products_scans_and_the_log_bear_the_bands_names(both: Any) -> None:
 
 
 def test_files_per_band(tmp_path: Path) -> None:
-    text = ["SaveMap", "Report", "SaveTOD"]
-    steps = [getattr(zonda, name)() for name in text]
+    steps = [getattr(zonda, name)() for name in ("ModeSpectrum", "SaveMap", "Report", "SaveTOD")]
     transfer = zonda.TransferFunction(bins=3)
     made = pipeline(transfer, zonda.MeasureFigures(metrics=["central_rms"]), *steps, without=(zonda.PinkNoise,))
     data = made.run(scene("f090", "f150"), output=tmp_path, threads=1)
@@ -112,6 +111,7 @@ def test_files_per_band(tmp_path: Path) -> None:
         assert header["NSCANS"] == 2
         assert (tmp_path / f"noiseless_map_{name}.fits").exists()
         assert (tmp_path / f"transfer_function_{name}.ecsv").exists()
+        assert (tmp_path / f"modes_{name}.ecsv").exists()
         assert (tmp_path / f"tod_scan-001-{name}.h5").exists()
         assert f"central_rms {name}" in [f.name for f in data[f"figures_{name}"]]
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
