@@ -58,7 +58,7 @@ DETECTOR_FLAGS = (
     Flag(PROCESSING, "processing", "left out by a step", True, PROCESSING),
     Flag(SOLAR_SYSTEM_OBJECT, "solar-system object", "a planet is in the beam", True, SOLAR_SYSTEM_OBJECT),
     Flag(OPAQUE, "opaque", "the atmosphere is opaque in its band most of the time", True, INVALID),
-    Flag(DEAD, "dead", "its signal is constant or not finite", True, INVALID),
+    Flag(DEAD, "dead", "its signal is constant or not finite, or the focal plane says so", True, INVALID),
 )
 """Of detectors (`Observation.detector_flags`)."""
 

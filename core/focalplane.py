@@ -15,11 +15,11 @@ from .types import Floats
 
 DEFAULTS: dict[str, float] = {
     "polarization_angle": 0.0, "polarization_efficiency": 0.0, "band": 0, "wafer": 0, "knee": 0.0, "slope": 1.0,
-    "minimum_frequency": 1e-3,
+    "minimum_frequency": 1e-3, "dead": 0,
 }  # fmt: skip
 """Values of columns that are not given."""
 
-WHOLE = ("band", "wafer")
+WHOLE = ("band", "wafer", "dead")
 """Columns of whole numbers."""
 
 
@@ -54,6 +54,8 @@ class Focalplane:
     knee, slope, minimum_frequency
         Pink noise: frequency at which it equals white noise of ``net`` [Hz], exponent of the fall f^-slope, frequency below which
         it is flat [Hz]. The knee is 0 where there is none.
+    dead
+        1 for a detector that gives no data, else 0: an observation begins with it flagged.
     """
 
     names: list[str]
@@ -70,6 +72,7 @@ class Focalplane:
     knee: Floats = field(default_factory=lambda: np.zeros(0))
     slope: Floats = field(default_factory=lambda: np.zeros(0))
     minimum_frequency: Floats = field(default_factory=lambda: np.zeros(0))
+    dead: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -113,6 +116,7 @@ class Focalplane:
             ("main-beam efficiency zeta", span(self.main_beam_efficiency, 1, "")),
             ("illumination efficiency epsilon", span(self.illumination_efficiency, 1, "")),
             ("polarized detectors", int((self.polarization_efficiency > 0).sum())),
+            ("dead detectors", int(self.dead.sum())),
         ]
         return html_table("Focalplane", rows)
 
@@ -140,9 +144,9 @@ class Focalplane:
         return Focalplane([self.names[row] for row in rows], **(found | {"band": np.zeros(len(rows), np.int64)}))
 
     @classmethod
-    def of_bands(cls, planes: Mapping[str, Focalplane]) -> Focalplane:
-        """The detectors of several bands by name, one band after the other; their names end with the band's."""
+    def of_bands(cls, planes: Mapping[str, Focalplane], suffix: bool = True) -> Focalplane:
+        """The detectors of several bands by name, one band after the other; with ``suffix`` their names end with the band's."""
         columns = [f.name for f in fields(cls) if f.name not in ("names", "band")]
         found: dict[str, Any] = {c: np.concatenate([getattr(plane, c) for plane in planes.values()]) for c in columns}
-        names = [f"{detector}-{band}" for band, plane in planes.items() for detector in plane.names]
+        names = [f"{detector}-{band}" if suffix else detector for band, plane in planes.items() for detector in plane.names]
         return cls(names, **found, band=np.repeat(np.arange(len(planes)), [len(plane) for plane in planes.values()]))

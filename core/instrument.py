@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, ValidationInfo, field_validator, model_serializer, model_validator
+from pydantic_core import PydanticCustomError
 
+from .array_table import OF_INSTRUMENT, ArrayTable, read_array, stated_by
 from .band import PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
+from .configuration.files import InputPath, find
 from .configuration.parameters import Parameters, named, named_or_written, quantity
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
-from .configuration.values import mistake
-from .errors import InputError
+from .configuration.values import mistake, refusal
+from .errors import InputError, ZondaError
 from .focalplane import Focalplane
+from .layouts import hexagonal_packing, rings, wafers
 from .registry import bands, instruments
 from .types import Floats
 from .variants import LIKE, variant
@@ -61,7 +66,7 @@ class Telescope(Parameters):
 
 
 class Instrument(Parameters):
-    """A camera on a telescope: hexagonally packed detectors in a round field of view. Subclass to lay out others."""
+    """A camera on a telescope: detectors in a round field of view, laid out or from a table. Subclass to lay out others."""
 
     name: str
     """Registered name."""
@@ -80,6 +85,13 @@ class Instrument(Parameters):
     """Number of detectors. Of several bands, that of each."""
     field_of_view: Angle = Field(ge=0, le=1.0)
     """Diameter of the circle that holds all detectors."""
+    layout: Literal["hexagon", "rings", "wafers"] = "hexagon"
+    """Pixels on a hexagonal lattice from the centre outward, on rings, or on hexagonal wafers that share them equally."""
+    wafers: int = Field(1, ge=1, le=1000)
+    """Number of wafers, for `layout: wafers`."""
+    focalplane_table: InputPath | None = Field(None, alias="focalplane")
+    """Table of detectors (ECSV or CSV) in place of a layout: columns `name`, `xi`, `eta`, and what they have of their own. The
+    number of detectors and the field of view follow from it."""
     polarization: Literal["none", "pairs"] = "none"
     """`pairs`: each pixel has two detectors, A and B, polarized at right angles; A is at 0 and at 45 deg in alternate pixels."""
     fwhm: Angle | None = Field(None, gt=0)
@@ -108,6 +120,8 @@ class Instrument(Parameters):
     @classmethod
     def _one_or_several_bands(cls, value: Any, info: ValidationInfo) -> Any:
         """What all bands state need not be stated for the instrument; ``band`` beside ``bands`` chooses one of them."""
+        if isinstance(value, dict) and value.get("focalplane") is not None:
+            value = _completed(value, info)
         if not isinstance(value, dict) or not isinstance(value.get("bands"), list) or not value["bands"]:
             return value
         if (chosen := value.get("band")) is not None:
@@ -128,16 +142,65 @@ class Instrument(Parameters):
             raise mistake(f"two bands are called {twice}", "", "give each a name of its own: products and files bear it")
         if self.band is None and not self.bands:
             raise mistake("a camera needs a band", "", "name one with band, or several with bands")
-        counts = {band.name: band.detectors or self.detectors for band in self.bands}
+        if self.focalplane_table is not None:
+            return self._table_fits(self.focalplane_table)
+        counts = self._counts
         if self.pixels == "shared" and len(set(counts.values())) > 1:
             listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
             text = f"shared pixels need as many detectors in every band: {listed}"
             raise mistake(text, "", "give all bands the same number of detectors, or write pixels: separate")
-        for name, number in (counts or {"": self.detectors}).items():
+        for name, number in (counts if self.bands else {"": self.detectors}).items():
+            who = f"detectors of {name} is" if name else "detectors is"
             if self.polarization == "pairs" and number % 2:
-                who = f"detectors of {name} is" if name else "detectors is"
                 raise mistake(f"polarization: pairs needs an even number of detectors, two in each pixel; {who} {number}")
+            if self.layout == "wafers" and number % (share := self.wafers * self._pair):
+                raise mistake(f"{self.wafers} wafers share their pixels equally; {who} {number}, no multiple of {share}")
+        if self.wafers > 1 and self.layout != "wafers":
+            raise mistake(f"{self.wafers} wafers go with layout: wafers, not {self.layout}")
         return self
+
+    def _table_fits(self, path: Path) -> Instrument:
+        try:
+            table = read_array(path)
+            table.check(self._counts, several=bool(self.bands))
+            if table.reach > math.tan(self.field_of_view / 2) * (1 + 1e-9):
+                field = f"{math.degrees(2 * math.atan(table.reach)):.6g} deg"
+                cure = f"leave out field_of_view, or write at least {field}"
+                raise InputError(f"has detectors in a field of {field}, more than field_of_view", place=table.place, cure=cure)
+            if self.polarization == "pairs" and "polarization_angle" not in table.columns:
+                cure = "add it, or leave out polarization: pairs, which belongs to layouts"
+                raise InputError("has no column 'polarization_angle'", place=table.place, cure=cure)
+        except ZondaError as err:
+            raise refusal(err) from None
+        return self
+
+    @model_serializer(mode="wrap")
+    def _by_the_keys_of_files(self, handler: SerializerFunctionWrapHandler) -> Any:
+        """``focalplane`` in place of the field's name, which the method takes."""
+        dumped = handler(self)
+        if "focalplane_table" in dumped:
+            dumped["focalplane"] = dumped.pop("focalplane_table")
+        return dumped
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        """Detectors of each band."""
+        return {band.name: band.detectors or self.detectors for band in self.bands} or {self.band.name: self.detectors}
+
+    @property
+    def _pair(self) -> int:
+        """Detectors of a pixel in one band."""
+        return 2 if self.polarization == "pairs" else 1
+
+    @field_validator("focalplane_table")
+    @classmethod
+    def _readable(cls, path: Path | None) -> Path | None:
+        if path is not None:
+            try:
+                read_array(path)
+            except ZondaError as err:
+                raise refusal(err) from None
+        return path
 
     @field_validator("band", mode="before")
     @classmethod
@@ -158,7 +221,8 @@ class Instrument(Parameters):
         if not self.bands:
             return {self.band.name: self}
         field = 2 * math.atan(math.tan(self.field_of_view / 2) * self._arrays[2])
-        common = {"bands": [], "field_of_view": field if self.pixels == "separate" else self.field_of_view}
+        apart = self.pixels == "separate" and self.focalplane_table is None
+        common = {"bands": [], "field_of_view": field if apart else self.field_of_view}
         return {b.name: self.model_copy(update={**common, "band": b.alone, **b.stated}) for b in self.bands}
 
     def check_one_band(self, what: str) -> None:
@@ -191,38 +255,44 @@ class Instrument(Parameters):
         return 1.22 * SPEED_OF_LIGHT / self.band.centre / self.telescope.diameter
 
     def focalplane(self) -> Focalplane:
-        """The detector table: pixels at points of a hexagonal lattice that just fill `field_of_view`, nearest its centre first.
+        """The detector table: that of a file, or pixels that are laid out so that they just fill `field_of_view`.
 
         A pixel has one detector, or two with ``polarization: pairs``: A and B, at right angles, next to each other in the table.
         A of every second pixel lies at 0, of the others at 45 deg. Several bands follow each other, in the order of `bands`.
         """
         if self.bands:
             return self._of_several_bands()
-        pair = 2 if self.polarization == "pairs" else 1
-        pixels, n = self.detectors // pair, self.detectors
-        x, y = hexagonal_packing(pixels)
+        stated = {key: getattr(self, key) for key in OF_INSTRUMENT} | {"fwhm": self.beam_fwhm}
+        if self.focalplane_table is not None:
+            return read_array(self.focalplane_table).plane(self.band.name, stated)
+        pair, n = self._pair, self.detectors
+        pixels = n // pair
+        x, y, wafer = self._pixels(pixels)
         reach = float(np.hypot(x, y).max())
         scale = math.tan(self.field_of_view / 2) / reach if reach > 0 else 0.0
         width = len(str(pixels - 1))
-        full = np.full
+        stated["minimum_frequency"] = stated.pop("pink_minimum_frequency")
         angle = np.add.outer(np.pi / 4 * (np.arange(pixels) % 2), [0.0, np.pi / 2]).ravel() if pair == 2 else np.zeros(n)
         return Focalplane(
             names=[f"d{k:0{width}d}{side}" for k in range(pixels) for side in ("AB" if pair == 2 else ("",))],
             xi=np.repeat(x * scale, pair),
             eta=np.repeat(y * scale, pair),
-            fwhm=full(n, self.beam_fwhm),
-            main_beam_efficiency=full(n, self.main_beam_efficiency),
-            illumination_efficiency=full(n, self.illumination_efficiency),
-            net=full(n, self.net),
             polarization_angle=angle,
-            polarization_efficiency=full(n, float(pair == 2)),
-            knee=full(n, self.knee),
-            slope=full(n, self.slope),
-            minimum_frequency=full(n, self.pink_minimum_frequency),
+            polarization_efficiency=np.full(n, float(pair == 2)),
+            wafer=np.repeat(wafer, pair),
+            **{key: np.full(n, value) for key, value in stated.items()},
         )
+
+    def _pixels(self, number: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+        """Places of pixels, in units of the layout, and the wafer of each."""
+        if self.layout == "wafers":
+            return wafers(number, self.wafers)
+        return *(hexagonal_packing if self.layout == "hexagon" else rings)(number), np.zeros(number, np.int64)
 
     def _of_several_bands(self) -> Focalplane:
         planes = {name: camera.focalplane() for name, camera in self.cameras.items()}
+        if self.focalplane_table is not None:
+            return Focalplane.of_bands(planes, suffix=False)
         if self.pixels == "separate":
             radius = math.tan(self.field_of_view / 2)
             for plane, x, y in zip(planes.values(), *self._arrays[:2], strict=True):
@@ -230,10 +300,29 @@ class Instrument(Parameters):
         return Focalplane.of_bands(planes)
 
 
-def hexagonal_packing(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The ``n`` points of a unit-pitch hexagonal lattice nearest its origin. Two arrays (n,), nearest first."""
-    rings = math.ceil(math.sqrt(n)) + 1
-    i, j = np.mgrid[-rings : rings + 1, -rings : rings + 1]
-    x, y = (i + j / 2.0).ravel(), (j * math.sqrt(3) / 2).ravel()
-    order = np.lexsort((np.round(np.arctan2(y, x), 9), np.round(np.hypot(x, y), 9)))[:n]
-    return x[order], y[order]
+def _completed(given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    """What is ``given`` for an instrument, with what its table of detectors states: number, field, medians."""
+    rest = {key: value for key, value in given.items() if value is not None}
+    try:
+        table = read_array(find(given["focalplane"], info))
+    except (ZondaError, PydanticCustomError):  # which the field's own validation tells, at its place
+        return {"detectors": 1, "field_of_view": "0 deg"} | rest
+    found: dict[str, Any] = {"field_of_view": f"{2 * math.atan(table.reach)!r} rad"}
+    if isinstance(several := given.get("bands"), list) and several:
+        rest["bands"] = [_band_with(table, band, rest) for band in several]
+    else:
+        band = given.get("band")
+        name = band.get("name") if isinstance(band, dict) else getattr(band, "name", band)
+        found |= stated_by(table, str(name), rest)
+    return found | rest
+
+
+def _band_with(table: ArrayTable, band: Any, rest: dict[str, Any]) -> Any:
+    """A band as it is given, with what the table states of it."""
+    if isinstance(band, CameraBand):
+        band = band.model_dump(mode="json")
+    own = {"name": band} if isinstance(band, str) else band
+    if not isinstance(own, dict) or "name" not in own:
+        return band
+    own = {key: value for key, value in own.items() if value is not None}
+    return stated_by(table, str(own["name"]), rest | own) | own

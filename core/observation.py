@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .emission import mean_emission
-from .flags import EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
+from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
 from .intervals import Intervals, runs
 from .notebook import html_table
@@ -138,7 +138,7 @@ class Observation:
         if not self.flags.size:
             self.flags = np.zeros(self.n_samples, np.uint8)
         if not self.detector_flags.size:
-            self.detector_flags = np.zeros(self.n_detectors, np.uint8)
+            self.detector_flags = np.where(self.focalplane.dead != 0, DEAD, 0).astype(np.uint8)
         if not self.intervals:
             self.intervals = {"scanning": runs(np.ones(self.n_samples, bool), self.seconds)}
 

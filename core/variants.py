@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from .configuration.parameters import named
@@ -47,6 +48,9 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Any:
     elif changes.get("band") is not None:
         changes["bands"] = []
     as_it_is = base.model_dump(mode="json") | {"telescope": base.telescope, "band": base.band, "bands": base.bands}
+    if changes.get("focalplane") is not None:  # number and field follow from the table
+        as_it_is |= {"detectors": None, "field_of_view": None, "polarization": "none", "layout": "hexagon", "wafers": 1}
+        as_it_is["bands"] = [band.model_copy(update={"detectors": None}) for band in base.bands]
     made = type(base).model_validate(as_it_is | changes, context=context)
     if "fwhm" not in changes:
         made = _with_beams(base, made, kept="bands" not in changes)
@@ -110,7 +114,10 @@ def _flat(dumped: Mapping[str, Any]) -> dict[str, Any]:
     for place, band in (("band", dumped["band"]), *((f"bands.{b['name']}", b) for b in dumped["bands"])):
         bands |= {place: band["name"]} if band and place == "band" else {}
         bands |= {f"{place}.{k}": v for k, v in (band or {}).items() if k not in ("name", "provenance")}
-    return {key: value for key, value in dumped.items() if key not in ("telescope", "band", "bands")} | telescope | bands
+    rest = {key: value for key, value in dumped.items() if key not in ("telescope", "band", "bands")}
+    if rest.get("focalplane") is not None:  # the same in every folder
+        rest["focalplane"] = Path(rest["focalplane"]).name
+    return rest | telescope | bands
 
 
 def _name(base: str, told: str) -> str:

@@ -78,7 +78,7 @@ def table(cls: typing.Any, but: str = "") -> list[str]:
         if name != but:
             text = " ".join((field.description or "").split()).replace("|", "\\|")
             text = " ".join(filter(None, (text, written_choices(field))))
-            lines.append(f"| `{name}` | {default(field)} | {text} |")
+            lines.append(f"| `{field.alias or name}` | {default(field)} | {text} |")
     return lines
 
 

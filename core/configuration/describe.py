@@ -64,7 +64,7 @@ def document(cls: type[BaseModel]) -> str:
     lines = [own_doc(cls), "", "Parameters", "----------"]
     for name, field in described(cls).items():
         default = "required" if field.is_required() else f"default {_value(field)!r}"
-        lines.append(f"{name} : {kind(field)}; {default}")
+        lines.append(f"{field.alias or name} : {kind(field)}; {default}")
         lines += [f"    {line}" for line in (field.description or "").splitlines()]
     return "\n".join(lines).strip()
 
@@ -73,8 +73,8 @@ def signature(cls: type[BaseModel]) -> inspect.Signature:
     """Parameters with their defaults as a user would write them."""
     empty = inspect.Parameter.empty
     made = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=empty if field.is_required() else _value(field))
-        for name, field in cls.model_fields.items()
+        inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=empty if field.is_required() else _value(field))
+        for key, field in ((field.alias or name, field) for name, field in cls.model_fields.items())
     ]
     return inspect.Signature(made)
 

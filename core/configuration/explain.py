@@ -141,7 +141,8 @@ class _Validated:
 
     def unknown(self, key: Any, loc: list[Any], span: Span) -> Diagnostic:
         owner, _ = _field(self.model, loc[:-1])
-        options = list(self.keys if self.keys and len(loc) == 1 else (owner or self.model).model_fields)
+        fields = (owner or self.model).model_fields
+        options = list(self.keys if self.keys and len(loc) == 1 else (field.alias or name for name, field in fields.items()))
         meant = SYNONYMS.get(str(key).lower(), "")
         inner = getattr(owner or self.model, "KEYS_BELONG_IN", "") if "." in str(key) else ""
         known = f"write {inner}: {{{key}: [...]}}" if inner else "not a known key"

@@ -133,8 +133,8 @@ class Parameters(BaseModel, metaclass=_Shown):
     def _arguments(self) -> dict[str, str]:
         """What was given, by name, as Python text."""
         dumped = self.model_dump(mode="json", include=self.model_fields_set)
-        names = [name for name in type(self).model_fields if name in self.model_fields_set]
-        return {name: _written(getattr(self, name), dumped.get(name)) for name in names}
+        keys = {name: field.alias or name for name, field in type(self).model_fields.items() if name in self.model_fields_set}
+        return {key: _written(getattr(self, name), dumped.get(key)) for name, key in keys.items()}
 
     def _as_argument(self) -> str:
         """Python text that a field which holds this takes."""

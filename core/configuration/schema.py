@@ -50,7 +50,7 @@ def json_schema() -> dict[str, Any]:
             definition["properties"]["band"] = _name_or(definition["properties"]["band"], registry.bands)
             several = definition["properties"]["bands"]
             several["items"] = _name_or(several["items"], registry.bands)
-            definition["required"] = [key for key in definition["required"] if key not in ("band", *PER_BAND)]
+            definition["required"] = [key for key in definition["required"] if key not in ("band", "field_of_view", *PER_BAND)]
             properties["instrument"]["anyOf"].append(_variant(definition))
     steps = _step(classes, references)
     properties["operators"] = {"type": "array", "minItems": 1, "description": "Steps, in order.", "items": steps}

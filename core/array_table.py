@@ -1,0 +1,187 @@
+"""Focal planes from tables: where detectors look, and what each has of its own.
+
+ECSV, or CSV whose first line names the columns, with units in brackets. A table has `name`, `xi` and `eta`; what else it may have
+is in `QUANTITIES` and `TEXTS`. What it does not have holds as the instrument or its band states it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .configuration.diagnostics import nearest
+from .errors import InputError
+from .focalplane import Focalplane
+from .storage.ecsv import Table, read_table
+from .types import Floats
+
+QUANTITIES = {
+    "xi": "rad", "eta": "rad", "polarization_angle": "rad", "polarization_efficiency": "", "fwhm": "rad",
+    "main_beam_efficiency": "", "illumination_efficiency": "", "net": "K s(1/2)", "knee": "Hz", "slope": "",
+    "pink_minimum_frequency": "Hz",
+}  # fmt: skip
+"""Columns of numbers and their units inside."""
+TEXTS = ("name", "band", "wafer", "dead")
+"""Columns of text."""
+POSITIVE = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "slope", "pink_minimum_frequency")
+LARGEST = {"polarization_efficiency": 1.0, "main_beam_efficiency": 1.0, "illumination_efficiency": 1.0, "slope": 3.0}
+SIGNED = ("xi", "eta", "polarization_angle")
+DEAD = {"true": 1, "yes": 1, "1": 1, "false": 0, "no": 0, "0": 0, "": 0}
+"""What stands in the column `dead`."""
+OF_INSTRUMENT = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope", "pink_minimum_frequency")
+"""Columns of what an instrument or a band states for all of its detectors."""
+
+
+@dataclass(frozen=True)
+class ArrayTable:
+    """A table of detectors that was read.
+
+    Attributes
+    ----------
+    place
+        The file, as messages call it.
+    names, bands
+        Of each detector; ``bands`` is empty where there is no such column.
+    columns
+        By name, (n,) SI: `QUANTITIES`, and ``wafer`` and ``dead`` as whole numbers.
+    """
+
+    place: str
+    names: list[str]
+    bands: list[str]
+    columns: Mapping[str, NDArray[Any]]
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of a detector from the boresight, tan(rad)."""
+        return float(np.hypot(self.columns["xi"], self.columns["eta"]).max())
+
+    def rows(self, band: str) -> NDArray[np.intp]:
+        """Those of a band; all where the table has no column for it."""
+        if not self.bands:
+            return np.arange(len(self.names))
+        return np.flatnonzero(np.array(self.bands) == band)
+
+    def plane(self, band: str, otherwise: Mapping[str, float]) -> Focalplane:
+        """The detectors of a band, in the order of the table; ``otherwise``: `OF_INSTRUMENT` where there is no column."""
+        rows = self.rows(band)
+        found = {key: np.full(len(rows), value) for key, value in otherwise.items()}
+        found |= {key: values[rows] for key, values in self.columns.items()}
+        found["minimum_frequency"] = found.pop("pink_minimum_frequency")
+        return Focalplane([self.names[row] for row in rows], **found)
+
+    def check(self, counts: Mapping[str, int], several: bool) -> None:
+        """Refuse a table that does not suit the bands of an instrument with ``counts`` of detectors (InputError).
+
+        A camera of one band may be one of several that the table has.
+        """
+        if several and not self.bands:
+            cure = f"add it, with the name of a band in each row: {', '.join(counts)}"
+            raise InputError("has no column 'band', and the instrument has several", place=self.place, cure=cure)
+        unknown = [k for k, band in enumerate(self.bands) if band not in counts]
+        if unknown and (several or len(unknown) == len(self.names)):
+            k = unknown[0]
+            text = f"detector {self.names[k]} in row {k + 1} is of the unknown band {self.bands[k]!r}"
+            raise InputError(text, place=self.place, cure=f"the instrument has: {', '.join(counts)}")
+        for band, stated in counts.items():
+            found = len(self.rows(band))
+            if found != stated:
+                of = f" of the band {band}" if self.bands else ""
+                rest = f"; others are of {', '.join(sorted(set(self.bands) - set(counts)))}" if unknown else ""
+                text = f"detectors{of}: {found} rows, but the instrument states {stated}{rest}"
+                cure = f"leave out detectors, or write detectors: {found}" if found else f"give the band {band} a row or more"
+                raise InputError(text, place=self.place, cure=cure)
+
+
+def read_array(path: Path) -> ArrayTable:
+    """Read a table of detectors.
+
+    Raises InputError for missing columns, names that are there twice, values that are not finite or out of their limits,
+    unknown units, and columns that are misspelt.
+    """
+    try:
+        state = path.stat()
+    except OSError:
+        raise InputError("no such file", place=str(path), cure="check the path") from None
+    return _read(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=4)
+def _read(path: Path, changed: int, size: int) -> ArrayTable:
+    table = read_table(path)
+    missing = [name for name in ("name", "xi", "eta") if name not in table.columns]
+    if missing:
+        cure = f"a table of detectors has name, xi and eta; it has: {', '.join(table.columns)}"
+        raise InputError(f"has no column {missing[0]!r}", place=table.place, cure=cure)
+    known = (*TEXTS, *QUANTITIES)
+    for column in table.columns:
+        if column not in known and (hint := nearest(column, known)):
+            raise InputError(f"has an unknown column {column!r}", place=table.place, cure=hint)
+    names = table.texts("name")
+    seen: dict[str, int] = {}
+    for row, name in enumerate(names):
+        if not name or name in seen:
+            text = f"name {name!r} of row {row + 1} is that of row {seen[name] + 1} too" if name else f"row {row + 1} has no name"
+            raise InputError(text, place=table.place, cure="give each detector a name of its own")
+        seen[name] = row
+    columns: dict[str, NDArray[Any]] = {
+        key: _within_limits(table, key, table.numbers(key, unit)) for key, unit in QUANTITIES.items() if key in table.columns
+    }
+    if "polarization_angle" in columns:
+        columns.setdefault("polarization_efficiency", np.ones(len(names)))
+    if "wafer" in table.columns:
+        columns["wafer"] = _numbered(table.texts("wafer"))
+    if "dead" in table.columns:
+        columns["dead"] = _dead(table)
+    bands = table.texts("band") if "band" in table.columns else []
+    return ArrayTable(table.place, names, bands, columns)
+
+
+def _within_limits(table: Table, key: str, values: Floats) -> Floats:
+    low = -np.inf if key in SIGNED else 0.0
+    bad = np.flatnonzero((values < low) | (values > LARGEST.get(key, np.inf)) | ((values == 0) & (key in POSITIVE)))
+    if bad.size:
+        row = int(bad[0])
+        limits = "more than 0" if key in POSITIVE else "0 or more"
+        limits += f", at most {LARGEST[key]:g}" if key in LARGEST else ""
+        text = f"{key} of row {row + 1} is {table.texts(key)[row]}"
+        raise InputError(text, place=table.place, cure=f"give {limits}")
+    return values
+
+
+def _numbered(texts: list[str]) -> NDArray[np.int64]:
+    """Whole numbers as they are; names by their place in the alphabet."""
+    try:
+        return np.array([int(text) for text in texts], np.int64)
+    except ValueError:
+        return np.unique(texts, return_inverse=True)[1].astype(np.int64).ravel()
+
+
+def _dead(table: Table) -> NDArray[np.int64]:
+    texts = [text.lower() for text in table.texts("dead")]
+    for row, text in enumerate(texts):
+        if text not in DEAD:
+            place = table.place
+            raise InputError(f"dead of row {row + 1} is {text!r}", place=place, cure="write true or false")
+    return np.array([DEAD[text] for text in texts], np.int64)
+
+
+def stated_by(table: ArrayTable, band: str, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """What a table says of the detectors of a band and ``stated`` lacks, as configuration: their number, and medians of columns.
+
+    Of all detectors where the table has none of this band, which `ArrayTable.check` refuses.
+    """
+    rows = table.rows(band)
+    rows = rows if len(rows) else np.arange(len(table.names))
+    found: dict[str, Any] = {"detectors": len(rows)}
+    for key in OF_INSTRUMENT:
+        if key in table.columns:
+            value, unit = float(np.median(table.columns[key][rows])), QUANTITIES[key]
+            found[key] = f"{value!r} {unit}" if unit else value
+    return {key: value for key, value in found.items() if stated.get(key) is None}

@@ -1,0 +1,62 @@
+"""Where the pixels of a camera lie: hexagonal lattices, rings, and wafers of them. Lengths are in units of the layout's own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .types import Floats
+
+GAP = 0.03
+"""Of wafers: distance between their edges, beyond one pitch, in units of the distance between their centres."""
+
+
+def hexagonal_packing(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The ``n`` points of a unit-pitch hexagonal lattice nearest its origin. Two arrays (n,), nearest first."""
+    x, y = _lattice(n)
+    order = np.lexsort((np.round(np.arctan2(y, x), 9), np.round(np.hypot(x, y), 9)))[:n]
+    return x[order], y[order]
+
+
+def rings(n: int) -> tuple[Floats, Floats]:
+    """``n`` points on rings one unit apart: one in the centre, 6 k on ring k, what is left evenly on the last."""
+    x, y, k = [np.zeros(1)], [np.zeros(1)], 0
+    left = n - 1
+    while left > 0:
+        k += 1
+        on_ring = min(6 * k, left)
+        angle = 2 * np.pi * np.arange(on_ring) / on_ring
+        x.append(k * np.cos(angle))
+        y.append(k * np.sin(angle))
+        left -= on_ring
+    return np.concatenate(x), np.concatenate(y)
+
+
+def hexagon(n: int) -> tuple[Floats, Floats]:
+    """The first ``n`` points of a unit-pitch lattice in hexagons about its origin, with corners at 0 and 60 deg."""
+    x, y = _lattice(n)
+    shell = np.max(np.abs([x - y / math.sqrt(3), 2 * y / math.sqrt(3), x + y / math.sqrt(3)]), axis=0)
+    order = np.lexsort((np.round(np.arctan2(y, x), 9), np.round(shell, 9)))[:n]
+    return x[order], y[order]
+
+
+def wafers(n: int, number: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """``n`` points shared equally by ``number`` hexagonal wafers, edge to edge about the origin: x, y and the wafer of each.
+
+    Wafer after wafer; ``number`` divides ``n``.
+    """
+    x, y = hexagon(n // number)
+    apothem = math.sqrt(3) / 2 * max(float(np.abs(x).max()), 1.0)
+    distance = (2 * apothem + 1) * (1 + GAP)
+    v, u = hexagonal_packing(number)  # neighbours at 30 deg: across the edges of a wafer
+    u, v = distance * (u - u.mean()), distance * (v - v.mean())
+    return np.add.outer(u, x).ravel(), np.add.outer(v, y).ravel(), np.repeat(np.arange(number), n // number)
+
+
+def _lattice(n: int) -> tuple[Floats, Floats]:
+    """Points of a hexagonal lattice, in rows; more than the ``n`` nearest its origin."""
+    reach = math.ceil(math.sqrt(n)) + 1
+    i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    return np.asarray((i + j / 2.0).ravel(), np.float64), np.asarray((j * math.sqrt(3) / 2).ravel(), np.float64)

@@ -1,0 +1,87 @@
+"""Where the pixels of a camera lie."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import zonda
+from zonda.core.errors import ZondaError
+from zonda.core.layouts import hexagon, hexagonal_packing, rings, wafers
+
+CAMERA: dict[str, Any] = {
+    "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"},
+    "band": {"name": "b150", "low": "140 GHz", "high": "160 GHz"}, "field_of_view": "1 deg",
+    "main_beam_efficiency": 0.6, "illumination_efficiency": 0.9, "net": "500 uK s(1/2)", "sample_rate": "20 Hz",
+}  # fmt: skip
+
+
+def nearest(x: Any, y: Any) -> Any:
+    return (np.hypot(x[:, None] - x, y[:, None] - y) + 1e9 * np.eye(len(x))).min(axis=1)
+
+
+def test_rings() -> None:
+    x, y = rings(1 + 6 + 12 + 5)
+    radii, counts = np.unique(np.hypot(x, y).round(9), return_counts=True)
+    np.testing.assert_array_equal(radii, [0, 1, 2, 3])
+    np.testing.assert_array_equal(counts, [1, 6, 12, 5])
+    last = np.sort(np.arctan2(y[-5:], x[-5:]) % (2 * np.pi))
+    np.testing.assert_allclose(np.diff(last), 2 * np.pi / 5)
+    assert len(rings(1)[0]) == 1
+
+
+@pytest.mark.parametrize("shells", [0, 1, 2, 5])
+def test_a_hexagon_is_whole_with_the_numbers_of_a_hexagon(shells: int) -> None:
+    n = 1 + 3 * shells * (shells + 1)
+    x, y = hexagon(n)
+    assert np.abs(x).max() == pytest.approx(shells)  # a corner on the x axis
+    assert np.abs(y).max() == pytest.approx(shells * np.sqrt(3) / 2)  # an edge towards y
+    if shells > 1:  # the six corners lie farther out than what a round patch of as many has
+        assert np.hypot(x, y).max() >= np.hypot(*hexagonal_packing(n)).max()
+
+
+@pytest.mark.parametrize(("number", "shells"), [(1, 3), (3, 2), (7, 4), (12, 2), (19, 1)])
+def test_wafers_do_not_overlap_and_are_alike(number: int, shells: int) -> None:
+    each = 1 + 3 * shells * (shells + 1)
+    x, y, wafer = wafers(number * each, number)
+    np.testing.assert_array_equal(np.bincount(wafer), each)
+    np.testing.assert_allclose(nearest(x, y), 1)  # the pitch; between wafers there is more
+    if number > 1:
+        apart = [
+            np.hypot(x[wafer == 0][:, None] - x[wafer == k], y[wafer == 0][:, None] - y[wafer == k]) for k in range(1, number)
+        ]
+        assert 1 < min(a.min() for a in apart) < 1.5
+    assert abs(x.mean()) < 1e-9 * number * each
+    assert abs(y.mean()) < 1e-9 * number * each
+
+
+@pytest.mark.parametrize("layout", ["hexagon", "rings", "wafers"])
+def test_all_layouts_fill_the_field(layout: str) -> None:
+    many = {"wafers": 3} if layout == "wafers" else {}
+    plane = zonda.Instrument(**CAMERA, detectors=114, layout=layout, polarization="pairs", **many).focalplane()
+    assert len(plane) == 114
+    assert 2 * np.arctan(plane.radius) == pytest.approx(np.radians(1))
+    np.testing.assert_array_equal(np.bincount(plane.wafer), [38, 38, 38] if many else [114])
+
+
+def test_wafers_of_two_bands_lie_upon_each_other() -> None:
+    bands = [{"name": "f090", "low": "80 GHz", "high": "100 GHz"}, {"name": "f150", "low": "140 GHz", "high": "160 GHz"}]
+    given = {k: v for k, v in CAMERA.items() if k != "band"} | {"bands": bands, "detectors": 21, "layout": "wafers", "wafers": 3}
+    plane = zonda.Instrument(**given).focalplane()
+    one, other = plane.of_band(0), plane.of_band(1)
+    np.testing.assert_array_equal(one.xi, other.xi)
+    np.testing.assert_array_equal(one.wafer, other.wafer)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"detectors": 22, "layout": "wafers", "wafers": 3}, "3 wafers share their pixels equally; detectors is 22"),
+        ({"detectors": 21, "wafers": 3}, "3 wafers go with layout: wafers, not hexagon"),
+    ],
+)
+def test_wafers_that_do_not_fit(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(ZondaError, match=words):
+        zonda.Instrument(**CAMERA, **given)
