@@ -11,6 +11,7 @@ from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
 from zonda.core.notebook import html_table
 from zonda.core.numerics.angles import ARCMIN
+from zonda.core.registry import instruments
 
 from . import calculator, default_pipeline, lines
 from .depth import depth_of, factors
@@ -120,6 +121,8 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
         return default_pipeline.make(default_pipeline.Asked(**given), settings)
     if beside := sorted(given.keys() - {"time"}):
         cure = f"change the pipeline with --set, or leave it or --{beside[0]} out"
+        if pipeline in {found.name for found in instruments.candidates()}:
+            cure = f"{pipeline} is an instrument: write --instrument {pipeline}"
         text = f"--{beside[0]} is part of a pipeline, and cannot be given beside one"
         raise InputError(text, place=default_pipeline.PLACE, cure=cure)
     if isinstance(pipeline, PipelineFile):

@@ -133,6 +133,7 @@ def test_in_python():
         ((), "neither a pipeline nor --instrument"),
         (("--instrument", "mustang2"), "--site"),
         (("mustang2_cluster", "--pwv", "3 mm"), "--pwv is part of a pipeline, and cannot be given beside one"),
+        (("mustang2", "--pwv", "3 mm"), "mustang2 is an instrument: write --instrument mustang2"),
         (("no_such_pipeline",), "no_such_pipeline"),
         ((*M2, "--target", "nowhere"), "--target"),
         ((*M2, "--quantile", "2"), "--quantile"),
