@@ -27,7 +27,7 @@ from .halves import halves_of
 from .map_layout import grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
-from .stokes_map import stokes_binnings
+from .stokes_map import check_polarized, stokes_binnings
 from .stokes_product import StokesSums
 from .stokes_sums import StokesBinning
 from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, WEIGHT, Binning, Sums, add_image, add_list
@@ -71,6 +71,8 @@ class BinMap(MapParameters):
 
     def check(self, data: Data) -> list[str]:
         """The share of the samples outside a map of a given width."""
+        for observation in data.observations[:1]:
+            check_polarized(self, observation)
         return [] if self.width is None or not data.observations else [outside(self, data.observations)]
 
     def observe(self, data: Data) -> None:

@@ -34,6 +34,16 @@ UNSOLVED = "pixels whose samples do not determine I, Q and U: NaN"
 """A count of the log."""
 
 
+def check_polarized(step: MapParameters, observation: Observation) -> None:
+    """Raise PipelineError where I, Q and U are wanted and no detector is polarized."""
+    if step.stokes == "IQU" and not observation.focalplane.polarized:
+        raise PipelineError(
+            f"stokes: IQU needs polarized detectors, and none of {observation.instrument.name} is",
+            place=step.label,
+            cure="set polarization: pairs of the instrument, or stokes: I",
+        )
+
+
 def stokes_binnings(
     step: MapParameters, observation: Observation, grid: Grid, levels: tuple[Floats, Floats, Floats], good: Any, spare: list[Sums]
 ) -> list[StokesBinning]:
@@ -43,12 +53,7 @@ def stokes_binnings(
     which samples count. Raises PipelineError where no detector is polarized.
     """
     plane, (weight, noise, window) = observation.focalplane, levels
-    if not plane.polarized:
-        raise PipelineError(
-            f"stokes: IQU needs polarized detectors, and none of {observation.instrument.name} is",
-            place=step.label,
-            cure="set polarization: pairs of the instrument, or stokes: I",
-        )
+    check_polarized(step, observation)
     own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
     angles = PolarizationAngles.of(observation, frame_rotation(step.frame)[2])
     pointing, signals = grid.pointing(observation), len(observation.signals)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zonda
+from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.map_file import MapFile, Provenance
 from zonda.core.numerics.projection import frame_rotation
@@ -15,6 +16,7 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import TangentGrid
 from zonda.operators.maps.stokes_product import StokesSums
+from zonda.plugins.checks import scenes
 from zonda.plugins.checks.scenes import run, scan
 
 STOKES_I, Q, U = 1.0, 0.3, -0.2
@@ -271,6 +273,10 @@ def test_what_is_refused():
     o = scan(7, 500)
     with pytest.raises(PipelineError, match="needs polarized detectors"):
         run([BinMap(stokes="IQU")], o, np.ones((7, 500)))
+    data = Data(scenes.scene(o.instrument))
+    data.observations = [o]
+    with pytest.raises(PipelineError, match="needs polarized detectors"):  # `zonda check` says so, too
+        BinMap(stokes="IQU").check(data)
     for parameters, text in (
         ({"noise": "scatter"}, "noise: scatter is for maps of I"),
         ({"contents": "hits"}, "contents: hits needs no stokes"),
