@@ -90,6 +90,7 @@ class _Check(Mistakes):
     def __init__(self, document: Document, name: str, folder: str | Path | None, found: list[Diagnostic]) -> None:
         super().__init__(document, folder, found)
         self.name = name
+        self.recorded_at: tuple[str, int] = ("operators", 0)  # the step that brings its own site and instrument
         self.tree: dict[Any, Any] = document.value
 
     def run(self) -> PipelineFile:
@@ -102,8 +103,10 @@ class _Check(Mistakes):
         self.sizes()
         self.requirements()
         steps = read_steps(self)
-        recorded = next((s.operator for s in steps if s is not None and isinstance(s.operator, WithScene)), None)
-        scene = self.scene(recorded)
+        number = next((i for i, s in enumerate(steps) if s is not None and isinstance(s.operator, WithScene)), None)
+        recorded = None if number is None else steps[number]
+        self.recorded_at = "operators", number or 0
+        scene = self.scene(None if recorded is None else recorded.operator)
         if header is not None:
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
@@ -227,7 +230,7 @@ class _Check(Mistakes):
         try:
             own = dict(step.own_scene(None if told is None else told.instrument))
         except ZondaError as err:
-            self.refused(err, self.document.mark(("operators",)).start)
+            self.refused(err, self.document.mark(self.recorded_at).value)
             return None
         scene = self.validate(Scene, {**own, **given}, (), "the pipeline", KEYS)
         if scene is None:

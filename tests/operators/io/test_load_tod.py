@@ -375,3 +375,26 @@ def test_it_keeps_the_contract(tmp_path: Path) -> None:
     zonda.Pipeline([Points(), Given(), zonda.SaveTOD()]).run(made_up_scene(), output=tmp_path, threads=1)
     (path,) = tmp_path.glob("tod_*.h5")
     zonda.testing.check_operator(zonda.LoadTOD(file=path))
+
+
+def test_a_campaign_of_two_nights_refuses_recorded_data(saved: Any, tmp_path: Path, capsys: Any) -> None:
+    from zonda.core import cli
+
+    path = tmp_path / "nights.yaml"
+    path.write_text(LOADED.format(file=saved["Filtered"][0]) + "campaign: {nights: {count: 2}}\n")
+    assert cli.main(["run", str(path), "--output", str(tmp_path / "out")]) == 2
+    err = capsys.readouterr().err
+    assert "recorded data are of one night" in err
+    assert "leave time out of the pipeline, and nights out of a campaign" in err
+
+
+def test_the_command_line_shows_the_step_of_a_bad_file(saved: Any, tmp_path: Path, capsys: Any) -> None:
+    from zonda.core import cli
+
+    (tmp_path / "short.h5").write_bytes(saved["Filtered"][0].read_bytes()[:9000])
+    (tmp_path / "p.yaml").write_text(LOADED.format(file="short.h5"))
+    assert cli.main(["check", str(tmp_path / "p.yaml")]) == 2
+    err = capsys.readouterr().err
+    assert "p.yaml:2:5" in err
+    assert "truncated" in err
+    assert "Traceback" not in err
