@@ -10,6 +10,7 @@ FOLDERS = {
     "core": "zonda/core",
     "operators": "zonda/operators",
     "plugins": "zonda/plugins",
+    "interop": "zonda/interop",
     "pipelines": "zonda/pipelines",
     "zonda": "zonda",
 }

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PARTS = ("core", "operators", "plugins", "pipelines", "zonda")
+PARTS = ("core", "operators", "plugins", "interop", "pipelines", "zonda")
 LONGEST_MODULE, LONGEST_FUNCTION, MOST_PARAMETERS, LONGEST_OPERATOR = 400, 60, 7, 60
 WORK = {"observe", "check", "configure", "prepare", "measure", "exec", "collect", "finalize"}
 """Methods in which an operator does its work; other public methods are there for the framework only."""
@@ -221,7 +221,7 @@ def _siblings(a: str, b: str) -> bool:
 
 
 def _upward(a: str, b: str) -> bool:
-    order = {"core": 0, "operators": 1, "plugins": 2}
+    order = {"core": 0, "operators": 1, "plugins": 2, "interop": 3}
     return order.get(a.split(".")[0], 3) < order.get(b.split(".")[0], -1)
 
 

@@ -112,7 +112,7 @@ def title(path: Path) -> str:
 def code_of_zonda() -> str:
     """A digest of everything that a figure depends on besides its page."""
     digest = hashlib.sha256()
-    for folder in ("core", "operators", "plugins", "pipelines", "zonda"):
+    for folder in ("core", "operators", "plugins", "interop", "pipelines", "zonda"):
         for path in sorted((ROOT / folder).rglob("*")):
             if path.suffix in {".py", ".yaml", ".npz", ".fits"}:
                 digest.update(path.read_bytes())

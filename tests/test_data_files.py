@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("core", "operators", "plugins", "pipelines", "zonda", "tests/data")
+FOLDERS = ("core", "operators", "plugins", "interop", "pipelines", "zonda", "tests/data")
 CODE = {".py", ".md", ".yaml", ".css", ".typed", ".tmpl"}
 
 

@@ -11,7 +11,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 def test_all_packages_are_listed():
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     found = {"zonda"}
-    for top in ("core", "operators", "plugins", "pipelines"):
+    for top in ("core", "operators", "plugins", "interop", "pipelines"):
         for init in (ROOT / top).rglob("__init__.py"):
             found.add(".".join(["zonda", *init.parent.relative_to(ROOT).parts]))
     assert found == set(listed)

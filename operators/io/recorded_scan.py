@@ -167,6 +167,8 @@ def _focalplane(
             found[name] = np.full(n, otherwise)
     if "polarization_efficiency" in columns:
         found["polarization_efficiency"] = columns["polarization_efficiency"]
+    if "wafer" in columns:
+        found["wafer"] = columns["wafer"]
     names = [tod.names[row] for row in rows]
     for name, values in {**found, "xi": tod.xi[rows], "eta": tod.eta[rows]}.items():
         bad = np.flatnonzero(~np.isfinite(values) | ((values <= 0) if name in ("fwhm", "slope") else values < -np.inf))

@@ -47,7 +47,7 @@ class TimeOrderedData:
     columns
         Further detector columns, (n_det,) each, SI: fwhm [rad], net [K_RJ sqrt(s)], knee, minimum_frequency [Hz], slope,
         band_centre, band_width [Hz], main_beam_efficiency, illumination_efficiency, polarization_angle [rad],
-        polarization_efficiency.
+        polarization_efficiency, wafer (whole numbers).
     streams
         (n_det, n_samp) arrays; K_RJ but for `transmission`, which is relative.
     intervals
@@ -175,6 +175,7 @@ class TimeOrderedData:
                 "knee": np.zeros(n) if "white" in o.components and "pink" not in o.components else f.knee,
                 "minimum_frequency": f.minimum_frequency,
                 "slope": f.slope,
+                "wafer": f.wafer.astype(np.float64),
             },
             intervals=o.intervals,
             weather=o.weather,
@@ -184,6 +185,7 @@ class TimeOrderedData:
                 "observation_index": o.index,
                 "centre_ra": o.centre[0],
                 "centre_dec": o.centre[1],
+                "band": instrument.band.name,
                 "telescope": instrument.telescope.name,
                 "telescope_diameter": instrument.telescope.diameter,
                 **(metadata or {}),

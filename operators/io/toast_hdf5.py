@@ -39,6 +39,7 @@ COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
     "slope": ("psd_alpha", "", ""),
     "main_beam_efficiency": ("main_beam_efficiency", "", ""),
     "illumination_efficiency": ("illumination_efficiency", "", ""),
+    "wafer": ("wafer_number", "", ""),
 }
 
 OFFSETS = ("tangent_xi", "tangent_eta")

@@ -1,0 +1,17 @@
+"""Packages that a bridge needs."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from zonda.core.errors import InputError
+
+
+def needed(module: str, extra: str) -> Any:
+    """A module of a package that the extra ``extra`` installs. Raises InputError where it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError as err:
+        cure = f"pip install 'zonda[{extra}]'"
+        raise InputError(f"cannot import {module}: {err}", place=f"zonda.interop.{extra}", cure=cure) from None

@@ -1,0 +1,50 @@
+"""A survey-like scan of two bands: turnarounds, trimmed ends, a dead and an opaque detector, kept in Python and in files."""
+
+import numpy as np
+import pytest
+
+import zonda
+from zonda.core.flags import DEAD, OPAQUE, SUN_UP
+from zonda.core.operator import Operator
+
+INSTRUMENT = {
+    "name": "camera",
+    "telescope": {"name": "dish", "diameter": "6 m"},
+    "bands": [
+        {"name": "f090", "low": "77 GHz", "high": "106 GHz", "net": "300 uK s(1/2)"},
+        {"name": "f150", "low": "130 GHz", "high": "170 GHz", "net": "360 uK s(1/2)"},
+    ],
+    "detectors": 14,
+    "polarization": "pairs",
+    "field_of_view": "8 deg",
+    "main_beam_efficiency": 0.7,
+    "illumination_efficiency": 0.9,
+    "sample_rate": "100 Hz",
+}
+SCENE = {"site": "atacama", "instrument": INSTRUMENT, "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
+SCAN = {"throw": "4 deg", "speed": "0.8 deg/s", "acceleration": "1 deg/s2", "scan_duration": "41.3 s", "check_limits": "warn"}
+
+
+class Marks(Operator):
+    """Flags a dead and an opaque detector and opaque samples, as CommonModeFilter and Efficiency do; the Sun, which is used."""
+
+    def prepare(self, observation):
+        observation.detector_flags[[1, 5]] |= np.array([DEAD, OPAQUE], np.uint8)
+        observation.flags[400:437] |= OPAQUE
+        observation.flags[420:600] |= SUN_UP
+
+
+@pytest.fixture(scope="session")
+def survey(tmp_path_factory):
+    """The data of the run, whose products are files and maps of either band."""
+    steps = [
+        zonda.PointingBackAndForth(**SCAN, flag_turnarounds=True),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        Marks(),
+        zonda.HighpassFilter(frequency="0.1 Hz", trim="1.5 s"),
+        zonda.BinMap(projection="CAR", pixel="2 arcmin"),
+        zonda.SaveTOD(),
+    ]
+    folder = tmp_path_factory.mktemp("survey")
+    return zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=folder, keep=["signal"], threads=1)

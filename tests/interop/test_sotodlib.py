@@ -1,0 +1,161 @@
+"""sotodlib and so3g on our scans: names, flags, pointing, and so3g's map beside ours.
+
+`.ci/sotodlib` runs these in an environment with sotodlib (the extra ``sotodlib``), where none may be skipped
+(ZONDA_SOTODLIB=required).
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+from zonda.core.errors import InputError
+from zonda.core.numerics.quaternions import detector_quaternions, multiply
+from zonda.interop.sotodlib import sight_line, to_axismanager
+from zonda.operators.io.save_tod import load_tod
+
+pytestmark = [pytest.mark.sotodlib, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
+
+if os.environ.get("ZONDA_SOTODLIB") == "required":
+    import sotodlib.core
+else:
+    sotodlib = pytest.importorskip("sotodlib.core", reason="sotodlib is not installed: .ci/sotodlib makes an environment with it")
+
+import so3g.proj
+import sotodlib.coords
+import sotodlib.core
+
+
+@pytest.fixture(scope="module")
+def aman(survey):
+    return to_axismanager(survey, scan="scan-000-f150")
+
+
+@pytest.fixture(scope="module")
+def observation(survey):
+    return survey.observations[1]
+
+
+def own_directions(o):
+    """(n_det, n_samp, 4): the direction (3) and the polarization's angle psi of each detector, of the observation itself."""
+    f = o.focalplane
+    found = []
+    for detector in detector_quaternions(f.xi, f.eta, f.polarization_angle):
+        x, y, z, w = multiply(o.boresight_radec, np.broadcast_to(detector, (o.n_samples, 4))).T
+        psi = np.arctan2(w * x + y * z, w * y - x * z)
+        found.append([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y), psi])
+    return np.array(found)
+
+
+def directions(sight, aman):
+    """The same by so3g, from sotodlib's names."""
+    plane = so3g.proj.FocalPlane.from_xieta(aman.focal_plane.xi, aman.focal_plane.eta, aman.focal_plane.gamma)
+    found = []
+    for lon, lat, c, s in (np.array(each).T for each in sight.coords(plane)):
+        found.append([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat), np.arctan2(s, c)])
+    return np.array(found)
+
+
+def apart(a, b):
+    """Largest separation [arcsec], and largest difference of polarization angles modulo 180 deg [arcsec]."""
+    psi = np.abs((a[:, 3] - b[:, 3] + np.pi / 2) % np.pi - np.pi / 2)
+    chord = np.sqrt(((a[:, :3] - b[:, :3]) ** 2).sum(axis=1))
+    return np.degrees([2 * np.arcsin(chord.max() / 2), psi.max()]) * 3600
+
+
+def test_names_and_values(aman, observation):
+    o = observation
+    assert aman.dets.vals.tolist() == o.focalplane.names
+    assert (aman.signal.shape, aman.signal.dtype) == ((o.n_detectors, o.n_samples), np.float32)
+    np.testing.assert_array_equal(aman.signal, o.detdata["signal"].astype(np.float32))
+    np.testing.assert_array_equal(aman.timestamps, o.start.posix + o.seconds)
+    # azimuth and elevation are recovered from quaternions: to rounding
+    np.testing.assert_allclose(aman.boresight.az % (2 * np.pi), o.azimuth, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(aman.boresight.el, o.elevation, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(aman.boresight.roll, 0, rtol=0, atol=1e-14)
+    tangent = np.hypot(o.focalplane.xi, o.focalplane.eta)
+    np.testing.assert_allclose(np.hypot(aman.focal_plane.xi, aman.focal_plane.eta), np.sin(np.arctan(tangent)), rtol=1e-12)
+    assert np.degrees(tangent.max() - np.hypot(aman.focal_plane.xi, aman.focal_plane.eta).max()) * 3600 > 20  # at almost 4 deg
+    assert set(aman.det_info.band) == set(aman.det_info.wafer.bandpass) == {"f150"}
+    assert aman.det_info.wafer_slot.tolist() == [f"ws{number}" for number in o.focalplane.wafer]
+    assert aman.obs_info.obs_id == "scan-000-f150"
+
+
+def test_flags_are_ranges_matrices(aman, observation):
+    o, flags = observation, aman.flags
+    for name in ("invalid", "processing", "turnarounds", "sun_up", "detectors", "samples", "excluded"):
+        assert isinstance(flags[name], so3g.proj.RangesMatrix)
+        assert flags[name].shape == (o.n_detectors, o.n_samples)
+    np.testing.assert_array_equal(~flags.excluded.mask(), o.good_detectors[:, None] & o.good_samples)
+    np.testing.assert_array_equal(flags.turnarounds.mask()[0], (o.flags & 4) != 0)
+    assert flags.sun_up.mask()[3, 420:600].all()
+    assert flags.detectors.mask().all(axis=1).nonzero()[0].tolist() == [1, 5]
+    flags.turnarounds.buffer(1)  # in place: rows are independent, and no other flag changes
+    widened = flags.turnarounds.mask()[:, 1:-1].sum(axis=1)
+    flags.turnarounds.buffer(-1)
+    assert (widened == widened[0]).all()
+    assert (widened[0] - flags.turnarounds.mask()[0, 1:-1].sum()) % 2 == 0
+
+
+def test_a_file_gives_what_the_run_gives(survey, aman):
+    path = survey.products["tod_file"][1]
+    for other in (to_axismanager(path), to_axismanager(load_tod(path)), to_axismanager(survey.observations[1])):
+        for name in ("timestamps", "signal", "boresight.az", "boresight_equ.psi", "focal_plane.xi", "det_info.band"):
+            np.testing.assert_array_equal(other[name], aman[name])
+        np.testing.assert_array_equal(other.flags.excluded.mask(), aman.flags.excluded.mask())
+        assert (other.det_info.wafer_slot == aman.det_info.wafer_slot).all()
+
+
+def test_so3g_points_where_zonda_points(survey, aman, observation):
+    """Both transform above the atmosphere by IAU models with the Earth's orientation of the IERS, and agree to 0.001 arcsec.
+    Polar motion, which so3g leaves out by itself, is 0.48 arcsec on this day; with the wrong sign it would be twice that."""
+    ours = own_directions(observation)
+    recorded = so3g.proj.CelestialSightLine.for_lonlat(aman.boresight_equ.ra, aman.boresight_equ.dec, aman.boresight_equ.psi)
+    assert apart(directions(recorded, aman), ours)[0] < 0.01
+    separation, angle = apart(directions(sight_line(survey, scan=1), aman), ours)
+    print(f"\nso3g's pointing: {separation:.3f} arcsec, polarization angle {angle:.2f} arcsec")
+    assert separation < 0.02
+    assert angle < 0.05
+
+
+def test_so3g_maps_what_zonda_maps(survey, aman, observation):
+    """so3g's projection of our pointing onto pixell's pixels: what lies on an edge of pixels may fall to either side."""
+    from pixell import enmap
+
+    ours = survey.products["map_f150"]
+    header = ours.wcs.to_header()
+    geometry = enmap.zeros(ours.hits.shape, ours.wcs)
+    assert header["CTYPE1"].endswith("CAR")
+    matrix = sotodlib.coords.P.for_tod(aman, geom=geometry.geometry, comps="T", cuts=aman.flags.excluded)
+    hits = np.asarray(matrix.to_weights()[0, 0])
+    total = np.asarray(matrix.to_map(tod=aman)[0])
+    moved = np.abs(hits - ours.hits).sum() / ours.hits.sum()
+    print(f"\nhits that are in another pixel: {moved / 2:.1e}")
+    assert hits.sum() == ours.hits.sum()
+    assert moved < 2e-4  # two for each sample that moved
+    same = (hits == ours.hits) & (hits > 0)
+    # all detectors weigh the same; float32 signals of 1e-2 K
+    found = total[same] / hits[same]
+    np.testing.assert_allclose(found, ours.signal[same], rtol=0, atol=1e-6 * np.abs(ours.signal[same]).max())
+
+
+def test_bands_are_joined_by_sotodlib(survey):
+    both = [to_axismanager(survey, scan=number) for number in (0, 1)]
+    whole = sotodlib.core.AxisManager.concatenate(both, axis="dets", other_fields="first")
+    assert whole.signal.shape == (28, survey.observations[0].n_samples)
+    assert sorted(set(whole.det_info.band)) == ["f090", "f150"]
+    assert whole.flags.excluded.shape == whole.signal.shape
+
+
+def test_errors_name_cause_and_cure(survey, tmp_path):
+    with pytest.raises(InputError, match=r"the stream 'sky' was not kept.*\n.*keep="):
+        to_axismanager(survey, "sky", scan=0)
+    with pytest.raises(InputError, match=r"there are 2 scans: scan-000-f090, scan-000-f150"):
+        to_axismanager(survey)
+    with pytest.raises(InputError, match=r"no stream 'sky'\n.*choose from: signal"):
+        to_axismanager(survey.products["tod_file"][0], "sky")
+    with pytest.raises(InputError, match="leave it out"):
+        to_axismanager(survey.observations[0], scan=1)
+    (tmp_path / "no.h5").write_bytes(b"nothing")
+    with pytest.raises(InputError, match=r"no\.h5"):
+        to_axismanager(tmp_path / "no.h5")
