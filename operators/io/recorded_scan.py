@@ -35,6 +35,14 @@ class RecordedInstrument(Instrument):
         """The file's detectors."""
         return self._plane.copy()
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, RecordedInstrument) or self.model_dump() != other.model_dump():
+            return False
+        return all(np.array_equal(v, vars(other._plane)[k]) for k, v in vars(self._plane).items())
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.detectors))
+
 
 def site_of(tod: TimeOrderedData) -> Site:
     """Where the file's telescope stands, with the climatology of a registered site that is nearer than `NEAR`."""

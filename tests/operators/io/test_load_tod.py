@@ -355,6 +355,12 @@ def test_a_pipeline_file_needs_neither_site_nor_instrument(saved: Any, tmp_path:
     assert again.scene().model_dump() == file.scene().model_dump()
     data = file.pipeline().run(file.scene(), output=tmp_path, threads=1)
     assert data["map"].hits.sum() == 19 * 2000
+    camera = data.observations[0].instrument
+    assert camera == parse(text).scene().instrument
+    assert camera != camera.model_copy(update={"name": "another"})
+    reported = parse(text + "  - Report\n")
+    reported.pipeline().run(reported.scene(), output=tmp_path, threads=1)
+    assert "mustang2" in (tmp_path / "report.html").read_text()
     with pytest.warns(UserWarning, match="instrument is that of the recorded data, .*; atlast of this file is not used"):
         other = parse("instrument: atlast\nsite: green_bank\n" + text)
     assert other.scene().instrument.telescope.diameter == 100
