@@ -151,7 +151,7 @@ class MapArrays:
             return None
         beam, areas = math.pi / math.log(16) * self.fwhm**2 / self.sample_rate, np.asarray(self.areas())
         if areas.max() < 1.001 * areas.min():
-            return beam / float(areas.max())
+            return beam / (float(areas.mean()) if self.projection == "CAR" else self.pixel**2)
         return np.asarray(np.broadcast_to(beam / areas, self.signal.shape), np.float64)
 
 

@@ -37,7 +37,7 @@ def scene(**changes: Any) -> zonda.Scene:
         ),
         (lambda: zonda.BinMap(pixel=np.zeros(3)), "expected an angle such as", "array([0., 0., 0.])", ""),
         (lambda: zonda.BinMap("2 arcsec"), "takes its parameters by their names", "'2 arcsec'", "as in pixel='2 arcsec'"),
-        (lambda: zonda.BinMap(projection="tan"), "must be 'TAN', got 'tan'", "'tan'", "did you mean 'TAN'?"),
+        (lambda: zonda.BinMap(projection="tan"), "must be 'TAN' or 'CAR', got 'tan'", "'tan'", "did you mean 'TAN'?"),
         (lambda: zonda.BinMap(half_difference="maybe"), "expected True or False, got 'maybe'", "'maybe'", ""),
         (lambda: zonda.PointingDaisy(scans=1.5), "scans: expected a whole number, got 1.5", "1.5", "Number of scans"),
         (lambda: zonda.PointingDaisy(scans=0), "scans: must be at least 1, got 0", "0", ""),

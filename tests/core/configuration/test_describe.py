@@ -19,7 +19,7 @@ from zonda.core.registry import operators
     [
         ("BinMap", "pixel", "an angle such as '4 arcmin'"),
         ("BinMap", "frame", "'icrs' or 'galactic'"),
-        ("BinMap", "projection", "'TAN'"),
+        ("BinMap", "projection", "'TAN' or 'CAR'"),
         ("BinMap", "half_difference", "'scans', 'detectors', 'halves', 'directions' or 'radii', or True or False"),
         ("SkyMap", "file", "the path of a file"),
         ("SkyMap", "map", "an array"),
@@ -48,7 +48,7 @@ def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
     text = pydoc.plain(pydoc.render_doc(cls))
     assert own_doc(cls).splitlines()[0] in text
     for parameter, field in cls.model_fields.items():
-        (line,) = [row for row in text.splitlines() if row.startswith(f" |  {parameter} : ")]
+        (line,) = [row for row in text.splitlines() if row.startswith(f" |  {field.alias or parameter} : ")]
         assert line.endswith("; required") if field.is_required() else "; default " in line
         assert all(repr(choice) in line for choice in choices(field))
         assert "see below" not in line
