@@ -79,8 +79,9 @@ class Instrument(Parameters):
     bands: list[CameraBand] = Field(default_factory=list, max_length=32)
     """Bands that are observed at the same time, each with what its detectors have of their own; what a band does not state holds
     as it is stated for the instrument. Maps and other products are made for each."""
-    pixels: Literal["shared", "separate"] = "shared"
-    """Of several bands: every pixel has detectors of every band, or the bands have arrays side by side."""
+    pixels: Literal["shared", "separate", "overlaid"] = "shared"
+    """Of several bands: every pixel has detectors of every band; the bands have arrays side by side; or each has an array of its
+    own that fills the field of view, as behind dichroic beam splitters."""
     detectors: int = Field(ge=1, le=1_000_000)
     """Number of detectors. Of several bands, that of each."""
     field_of_view: Angle = Field(ge=0, le=1.0)

@@ -50,9 +50,20 @@ def wafers(n: int, number: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
     x, y = hexagon(n // number)
     apothem = math.sqrt(3) / 2 * max(float(np.abs(x).max()), 1.0)
     distance = (2 * apothem + 1) * (1 + GAP)
-    v, u = hexagonal_packing(number)  # neighbours at 30 deg: across the edges of a wafer
+    v, u = _compact(number)  # neighbours at 30 deg: across the edges of a wafer
     u, v = distance * (u - u.mean()), distance * (v - v.mean())
     return np.add.outer(u, x).ravel(), np.add.outer(v, y).ravel(), np.repeat(np.arange(number), n // number)
+
+
+def _compact(n: int) -> tuple[Floats, Floats]:
+    """``n`` points of a unit-pitch hexagonal lattice, about a point, a middle of two or of three: where they reach least far."""
+    x, y = _lattice(n)
+    found = []
+    for a, b in ((0.0, 0.0), (0.5, 0.0), (0.5, math.sqrt(3) / 6)):
+        away = np.hypot(x - a, y - b)
+        order = np.lexsort((np.round(np.arctan2(y - b, x - a), 9), np.round(away, 9)))[:n]
+        found.append((float(away[order[-1]]), x[order], y[order]))
+    return min(found, key=lambda one: round(one[0], 9))[1:]
 
 
 def _lattice(n: int) -> tuple[Floats, Floats]:

@@ -194,7 +194,8 @@ CAMERAS = {
         "a camera like LABOCA on the 12 m Atacama Pathfinder Experiment",
         *("APEX", "11.4 arcmin", 0.6, 0.9, "0.1 Hz", "25 Hz"),
         (Channel("laboca_345ghz", 295, "2 mK s(1/2)", "19 arcsec"),),
-        ROUND,
+        "detectors, field, beam (19.2 arcsec), band of 60 GHz about 345 GHz: Siringo et al. 2009, A&A 497, 945; "
+        "stand-in: NET, about 75 mJy s(1/2) in this beam; stand-in: efficiencies and knee, assumed",
     ),
     "hexagonal_array": Camera(
         "a generic hexagonal array on a 6 m telescope",

@@ -18,6 +18,7 @@ COMMANDS = {
     "run": "zonda.core.cli.run:run",
     "schema": "zonda.core.cli.listing:schema",
     "sensitivity": "zonda.plugins.commands.sensitivity:sensitivity",
+    "show": "zonda.plugins.commands.show:show",
     "status": "zonda.core.campaign.command:status",
     "validate": "zonda.plugins.commands.validate:validate",
     "weather": "zonda.plugins.commands.weather:weather",

@@ -10,6 +10,7 @@ import pytest
 from zonda.core.registry import bands, instruments, sites
 from zonda.operators.atmosphere.weather.climatology import climatologies
 from zonda.plugins import bands as band_table
+from zonda.plugins import cameras
 from zonda.plugins import instruments as instrument_table
 from zonda.plugins import sites as site_table
 
@@ -21,7 +22,8 @@ ALL = {"zonda.sites": site_table, "zonda.instruments": instrument_table, "zonda.
 @pytest.mark.parametrize("group", ALL)
 def test_every_name_has_its_entry_point(group):
     module = ALL[group]
-    assert POINTS[group] == {name: f"{module.__name__}:{name}" for name in dir(module)}
+    survey = {name: f"{cameras.__name__}:{name}" for name in dir(cameras)} if group == "zonda.instruments" else {}
+    assert POINTS[group] == {name: f"{module.__name__}:{name}" for name in dir(module)} | survey
     with pytest.raises(AttributeError, match="no attribute 'nowhere'"):
         _ = module.nowhere
 
@@ -62,6 +64,33 @@ def test_every_instrument(name):
     plane = made.focalplane()
     assert len(plane) == made.detectors
     assert 2 * np.arctan(plane.radius) == pytest.approx(made.field_of_view, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(cameras.CAMERAS))
+def test_every_camera_of_several_bands(name):
+    made, table = instruments.create(name), cameras.CAMERAS[name]
+    assert "stand-in: " in made.provenance
+    assert made.telescope.site in sites
+    plane, pixels = made.focalplane(), {}
+    for k, (channel, (band, camera)) in enumerate(zip(table.channels, made.cameras.items(), strict=True)):
+        rows = plane.of_band(k)
+        assert (band, len(rows)) == (channel.name, channel.detectors)
+        assert set(np.bincount(rows.wafer)) == {channel.detectors // table.wafers}
+        limit = 1.22 * 299792458 / camera.band.centre / made.telescope.diameter
+        assert 0.75 * limit < camera.beam_fwhm < 1.8 * limit  # published ones; of so_sat_lf 0.78
+        pixels[band] = {*zip(rows.xi.tolist(), rows.eta.tolist(), strict=True)}
+    alike = len({frozenset(places) for places in pixels.values()}) == 1
+    assert alike == (made.pixels == "shared")
+    # arrays side by side stand about the middle of all, so that the farthest detector is not quite at the edge
+    assert 2 * np.arctan(plane.radius) == pytest.approx(made.field_of_view, rel=0.1 if made.pixels == "separate" else 1e-9)
+    assert plane.polarized
+
+
+def test_nets_of_the_cmb_are_turned_into_rayleigh_jeans():
+    # dT_RJ / dT_CMB = x^2 e^x / (e^x - 1)^2 with x = h nu / k T_CMB
+    x = 6.62607015e-34 * 92e9 / (1.380649e-23 * 2.72548)
+    factor = x**2 * np.exp(x) / np.expm1(x) ** 2
+    assert instruments.create("so_lat_mf").cameras["f090"].net == pytest.approx(361e-6 * factor, rel=1e-3)  # of 4 digits
 
 
 def test_atlast_is_the_papers():

@@ -40,6 +40,10 @@ def completed(words: str, folder=None, code: str = RUN) -> list[str]:
     return [line.partition(",")[2] for line in done.stdout.splitlines() if line.startswith("plain,")]
 
 
+def test_instruments_are_completed_for_show():
+    assert completed("zonda show instrument so_lat_m") == ["so_lat_mf"]
+
+
 def test_names_are_completed(tmp_path):
     (tmp_path / "mine.yaml").write_text("")
     (tmp_path / "music").mkdir()

@@ -1,0 +1,55 @@
+"""``zonda show instrument``: the bands, detectors and focal plane of an instrument, printed and drawn.
+
+Only click is imported with this module.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from zonda.core.cli import complete
+
+if TYPE_CHECKING:
+    from zonda.core.instrument import Instrument
+
+
+@click.group()
+def show() -> None:
+    """Show an instrument: its bands, its detectors and a picture of its focal plane."""
+
+
+@show.command()
+@click.argument("name", shell_complete=complete.instruments)
+@click.option("--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The picture.  [default: out/show/NAME.png]")
+def instrument(name: str, output: Path | None) -> None:
+    """Print what an instrument is, and draw its focal plane (also as PDF or SVG).
+
+    NAME is a registered name (`zonda plugins`), or a pipeline file whose instrument is meant.
+    """
+    from zonda.core.storage.files import atomic_path, product_path
+
+    from .instrument_plots import focal_plane_figure
+    from .instrument_text import lines
+
+    if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise click.BadParameter(f"{output} is no .png, .pdf or .svg", param_hint="'--output'")
+    camera = _instrument(name)
+    plane = camera.focalplane()
+    click.echo("\n".join(lines(camera, plane)))
+    path = product_path("out/show", camera.name, ".png") if output is None else output
+    with atomic_path(path) as temporary:
+        focal_plane_figure(camera, plane).savefig(temporary)
+    click.echo(f"\n{path}")
+
+
+def _instrument(name: str) -> Instrument:
+    from zonda.core.configuration.pipeline_file import load
+    from zonda.core.registry import instruments
+
+    if name.endswith((".yaml", ".yml")):
+        return load(name).scene().instrument
+    found: Instrument = instruments.create(name)
+    return found
