@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import h5py
 import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from astropy.wcs import WCS
 
 import zonda
@@ -67,7 +70,8 @@ def instrument(band: Any = None, telescope: Any = None, kind: Any = zonda.Instru
         "knee": "0.5 Hz",
         "sample_rate": "50 Hz",
     }
-    return kind(**(values | more))
+    values |= more
+    return kind(**{k: v for k, v in values.items() if v is not None or k not in ("detectors", "field_of_view")})
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +106,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.savetxt(folder / "flat.txt", np.stack([multipoles, np.full(len(multipoles), 1e3)], axis=1))
     for name, flux in (("sources", 1.0), ("others", 2.0)):
         (folder / f"{name}.csv").write_text(f"ra [deg],dec [deg],flux [Jy],spectral_index\n75,20,{flux},-0.7\n")
+    (folder / "array.csv").write_text("name,xi [arcsec],eta [arcsec]\na,0,0\nb,10,0\nc,0,20\n")
     a, b, *_ = instrument().focalplane().names
     (folder / "shares.csv").write_text(f"detector,source,share\n{a},{b},0.01\n")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
@@ -121,7 +126,25 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if name == "scan":
             columns.append(np.arange(t.size) // 10 % 4)  # in turn no flag, 1, 2 and both
             np.savetxt(folder / "flagged.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=f"{head}, flags")
+    recorded(folder)
     return folder
+
+
+def recorded(folder: Path) -> None:
+    """Two saved scans, one with flags of samples and of a detector, a longer one, and a table of noise."""
+    for name, seconds, seed in (("recorded", 12, 3), ("again", 12, 4), ("long", 30, 3)):
+        pointing = make("PointingDaisy", **(SCAN | {"scan_duration": f"{seconds} s", "scans": 1}))
+        steps = [pointing, make("WhiteNoise"), make("Efficiency"), make("SaveTOD")]
+        zonda.Pipeline(steps).run(scene(seed=seed), output=folder / name, threads=1)
+        shutil.copy(folder / name / "tod_scan-000.h5", folder / f"{name}.h5")
+    shutil.copy(folder / "recorded.h5", folder / "flagged.h5")
+    with h5py.File(folder / "flagged.h5", "r+") as file:
+        file["shared/flags"][100:200] = 2
+        file["detdata/flags"][3] = 4
+    names = instrument().focalplane().names
+    nets = np.linspace(1e-3, 3e-3, len(names))
+    table = Table([names, nets, np.ones(len(names)), np.ones(len(names))], names=["name", "net", "knee", "slope"])
+    table.write(folder / "noise.ecsv", format="ascii.ecsv")
 
 
 def make(which: str, /, **parameters: Any) -> Any:
@@ -267,6 +290,17 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "celestial": ({}, {"celestial": "recorded"}),
         "interpolation_error": ({"file": "long.csv"}, {"interpolation_error": 1e-9}),
     },
+    "LoadTOD": {
+        "file": ({}, {"file": "again.h5"}),
+        "signal": ({}, {"signal": "none"}),
+        "band": ({}, {"band": "150 GHz"}),
+        "noise": ({}, {"noise": "noise.ecsv"}),
+        "celestial": ({}, {"celestial": "recomputed"}),
+        "flag_mask": ({"file": "flagged.h5"}, {"flag_mask": 1}),
+        "detector_mask": ({"file": "flagged.h5"}, {"detector_mask": 1}),
+        "target": ({}, {"target": "05h00m10s +20d00m00s"}),
+        "interpolation_error": ({"file": "long.h5", "celestial": "recomputed"}, {"interpolation_error": 1e-9}),
+    },
     "SkyMap": {
         "file": ({}, {"file": "flux.fits"}),
         "map": (ARRAY, {"map": 2 * ARRAY["map"]}),
@@ -395,7 +429,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "width": ({}, {"width": "3 arcmin"}),
         "height": ({"width": "3 arcmin"}, {"height": "2 arcmin"}),
         "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
-        "projection": ({}, {"projection": REFUSED}),
+        "projection": ({}, {"projection": "CAR"}),
         "frame": ({}, {"frame": "galactic"}),
         "nside": ({}, {"nside": 8192}),
         "ordering": ({"nside": 8192}, {"ordering": "nested"}),
@@ -505,6 +539,7 @@ CHAINS = {
     "GroundFilter": ["WhiteNoise", "PinkNoise", "Efficiency", "GroundFilter"],
     "Taper": ["WhiteNoise", "PinkNoise", "Efficiency", "Taper"],
     "BinMap": ["SkyMap", "WhiteNoise", "Efficiency", "BinMap"],
+    "LoadTOD": ["BinMap"],
     "PowerSpectrum": ["WhiteNoise", "PinkNoise", "Efficiency", "PowerSpectrum"],
     "TimeStreams": ["WhiteNoise", "Efficiency", "TimeStreams"],
     "ModeSpectrum": ["WhiteNoise", "PinkNoise", "Efficiency", "ModeSpectrum"],
@@ -546,6 +581,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "CompareStreams": {"reference": "white"},
     "MeasureFigures": {"metrics": ["coverage", "central_rms"]},
     "PointingRecorded": {"file": "scan.csv"},
+    "LoadTOD": {"file": "recorded.h5"},
     "PointingSchedule": {"schedule": "night.txt", "speed": "0.5 deg/s", "check_limits": "warn"},
 }
 
@@ -555,21 +591,21 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 
     def step(other: str) -> Any:
         values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
-        values = values | {
-            key: maps / values[key] for key in ("file", "schedule", "catalogue", "spectrum") if values.get(key) is not None
-        }
+        files = ("file", "schedule", "catalogue", "spectrum", *(("noise",) if other == "LoadTOD" else ()))
+        values = values | {key: maps / values[key] for key in files if values.get(key) is not None}
         if which == "BinMap" == other and "nside" in values:
             values.pop("pixel", None)
         return make(other, **values)
 
     if which == "Mispointing":  # stands behind a pointing step
         return [step(other) for other in CHAINS[which]]
-    pointing = which if which.startswith("Pointing") else "PointingDaisy"
+    pointing = which if which.startswith(("Pointing", "LoadTOD")) else "PointingDaisy"
     return [step(pointing), *(step(other) for other in CHAINS.get(which, []))]
 
 
 REFUSALS = {
-    ("BinMap", "projection"): "'TAN'",
+    ("LoadTOD", "signal"): "BinMap needs signal",
+    ("LoadTOD", "band"): "no band, or more than one, at 150 GHz",
     ("SkyMap", "missing"): "NaN",
     ("PolynomialFilter", "interval"): "no interval 'throw'",
     ("TransferFunction", "map"): "there is no map 'chart'",
@@ -703,6 +739,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "polarization": {"polarization": "pairs", "detectors": 20},
         "detectors": {"detectors": 7},
         "field_of_view": {"field_of_view": "3 arcmin"},
+        "layout": {"layout": "rings"},
+        "wafers": {"layout": "wafers", "detectors": 21, "wafers": 3},
+        "focalplane": {"focalplane": "array.csv", "detectors": None, "field_of_view": None},
         "fwhm": {"fwhm": None},
         "main_beam_efficiency": {"main_beam_efficiency": 0.4},
         "illumination_efficiency": {"illumination_efficiency": 0.7},
@@ -761,7 +800,8 @@ def described(what: str, change: dict[str, Any], maps: Path) -> tuple[Any, dict[
     if what == "site":
         return scene(site=Site(**(SITE | change))), {}
     if what == "instrument":
-        return scene(instrument=instrument(**change)), {}
+        table = {"focalplane": maps / change["focalplane"]} if "focalplane" in change else {}
+        return scene(instrument=instrument(**(change | table))), {}
     if what == "telescope":
         return scene(instrument=instrument(telescope=change)), {}
     if what == "band":
@@ -806,4 +846,4 @@ def test_no_parameter_of_the_scene_is_left_out() -> None:
     assert set(classes) == set(SETTINGS)
     for what, cls in classes.items():
         said = SAID | ({"site"} if what == "telescope" else set())  # where it stands: `zonda check` compares, nothing is computed
-        assert set(cls.model_fields) - said == set(SETTINGS[what]), what
+        assert {field.alias or name for name, field in cls.model_fields.items()} - said == set(SETTINGS[what]), what
