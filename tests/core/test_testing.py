@@ -29,6 +29,15 @@ BUILT_IN = {
     "Detrend": {"order": 2},
     "Despline": {"knots": "5 s"},
     "Taper": {"share": "20 %"},
+    "PolynomialFilter": {"order": 2},
+    "GroundFilter": {},
+    "HalfWavePlate": {"frequency": "2 Hz"},
+    "Leakage": {},
+    "GroundPickup": {},
+    "Glitches": {},
+    "GainDrift": {},
+    "TimeConstant": {},
+    "Crosstalk": {},
     "BinMap": {"pixel": "20 arcsec"},
     "PowerSpectrum": {},
     "TimeStreams": {},
@@ -67,9 +76,30 @@ def test_recorded_pointing_keeps_the_contract(tmp_path):
     check_operator(operators.get("PointingRecorded")(file=tmp_path / "scan.csv"))
 
 
+def test_schedules_keep_the_contract(tmp_path):
+    row = "2024-11-25 07:00:00 | 2024-11-25 07:00:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
+    (tmp_path / "night.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
+    check_operator(operators.get("PointingSchedule")(schedule=tmp_path / "night.txt", speed="0.5 deg/s", check_limits="warn"))
+
+
+def test_point_sources_keep_the_contract(tmp_path):
+    (tmp_path / "sources.csv").write_text("ra [deg],dec [deg],flux [Jy]\n75,20,1\n")
+    check_operator(operators.get("PointSources")(catalogue=tmp_path / "sources.csv"))
+
+
+def test_the_cmb_keeps_the_contract(tmp_path):
+    np.savetxt(tmp_path / "theory.txt", [[number, 1000.0] for number in range(2, 200)])
+    check_operator(operators.get("CMBSky")(spectrum=tmp_path / "theory.txt", nside=64))
+
+
+OF_OTHER_SCANS = {"LoadTOD", "Mispointing"}
+"""The kit has no scan for them: one brings its own, the other changes where those of another step point."""
+
+
 def test_none_is_forgotten():
     own = {c.name for c in operators.candidates() if c.distribution == "zonda"}
-    assert own == {*BUILT_IN, "SkyMap", "PointingRecorded"}
+    files = {"SkyMap", "PointingRecorded", "PointingSchedule", "PointSources", "CMBSky"}
+    assert own == {*BUILT_IN, *files, *OF_OTHER_SCANS}
 
 
 class Good(Operator):
