@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from zonda.core.data import Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_MASK
 from zonda.core.kept import kept, one_scan
+from zonda.core.registry import ground_weather
 from zonda.operators.io.recorded_stream import RecordedStream
 from zonda.operators.io.save_tod import reader
 from zonda.operators.io.time_ordered_data import TimeOrderedData
@@ -57,13 +59,17 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
     InputError
         There is no such scan or stream, or a file cannot be read.
     """
+    scene = None
     if isinstance(source, Data):
-        source = one_scan(source.observations, scan)
+        scene, source = source.scene, one_scan(source.observations, scan)
     elif scan is not None:
         raise InputError("scan chooses from the scans of a run", place=f"scan={scan!r}", cure="leave it out: there is one")
     if isinstance(source, Observation):
         values, flagged = kept(source, stream), None
         tod = TimeOrderedData.of(source)
+        if scene is not None and tod.weather is None:  # no step made an atmosphere of it; as SaveTOD writes it
+            with contextlib.suppress(InputError):
+                tod.weather = ground_weather.get("scene")(scene)
     elif isinstance(source, TimeOrderedData):
         if stream not in source.streams:
             raise _absent(stream, source.streams, source.name)

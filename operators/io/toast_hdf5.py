@@ -128,9 +128,7 @@ def _long_attribute(group: Any, name: str, text: str) -> None:
 
 
 def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
-    import astropy.units as u
     from astropy.io.misc.hdf5 import write_table_hdf5
-    from astropy.table import QTable
 
     site, latitude, longitude, altitude = tod.site
     group.attrs.update(
@@ -153,8 +151,19 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
     )
     if tod.weather is not None:
         _write_weather(group, tod.weather)
+    table = detectors_table(tod)
+    for name in ("name", "pixel"):
+        table[name] = np.asarray(table[name]).astype("S")
+    write_table_hdf5(table, group, path="focalplane", serialize_meta=True)
+
+
+def detectors_table(tod: TimeOrderedData) -> Any:
+    """The detectors as TOAST's `Focalplane` takes them: a QTable."""
+    import astropy.units as u
+    from astropy.table import QTable
+
     table = QTable()
-    table["name"] = np.array(tod.names).astype("S")
+    table["name"] = np.array(tod.names)
     table["quat"] = tod.quats
     for ours, values in tod.columns.items():
         theirs, unit, si = COLUMNS[ours]
@@ -169,7 +178,7 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
     table["uid"] = np.array([name_uid(d) for d in tod.names], np.uint32)
     table.meta["sample_rate"] = tod.sample_rate * u.Hz
     table.meta["field_of_view"] = u.Quantity(tod.field_of_view, u.rad).to(u.deg)
-    write_table_hdf5(table, group, path="focalplane", serialize_meta=True)
+    return table
 
 
 WEATHER = {  # ours: (TOAST's name, unit)
@@ -203,17 +212,26 @@ def _write_metadata(file: Any, tod: TimeOrderedData) -> None:
     for key, value in tod.metadata.items():
         other.attrs[f"zonda_{key}"] = value
     file.create_group("attr")
-    if {"net", "knee", "slope", "minimum_frequency"} <= set(tod.columns) and (tod.columns["net"] > 0).all():
-        _write_noise(metadata.create_group("noise_model"), tod)
+    if (noise := nominal_noise(tod)) is not None:
+        _write_noise(metadata.create_group("noise_model"), tod, *noise)
 
 
-def _write_noise(group: Any, tod: TimeOrderedData) -> None:
-    """The nominal noise, in TOAST's two-sided convention: NET^2 (1 + (knee / max(f, f_min))^slope)."""
+def nominal_noise(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats] | None:
+    """Frequencies (n,) [Hz] and densities (n_det, n) [K^2 s] of the nominal noise; None: the detectors state none.
+
+    In TOAST's two-sided convention: NET^2 (1 + (knee / max(f, f_min))^slope).
+    """
     c, rate = tod.columns, tod.sample_rate
+    if not {"net", "knee", "slope", "minimum_frequency"} <= set(c) or not (c["net"] > 0).all():
+        return None
     lowest = min(1e-5, rate / max(2 * tod.n_samples, 1))
     frequency = np.geomspace(lowest, rate / 2, 100)
     f = np.maximum(frequency, c["minimum_frequency"][:, None])
-    psd = c["net"][:, None] ** 2 * (1 + (c["knee"][:, None] / f) ** c["slope"][:, None])
+    return frequency, c["net"][:, None] ** 2 * (1 + (c["knee"][:, None] / f) ** c["slope"][:, None])
+
+
+def _write_noise(group: Any, tod: TimeOrderedData, frequency: AnyFloats, psd: AnyFloats) -> None:
+    c, rate = tod.columns, tod.sample_rate
     names = [d.encode() for d in tod.names]
     width = max(len(d) for d in names) + 1
     group.attrs["class"] = "toast.noise.Noise"

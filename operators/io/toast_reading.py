@@ -160,14 +160,6 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         check_size(dataset, place)
     names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]
     table, rows = _focalplane(instrument, names, place)
-    columns = {}
-    for ours, (theirs, unit, si) in COLUMNS.items():
-        if theirs in table.colnames:
-            values = table[theirs][rows]
-            columns[ours] = np.array(u.Quantity(values, unit).to_value(si) if unit else values, np.float64)
-    if "pol_leakage" in table.colnames:
-        epsilon = np.asarray(table["pol_leakage"][rows], np.float64)
-        columns.setdefault("polarization_efficiency", (1 - epsilon) / (1 + epsilon))
     other: Mapping[str, Any] = file["metadata/other"].attrs if "metadata/other" in file else {}
     times = shared["times"][:]
     seconds = shared["seconds"][:] if "seconds" in shared else times - times[0]
@@ -198,13 +190,33 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         detector_flags=detector_flags,
         names=names,
         quats=np.asarray(table["quat"][rows], np.float64),
-        columns=columns,
+        columns=columns_of(table, rows),
         intervals=_intervals(file, times, seconds),
         weather=_weather(a),
         hwp_angle=shared["hwp_angle"][:] if "hwp_angle" in shared else None,
         metadata={k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()},
-        offsets=np.array([table[k][rows] for k in OFFSETS]).T if {*OFFSETS} <= set(table.colnames) else None,
+        offsets=offsets_of(table, rows),
     )
+
+
+def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
+    """`TimeOrderedData.columns` of these rows of TOAST's table of detectors."""
+    import astropy.units as u
+
+    columns = {}
+    for ours, (theirs, unit, si) in COLUMNS.items():
+        if theirs in table.colnames:
+            values = table[theirs][rows]
+            columns[ours] = np.array(u.Quantity(values, unit).to_value(si) if unit else values, np.float64)
+    if "pol_leakage" in table.colnames:
+        epsilon = np.asarray(table["pol_leakage"][rows], np.float64)
+        columns.setdefault("polarization_efficiency", (1 - epsilon) / (1 + epsilon))
+    return columns
+
+
+def offsets_of(table: Any, rows: NDArray[np.intp]) -> Floats | None:
+    """`TimeOrderedData.offsets` of these rows of TOAST's table of detectors."""
+    return np.array([table[k][rows] for k in OFFSETS]).T if {*OFFSETS} <= set(table.colnames) else None
 
 
 def _focalplane(instrument: Any, names: list[str], place: str) -> tuple[Any, NDArray[np.intp]]:
