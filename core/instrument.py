@@ -307,7 +307,8 @@ def _completed(given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
     try:
         table = read_array(find(given["focalplane"], info))
     except (ZondaError, PydanticCustomError):  # which the field's own validation tells, at its place
-        return {"detectors": 1, "field_of_view": "0 deg"} | rest
+        efficiencies = {"main_beam_efficiency": 1.0, "illumination_efficiency": 1.0}
+        return {"detectors": 1, "field_of_view": "0 deg", "net": "0 K s(1/2)"} | efficiencies | rest
     found: dict[str, Any] = {"field_of_view": f"{2 * math.atan(table.reach)!r} rad"}
     if isinstance(several := given.get("bands"), list) and several:
         rest["bands"] = [_band_with(table, band, rest) for band in several]

@@ -56,14 +56,14 @@ def _detectors(instrument: Instrument, plane: Focalplane) -> str:
     if instrument.focalplane_table is not None:
         how = f"from {instrument.focalplane_table.name}"
     wafers = len(np.unique(plane.wafer))
-    each = " in each band" if instrument.bands and instrument.pixels != "shared" else ""
+    each = " in each band" if instrument.bands and instrument.pixels != "shared" and instrument.focalplane_table is None else ""
     said = [
         f"{len(plane)}",
         how,
         f"{wafers} wafers{each}" if wafers > 1 else "",
         "polarized" if plane.polarized else "not polarized",
     ]
-    if len(instrument.bands) > 1:
+    if len(instrument.bands) > 1 and instrument.focalplane_table is None:
         said.insert(2, f"pixels {instrument.pixels}")
     if dead := int(plane.dead.sum()):
         said.append(f"{dead} dead")

@@ -119,6 +119,14 @@ def test_the_instrument_need_not_state_what_the_table_has(tmp_path: Path) -> Non
     assert camera.detectors == 3
 
 
+def test_of_a_table_that_cannot_be_read_nothing_else_is_said(tmp_path: Path) -> None:
+    table = written(tmp_path / "a.csv", f"{HEAD}, net [uK s(1/2)]", ["a, 0, 0, 300", "a, 0.1, 0, 400"])
+    with pytest.raises(ZondaError) as caught:  # not that net is missing, which the table would have given
+        zonda.Instrument(**{k: v for k, v in CAMERA.items() if k != "net"}, focalplane=str(table))
+    assert "is that of row 1 too" in str(caught.value)
+    assert "net" not in str(caught.value).splitlines()[0]
+
+
 def test_ecsv_of_astropy(tmp_path: Path) -> None:
     from astropy import units as u
     from astropy.table import QTable
@@ -215,5 +223,6 @@ def test_a_pipeline_file_names_the_table_beside_it(tmp_path: Path) -> None:
     with pytest.raises(ZondaError, match=r"xi of row 2 is 'nan'") as caught:
         load(path)
     assert "my.yaml:4" in str(caught.value)
+    assert "1 mistake" in str(caught.value)
     written(tmp_path / "array.csv", HEAD, ["a, 0, 0", "b, 0.01, 0"])
     assert load(path).scene().instrument.detectors == 2

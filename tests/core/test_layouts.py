@@ -75,6 +75,21 @@ def test_wafers_of_two_bands_lie_upon_each_other() -> None:
     np.testing.assert_array_equal(one.wafer, other.wafer)
 
 
+def test_overlaid_bands_fill_the_same_field_each_by_itself() -> None:
+    bands = [
+        {"name": "f090", "low": "80 GHz", "high": "100 GHz", "detectors": 19},
+        {"name": "f150", "low": "140 GHz", "high": "160 GHz", "detectors": 61},
+    ]
+    given = {k: v for k, v in CAMERA.items() if k != "band"} | {"bands": bands, "pixels": "overlaid"}
+    camera = zonda.Instrument(**given)
+    plane = camera.focalplane()
+    for k, (name, count) in enumerate({"f090": 19, "f150": 61}.items()):
+        own = plane.of_band(k)
+        assert len(own) == count
+        assert 2 * np.arctan(own.radius) == pytest.approx(np.radians(1))
+        np.testing.assert_array_equal(own.xi, camera.cameras[name].focalplane().xi)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
