@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from .configuration.diagnostics import nearest
 from .errors import InputError
 from .focalplane import Focalplane
-from .storage.ecsv import Table, read_table
 from .types import Floats
+
+if TYPE_CHECKING:
+    from .storage.ecsv import Table
 
 QUANTITIES = {
     "xi": "rad", "eta": "rad", "polarization_angle": "rad", "polarization_efficiency": "", "fwhm": "rad",
@@ -114,6 +116,8 @@ def read_array(path: Path) -> ArrayTable:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, changed: int, size: int) -> ArrayTable:
+    from .storage.ecsv import read_table  # most runs read no table
+
     table = read_table(path)
     missing = [name for name in ("name", "xi", "eta") if name not in table.columns]
     if missing:
