@@ -156,7 +156,7 @@ def test_a_plugin_that_cannot_be_imported(here):
 def test_an_output_folder_that_cannot_be_written(here, capsys):
     assert cli.main(["run", "my.yaml", "--output", "/proc/self/zonda"]) == 2
     message = capsys.readouterr().err
-    assert "/proc/self/zonda: cannot be written" in message
+    assert "/proc/self/zonda: cannot be made" in message
     assert "choose another" in message
     assert "Traceback" not in message
 

@@ -30,7 +30,7 @@ def zonda(environment, *arguments, cwd=None):
 def test_listed_and_importable(installed):
     done = zonda(installed, "plugins", "--check")
     assert done.returncode == 0, done.stderr
-    for name in ("example_camera", "example_peak", "example_rings", "TimeConstant"):
+    for name in ("example_camera", "example_peak", "example_rings", "ReadoutLag"):
         (line,) = [x for x in done.stdout.splitlines() if name in x.split()]
         assert "zonda-example" in line
 
@@ -43,8 +43,8 @@ def test_a_pipeline_uses_it(installed, tmp_path):
 
 def test_its_operator_keeps_the_contract(installed):
     code = (
-        "import zonda.testing; from zonda_example.time_constant import TimeConstant; "
-        "zonda.testing.check_operator(TimeConstant(tau='50 ms'))"
+        "import zonda.testing; from zonda_example.readout_lag import ReadoutLag; "
+        "zonda.testing.check_operator(ReadoutLag(tau='50 ms'))"
     )
     done = subprocess.run([sys.executable, "-c", code], env=installed, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""An operator: the thermal time constant of a bolometer."""
+"""An operator: a read-out that lags behind the detectors."""
 
 from typing import ClassVar
 
@@ -7,7 +7,7 @@ import numpy as np
 from zonda import Operator, Seconds, quantity
 
 
-class TimeConstant(Operator):
+class ReadoutLag(Operator):
     """Blur each time stream with exp(-t / tau) / tau for t >= 0, cut off after 8 tau (3e-4 of the response)."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
