@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
+from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix, ray_coefficients
 from zonda.core.numerics.tangent import TangentWcs
 from zonda.core.types import Floats
 
+from .healpix import Lookup, healpix_pixels, lookup
 from .plate_carree import PlateCarreeGrid
 
 if TYPE_CHECKING:
@@ -66,18 +68,18 @@ class HealpixGrid:
     def n_pixels(self) -> int:
         return len(self.pixels_covered)
 
+    @cached_property
+    def lookup(self) -> Lookup:
+        """Where each covered pixel lies among them."""
+        return lookup(self.pixels_covered)
+
     def pointing(self, observation: Observation) -> Floats:
-        """Boresight quaternions (n_samp, 4); the frame is applied in `pixels`."""
-        return observation.boresight_radec
+        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame (`ray_coefficients`)."""
+        return np.ascontiguousarray(ray_coefficients(observation.boresight_radec, frame_rotation(self.frame)).T)
 
     def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
         """Indices (n_det, stop - first) into ``pixels_covered`` of detectors at (xi, eta), -1 elsewhere. Into ``out``."""
-        import healpy
-
-        where = directions(pointing[first:stop], xi, eta) @ frame_rotation(self.frame).T
-        pixel = healpy.vec2pix(self.nside, where[..., 0], where[..., 1], where[..., 2], nest=self.nest)
-        place = np.minimum(np.searchsorted(self.pixels_covered, pixel), self.n_pixels - 1)
-        out[:] = np.where(self.pixels_covered[place] == pixel, place, -1)
+        healpix_pixels(pointing, first, stop, xi, eta, self.nside, self.nest, *self.lookup, out)
 
 
 Grid = TangentGrid | PlateCarreeGrid | HealpixGrid
