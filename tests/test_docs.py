@@ -37,6 +37,28 @@ def with_recorded_data(folder, text):
     (folder / "tod_scan-000.h5").rename(folder / "night.h5")
 
 
+def with_files_of_the_page(folder, text):
+    """The files that a page shows in full, as "`NAME`:" and a block of text."""
+    for page in (page for page in map(Path.read_text, PAGES) if text in page):
+        for name, content in re.findall(r"^`([\w.-]+)`:\n\n```text\n(.*?)```", page, re.S | re.M):
+            (folder / name).write_text(content)
+
+
+def with_survey_data(folder, text):
+    """The files of streams that the page of a survey maps again, of a short run of its pipeline."""
+    names = re.findall(r"tod_scan-00\d-f150\.h5", text)
+    if not names:
+        return
+    import zonda
+
+    page = (ROOT / "docs" / "survey.md").read_text()
+    (folder / "survey.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, re.S)[1])
+    changes = ["instrument.detectors=4", "PointingSchedule.sample_rate=10 Hz"]
+    file = zonda.load(folder / "survey.yaml", overrides=changes)
+    steps = [o for o in file.operators if type(o).__name__ in ("PointingSchedule", "WhiteNoise", "Efficiency", "SaveTOD")]
+    zonda.Pipeline(steps).run(file.scene(), output=folder, threads=1)
+
+
 def defined_before(text):
     """Names of the page's first block of Python, where this one goes on from there."""
     if "import zonda" in text:
@@ -69,6 +91,8 @@ def test_yaml(text, tmp_path, monkeypatch, capsys):
 
     in_a_folder_with_a_map(tmp_path, monkeypatch)
     with_recorded_data(tmp_path, text)
+    with_files_of_the_page(tmp_path, text)
+    with_survey_data(tmp_path, text)
     (tmp_path / "page.yaml").write_text(text)
     status = cli.main(["check", "page.yaml"])
     out, err = capsys.readouterr()

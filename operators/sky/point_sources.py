@@ -22,6 +22,7 @@ from zonda.core.block import Block
 from zonda.core.compilation.jit import nb
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.units import Hertz
+from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.numerics.projection import boresights, rotation_matrices
@@ -55,6 +56,10 @@ class PointSources(Operator):
     """Frequency of the fluxes, where the catalogue has no column of it. Default: the band's centre."""
     scale: float = Field(1.0, ge=-1e30, le=1e30)
     """Factor on all fluxes."""
+
+    def check(self, data: Data) -> list[str]:
+        """How many sources the catalogue has; raises InputError where it is wrong."""
+        return [f"{len(Catalogue.read(self).flux)} sources in {self.catalogue}"]
 
     def prepare(self, observation: Observation) -> Sources:
         """The sources with their brightness, and which of them are in view when."""

@@ -90,3 +90,6 @@ def test_catalogues_that_are_wrong(tmp_path, heading, row, match):
     with pytest.raises(InputError, match=match) as caught:
         Catalogue.read(PointSources(catalogue=path))
     assert "bad.csv" in str(caught.value)
+    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d")
+    with pytest.raises(InputError, match=match):  # `zonda check` says so too
+        PointSources(catalogue=path).check(zonda.Data(scene))
