@@ -103,7 +103,7 @@ class PolynomialPlanning(Planning[PolynomialFilter]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the slow part in."""
         functions = self.operator.order + 1
-        cost = Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=4e-9 + 1.2e-9 * functions)
+        cost = Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=1.2e-8 + 3.6e-9 * functions)
         return Estimate((), cost, _left_in(context))
 
 
@@ -118,7 +118,7 @@ class GroundPlanning(Planning[GroundFilter]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the template in."""
-        cost = Cost(fixed=0.01, per_time=1e-7, per_sample=5e-9 + 2e-9 * self.operator.trend)
+        cost = Cost(fixed=0.01, per_time=1e-7, per_sample=1.2e-8 + 5e-9 * self.operator.trend)
         return Estimate((), cost, _left_in(context))
 
 

@@ -28,7 +28,7 @@ class BinMapPlanning(Planning[BinMap]):
         """Its cost."""
         n = self.operator.grid.n_pixels
         if self.operator.stokes == "IQU":
-            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, 2.6e-8 if self.operator.nside else 2.4e-8))
+            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, 4.2e-8 if self.operator.nside else 2.4e-8))
         return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9))
 
     def memory(self, observation: Observation) -> int:
