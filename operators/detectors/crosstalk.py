@@ -21,6 +21,7 @@ from zonda.core.compilation.jit import nb
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
+from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.focalplane import Focalplane
 from zonda.core.observation import Observation
@@ -57,6 +58,12 @@ class Crosstalk(Operator):
         if self.file is not None and "level" in self.model_fields_set:
             raise ValueError("give either level, for nearest neighbours, or file")
         return self
+
+    def check(self, data: Data) -> list[str]:
+        """Raise InputError where the table is wrong, or of other detectors."""
+        if self.file is not None and data.observations:
+            read_shares(self.file, data.observations[0].focalplane)
+        return []
 
     def prepare(self, observation: Observation) -> Shares:
         """The shares by detector. Raises InputError for a file that does not suit the focal plane."""

@@ -56,6 +56,10 @@ class CMBSky(Operator):
             raise ValueError(f"nside is a power of two, not {value}")
         return value
 
+    def check(self, data: Data) -> list[str]:
+        """Up to which multipole the spectrum reaches; raises InputError where it is wrong."""
+        return [f"{self.spectrum} reaches multipole {read_spectrum(str(self.spectrum)).shape[1] - 1}"]
+
     def prepare(self, observation: Observation) -> Any:
         """See `SkyMap`."""
         rms = float(np.std(self.sky(observation.seed).map.table.data["I"]))  # type: ignore[union-attr]
@@ -90,7 +94,10 @@ class CMBSky(Operator):
 def read_spectrum(place: str) -> Floats:
     """C_l [K^2], (4, lmax + 1): TT, EE, BB, TE from l = 0; zero where the file has none. Raises InputError."""
     with reading(place, "a power spectrum", CURE):
-        table = np.loadtxt(place, ndmin=2)
+        try:
+            table = np.loadtxt(place, ndmin=2)
+        except ValueError as error:  # numpy's own cures are for those who call it
+            raise ValueError(str(error).partition("; use `")[0]) from None
     if table.shape[1] not in (2, 5):
         raise InputError(f"has {table.shape[1]} columns, not 2 or 5", place=place, cure=CURE)
     ell = table[:, 0]

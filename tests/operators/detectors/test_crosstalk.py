@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import zonda.testing
+from zonda.core.data import Data
 from zonda.core.errors import InputError, ZondaError
 from zonda.operators.detectors.crosstalk import Crosstalk, neighbours
 
@@ -78,6 +79,8 @@ def test_bad_files(bench, tmp_path, rows, heading, match):
     with pytest.raises(InputError, match=match) as caught:
         bench.run([Crosstalk(file=path)], observation, {"signal": np.zeros((3, 100))})
     assert "shares.csv" in str(caught.value)
+    with pytest.raises(InputError, match=match):  # before a run
+        Crosstalk(file=path).check(Data(None, observations=[observation]))
 
 
 def test_either_a_level_or_a_file(tmp_path):

@@ -82,6 +82,7 @@ def test_without_a_spectrum_it_is_refused():
     ("text", "match"),
     [
         ("2 1000\n3 x\n", "cannot be read as a power spectrum"),
+        ("2 1000 5\n3 1000\n", "the number of columns changed"),
         ("2 1000 1\n3 1000 1\n", "has 3 columns, not 2 or 5"),
         ("2 1000\n4 1000\n", "multipoles are missing"),
         ("3 1000\n2 1000\n", "no rising series"),
@@ -95,3 +96,6 @@ def test_files_that_are_no_spectrum(tmp_path, text, match):
     with pytest.raises(InputError, match=match) as caught:
         read_spectrum(str(path))
     assert "bad.txt" in str(caught.value)
+    assert "usecols" not in str(caught.value)
+    with pytest.raises(InputError, match=match):  # before a run
+        zonda.CMBSky(spectrum=path).check(None)
