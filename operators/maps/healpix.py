@@ -110,7 +110,7 @@ def _angles(h, low, end, a, b, height, cap, quarter):  # type: ignore[no-untyped
         quarter[k] = t if t < 4.0 else 0.0
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def _ring(z, s, t, nside):  # type: ignore[no-untyped-def]
     """Pixel number in the RING ordering."""
     if abs(z) <= 2.0 / 3.0:
@@ -125,7 +125,7 @@ def _ring(z, s, t, nside):  # type: ignore[no-untyped-def]
     return (2 * ring * (ring - 1) if z > 0.0 else 12 * nside * nside - 2 * ring * (ring + 1)) + column
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def _nested(z, s, t, nside):  # type: ignore[no-untyped-def]
     """Pixel number in the NESTED ordering."""
     if abs(z) <= 2.0 / 3.0:
@@ -143,7 +143,7 @@ def _nested(z, s, t, nside):  # type: ignore[no-untyped-def]
     return face * nside * nside + (_spread(x) | (_spread(y) << 1))
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def _spread(v):  # type: ignore[no-untyped-def]
     """The bits of ``v``, below 2 ** 29, at the even places."""
     v = (v | (v << 16)) & 0x0000FFFF0000FFFF
@@ -153,7 +153,7 @@ def _spread(v):  # type: ignore[no-untyped-def]
     return (v | (v << 1)) & 0x5555555555555555
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def _by_pages(pixel, page, pages, places, found):  # type: ignore[no-untyped-def]
     """Index of each pixel among the covered ones, -1 where it is none of them, from the pages of `Lookup`."""
     count = np.int64(pages.size)
@@ -163,7 +163,7 @@ def _by_pages(pixel, page, pages, places, found):  # type: ignore[no-untyped-def
         found[k] = places[(number << PAGE) + (pixel[k] & ((1 << PAGE) - 1))] if number >= 0 else np.int32(-1)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def _by_search(pixel, covered, found):  # type: ignore[no-untyped-def]
     """Index of each pixel among the covered ones, -1 where it is none of them, by bisection."""
     for k in range(found.size):
