@@ -49,6 +49,8 @@ operators:
 """
 TASKS_IN_ALL = 8
 KILLS_OF_THE_MAIN_PROCESS, KILLS_OF_WORKERS = 16, 4
+ROUNDS = 20
+"""Most campaigns that are begun anew because a signal came too late."""
 
 NURSERY = """
 import json, os, sys, time
@@ -234,11 +236,17 @@ def killed(place: Path, nursery: Nursery, name: str, moments: random.Random, *ar
 
 def partly(place: Path, nursery: Nursery, name: str) -> None:
     """A campaign that was killed when some of its tasks, not all, were done."""
-    pid = nursery.begin(*forward(place, name))
-    while len(list((place / name / TASKS).glob("[0-9]*.npz"))) < 4:
-        time.sleep(0.002)
-    os.kill(pid, signal.SIGKILL)
-    assert nursery.end()[0] == -signal.SIGKILL
+    for _ in range(ROUNDS):
+        pid = nursery.begin(*forward(place, name))
+        while len(list((place / name / TASKS).glob("[0-9]*.npz"))) < 4:
+            time.sleep(0.002)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        status, said = nursery.end()
+        if status:
+            break
+        shutil.rmtree(place / name)  # it was quicker
+    assert status == -signal.SIGKILL, said
     check_whole(place / name)
     assert 4 <= len(list((place / name / TASKS).glob("[0-9]*.npz"))) < TASKS_IN_ALL
 
@@ -394,11 +402,15 @@ def test_two_main_processes_at_once(place: Path, nursery: Nursery, whole_run: An
 
 def test_sigterm_ends_a_campaign_cleanly(place: Path, nursery: Nursery, whole_run: Any) -> None:
     name = "term"
-    pid = nursery.begin(*forward(place, name))
-    while len(list((place / name / TASKS).glob("[0-9]*.npz"))) < 2:
-        time.sleep(0.002)
-    os.kill(pid, signal.SIGTERM)
-    status, said = nursery.end()
+    for _ in range(ROUNDS):
+        pid = nursery.begin(*forward(place, name))
+        while len(list((place / name / TASKS).glob("[0-9]*.npz"))) < 2:
+            time.sleep(0.002)
+        os.kill(pid, signal.SIGTERM)
+        status, said = nursery.end()
+        if status:
+            break
+        shutil.rmtree(place / name)  # it was quicker
     assert status == 143, said
     assert not [p for p in (place / name).rglob(".*") if p.is_file()], "a lock or a temporary file is left"
     finish(place, nursery, name)

@@ -19,6 +19,7 @@ import pytest
 from zonda.core.campaign.job import FILE, LOG
 
 from .test_campaign_kills import (
+    ROUNDS,
     TASKS_IN_ALL,
     Nursery,
     check_whole,
@@ -36,9 +37,6 @@ from .test_campaign_kills import (
 __all__ = ["nursery", "place", "whole_run"]
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc")
-
-ROUNDS = 20
-"""Most campaigns that are begun anew because a kill came too late."""
 
 
 def wait_for(condition: Callable[[], bool], alive: Callable[[], bool]) -> None:
