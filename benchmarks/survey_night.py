@@ -1,12 +1,13 @@
 """Half an hour of a 6 m survey telescope, two bands, polarized, in one HEALPix map each: CPU time by step, memory, forecast.
 
-    python benchmarks/survey_night.py                # a tenth of it: 3 min
-    python benchmarks/survey_night.py --factor 1     # 30 min, 6.2e8 samples
+    python benchmarks/survey_night.py                                # a tenth of it: half a minute
+    python benchmarks/survey_night.py --factor 1                     # 30 min, 6.2e8 samples
+    python benchmarks/survey_night.py --factor 1 --memory 2.5 --common-mode
 
 2 x 1720 detectors in pairs with shared pixels, 100 Hz: constant-elevation scans, atmosphere, white and pink noise, polynomials
-of each detector's scan, the ground's template, maps of I, Q and U; no stream is saved. A first run of 12 s, not counted,
-compiles. CPU seconds are those of a process of its own with imports and planning; by step, those that the pipeline timed. The
-forecast is that of `zonda plan`.
+of each detector's scan, the ground's template, maps of I, Q and U and of their half-difference; no stream is saved. With
+`--common-mode` one singular mode of each band is removed too. A first run of 12 s, not counted, compiles. CPU seconds are those
+of a process of its own with imports and planning; by step, those that the pipeline timed. The forecast is that of `zonda plan`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ PIXELS = 860
 BANDS = (("f090", 77, 106, 300), ("f150", 130, 170, 360))
 
 
-def text(seconds: float, nside: int) -> str:
+def text(seconds: float, options: argparse.Namespace) -> str:
     """The pipeline file."""
     bands = "".join(
         f"    - {{name: {n}, low: {a} GHz, high: {b} GHz, net: {net} uK s(1/2), knee: 0.5 Hz, detectors: {2 * PIXELS}}}\n"
@@ -54,7 +55,8 @@ operators:
   - Efficiency
   - PolynomialFilter: {{order: 3}}
   - GroundFilter
-  - BinMap: {{stokes: IQU, nside: {nside}, half_difference: false}}
+{"  - CommonModeFilter: {modes: 1}" if options.common_mode else ""}
+  - BinMap: {{stokes: IQU, nside: {options.nside}, half_difference: {options.half_difference}}}
   - SaveMap
 """
 
@@ -69,7 +71,7 @@ def one(file: Path, memory: int | None) -> None:
     import zonda
 
     loaded = zonda.load(str(file))
-    made = zonda.plan(loaded, prune_all=False, threads=1)
+    made = zonda.plan(loaded, prune_all=False, threads=1, memory=memory)
     start = time.process_time()
     loaded = made.apply(loaded)
     more = {} if memory is None else {"ceiling": memory}
@@ -90,7 +92,7 @@ def one(file: Path, memory: int | None) -> None:
 def launch(folder: Path, seconds: float, options: argparse.Namespace) -> dict:
     """Figures of a run in a process of its own."""
     file = folder / "night.yaml"
-    file.write_text(text(seconds, options.nside))
+    file.write_text(text(seconds, options))
     command = [sys.executable, __file__, "--one", str(file)]
     command += ["--memory", str(options.memory)] if options.memory else []
     done = subprocess.run(command, capture_output=True, text=True)
@@ -104,6 +106,8 @@ def main() -> None:
     parser.add_argument("--factor", type=float, default=0.1, help="share of the 30 min (default 0.1)")
     parser.add_argument("--nside", type=int, default=1024)
     parser.add_argument("--memory", type=float, help="GB that the run may hold")
+    parser.add_argument("--common-mode", action="store_true", help="remove a singular mode of each band")
+    parser.add_argument("--half-difference", default="halves", help="that of BinMap (default halves)")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     memory = None if options.memory is None else round(options.memory * 1e9)

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix, ray_coefficients
+from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
 from zonda.core.numerics.tangent import TangentWcs
 from zonda.core.types import Floats
 
 from .healpix import Lookup, healpix_pixels, lookup
+from .image_grid import ImageGrid, rays
 from .plate_carree import PlateCarreeGrid
 
 if TYPE_CHECKING:
@@ -28,23 +29,13 @@ MOST_PIXELS = 1 << 28
 """Largest grid that is made."""
 
 
-@dataclass(frozen=True)
-class TangentGrid:
-    """A TAN image: ``shape`` (ny, nx), centre [rad] in ``frame``, square pixels of side ``pixel`` [rad], east to the left."""
-
-    centre: tuple[float, float]
-    pixel: float
-    shape: tuple[int, int]
-    frame: str = "icrs"
-
-    @property
-    def n_pixels(self) -> int:
-        return self.shape[0] * self.shape[1]
+class TangentGrid(ImageGrid):
+    """A TAN image: its origin is the centre [rad] in ``frame``; pixels are square, east is to the left."""
 
     @property
     def wcs(self) -> TangentWcs:
         """World coordinates whose reference point is the middle of the image, for odd and even sizes alike."""
-        return tangent_wcs(self.centre, self.pixel, self.shape, self.frame)
+        return tangent_wcs(self.origin, self.pixel, self.shape, self.frame)
 
     def pointing(self, observation: Observation) -> Floats:
         """Homographies (9, n_samp), see `core.numerics.projection`."""
@@ -74,8 +65,8 @@ class HealpixGrid:
         return lookup(self.pixels_covered)
 
     def pointing(self, observation: Observation) -> Floats:
-        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame (`ray_coefficients`)."""
-        return np.ascontiguousarray(ray_coefficients(observation.boresight_radec, frame_rotation(self.frame)).T)
+        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
+        return rays(observation, self.frame)
 
     def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
         """Indices (n_det, stop - first) into ``pixels_covered`` of detectors at (xi, eta), -1 elsewhere. Into ``out``."""

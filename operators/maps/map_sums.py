@@ -6,22 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
-from zonda.core.errors import PipelineError
-from zonda.core.numerics.chunks import empty
-from zonda.core.product import Product
 from zonda.core.types import Floats
 
-from .sums import DATA, FLAGGED, HITS, NOISE, VALUE, Binning, Sums
-
-MOST = 2.0**62
-"""Below what a sum must stay."""
+from .pixel_sums import MOST, PixelSums, refuse_overflow, zeros
+from .sums import DATA, HITS, NOISE, Binning, Sums
 
 
-class MapSums(Product):
-    """Sums of two halves of the samples: of the even and of the odd observations, in their order, or of halves of each.
+class MapSums(PixelSums):
+    """Sums for a map of I.
 
     Parameters
     ----------
@@ -40,21 +34,13 @@ class MapSums(Product):
         (2, n_pixels, 4) of the complete signal, columns as in `sums`; hits and weights are those of all signals.
     others
         By stream of the further signals, (2, n_pixels): the sums of w d; ``scatters``: their noise terms, where they differ.
-    scans, rates
-        Names of the observations, and their sample rates, Hz.
-    unknown_variance
-        A scan's weights are uniform because every NET is zero.
     """
 
     def __init__(self, n_pixels: int, signals: Sequence[str], scatter: bool = False, of_scans: bool = True) -> None:
-        self.signals = tuple(signals)
-        self.sums = _zeros(n_pixels, 4)
-        self.others = {name: _zeros(n_pixels, 1)[..., 0] for name in self.signals[1:]}
-        self.scatters = {name: _zeros(n_pixels, 1)[..., 0] for name in self.others} if scatter else {}
-        self.of_scans = of_scans
-        self.scans: list[str] = []
-        self.rates: set[float] = set()
-        self.unknown_variance = False
+        super().__init__(signals, of_scans)
+        self.sums = zeros(n_pixels, 4)
+        self.others = {name: zeros(n_pixels, 1)[..., 0] for name in self.signals[1:]}
+        self.scatters = {name: zeros(n_pixels, 1)[..., 0] for name in self.others} if scatter else {}
         self._largest = np.zeros(4)
         self._largest_of = dict.fromkeys(self.others, 0.0)
         self._deepest = [0, 0]
@@ -65,13 +51,10 @@ class MapSums(Product):
         ``halves``: the binnings of either half of its samples, or one list of all of them.
         """
         inside, dropped = 0, np.zeros(4, np.int64)
-        for k, binnings in enumerate(halves, start=len(self.scans) % 2 if self.of_scans else 0):
+        for k, binnings in enumerate(halves, start=self.shift):
             binned, lost = self._add_half(k, binnings)
             inside, dropped = inside + binned, dropped + lost
-        # what belongs to the other half counted as flagged
-        dropped[FLAGGED] -= (len(halves) - 1) * observation.n_detectors * observation.n_samples
-        self.scans.append(observation.name)
-        self.rates.add(float(observation.sample_rate))
+        self._added(observation, len(halves), dropped)
         self._check(f"{place}, {observation.name}")
         return inside, dropped
 
@@ -112,7 +95,7 @@ class MapSums(Product):
 
     def __iadd__(self, other: MapSums) -> MapSums:
         """Add sums whose scans follow those that are here: exact, so that their order does not matter but for which are even."""
-        shift = len(self.scans) % 2 if self.of_scans else 0
+        shift = self.shift
         for k in range(2):
             half, pixels = (k + shift) % 2, np.flatnonzero(other.sums[k, :, HITS])
             merged = other.sums[k].take(pixels, axis=0) + (self.sums[half].take(pixels, axis=0) if self.scans else 0)
@@ -123,18 +106,15 @@ class MapSums(Product):
             self._note(half, int(merged[:, HITS].max(initial=0)), other._largest)
         for name, high in other._largest_of.items():
             self._largest_of[name] = max(self._largest_of[name], high)
-        self.scans += other.scans
-        self.rates |= other.rates
-        self.unknown_variance |= other.unknown_variance
+        self._joined(other)
         self._check("the sum of the maps of all tasks")
         return self
 
     def arrays(self) -> dict[str, Any]:
         """Numbers of the pixels with hits, and their sums."""
-        found: dict[str, Any] = {
-            "signals": list(self.signals), "n_pixels": self.sums.shape[1], "scans": list(self.scans), "rates": sorted(self.rates),
-            "largest": self._largest, "largest_of": dict(self._largest_of), "unknown_variance": self.unknown_variance,
-            "scatter": bool(self.scatters), "of_scans": self.of_scans,
+        found = self._about() | {
+            "n_pixels": self.sums.shape[1], "largest": self._largest, "largest_of": dict(self._largest_of),
+            "scatter": bool(self.scatters),
         }  # fmt: skip
         for k in range(2):
             pixels = np.flatnonzero(self.sums[k, :, HITS])
@@ -149,8 +129,7 @@ class MapSums(Product):
     def of(cls, arrays: Mapping[str, Any]) -> MapSums:
         """See `Product.of`."""
         made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), bool(arrays["scatter"]), bool(arrays["of_scans"]))
-        made.scans, made.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
-        made.unknown_variance = bool(arrays["unknown_variance"])
+        made._with_about(arrays)
         made._largest_of = {name: float(high) for name, high in arrays["largest_of"].items()}
         for k in range(2):
             pixels, sums = arrays[f"pixels_{k}"], arrays[f"sums_{k}"]
@@ -180,21 +159,10 @@ class MapSums(Product):
     def _check(self, place: str) -> None:
         """No sum can have overflowed."""
         largest = max(float(self._largest.max()), *self._largest_of.values(), 0.0)
-        if sum(self._deepest) * largest < MOST:
-            return
-        deepest = float(self.sums[:, :, HITS].sum(axis=0).max(initial=0))
-        if deepest * largest >= MOST:
-            highest = max(float(self._largest[DATA]), *self._largest_of.values(), 0.0) / VALUE
-            raise PipelineError(
-                f"{deepest:.0f} samples in one pixel, each up to {highest:.3g} K, overflow the map's fixed-point sums",
-                place=place,
-                cure="make smaller pixels, or put a HighpassFilter before",
+        if sum(self._deepest) * largest >= MOST:
+            refuse_overflow(
+                self.sums[:, :, HITS], largest, max(float(self._largest[DATA]), *self._largest_of.values(), 0.0), place
             )
-
-
-def _zeros(n_pixels: int, columns: int) -> NDArray[np.int64]:
-    """(2, n_pixels, columns) zeros that take no memory until they are written."""
-    return empty((2 * n_pixels, columns), np.int64).reshape(2, n_pixels, columns)
 
 
 def _nothing(half: Sums) -> Sums:

@@ -22,6 +22,8 @@ from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, frame_rotation, ray_coefficients
 from zonda.core.types import Floats
 
+from .image_grid import ImageGrid, rays
+
 if TYPE_CHECKING:
     from zonda.core.data import Observation
 
@@ -32,17 +34,10 @@ Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
-class PlateCarreeGrid:
-    """A CAR image: ``shape`` (ny, nx), pixels of side ``pixel`` [rad], the ``first`` (column, row) of them on the full sky."""
+class PlateCarreeGrid(ImageGrid):
+    """A CAR image: its origin is the (column, row) of its first pixel on the full sky."""
 
-    first: tuple[int, int]
-    pixel: float
-    shape: tuple[int, int]
-    frame: str = "icrs"
-
-    @property
-    def n_pixels(self) -> int:
-        return self.shape[0] * self.shape[1]
+    origin: tuple[int, int]
 
     @property
     def wcs(self) -> Any:
@@ -52,8 +47,8 @@ class PlateCarreeGrid:
         rows, degrees, middle = rows_of(self.pixel), 180.0 / rows_of(self.pixel), self.shape[1] // 2
         wcs = WCS(naxis=2)
         wcs.wcs.ctype = ["RA---CAR", "DEC--CAR"] if self.frame == "icrs" else ["GLON-CAR", "GLAT-CAR"]
-        wcs.wcs.crval = [(180.0 - (self.first[0] + middle) * degrees) % 360.0, 0.0]
-        wcs.wcs.crpix = [middle + 1.0, rows / 2 + 0.5 - self.first[1]]
+        wcs.wcs.crval = [(180.0 - (self.origin[0] + middle) * degrees) % 360.0, 0.0]
+        wcs.wcs.crpix = [middle + 1.0, rows / 2 + 0.5 - self.origin[1]]
         wcs.wcs.cdelt = [-degrees, degrees]
         if self.frame == "icrs":
             wcs.wcs.radesys = "ICRS"
@@ -61,12 +56,12 @@ class PlateCarreeGrid:
         return wcs
 
     def pointing(self, observation: Observation) -> Floats:
-        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame (`ray_coefficients`)."""
-        return np.ascontiguousarray(ray_coefficients(observation.boresight_radec, frame_rotation(self.frame)).T)
+        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
+        return rays(observation, self.frame)
 
     def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
         """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into ``out``."""
-        plate_carree_pixels(pointing, first, stop, xi, eta, rows_of(self.pixel), *self.first, *self.shape, out)
+        plate_carree_pixels(pointing, first, stop, xi, eta, rows_of(self.pixel), *self.origin, *self.shape, out)
 
 
 def rows_of(pixel: float) -> int:

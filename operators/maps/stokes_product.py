@@ -9,17 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
-from zonda.core.errors import PipelineError
-from zonda.core.numerics.chunks import empty
-from zonda.core.product import Product
 
-from .map_sums import MOST
+from .pixel_sums import PixelSums, refuse_overflow, zeros
 from .stokes_sums import DATA, HIT, MATRIX, StokesBinning
-from .sums import FLAGGED, VALUE, Sums
+from .sums import Sums
 
 
-class StokesSums(Product):
-    """Sums of two halves of the samples (`map_sums.MapSums`), those of `stokes_sums`.
+class StokesSums(PixelSums):
+    """Sums for a map of I, Q and U, those of `stokes_sums`.
 
     Attributes
     ----------
@@ -29,19 +26,13 @@ class StokesSums(Product):
         By stream of a signal, (2, n_pixels, 3) b.
     noise
         (2, n_pixels, 6) N; None: it is A.
-    scans, rates, unknown_variance
-        As of `MapSums`.
     """
 
     def __init__(self, n_pixels: int, signals: Sequence[str], of_scans: bool = True) -> None:
-        self.signals = tuple(signals)
-        self.of_scans = of_scans
-        self.matrix = _zeros(n_pixels, DATA)
-        self.data = {name: _zeros(n_pixels, 3) for name in self.signals}
+        super().__init__(signals, of_scans)
+        self.matrix = zeros(n_pixels, DATA)
+        self.data = {name: zeros(n_pixels, 3) for name in self.signals}
         self.noise: NDArray[np.int64] | None = None
-        self.scans: list[str] = []
-        self.rates: set[float] = set()
-        self.unknown_variance = False
         self._largest = 0.0
         self._largest_of = dict.fromkeys(self.signals, 0.0)
 
@@ -51,17 +42,14 @@ class StokesSums(Product):
         ``halves``: the binning of either half of its samples, or one of all of them.
         """
         inside, dropped = 0, np.zeros(4, np.int64)
-        for k, binning in enumerate(halves, start=len(self.scans) % 2 if self.of_scans else 0):
+        for k, binning in enumerate(halves, start=self.shift):
             if binning.own_noise:
                 self._with_noise()
             for pixels, found, lost, largest in binning.taken():
                 self._add_part(k, pixels, found)
                 self._note(float(largest[0]), dict.fromkeys(self.signals, float(largest[1])))
                 inside, dropped = inside + int(found[:, HIT].sum()), dropped + lost
-        # what belongs to the other half counted as flagged
-        dropped[FLAGGED] -= (len(halves) - 1) * observation.n_detectors * observation.n_samples
-        self.scans.append(observation.name)
-        self.rates.add(float(observation.sample_rate))
+        self._added(observation, len(halves), dropped)
         self._check(f"{place}, {observation.name}")
         return inside, dropped
 
@@ -89,7 +77,7 @@ class StokesSums(Product):
 
     def __iadd__(self, other: StokesSums) -> StokesSums:
         """Add sums whose scans follow those that are here: exact."""
-        shift = len(self.scans) % 2 if self.of_scans else 0
+        shift = self.shift
         if other.noise is not None:
             self._with_noise()
         for k in range(2):
@@ -101,18 +89,15 @@ class StokesSums(Product):
                 theirs = other.matrix[k][:, MATRIX] if other.noise is None else other.noise[k]
                 self.noise[half][pixels] += theirs.take(pixels, axis=0)
         self._note(other._largest, other._largest_of)
-        self.scans += other.scans
-        self.rates |= other.rates
-        self.unknown_variance |= other.unknown_variance
+        self._joined(other)
         self._check("the sum of the maps of all tasks")
         return self
 
     def arrays(self) -> dict[str, Any]:
         """Numbers of the pixels with hits, and their sums."""
-        found: dict[str, Any] = {
-            "signals": list(self.signals), "n_pixels": self.matrix.shape[1], "scans": list(self.scans),
-            "rates": sorted(self.rates), "largest": self._largest, "largest_of": dict(self._largest_of),
-            "unknown_variance": self.unknown_variance, "of_scans": self.of_scans, "own_noise": self.noise is not None,
+        found = self._about() | {
+            "n_pixels": self.matrix.shape[1], "largest": self._largest, "largest_of": dict(self._largest_of),
+            "own_noise": self.noise is not None,
         }  # fmt: skip
         for k in range(2):
             pixels = np.flatnonzero(self.matrix[k, :, HIT])
@@ -126,8 +111,7 @@ class StokesSums(Product):
     def of(cls, arrays: Mapping[str, Any]) -> StokesSums:
         """See `Product.of`."""
         made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), bool(arrays["of_scans"]))
-        made.scans, made.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
-        made.unknown_variance = bool(arrays["unknown_variance"])
+        made._with_about(arrays)
         made._note(float(arrays["largest"]), {name: float(high) for name, high in arrays["largest_of"].items()})
         if arrays["own_noise"]:
             made._with_noise()
@@ -159,15 +143,4 @@ class StokesSums(Product):
     def _check(self, place: str) -> None:
         """No sum can have overflowed."""
         highest = max(self._largest_of.values())
-        deepest = float(self.matrix[:, :, HIT].sum(axis=0).max(initial=0))
-        if deepest * max(self._largest, highest) >= MOST:
-            raise PipelineError(
-                f"{deepest:.0f} samples in one pixel, each up to {highest / VALUE:.3g} K, overflow the map's fixed-point sums",
-                place=place,
-                cure="make smaller pixels, or put a HighpassFilter before",
-            )
-
-
-def _zeros(n_pixels: int, columns: int) -> NDArray[np.int64]:
-    """(2, n_pixels, columns) zeros that take no memory until they are written."""
-    return empty((2 * n_pixels, columns), np.int64).reshape(2, n_pixels, columns)
+        refuse_overflow(self.matrix[:, :, HIT], max(self._largest, highest), highest, place)
