@@ -193,7 +193,7 @@ class Survey:
         if (scan, step) not in self._tracks:
             index = np.arange(step // 2, o.n_samples // step * step, step)
             grid = self._grid
-            plane = tangent_wcs(grid.centre, 1.0, (1, 1), grid.frame)
+            plane = tangent_wcs(grid.origin, 1.0, (1, 1), grid.frame)
             matrices = np.ascontiguousarray(homographies(o.boresight_radec[index], plane))
             self._tracks[scan, step] = Track(o, index, step, o.sample_rate / step, matrices)
         return self._tracks[scan, step]
