@@ -6,6 +6,7 @@ is in `QUANTITIES` and `TEXTS`. What it does not have holds as the instrument or
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -34,6 +35,8 @@ TEXTS = ("name", "band", "wafer", "dead")
 POSITIVE = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "slope", "pink_minimum_frequency")
 LARGEST = {"polarization_efficiency": 1.0, "main_beam_efficiency": 1.0, "illumination_efficiency": 1.0, "slope": 3.0}
 SIGNED = ("xi", "eta", "polarization_angle")
+FARTHEST = math.tan(0.5)
+"""Largest distance of a detector from the boresight, tan(rad): half the largest field of view of an `Instrument`."""
 DEAD = {"true": 1, "yes": 1, "1": 1, "false": 0, "no": 0, "0": 0, "": 0}
 """What stands in the column `dead`."""
 OF_INSTRUMENT = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope", "pink_minimum_frequency")
@@ -90,15 +93,20 @@ class ArrayTable:
         if unknown and (several or len(unknown) == len(self.names)):
             k = unknown[0]
             text = f"detector {self.names[k]} in row {k + 1} is of the unknown band {self.bands[k]!r}"
-            raise InputError(text, place=self.place, cure=f"the instrument has: {', '.join(counts)}")
+            hint = nearest(self.bands[k], list(counts))
+            cure = f"{hint + ' ' if hint else ''}the instrument has: {', '.join(counts)}"
+            raise InputError(text, place=self.place, cure=cure)
         for band, stated in counts.items():
             found = len(self.rows(band))
+            if not found:
+                text = f"has no detector of the band {band}; its bands: {', '.join(sorted(set(self.bands)))}"
+                cure = f"give the band {band} a row or more, or leave it out of the instrument"
+                raise InputError(text, place=self.place, cure=cure)
             if found != stated:
                 of = f" of the band {band}" if self.bands else ""
                 rest = f"; others are of {', '.join(sorted(set(self.bands) - set(counts)))}" if unknown else ""
                 text = f"detectors{of}: {found} rows, but the instrument states {stated}{rest}"
-                cure = f"leave out detectors, or write detectors: {found}" if found else f"give the band {band} a row or more"
-                raise InputError(text, place=self.place, cure=cure)
+                raise InputError(text, place=self.place, cure=f"leave out detectors, or write detectors: {found}")
 
 
 def read_array(path: Path) -> ArrayTable:
@@ -137,6 +145,13 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
     columns: dict[str, NDArray[Any]] = {
         key: _within_limits(table, key, table.numbers(key, unit)) for key, unit in QUANTITIES.items() if key in table.columns
     }
+    away = np.hypot(columns["xi"], columns["eta"])
+    if away.max() > FARTHEST:
+        row = int(away.argmax())
+        degrees, most = (math.degrees(math.atan(tangent)) for tangent in (away[row], FARTHEST))
+        text = f"detector {names[row]} in row {row + 1} looks {degrees:.4g} deg away from the boresight"
+        cure = f"give xi and eta within {most:.4g} deg; see that their units are right"
+        raise InputError(text, place=table.place, cure=cure)
     if "polarization_angle" in columns:
         columns.setdefault("polarization_efficiency", np.ones(len(names)))
     if "wafer" in table.columns:

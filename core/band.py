@@ -13,8 +13,9 @@ from pydantic import Field, PrivateAttr, model_validator
 from .configuration.files import InputPath
 from .configuration.parameters import Parameters, named, named_or_written
 from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond
+from .configuration.values import mistake
 from .errors import InputError
-from .registry import bands
+from .registry import RegistryError, bands
 from .storage import packed
 
 SPEED_OF_LIGHT = 299792458.0
@@ -146,7 +147,11 @@ class CameraBand(Band):
         if isinstance(value, str):
             return named(bands, value).model_dump(mode="json")
         if isinstance(value, dict) and isinstance(value.get("name"), str) and not PASSBAND & {k for k, v in value.items() if v}:
-            return named(bands, value["name"]).model_dump(mode="json") | value
+            try:
+                return bands.create(value["name"]).model_dump(mode="json") | value
+            except RegistryError as err:
+                passband = "a band of your own needs a passband: low and high, or file"
+                raise mistake(err.message, err.label, f"{passband}\n{err.cure}", at=("name",)) from None
         return value
 
     @property
@@ -167,6 +172,8 @@ if TYPE_CHECKING:
 else:
     BandOfCamera = Band | None
 """The band of an `Instrument`: there is none where it has several, and nothing that asks for it can go on."""
+
+NO_BAND: Any = None
 
 PASSBAND = {"low", "high", "file"}
 """Keys of a passband."""

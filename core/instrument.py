@@ -12,7 +12,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, ValidationInfo, field
 from pydantic_core import PydanticCustomError
 
 from .array_table import OF_INSTRUMENT, ArrayTable, read_array, stated_by
-from .band import PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
+from .band import NO_BAND, PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
 from .configuration.files import InputPath, find
 from .configuration.parameters import Parameters, named, named_or_written, quantity
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
@@ -74,8 +74,8 @@ class Instrument(Parameters):
     """What it is, in one line."""
     telescope: Telescope
     """The dish it is mounted on."""
-    band: BandOfCamera
-    """The passband: a registered name, or a Band. Beside `bands`: the name of the one that is observed with."""
+    band: BandOfCamera = NO_BAND
+    """The passband: a registered name, or a Band. Not needed with `bands`; beside them the name of the one to observe with."""
     bands: list[CameraBand] = Field(default_factory=list, max_length=32)
     """Bands that are observed at the same time, each with what its detectors have of their own; what a band does not state holds
     as it is stated for the instrument. Maps and other products are made for each."""
@@ -134,31 +134,45 @@ class Instrument(Parameters):
             return camera.model_dump(mode="json") | {"telescope": camera.telescope, "band": camera.band}
         own = [band.model_dump(mode="json") if isinstance(band, CameraBand) else band for band in value["bands"]]
         stated = [key for key in PER_BAND if all(isinstance(band, dict) and band.get(key) is not None for band in own)]
-        return {"band": None} | {key: own[0][key] for key in stated} | value
+        return {key: own[0][key] for key in stated} | value
 
     @model_validator(mode="after")
     def _bands_fit(self) -> Instrument:
         names = [band.name for band in self.bands]
         if twice := next((name for name in names if names.count(name) > 1), None):
-            raise mistake(f"two bands are called {twice}", "", "give each a name of its own: products and files bear it")
+            second = len(names) - 1 - names[::-1].index(twice)
+            help = "give each a name of its own: products and files bear it"
+            raise mistake(f"two bands are called {twice}", "", help, at=("bands", second, "name"))
         if self.band is None and not self.bands:
-            raise mistake("a camera needs a band", "", "name one with band, or several with bands")
+            raise mistake("a camera needs a band", "", "name one with band, or several with bands", at=("band",))
         if self.focalplane_table is not None:
             return self._table_fits(self.focalplane_table)
         counts = self._counts
         if self.pixels == "shared" and len(set(counts.values())) > 1:
             listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
             text = f"shared pixels need as many detectors in every band: {listed}"
-            raise mistake(text, "", "give all bands the same number of detectors, or write pixels: separate")
-        for name, number in (counts if self.bands else {"": self.detectors}).items():
-            who = f"detectors of {name} is" if name else "detectors is"
-            if self.polarization == "pairs" and number % 2:
-                raise mistake(f"polarization: pairs needs an even number of detectors, two in each pixel; {who} {number}")
-            if self.layout == "wafers" and number % (share := self.wafers * self._pair):
-                raise mistake(f"{self.wafers} wafers share their pixels equally; {who} {number}, no multiple of {share}")
+            raise mistake(text, "", "give all bands the same number of detectors, or write pixels: separate", at=("bands",))
         if self.wafers > 1 and self.layout != "wafers":
-            raise mistake(f"{self.wafers} wafers go with layout: wafers, not {self.layout}")
+            help = "write layout: wafers, or leave out wafers"
+            raise mistake(f"{self.wafers} wafers go with layout: wafers, not {self.layout}", "", help, at=("wafers",))
+        for k, (name, number) in enumerate(counts.items()):
+            self._check_number(k, name if self.bands else "", number)
         return self
+
+    def _check_number(self, k: int, band: str, number: int) -> None:
+        """Raise what a validator does where the ``number`` of detectors of the ``k``-th band does not suit pixels and wafers."""
+        own = bool(self.bands) and self.bands[k].detectors is not None
+        at: tuple[str | int, ...] = ("bands", k, "detectors") if own else ("detectors",)
+        who = f"detectors of {band} is" if band else "detectors is"
+        share = self._pair * (self.wafers if self.layout == "wafers" else 1)
+        below = number // share * share
+        cure = f"write {below} or {below + share}" if below else f"write {share}"
+        if self.polarization == "pairs" and number % 2:
+            text = f"polarization: pairs needs an even number of detectors, two in each pixel; {who} {number}"
+            raise mistake(text, "", cure, at=at)
+        if number % share:
+            text = f"{self.wafers} wafers share their pixels equally; {who} {number}, no multiple of {share}"
+            raise mistake(text, "", f"{cure}, or layout: hexagon", at=at)
 
     def _table_fits(self, path: Path) -> Instrument:
         try:
@@ -172,7 +186,7 @@ class Instrument(Parameters):
                 cure = "add it, or leave out polarization: pairs, which belongs to layouts"
                 raise InputError("has no column 'polarization_angle'", place=table.place, cure=cure)
         except ZondaError as err:
-            raise refusal(err) from None
+            raise refusal(err, at=("focalplane",)) from None
         return self
 
     @model_serializer(mode="wrap")

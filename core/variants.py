@@ -7,7 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from .band import PER_BAND
+from .configuration.diagnostics import nearest
 from .configuration.parameters import named
+from .configuration.values import mistake
+from .registry import bands as registered_bands
 from .registry import instruments
 
 LIKE = "like"
@@ -26,7 +30,8 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Any:
     """The instrument ``given["like"]`` (a registered name or an Instrument) with the other keys of ``given`` changed.
 
     A mapping for ``telescope`` changes the keys that it names; ``band`` is replaced as a whole. Where telescope or band change
-    and ``fwhm`` is not given, the beam keeps its ratio to the diffraction limit. Where ``name`` is not given it lists the changes
+    and ``fwhm`` is not given, the beam keeps its ratio to the diffraction limit. What bands may state for themselves, such as
+    ``detectors`` or ``net``, holds for all of them where it is changed. Where ``name`` is not given it lists the changes
     and is the same however their units are written. A variant without changes is the instrument itself.
 
     Raises
@@ -46,11 +51,16 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Any:
     elif changes.get("bands"):
         changes["band"] = None
     elif changes.get("band") is not None:
+        _check_band(base, changes["band"])
         changes["bands"] = []
-    as_it_is = base.model_dump(mode="json") | {"telescope": base.telescope, "band": base.band, "bands": base.bands}
+    for_all = {key: None for key in PER_BAND if changes.get(key) is not None}  # stands above what the bands state
+    own = [band.model_copy(update=for_all) for band in base.bands]
+    as_it_is = base.model_dump(mode="json") | {"telescope": base.telescope, "band": base.band, "bands": own}
+    if changes.get("layout", base.layout) != base.layout:
+        as_it_is["wafers"] = 1
     if changes.get("focalplane") is not None:  # number and field follow from the table
         as_it_is |= {"detectors": None, "field_of_view": None, "polarization": "none", "layout": "hexagon", "wafers": 1}
-        as_it_is["bands"] = [band.model_copy(update={"detectors": None}) for band in base.bands]
+        as_it_is["bands"] = [band.model_copy(update={"detectors": None}) for band in own]
     made = type(base).model_validate(as_it_is | changes, context=context)
     if "fwhm" not in changes:
         made = _with_beams(base, made, kept="bands" not in changes)
@@ -88,6 +98,14 @@ def written(given: Mapping[str, Any], made: Any) -> dict[str, Any]:
 def one_of(instrument: Any, band: Any) -> bool:
     """Whether ``band`` is the name of one of the bands of an instrument that has several."""
     return isinstance(band, str) and any(own.name == band for own in getattr(instrument, "bands", ()))
+
+
+def _check_band(base: Any, band: Any) -> None:
+    """Raise what a validator does where ``band`` is a name that neither ``base``, which has several, nor anything else has."""
+    if isinstance(band, str) and base.bands and band not in registered_bands:
+        names = [own.name for own in base.bands]
+        cure = f"its bands: {', '.join(names)}; or name a registered band (`zonda plugins`), or write one out"
+        raise mistake(f"{base.name} has no band {band!r}", nearest(band, names), cure, at=("band",))
 
 
 def _with_beams(base: Any, made: Any, kept: bool) -> Any:

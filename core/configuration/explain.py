@@ -125,7 +125,8 @@ class _Validated:
     def diagnostic(self, e: Any) -> Diagnostic:
         """One of pydantic's errors."""
         path, loc = self.at, []
-        for part in e["loc"][:-1] if e["type"] == "missing" else e["loc"]:  # leaves out tags of unions
+        place = e["loc"][:-1] if e["type"] == "missing" else (*e["loc"], *e.get("ctx", {}).get("at", ()))
+        for part in place:  # leaves out tags of unions
             if (*path, part) in self.document.marks:
                 path = (*path, part)
                 loc.append(part)

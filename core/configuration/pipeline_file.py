@@ -19,7 +19,7 @@ from ..run.order import check_order
 from ..scene import Scene, WithScene
 from ..signal import Signal, can_be_named
 from ..site import Site
-from ..variants import LIKE, one_of
+from ..variants import LIKE
 from ..weather import WeatherSource, resolve
 from . import overrides as settings
 from . import yaml_places
@@ -203,12 +203,8 @@ class _Check(Mistakes):
             given["instrument"] = dict(given["instrument"])
             if not self.named(given["instrument"], LIKE, registry.instruments, ("instrument", LIKE)):
                 lost.add("instrument")
-            own = one_of(given["instrument"].get(LIKE), given["instrument"].get("band"))
-            if (
-                not own
-                and not given["instrument"].get("bands")
-                and not self.named(given["instrument"], "band", registry.bands, ("instrument", "band"))
-            ):
+            own = LIKE in given["instrument"] or given["instrument"].get("bands")  # which say more of an unknown band
+            if not own and not self.named(given["instrument"], "band", registry.bands, ("instrument", "band")):
                 given["instrument"]["band"] = {"name": "", "low": "1 Hz", "high": "2 Hz"}  # goes on to find the other mistakes
         if given.get("weather") is not None:
             given["weather"] = self.weather(given["weather"])

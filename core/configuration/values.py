@@ -32,14 +32,20 @@ class TextValue:
         return cls.json_schema
 
 
-def mistake(message: str, label: str = "", help: str = "", caret: tuple[int, int] | None = None) -> PydanticCustomError:
-    """What a validator raises: shown at the value's place. ``caret``: (offset, length) of what is wrong in a text."""
-    return PydanticCustomError("mistake", "{message}", {"message": message, "label": label, "help": help, "caret": caret})
+def mistake(
+    message: str, label: str = "", help: str = "", caret: tuple[int, int] | None = None, at: tuple[str | int, ...] = ()
+) -> PydanticCustomError:
+    """What a validator raises: shown at the value's place.
+
+    ``caret``: (offset, length) of what is wrong in a text. ``at``: keys and indices that lead to it within a mapping or list.
+    """
+    context = {"message": message, "label": label, "help": help, "caret": caret, "at": at}
+    return PydanticCustomError("mistake", "{message}", context)
 
 
-def refusal(err: ZondaError) -> PydanticCustomError:
-    """What a validator raises where ``err`` says what is wrong with its value."""
+def refusal(err: ZondaError, at: tuple[str | int, ...] = ()) -> PydanticCustomError:
+    """What a validator raises where ``err`` says what is wrong with its value, or with what is ``at`` a place within it."""
     if isinstance(err, ConfigurationError) and err.diagnostics:
         first = err.diagnostics[0]
-        return mistake(first.message, first.label, first.help)
-    return mistake(f"{err.place}: {err.message}" if err.place else err.message, getattr(err, "label", ""), err.cure)
+        return mistake(first.message, first.label, first.help, at=at)
+    return mistake(f"{err.place}: {err.message}" if err.place else err.message, getattr(err, "label", ""), err.cure, at=at)

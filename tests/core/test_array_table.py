@@ -179,6 +179,7 @@ FAULTS = [
     (f"{HEAD}, dead", ["a, 0, 0, maybe"], "dead of row 1 is 'maybe'", "true or false"),
     (f"{HEAD}, polarisation_angle [deg]", ["a, 0, 0, 0"], "unknown column 'polarisation_angle'", "'polarization_angle'"),
     (HEAD, [], "has no rows", "a row or more"),
+    (HEAD, ["a, 0, 0", "b, 30, 20"], "detector b in row 2 looks 32.18 deg away", "see that their units are right"),
 ]
 
 
@@ -196,7 +197,8 @@ def test_faults_of_a_table(tmp_path: Path, head: str, rows: list[str], cause: st
     [
         (TWO, HEAD, ["a, 0, 0"], "has no column 'band', and the instrument has several"),
         (TWO, f"{HEAD}, band", ["a, 0, 0, f090", "b, 0, 0, f151"], "detector b in row 2 is of the unknown band 'f151'"),
-        (TWO, f"{HEAD}, band", ["a, 0, 0, f090"], "of the band f150"),
+        (TWO, f"{HEAD}, band", ["a, 0, 0, f090"], "has no detector of the band f150; its bands: f090"),
+        (TWO, f"{HEAD}, band", ["a, 0, 0, f090", "b, 0, 0, f151"], "did you mean 'f150'? the instrument has: f090, f150"),
         (CAMERA, f"{HEAD}, band", ["a, 0, 0, f090"], "unknown band 'f090'"),
         (CAMERA | {"detectors": 2}, f"{HEAD}, band", ["a, 0, 0, b150", "b, 0, 0, b15"], "1 rows, but the instrument states 2"),
         (CAMERA | {"detectors": 7}, HEAD, ["a, 0, 0", "b, 0.1, 0"], "2 rows, but the instrument states 7"),

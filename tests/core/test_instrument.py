@@ -136,6 +136,13 @@ def test_pairs_need_an_even_number():
         zonda.Instrument(**dict(CAMERA, detectors=7, polarization="pairs"))
 
 
+def test_a_band_is_not_needed_where_there_are_several():
+    """`help(Instrument)` says so; an instrument with neither is refused."""
+    assert "band : a Band; default None" in zonda.Instrument.__doc__
+    with pytest.raises(ZondaError, match="a camera needs a band"):
+        zonda.Instrument(**{key: value for key, value in CAMERA.items() if key != "band"})
+
+
 def test_a_polarization_efficiency_beyond_one_is_refused():
     plane = zonda.Instrument(**CAMERA).focalplane()
     plane.polarization_efficiency[2] = 1.2

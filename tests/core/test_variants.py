@@ -141,3 +141,38 @@ def test_only_an_instrument_has_variants(base: Instrument) -> None:
     assert not hasattr(base.band, "varied")
     with pytest.raises(ValueError, match="like takes the name of an instrument"):
         variant({"like": base.band})
+
+
+def test_what_is_changed_for_a_camera_of_several_bands_holds_for_all_of_them() -> None:
+    made = instruments.create("act_pa5").varied(net="1 mK s(1/2)", detectors=10, fwhm="3 arcmin")
+    for camera in made.cameras.values():
+        assert (camera.net, camera.detectors) == (1e-3, 10)
+        assert np.isclose(camera.beam_fwhm, np.radians(3 / 60), rtol=1e-12)
+    assert len(made.focalplane()) == 20
+
+
+def test_a_layout_without_wafers_has_none() -> None:
+    made = instruments.create("so_lat_mf").varied(layout="hexagon", detectors=170)
+    assert (made.wafers, set(made.focalplane().wafer)) == (1, {0})
+
+
+@pytest.mark.parametrize(
+    ("changes", "at", "message", "cure"),
+    [
+        ("detectors: 170", "170", "12 wafers share their pixels equally; detectors of f090 is 170", "write 168 or 192"),
+        ("detectors: 2", "2", "12 wafers share their pixels equally; detectors of f090 is 2", "write 24,"),
+        ("detectors: 171, layout: hexagon", "171", "needs an even number of detectors", "write 170 or 172"),
+        ("band: f091", "f091", "so_lat_mf has no band 'f091'", "its bands: f090, f150"),
+        ("bands: [{name: act_15ghz, net: 1 mK s(1/2)}]", "act_15ghz", "unknown band 'act_15ghz'", "low and high, or file"),
+        ("layout: rings, wafers: 3", "3", "3 wafers go with layout: wafers, not rings", "write layout: wafers"),
+    ],
+)
+def test_mistakes_stand_at_what_is_wrong(changes: str, at: str, message: str, cure: str) -> None:
+    with pytest.raises(ConfigurationError) as err:
+        parse(TEXT.replace("{like: mustang2, detectors: 170}", f"{{like: so_lat_mf, {changes}}}"))
+    (found,) = err.value.diagnostics
+    assert message in found.message
+    assert cure in found.help
+    assert found.render().splitlines()[4].count("^") == len(at)
+    if "band" in changes:
+        assert "did you mean" in found.label
