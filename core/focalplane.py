@@ -133,6 +133,12 @@ class Focalplane:
         """Largest distance of a detector from the boresight, tan(rad)."""
         return float(np.hypot(self.xi, self.eta).max()) if len(self) else 0.0
 
+    @property
+    def reach(self) -> float:
+        """Largest distance of a detector from the middle of the array, which need not be the boresight, tan(rad)."""
+        middle = [(v.min() + v.max()) / 2 for v in (self.xi, self.eta)] if len(self) else (0.0, 0.0)
+        return float(np.hypot(self.xi - middle[0], self.eta - middle[1]).max(initial=0.0))
+
     def copy(self) -> Focalplane:
         """An independent copy (an observation may change its own, e.g. `Efficiency` sets the efficiencies)."""
         return Focalplane(**{f.name: getattr(self, f.name).copy() for f in fields(self)})

@@ -27,13 +27,14 @@ def work(request: Request) -> Measured:
     """Run the pipeline as often as asked; raises `ZondaError` where it fails."""
     from numba.core.event import install_recorder
 
+    from ..configuration.pipeline_file import load
+    from .bands import metric_of
     from .measure import Measured
-    from .metrics import get
 
-    metric = get(request.metric)
     first_seed = request.seeds[0]
     start, memory = time.process_time(), 0
     with install_recorder("numba:compile") as compiled:
+        metric = metric_of(load(request.pipeline, request.overrides), request.metric)
         data, instrumented = run(request, metric, first_seed, timed=request.repeats > 0)
     first = time.process_time() - start
     timings: list[dict[str, float]] = []

@@ -59,6 +59,26 @@ class Metric:
         size = float(np.linalg.norm(b))
         return float(np.linalg.norm(a - b)) / size if size > 0 else float(np.any(a != b))
 
+    def errors(self, found: Any, reference: Any) -> Mapping[str, float]:
+        """`error` by the names of parts of which the largest counts (bands); empty where there is one part."""
+        return {}
+
+    def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
+        """(E, R): change of the mean over seeds of `summary`, relative, and its standard error, equation (1).
+
+        With d_s the difference of the two summaries at seed s (n values each), m the mean summary of the reference,
+
+            E^2 = mean_n (mean_s d)^2 / mean_n m^2,    R^2 = mean_n (var_s d / S) / mean_n m^2                   (1)
+
+        What the same seed leaves in common in both cancels in d.
+        """
+        a, b = (np.array([self.summary(f) for f in runs]) for runs in (found, reference))
+        size, count = np.mean(b.mean(0) ** 2), len(a)
+        d = a - b
+        error = np.mean(d.mean(0) ** 2) / size
+        resolution = np.mean(d.var(0, ddof=1) / count) / size if count > 1 else np.inf
+        return float(np.sqrt(error)), float(np.sqrt(resolution))
+
     def summary(self, found: Any) -> Floats:
         """(n,) numbers whose means over seeds are compared where the random numbers differ."""
         return np.atleast_1d(np.asarray(found, np.float64)).ravel()

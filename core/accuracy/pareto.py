@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from .settings import Setting
 from .sweep import Alone, Bench, Sweep
@@ -22,13 +22,17 @@ SAME_MEMORY = 1.02
 
 @dataclass(frozen=True)
 class Point:
-    """A joint setting, measured: error against the reference, CPU seconds and their spread, peak memory in bytes."""
+    """A joint setting, measured: error against the reference, CPU seconds and their spread, peak memory in bytes.
+
+    ``bands``: the error of each band by its name, of which ``error`` is the largest; empty where the camera has one.
+    """
 
     setting: Setting
     error: float
     seconds: float
     spread: float
     memory: int
+    bands: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class _Step:
 def point(bench: Bench, setting: Setting, reference: Setting) -> Point:
     """Measure a joint setting."""
     error = bench.error(setting, reference)
-    return Point(setting, error, *bench.seconds(setting), bench.measure(setting).memory)
+    return Point(setting, error, *bench.seconds(setting), bench.measure(setting).memory, bench.errors(setting, reference))
 
 
 def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[Point]:

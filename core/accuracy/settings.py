@@ -70,7 +70,6 @@ def knobs_of(file: PipelineFile, only: Iterable[str] = ()) -> list[PipelineKnob]
     InputError
         Where there are none, or ``only`` names one that is not there (the nearest is named).
     """
-    file.scene().instrument.check_one_band("zonda accuracy")
     found = []
     labels = [operator.label for operator in file.pipeline().operators]
     names = _names(file)

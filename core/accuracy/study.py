@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
+from .bands import metric_of
 from .measure import Measured, Request, measure
-from .metrics import get
 from .pareto import Point, cheapest, pareto, point, search
 from .settings import PipelineKnob, Setting, overrides
 from .sweep import Bench, Run, Sweep, sweep, tightest
@@ -107,7 +107,7 @@ def study(
     ZondaError
         Where the tightest setting cannot be run.
     """
-    metric = get(setup.metric)
+    metric = metric_of(file, setup.metric)
     metric.check(file.operators, file.runs)
     if not knobs:
         raise InputError("no step declares a knob", place=file.place, cure="docs/accuracy.md says how an operator does")

@@ -66,22 +66,13 @@ class Bench:
         """Of a setting against a reference with the same random numbers."""
         return self.metric.error(self.measure(setting).found[0], self.measure(reference).found[0])
 
+    def errors(self, setting: Setting, reference: Setting) -> dict[str, float]:
+        """`error` of each band, by its name; empty where the camera has one."""
+        return dict(self.metric.errors(self.measure(setting).found[0], self.measure(reference).found[0]))
+
     def mean_error(self, setting: Setting, reference: Setting) -> tuple[float, float]:
-        """(E, R): change of the mean over seeds of the metric's summary, relative, and its standard error, equation (1).
-
-        With d_s the difference of the two summaries at seed s (n values each), m the mean summary of the reference,
-
-            E^2 = mean_n (mean_s d)^2 / mean_n m^2,    R^2 = mean_n (var_s d / S) / mean_n m^2                   (1)
-
-        What the same seed leaves in common in both cancels in d.
-        """
-        summary = self.metric.summary
-        a, b = (np.array([summary(f) for f in self.measure(s, True).found]) for s in (setting, reference))
-        size, count = np.mean(b.mean(0) ** 2), len(a)
-        d = a - b
-        error = np.mean(d.mean(0) ** 2) / size
-        resolution = np.mean(d.var(0, ddof=1) / count) / size if count > 1 else np.inf
-        return float(np.sqrt(error)), float(np.sqrt(resolution))
+        """Change of the mean over seeds and its standard error (`Metric.mean_error`)."""
+        return self.metric.mean_error(self.measure(setting, True).found, self.measure(reference, True).found)
 
     def scatter(self, reference: Setting) -> float | None:
         """Realization scatter in units of the error: rms over pairs of seeds of their error, divided by sqrt(2)."""

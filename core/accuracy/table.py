@@ -30,6 +30,11 @@ def percent(value: float | None) -> str:
     return f"{100 * value:.{3 if abs(value) >= 1 else 2}g} %"
 
 
+def by_band(errors: Mapping[str, float]) -> str:
+    """Errors of bands in a line."""
+    return ", ".join(f"{name} {percent(error)}" for name, error in errors.items())
+
+
 def fragment(setting: Mapping[str, str], heading: str) -> str:
     """YAML of the setting: parameters under the step they belong to, to be merged into the file's steps by hand.
 
@@ -113,6 +118,11 @@ def _front(study: Study, width: int) -> Iterator[str]:
         yield f"  {_point(point)}  {_short(_pairs(point, study), width - 42)}{_marks(point, study)}"
     if study.present not in study.front:
         yield f"  {_point(study.present)}  {_short(_pairs(study.present, study), width - 42)}{_marks(study.present, study)}"
+    if study.present.bands:
+        yield "error of each band, of which the largest counts"
+        for name, found in (("file", study.present), ("chosen", study.chosen)):
+            if found is not None:
+                yield f"  {name:>6}  {by_band(found.bands)}"
 
 
 def _recommended(study: Study) -> Iterator[str]:

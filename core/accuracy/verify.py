@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from .bands import metric_of
 from .child import run
 from .measure import Request, measure
-from .metrics import get
 from .settings import knobs_of, overrides
 from .store import StoredFront, fingerprint
 from .sweep import tightest
@@ -44,12 +44,13 @@ def achieved(
     metric: str,
     threads: int | None = None,
     data: Data | None = None,
-) -> float:
-    """Error of this pipeline's own setting against its knobs at their tightest, same scans and seed.
+) -> tuple[float, dict[str, float]]:
+    """Error of this pipeline's own setting against its knobs at their tightest, same scans and seed; and that of each
+    band by its name, of which it is the largest (empty where the camera has one band).
 
     ``data``: of a run of it, which saves one of the two runs where the metric needs no step and no signal of its own.
     """
-    measures = get(metric)
+    measures = metric_of(file, metric)
     measures.check(file.operators, file.runs)
     reference = overrides(tightest(knobs_of(file)))
 
@@ -58,7 +59,8 @@ def achieved(
 
     enough = len(measures.steps(list(file.operators))) == len(file.operators) and not measures.signals(file.runs)
     own = measures.measure(data) if data is not None and enough else found(settings)
-    return measures.error(own, found((*settings, *reference)))
+    tightened = found((*settings, *reference))
+    return measures.error(own, tightened), dict(measures.errors(own, tightened))
 
 
 def retest(front: StoredFront, file: PipelineFile, pipeline: str, points: int | None = None) -> list[Retest]:
@@ -70,7 +72,7 @@ def retest(front: StoredFront, file: PipelineFile, pipeline: str, points: int | 
     if front.fingerprint != fingerprint(file):
         cure = "make it anew: zonda accuracy PIPELINE --store"
         raise InputError("the stored Pareto front is of other steps or another scene", place=file.place, cure=cure)
-    metric = get(front.metric)
+    metric = metric_of(file, front.metric)
     base = (*overrides(front.shorter), f"seed={front.seed}")
 
     def found(setting: dict[str, str]) -> Any:

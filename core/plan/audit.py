@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import PipelineError
 from ..signal import Signal
+from .bands import PlanOfBands, files_of_bands
 from .context import Context
 from .coverage import DEEP
 from .decide import Decided
@@ -138,6 +139,35 @@ class Audit:
     def json(self) -> str:
         """The rows as JSON."""
         return json.dumps({"slice": self.slice, "rows": [{**dataclasses.asdict(r), "violated": r.violated} for r in self.rows]})
+
+
+@dataclass(frozen=True)
+class AuditOfBands:
+    """The audits of all bands, by their names."""
+
+    bands: Mapping[str, Audit]
+
+    @property
+    def violated(self) -> bool:
+        """Whether any bound was, of any band."""
+        return any(found.violated for found in self.bands.values())
+
+    def __str__(self) -> str:
+        rows = [r for found in self.bands.values() for r in found.rows]
+        text = "\n\n".join(f"band {name}: {found}" for name, found in self.bands.items())
+        return f"{text}\n\nall bands: {len(rows)} bounds, {sum(r.violated for r in rows)} violated"
+
+    def json(self) -> str:
+        """The rows of each band as JSON."""
+        return json.dumps({"bands": {name: json.loads(found.json()) for name, found in self.bands.items()}})
+
+
+def audit_of_bands(file: PipelineFile, made: PlanOfBands, *, threads: int | None = None) -> AuditOfBands:
+    """`audit` of each band, in a camera that has no other: what the plan of that band decides. A run for all bands takes of
+    that what they have in common."""
+    return AuditOfBands({
+        name: audit(one, made.plans[name], threads=threads) for name, one in files_of_bands(file).items()
+    })  # fmt: skip
 
 
 def audit(

@@ -38,10 +38,10 @@ class PlanOfBands:
 
 def plan(file: PipelineFile, **options: Any) -> Plan | PlanOfBands:
     """Plan a pipeline file, each band of its camera; arguments and errors as of `planner.plan`."""
-    of_bands = files_of_bands(file) if isinstance(file, PipelineFile) else {}
-    if not of_bands:
+    names = files_of_bands(file) if isinstance(file, PipelineFile) else {}
+    if not names:
         return planner.plan(file, **options)
-    return PlanOfBands({name: planner.plan(one, **options) for name, one in of_bands.items()})
+    return PlanOfBands({name: planner.plan(file, band=name, **options) for name in names})
 
 
 def as_dict(made: Plan | PlanOfBands) -> dict[str, Any]:

@@ -42,10 +42,9 @@ def plan(
     ensure_cache()
     from ..configuration.pipeline_file import load
     from ..run.first_look import first_look
-    from .bands import as_dict
+    from .bands import PlanOfBands, as_dict
     from .bands import plan as make
     from .only import only as alone
-    from .result import Plan
 
     file = load(pipeline, settings)
     if file.header.campaign is not None:
@@ -57,17 +56,16 @@ def plan(
     if only:
         file = alone(file, only)
     first_look(file.pipeline(), file.scene())
-    if audit:
-        file.scene().instrument.check_one_band("zonda plan --audit")
     made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)
-    if not audit or not isinstance(made, Plan):
+    if not audit:
         import json
 
         click.echo(json.dumps(as_dict(made), indent=2) if as_json else str(made))
         return
     from .audit import audit as compare
+    from .audit import audit_of_bands
 
-    found = compare(file, made, threads=threads)
+    found = audit_of_bands(file, made, threads=threads) if isinstance(made, PlanOfBands) else compare(file, made, threads=threads)
     click.echo(found.json() if as_json else str(found))
     if found.violated:
         raise click.exceptions.Exit(1)

@@ -121,6 +121,8 @@ class Context:
     """Labels of the operators that make a product of the time streams themselves (`Planning.reads_streams`)."""
     kept_streams: frozenset[str] = frozenset()
     """Streams that some operator saves, measures or draws besides ``signal``."""
+    band: str = ""
+    """Which one this is of, where the camera has several."""
 
     @property
     def first(self) -> Observation:
@@ -231,7 +233,7 @@ class Context:
         share = cover.hits / max(self.samples, 1)  # of all samples that fall in one pixel
         if common:
             # while the focal plane covers the pixel, every detector may pass it
-            area = math.pi * max(o.focalplane.radius, cover.pixel) ** 2
+            area = math.pi * max(o.focalplane.reach, cover.pixel) ** 2
             rate = max(o.n_detectors * cover.pixel**2 / area, o.n_detectors * share) * o.sample_rate
         else:
             rate = share * o.sample_rate

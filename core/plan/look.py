@@ -12,6 +12,7 @@ from ..data import Data, Observation
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
+from ..run.bands import check_steps, data_of_bands, distribute, points
 from ..run.signals import note_signals
 from ..scene import Scene
 from ..signal import is_stream
@@ -24,14 +25,31 @@ LOOKED_AT = 4
 """Observations whose levels of noise are looked at, apart from those at the extremes of elevation."""
 
 
-def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
-    """Point the telescope and gather what the bounds need. ``pipeline`` is the planner's own copy."""
+def observed(operators: Sequence[Operator], scene: Scene, band: str = "") -> Data:
+    """What operators observe; of a camera of several bands this ``band``, its detectors where they are in the whole camera."""
+    data = Data(scene=scene)
+    if band:
+        check_steps([*operators])
+        for operator in filter(points, operators):
+            operator.observe(data)
+        bands = data_of_bands(data)
+        distribute(data, [*bands.values()])
+        for scan, whole in zip(bands[band].observations, data.observations, strict=True):
+            scan.tally.update(whole.tally)
+        data, operators = bands[band], [o for o in operators if not points(o)]
+    for operator in operators:
+        operator.observe(data)
+    return data
+
+
+def look(pipeline: Pipeline, scene: Scene, structure: Structure, band: str = "") -> Context:
+    """Point the telescope and gather what the bounds need, of one band where the camera has several.
+
+    ``pipeline`` is the planner's own copy.
+    """
     operators = [o for o in pipeline.operators if o.label in structure.operators]
     readers = frozenset(o.label for o in operators if planning_of(o).reads_streams)
-    data = Data(scene=scene)
-    for operator in operators:
-        if operator.label not in readers and not isinstance(operator, Output):
-            operator.observe(data)
+    data = observed([o for o in operators if o.label not in readers and not isinstance(o, Output)], scene, band)
     acting = work(pipeline, structure)
     note_signals(data.observations, acting.components, acting.signals)
     shown = _some(data.observations)
@@ -39,7 +57,7 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure) -> Context:
         for operator in operators:
             operator.configure(observation)
     streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.label in readers))
-    context = Context(scene, data.observations, operators, acting, readers=readers, kept_streams=streams)
+    context = Context(data.scene, data.observations, operators, acting, readers=readers, kept_streams=streams, band=band)
     context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(operators, shown, context)
     pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]

@@ -44,6 +44,7 @@ def plan(
     threads: int | None = None,
     memory: int | None = None,
     measure: bool = False,
+    band: str = "",
 ) -> Plan:
     """Plan a pipeline file: decide as on a reference machine (one thread, memory for all), predict for this one.
 
@@ -57,6 +58,8 @@ def plan(
         False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
     measure
         Run a slice of a few seconds to find the cost of operators that do not state it; decisions do not depend on it.
+    band
+        The one that is planned, of a camera with several.
 
     Raises
     ------
@@ -66,11 +69,12 @@ def plan(
     _check_arguments(file, keep, drop)
     begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
-    scene.instrument.check_one_band("zonda plan")
+    if not band:
+        scene.instrument.check_one_band("zonda plan")
     labels = [o.label for o in pipeline.operators]
     everything = Structure.of_all(pipeline)
     structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
-    context = look(pipeline, scene, structure)
+    context = look(pipeline, scene, structure, band)
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
     context.limits = allowed = {m: v for m, v in budget.items() if m in context.metrics}
     estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
@@ -133,7 +137,7 @@ def _effects(
     whole = [label for label in structure.operators if label in drop]
     if not whole:
         return effects, context
-    left = without(file, structure, whole)
+    left = without(file, structure, whole, context.band)
     effects = [d for d in effects if d.operator not in whole]
     return effects + [Decided(label, everything_of(label, estimates, context, left)) for label in whole], left
 

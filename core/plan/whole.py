@@ -17,8 +17,8 @@ NAME = "everything"
 """Name of the effect."""
 
 
-def without(file: PipelineFile, structure: Structure, dropped: Sequence[str]) -> Context:
-    """The context of the bounds without these operators (labels).
+def without(file: PipelineFile, structure: Structure, dropped: Sequence[str], band: str = "") -> Context:
+    """The context of the bounds without these operators (labels), of one ``band`` where the camera has several.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def without(file: PipelineFile, structure: Structure, dropped: Sequence[str]) ->
                     cure="remove this --drop, or drop both",
                 )
     kept = tuple(label for label in structure.operators if label not in dropped)
-    return look(pipeline, file.scene(), dataclasses.replace(structure, operators=kept))
+    return look(pipeline, file.scene(), dataclasses.replace(structure, operators=kept), band)
 
 
 def everything_of(label: str, estimates: Mapping[str, Estimate], context: Context, left: Context) -> Effect:

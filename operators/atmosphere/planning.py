@@ -278,7 +278,7 @@ def _points(context: Context, first: AtmosphereModel, tolerance: float) -> float
 
 def _cells(o: Observation, a: Calibrated) -> float:
     """Lattice points that one scan sweeps over: (throw x distance) x (height of the field x distance + drift) / spacing^2."""
-    field = 2 * o.focalplane.radius
+    field = 2 * o.focalplane.reach
     across = float(np.ptp(np.unwrap(o.azimuth))) * math.cos(a.elevations[0]) + field
     along = a.elevations[1] - a.elevations[0] + field
     total = 0.0

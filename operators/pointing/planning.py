@@ -74,11 +74,21 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
                    "1.43 x interpolation_error"),
             not_simulated("sample integration", "samples are instants", context.sky_error(smear),
                           "(v / f_s)^2 8 ln 2 / (24 FWHM^2): loss of a point source's peak along the scan"),
-            *(Effect(what, (full("checked"),), {}, text) for _, what, text in o.tally if what.startswith(MOTION)),
+            *(Effect(what, (full("checked"),), {}, text) for what, text in _motion(context)),
             Effect("time stamps", (full("float64 seconds since the start"),), shift(resolution),
                    "1.43 / FWHM x spacing of float64 at the scan's end x speed"),
         )  # fmt: skip
         return Estimate(effects, Cost(fixed=0.01, per_time=0.5e-6, kernel="python"))
+
+
+def _motion(context: Context) -> list[tuple[str, str]]:
+    """What is known of the telescope's motion: (what, text). Samples per beam are those of the band that is planned."""
+    topics = LargestMotion.TOPICS if context.band else MOTION
+    found = [(what, text) for _, what, text in context.first.tally if what.startswith(topics)]
+    sampled = SamplesPerBeam()
+    for o in context.observations if context.band else ():
+        sampled.add(o, o.sample_rate)
+    return found + sampled.statements()
 
 
 class RecordedPlanning(PointingPlanning):

@@ -55,26 +55,29 @@ def sensitivity(
     ensure_cache()
     from zonda.core.storage.files import check_output_folder
     from zonda.plugins.forecast import report
+    from zonda.plugins.forecast.sensitivity import SensitivityOfBands
     from zonda.plugins.forecast.sensitivity import sensitivity as forecast
 
     if output is not None:
         check_output_folder(output)
     found = forecast(pipeline, settings=settings, **asked)
-    needed = None if reach is None else found.reach(reach)
+    each = found.bands.values() if isinstance(found, SensitivityOfBands) else (found,)
+    needed = [] if reach is None else [one.reach(reach) for one in each]
     if audit is not None:
         found = found.audited(audit, threads)
     written = found.write(output) if output is not None else []
     if as_json:
         import json
 
-        click.echo(
-            json.dumps(found.as_dict() | ({} if needed is None else {"reach": {"depth": reach, "seconds": needed}}), indent=2)
-        )
+        text = found.as_dict() | ({"reach": {"depth": reach, "seconds": max(needed)}} if needed else {})
+        click.echo(json.dumps(text, indent=2))
         return
     if pipeline is None:
         click.echo(report.made(asked, settings))
     click.echo(str(found))
-    if needed is not None:
-        click.echo(f"\n{report.reached(found, str(reach), needed)}")
+    for one, seconds in zip(each, needed, strict=False):
+        click.echo(f"\n{report.reached(one, str(reach), seconds)}")
+    if len(needed) > 1:
+        click.echo(f"\n{report.reached_by_all(str(reach), max(needed))}")
     for path in written:
         click.echo(f"{path}")

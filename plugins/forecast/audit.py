@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.pipeline import Pipeline
 from zonda.core.signal import product_name, stream_of
@@ -85,34 +87,58 @@ class Audited:
         return "\n".join(lines)
 
 
-def audit(file: PipelineFile, depth: Depth, radius: float, seeds: int, threads: int | None = None) -> Audited:
-    """Simulate a pipeline with ``seeds`` seeds, from its own on, and compare the noise of the map with the forecast.
+@dataclass(frozen=True)
+class Forecasted:
+    """What is beside the simulations: the depth of a map, the radius of its circle and its beam's FWHM, rad."""
 
-    The parts are signals of one run, behind the modes of the complete one, so that their maps add up to its map.
+    depth: Depth
+    radius: float
+    fwhm: float
+
+
+def audit(file: PipelineFile, forecasts: Mapping[str, Forecasted], seeds: int, threads: int | None = None) -> dict[str, Audited]:
+    """Simulate a pipeline with ``seeds`` seeds, from its own on, and compare the noise of its maps with the ``forecasts``.
+
+    They are by the name of the band, "" where the camera has one. The parts are signals of one run, behind the modes of the
+    complete one, so that their maps add up to its map.
     """
     if seeds < 2:
         raise InputError(f"{seeds} simulation has no standard error", place="--audit", cure="ask for 2 or more")
-    parts = [p for p in PARTS if depth.variance[p][-1] > 0]
-    found = np.array([_squares(file, parts, radius, file.scene().seed + k, threads) for k in range(seeds)])
-    rows, sigma = [], file.scene().instrument.beam_fwhm / FWHM_PER_SIGMA
+    parts = {band: [p for p in PARTS if f.depth.variance[p][-1] > 0] for band, f in forecasts.items()}
+    made = [_maps(file, parts, file.scene().seed + k, threads) for k in range(seeds)]
+    return {
+        band: _audited(of, parts[band], np.array([[m.smoothed_rms(m.fwhm, of.radius) ** 2 for m in one[band]] for one in made]))
+        for band, of in forecasts.items()
+    }
+
+
+def _audited(of: Forecasted, parts: list[str], found: Floats) -> Audited:
+    """``found``: (seeds, n_part + 1) squared rms [K^2] behind the beam in the circle: of each part, and of all noise."""
+    rows, seeds = [], len(found)
     for name, squares in zip([*parts, TOGETHER], found.T, strict=True):
-        forecast = sum(float(depth.variance[p][-1]) for p in (parts if name == TOGETHER else [name]))
+        forecast = sum(float(of.depth.variance[p][-1]) for p in (parts if name == TOGETHER else [name]))
         mean = math.sqrt(squares.mean())
-        error = max(float(squares.std(ddof=1)) / (2 * mean), scatter(sigma, radius) * mean) / math.sqrt(seeds)
+        own = float(squares.std(ddof=1)) / (2 * mean)
+        error = max(own, scatter(of.fwhm / FWHM_PER_SIGMA, of.radius) * mean) / math.sqrt(seeds)
         rows.append(Row(name, math.sqrt(forecast), mean, error, seeds))
     return Audited(tuple(rows))
 
 
-def _squares(file: PipelineFile, parts: list[str], radius: float, seed: int, threads: int | None) -> Floats:
-    """(n_part + 1,) squared rms [K^2] behind the beam in the circle: of each part, and of all noise."""
+def _maps(file: PipelineFile, parts: Mapping[str, Sequence[str]], seed: int, threads: int | None) -> dict[str, list[MapProduct]]:
+    """By band the maps of each part, and of all noise."""
     operators = [
         o.model_copy(update={"smooth": None, "half_difference": False}) if isinstance(o, BinMap) else o
         for o in steps_of(file).operators
     ]
-    runs = {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in parts} if len(parts) > 1 else {}
+    every = dict.fromkeys(p for own in parts.values() for p in own)
+    runs = {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in every} if len(every) > 1 else {}
     pipeline = Pipeline(operators, runs=runs, name=file.header.name, precision=file.header.precision)
     scene = file.scene().model_copy(update={"seed": seed})
     products = pipeline.run(scene, threads=threads).products
     name = next(o.product for o in operators if isinstance(o, BinMap))
-    maps = [products[product_name(stream_of(run), name)] for run in runs] or [products[name]]
-    return np.array([m.smoothed_rms(m.fwhm, radius) ** 2 for m in [*maps, products[name]]])
+    found = {}
+    for band, own in parts.items():
+        plain = f"{name}_{band}" if band else name
+        of_parts = [products[product_name(stream_of(f"only_{COMPONENTS[p]}"), plain)] if runs else products[plain] for p in own]
+        found[band] = [*of_parts, products[plain]]
+    return found

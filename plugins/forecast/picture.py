@@ -53,6 +53,5 @@ def figure(found: Forecast) -> Any:
     ax.set_ylabel(f"rms behind the beam [{kelvin}]")
     ax.grid(alpha=0.25, lw=0.5, which="both")
     ax.legend(frameon=False)
-    instrument, radius = found.survey.scene.instrument.name, found.radius / ARCMIN
-    ax.set_title(f"{found.file.header.name}: {instrument}, circle of radius {radius:.3g}′", fontsize=10)
+    ax.set_title(f"{found.file.header.name}: {found.camera}, circle of radius {found.radius / ARCMIN:.3g}′", fontsize=10)
     return drawn

@@ -19,6 +19,8 @@ from .lines import duration, in_unit, number, prefixed
 from .survey import Survey, elevations
 
 if TYPE_CHECKING:
+    from zonda.core.configuration.loaded import PipelineFile
+
     from .result import Forecast
 
 TITLES = {"Jy": "point source"}
@@ -39,7 +41,7 @@ def _header(found: Forecast) -> list[str]:
     o = survey.observations[0]
     low, high = (math.degrees(e) for e in elevations(survey))
     number, length = len(survey.observations), duration(float(found.depth.seconds[-1]))
-    place = f"{survey.scene.instrument.name} at {survey.scene.site.name}"
+    place = f"{found.camera} at {survey.scene.site.name}"
     lines = [f"{header.name}: {place}, {number} scan{'s' if number > 1 else ''}, {length} in all, from {o.start}"]
     lines.append(f"elevation {low:.1f} to {high:.1f} deg{_water(survey)}")
     lines.append("filters: " + (", ".join(_filters(survey)) or "none"))
@@ -115,7 +117,8 @@ def reached(found: Forecast, wanted: str, seconds: float) -> str:
     parts = ", ".join(f"{p} {in_unit(float(found.depth.part(p, seconds)), 'K_RJ')}" for p in PARTS)
     low, high = ((1 + sign * found.depth.total_error(seconds)) ** 2 * seconds for sign in (-1, 1))
     lines = [
-        f"{wanted} after {duration(seconds)} of integration, {low / 3600:.3g} to {high / 3600:.3g} h by the stated errors",
+        (f"band {found.band}: " if found.band else "")
+        + f"{wanted} after {duration(seconds)} of integration, {low / 3600:.3g} to {high / 3600:.3g} h by the stated errors",
         f"  {parts}",
     ]
     end = float(found.depth.seconds[-1])
@@ -123,6 +126,11 @@ def reached(found: Forecast, wanted: str, seconds: float) -> str:
         text = f"  white and 1/f noise fall as time^-1/2; the atmosphere is forecast for the first {duration(end)}"
         lines.append(f"{text} and taken to do so too")
     return "\n".join(lines)
+
+
+def reached_by_all(wanted: str, seconds: float) -> str:
+    """How long a depth takes in all bands."""
+    return f"{wanted} in all bands after {duration(seconds)} of integration"
 
 
 def as_dict(found: Forecast) -> dict[str, Any]:
@@ -142,6 +150,7 @@ def as_dict(found: Forecast) -> dict[str, Any]:
     return {
         "pipeline": found.file.header.name,
         "instrument": survey.scene.instrument.name,
+        "band": survey.scene.instrument.band.name,
         "site": survey.scene.site.name,
         "start": str(survey.observations[0].start),
         "scans": len(survey.observations),
@@ -164,9 +173,21 @@ def as_dict(found: Forecast) -> dict[str, Any]:
 
 def write(found: Forecast, folder: Path) -> list[Path]:
     """See `Sensitivity.write`. Raises OutputError."""
+    return write_bands(found.file, {found.band: found}, folder)
+
+
+def write_bands(file: PipelineFile, bands: Mapping[str, Forecast], folder: Path) -> list[Path]:
+    """See `SensitivityOfBands.write`. Raises OutputError."""
+    check_output_folder(folder)
+    paths = [path for found in bands.values() for path in write_depth(found, folder)]
+    return [*paths, write_text(folder / "pipeline.yaml", file.resolved_yaml())]
+
+
+def write_depth(found: Forecast, folder: Path) -> list[Path]:
+    """Table and picture; the band's name is behind theirs where the camera has several. Raises OutputError."""
     from .picture import figure
 
-    check_output_folder(folder)
+    stem = f"sensitivity_{found.band}" if found.band else "sensitivity"
     seconds = found.times
     columns = [Column("time", seconds, "s", "integration time")]
     for unit in UNITS:
@@ -181,6 +202,7 @@ def write(found: Forecast, folder: Path) -> list[Path]:
     meta = {
         "PIPELINE": found.file.header.name,
         "INSTRUMENT": found.survey.scene.instrument.name,
+        "BAND": found.survey.scene.instrument.band.name,
         "SITE": found.survey.scene.site.name,
         "BEAM": f"{found.survey.fwhm / ARCSEC:.6g} arcsec",
         "RADIUS": f"{found.radius / ARCMIN:.6g} arcmin",
@@ -188,9 +210,8 @@ def write(found: Forecast, folder: Path) -> list[Path]:
         "SCANTIME": float(found.depth.seconds[-1]),
         **{f"ERROR_{p.replace('1/f', 'one_over_f').upper()}": float(found.depth.error[p]) for p in PARTS},
     }
-    paths = [write_ecsv(folder / "sensitivity.ecsv", columns, meta)]
-    with atomic_path(folder / "sensitivity.png") as temporary:
+    table, picture = (folder / f"{stem}.{kind}" for kind in ("ecsv", "png"))
+    write_ecsv(table, columns, meta)
+    with atomic_path(picture) as temporary:
         figure(found).savefig(temporary)
-    paths.append(folder / "sensitivity.png")
-    paths.append(write_text(folder / "pipeline.yaml", found.file.resolved_yaml()))
-    return paths
+    return [table, picture]

@@ -39,6 +39,8 @@ class Forecast:
         What the AtLAST calculator's formula gives for that time; None: the scene has no atmosphere.
     audit
         Simulated depths, see `Sensitivity.audited`; None: nothing was simulated.
+    band
+        Name of the band, where the camera has several.
     """
 
     file: PipelineFile
@@ -49,6 +51,13 @@ class Forecast:
     factors: Mapping[str, float]
     calculated: Calculated | None
     audit: Audited | None = None
+    band: str = ""
+
+    @property
+    def camera(self) -> str:
+        """The camera's name, and the band's where it has several."""
+        name = self.survey.scene.instrument.name
+        return f"{name}, band {self.band}" if self.band else name
 
     def rms(self, seconds: float | None = None, unit: str = "K_RJ", part: str = "") -> float:
         """The depth after an integration time [s] in a unit (`depth.UNITS`): of a part (`depth.PARTS`), or of all.

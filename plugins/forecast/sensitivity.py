@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +31,7 @@ class Sensitivity(Forecast):
 
     def audited(self, seeds: int, threads: int | None = None) -> Sensitivity:
         """With the depth that ``seeds`` simulations of the pipeline find, see `audit`."""
-        from .audit import audit
-
-        return replace(self, audit=audit(self.file, self.depth, self.radius, seeds, threads))
+        return next(iter(_audited({self.band: self}, self.file, seeds, threads).values()))
 
     def as_dict(self) -> dict[str, Any]:
         """Everything as numbers and text, for JSON."""
@@ -63,14 +61,52 @@ class Sensitivity(Forecast):
         return html_table(f"Depth of {self.file.header.name}, behind the beam", rows)
 
 
+@dataclass(frozen=True)
+class SensitivityOfBands:
+    """The depths of the maps of a camera with several bands, by their names; what is written and said is each band's."""
+
+    file: PipelineFile
+    bands: Mapping[str, Sensitivity]
+
+    def __getitem__(self, band: str) -> Sensitivity:
+        """The depth of a band's map. Raises InputError for a band that the camera has not."""
+        if band not in self.bands:
+            raise InputError(f"there is no band {band!r}", place="sensitivity", cure=f"choose from: {', '.join(self.bands)}")
+        return self.bands[band]
+
+    def reach(self, rms: str | float) -> float:
+        """Integration time [s] after which the maps of all bands are as deep, see `Forecast.reach`."""
+        return max(found.reach(rms) for found in self.bands.values())
+
+    def audited(self, seeds: int, threads: int | None = None) -> SensitivityOfBands:
+        """With the depths that ``seeds`` simulations of the pipeline find, see `audit`."""
+        return replace(self, bands=_audited(self.bands, self.file, seeds, threads))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything as numbers and text, for JSON."""
+        return {"bands": {name: found.as_dict() for name, found in self.bands.items()}}
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write ``sensitivity_BAND.ecsv`` and ``sensitivity_BAND.png`` of all bands, and ``pipeline.yaml``; their paths."""
+        from .report import write_bands
+
+        return write_bands(self.file, self.bands, Path(folder))
+
+    def __str__(self) -> str:
+        return "\n\n".join(map(str, self.bands.values()))
+
+    def _repr_html_(self) -> str:
+        return "".join(found._repr_html_() for found in self.bands.values())
+
+
 def sensitivity(
     pipeline: Any = None,
     *,
     radius: str | float | None = None,
     settings: Sequence[str] = (),
     **asked: Any,
-) -> Sensitivity:
-    """Forecast the depth of a map without a run.
+) -> Sensitivity | SensitivityOfBands:
+    """Forecast the depth of a map without a run, of a camera with several bands that of each band's map.
 
     >>> zonda.sensitivity("mustang2_cluster")                                            # doctest: +SKIP
     >>> zonda.sensitivity(instrument="mustang2", site="green_bank", pwv="7.7 mm", time="1 h").reach("20 uK")    # doctest: +SKIP
@@ -94,7 +130,15 @@ def sensitivity(
         For a pipeline that the forecast does not cover, with the step's name; and what loading and pointing raise.
     """
     file = _file(pipeline, settings, asked)
-    survey = survey_of(file)
+    bands = [band.name for band in file.scene().instrument.bands]
+    if bands:
+        return SensitivityOfBands(file, {band: _forecast(file, radius, asked, band) for band in bands})
+    return _forecast(file, radius, asked)
+
+
+def _forecast(file: PipelineFile, radius: str | float | None, asked: Mapping[str, Any], band: str = "") -> Sensitivity:
+    """The depth of one band's map."""
+    survey = survey_of(file, band)
     size = max(RADIUS, BEAMS * survey.fwhm)
     if isinstance(radius, str):
         size = default_pipeline.positive("--radius", Unit("rad"), radius, size)
@@ -104,7 +148,16 @@ def sensitivity(
     seconds = default_pipeline.positive("--time", Unit("s", "3 h"), asked.get("time"), float(depth.seconds[-1]))
     instrument = survey.scene.instrument
     units = factors(instrument.band, survey.fwhm)
-    return Sensitivity(file, survey, depth, size, seconds, units, calculator.of_survey(survey, seconds))
+    return Sensitivity(file, survey, depth, size, seconds, units, calculator.of_survey(survey, seconds), band=band)
+
+
+def _audited(found: Mapping[str, Sensitivity], file: PipelineFile, seeds: int, threads: int | None) -> dict[str, Sensitivity]:
+    """The forecasts, by band, with what simulations find."""
+    from .audit import Forecasted, audit
+
+    forecasts = {band: Forecasted(one.depth, one.radius, one.survey.fwhm) for band, one in found.items()}
+    audits = audit(file, forecasts, seeds, threads)
+    return {band: replace(one, audit=audits[band]) for band, one in found.items()}
 
 
 def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> PipelineFile:

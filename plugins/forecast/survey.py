@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.projection import boresights, homographies
 from zonda.core.observation import Observation
 from zonda.core.pipeline import Pipeline
+from zonda.core.plan.look import observed
 from zonda.core.run.signals import note_signals
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
@@ -232,17 +232,17 @@ class Survey:
             raise PipelineError(text, place="zonda sensitivity", cure="choose a smaller --radius")
 
 
-def survey_of(file: PipelineFile) -> Survey:
+def survey_of(file: PipelineFile, band: str = "") -> Survey:
     """Point the telescope and resolve the noise, as the pipeline's steps do it; nothing is drawn.
+
+    ``band``: the one that is looked at, of a camera with several.
 
     Raises PipelineError for what the forecast does not cover, and what the steps raise.
     """
-    chosen, scene = steps_of(file), file.scene()
-    scene.instrument.check_one_band("zonda sensitivity")
-    header = file.header
+    chosen, header = steps_of(file), file.header
     pipeline = Pipeline(chosen.operators, name=header.name, precision=header.precision)
     steps = Steps.among(pipeline.operators)  # copies, which know the scans
-    data = pipeline.point(scene, {}, Path())
+    data = observed(pipeline.operators, file.scene(), band)
     observations = data.observations
     note_signals(observations, pipeline.signals.components, pipeline.signals.formed)
     chosen_scans = sorted({round(k) for k in np.linspace(0, len(observations) - 1, min(CONFIGURED, len(observations)))})
@@ -257,7 +257,7 @@ def survey_of(file: PipelineFile) -> Survey:
     if steps.binning.weights == "inverse_variance":
         nets = np.array([_rms(observations[k].expected_net()) for k in nearest])
         weights = np.where(nets > 0, (nets[0] / np.where(nets > 0, nets, 1.0)) ** 2, 1.0)
-    return Survey(scene, steps, observations, [levels[k] for k in nearest], weights, nearest)
+    return Survey(data.scene, steps, observations, [levels[k] for k in nearest], weights, nearest)
 
 
 def _check_scans(observations: Sequence[Observation], name: str) -> None:
