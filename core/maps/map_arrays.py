@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ..numerics.tangent import TangentWcs
     from ..storage.fits_image import Cards
     from .polarized import Polarization
+    from .scan_hits import ScanHits
 
 SMALL = 1 << 20
 """Pixels of a map whose distances from the centre are kept."""
@@ -84,6 +85,11 @@ class MapArrays:
     difference: str = "even - odd scans"
     polarization: Polarization | None = None
     """Q and U; ``signal`` and the others are of I then, and ``hits`` and ``weights`` 0 where I, Q and U are not determined."""
+    directions: Floats | None = None
+    """(2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors moved through each pixel; NaN
+    where none did. None: not kept (`BinMap: {crosslinking: true}`)."""
+    scan_hits: ScanHits | None = None
+    """Hits of each scan (`BinMap: {scan_hits: true}`)."""
     band: Band | None = None
     """Band of the run, with which `to` converts units; None: not known."""
 
@@ -95,6 +101,21 @@ class MapArrays:
         if self.header is None:
             raise InputError("a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy")
         return WCS(self.header)
+
+    @property
+    def crosslinking(self) -> Floats | None:
+        """How one-sided the scan directions in each pixel are: 0 where they cross evenly, 1 where all are along one line.
+
+        The modulus of the mean of exp(2 i psi), psi the direction of motion, as of ACT's maps (Aiola et al. 2020, `xlink`) and
+        TOAST's `CrossLinking`. NaN where no detector moved; None where it was not kept.
+        """
+        return None if self.directions is None else np.hypot(*self.directions)
+
+    def hits_of(self, scan: str | int) -> NDArray[np.int32]:
+        """Hits of one scan, by name or number, shape of ``signal``. Raises InputError where they were not kept."""
+        if self.scan_hits is None:
+            raise InputError("the hits of each scan were not kept", place="map", cure="set scan_hits: true of the map maker")
+        return self.scan_hits.plane(scan, self.signal.shape)
 
     @property
     def projection(self) -> Literal["TAN", "CAR", "HEALPix"]:

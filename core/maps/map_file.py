@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,9 +29,14 @@ _MEANING = {
     "noise": "standard error per pixel",
     "half_difference": "noise from the difference of two halves",
     "source_free": "map of all but the sky",
+    "crosslinking": "0: scans cross evenly, 1: one direction",
+    "mean_cos_2psi": "mean of cos 2 psi, psi the scan direction",
+    "mean_sin_2psi": "mean of sin 2 psi, psi from east to north",
     **MEANINGS,
 }
-COUNTS = ("hits", "condition")
+CROSSING = ("crosslinking", "mean_cos_2psi", "mean_sin_2psi")
+"""Planes that tell in which directions the scans go."""
+COUNTS = ("hits", "condition", *CROSSING)
 """Planes without unit."""
 _SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
 _COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
@@ -90,10 +95,13 @@ class MapFile:
     @classmethod
     def of(cls, name: str, product: MapArrays) -> MapFile:
         """With the planes that a product has."""
+        found: dict[str, Any]
         if product.polarization is not None:
-            return cls(name, product, file_planes(product))
-        wanted = PLANES if product.contents == "all" else ("hits",)
-        found = {plane: getattr(product, plane) for plane in wanted}
+            found = file_planes(product)
+        else:
+            found = {plane: getattr(product, plane) for plane in (PLANES if product.contents == "all" else ("hits",))}
+        if product.directions is not None:
+            found = found | dict(zip(CROSSING, (product.crosslinking, *product.directions), strict=True))
         return cls(name, product, {plane: values for plane, values in found.items() if values is not None})
 
     def unit(self, plane: str) -> str:
@@ -141,8 +149,19 @@ class MapFile:
             with open(temporary, "ab") as file:
                 for piece in self._images(about) if self.product.header is not None else ():
                     file.write(piece)
+                for table in self._scan_tables():
+                    file.write(table)
                 file.write(about.tables)
         return path
+
+    def _scan_tables(self) -> Iterator[bytes]:
+        """Hits of each scan: its number, pixel (HEALPix, or y nx + x) and samples, a row each; and the names of the scans."""
+        if (found := self.product.scan_hits) is not None and "hits" in self.planes:
+            columns: dict[str, NDArray[Any]] = {**found.table}
+            if self.product.pixels is not None:
+                columns["PIXEL"] = self.product.pixels[columns["PIXEL"]]
+            yield _table("SCAN_HITS", columns)
+            yield _text_table("SCANS", {"NAME": found.scans})
 
     def _images(self, about: Provenance) -> Iterator[bytes]:
         world = (tangent.plain(self.product.header) or self.product.wcs).to_header(relax=True)
@@ -254,16 +273,22 @@ def _tables(data: Data) -> Iterable[bytes]:
 
 
 def _text_table(name: str, columns: dict[str, list[str]]) -> bytes:
-    """FITS 4.0, section 7.3; see `core.storage.fits_image` for why not astropy."""
     plain = {title: [ascii_text(t) for t in texts] for title, texts in columns.items()}
     widths = {title: max([1, *map(len, texts)]) for title, texts in plain.items()}
-    rows = list(zip(*([t.ljust(widths[title], "\0") for t in texts] for title, texts in plain.items()), strict=True))
+    return _table(name, {title: np.array([t.encode("ascii") for t in plain[title]], f"S{widths[title]}") for title in plain})
+
+
+def _table(name: str, columns: Mapping[str, NDArray[Any]]) -> bytes:
+    """Columns of texts (``S``), int32 or int64: FITS 4.0, section 7.3; see `core.storage.fits_image` for why not astropy."""
+    plain = {title: values.astype(values.dtype.newbyteorder(">")) for title, values in columns.items()}
+    rows = np.rec.fromarrays(list(plain.values()), dtype=[(title, values.dtype) for title, values in plain.items()])
     cards = Cards([("XTENSION", "BINTABLE", "binary table extension"), ("BITPIX", 8), ("NAXIS", 2)])
-    sizes = {"NAXIS1": sum(widths.values()), "NAXIS2": len(rows), "PCOUNT": 0, "GCOUNT": 1, "TFIELDS": len(plain)}
+    sizes = {"NAXIS1": rows.dtype.itemsize, "NAXIS2": len(rows), "PCOUNT": 0, "GCOUNT": 1, "TFIELDS": len(plain)}
     for key, size in sizes.items():
         cards[key] = size
-    for k, (title, width) in enumerate(widths.items(), 1):
-        cards[f"TTYPE{k}"], cards[f"TFORM{k}"] = title, f"{width}A"
+    for k, (title, values) in enumerate(plain.items(), 1):
+        form = f"{values.dtype.itemsize}A" if values.dtype.kind == "S" else "J" if values.dtype.itemsize == 4 else "K"
+        cards[f"TTYPE{k}"], cards[f"TFORM{k}"] = title, form
     cards["EXTNAME"] = name
-    body = "".join("".join(row) for row in rows).encode("ascii")
+    body = rows.tobytes()
     return cards.tostring().encode("ascii") + body + bytes(-len(body) % BLOCK)

@@ -54,7 +54,8 @@ class MapProduct(MapArrays):
     def plot(self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None) -> Any:
         """Draw a plane; the matplotlib Axes.
 
-        Planes are ``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``; of a polarized map also ``Q``, ``U``, ``P``.
+        Planes are ``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``, ``crosslinking``; of a polarized map also
+        ``Q``, ``U``, ``P``.
         Raises InputError for a plane that the map has not.
 
         Parameters

@@ -14,7 +14,9 @@ from ..types import AnyFloats
 from .map_arrays import MapArrays
 from .stokes import stokes_plane
 
-PLANES = ("signal", "noise", "hits", "weights", "half_difference")
+PLANES = ("signal", "noise", "hits", "weights", "half_difference", "crosslinking")
+UNITS = {"hits": "samples per pixel", "weights": "weight", "crosslinking": "0: evenly crossed, 1: one direction"}
+"""What the colours of planes that are no brightness mean."""
 SHOWN = 99.5
 """Per cent of the pixels that the colours cover by default."""
 FAR = 0.1
@@ -51,7 +53,7 @@ def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float |
         values = flat[plane]
     else:
         wcs = product.wcs
-    unit = {"hits": "samples per pixel", "weights": "weight"}.get(plane, product.unit)
+    unit = UNITS.get(plane, product.unit)
     around_zero = plane in ("signal", "half_difference")
     fwhm = product.resolution if plane == "signal" else 0.0
     shown = Shown(values, wcs, unit, title or plane.replace("_", " "), around_zero, fwhm)

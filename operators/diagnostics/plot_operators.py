@@ -38,6 +38,7 @@ from .drawing.pictures import (
     Picture,
     Style,
     draw_coverage,
+    draw_crosslinking,
     draw_input,
     draw_map,
     draw_modes,
@@ -209,6 +210,9 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
     for name, product in maps.items():
         if "/" not in name and name in data.products:  # Q and U have the hits of I
             yield Drawing(f"coverage {name}", draw_coverage, partial(_coverage, name, product))
+        if "/" not in name and name in data.products and product.directions is not None:
+            file = f"crosslinking{'' if name == 'map' else f'_{name}'}"
+            yield Drawing(f"crosslinking {name}", draw_crosslinking, partial(_crosslinking, file, product))
         if sources := noise_sources(maps, name):
             yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style))
     if data.observations:
@@ -265,7 +269,7 @@ def _input(name: str, image: Image) -> tuple[Any, ...]:
 
 def _flat(
     product: MapProduct,
-    *planes: Literal["signal", "half_difference"],
+    *planes: Literal["signal", "half_difference", "crosslinking"],
     style: Style | None = None,
     per_beam: AnyFloats | float | None = None,
 ) -> FlatMap:
@@ -280,7 +284,7 @@ def _flat(
             there = found.pop("per_beam")
             per_beam = np.where(np.isfinite(there), there, np.nanmean(there))
         header = wcs.to_header(relax=True)
-        rms = {} if style is None else {p: product.rms(style.central_diameter / 2, of=p) for p in planes}
+        rms = {} if style is None else {p: product.rms(style.central_diameter / 2, of=p) for p in planes if p != "crosslinking"}
     arrays = {plane: np.asarray(values, np.float32) for plane, values in found.items()}
     return FlatMap(
         {plane: arrays[plane] for plane in planes}, arrays["hits"], np.nan_to_num(arrays["weights"]), SkyAxes.of(header),
@@ -313,6 +317,10 @@ def _coverage(name: str, product: MapProduct) -> tuple[Any, ...]:
     hits, per_beam = product.hits, product.seconds_per_beam()
     flat = _flat(product, per_beam=per_beam)
     return f"coverage{'' if name == 'map' else f'_{name}'}", flat, int(hits.sum()), int((hits > 0).sum())
+
+
+def _crosslinking(file: str, product: MapProduct) -> tuple[Any, ...]:
+    return file, _flat(product, "crosslinking")
 
 
 def _streams(file: str, stream: TimeStream, before: dict[str, str]) -> tuple[Any, ...]:

@@ -26,6 +26,7 @@ class SaveMap(Output):
     ``map.fits``, ``noiseless_map.fits`` ...: the signal in the primary HDU (K_RJ), then HITS, WEIGHTS, NOISE and, where it was
     made, HALF_DIFFERENCE, all with the same world coordinates; HEALPix maps are explicit-index (partial) tables that healpy
     reads. Of polarized maps I, Q, U (POLCCONV = COSMO), HITS, WEIGHTS, the covariance COV_II ... COV_UU and CONDITION.
+    CROSSLINKING and the table SCAN_HITS where `BinMap` kept them.
     ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the central
     arcminute. Every file carries beam, seed, versions, the resolved YAML and the log of the run.
 

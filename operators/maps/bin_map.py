@@ -12,15 +12,18 @@ The sums are kept in fixed point (`sums`), so that they are exact; each sample i
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.tiles import TILE_SAMPLES
 
+from .coverage import Coverage, Directions
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
@@ -91,15 +94,15 @@ class BinMap(MapParameters):
             raise PipelineError("no grid: observe() was not called", place=self.label, cure="run it in a Pipeline")
         return self._grid
 
-    def prepare(self, observation: Observation) -> list[Binning] | list[StokesBinning]:
-        """Pointing, weights and empty sums for one observation: one for all signals, or one for each with noise of its own."""
-        return binnings(self, observation, self._layout["variance"], self._spare)
+    def prepare(self, observation: Observation) -> Prepared:
+        """Pointing, weights and empty sums for one observation."""
+        return prepared(self, observation, self._layout["variance"], self._spare)
 
-    def exec(self, block: Block, state: list[Any]) -> None:
+    def exec(self, block: Block, state: Prepared) -> None:
         """Add one block to this thread's sums."""
         add_signals(self, block, state, self._layout["variance"])
 
-    def collect(self, data: Data, observation: Observation, state: list[Any]) -> None:
+    def collect(self, data: Data, observation: Observation, state: Prepared) -> None:
         """Add this observation to the even or the odd scans' sums."""
         add_scan(self, data, observation, state)
 
@@ -111,9 +114,20 @@ class BinMap(MapParameters):
             finish(self, data, self.grid, self._layout, sums)
 
 
-def binnings(step: BinMap, observation: Observation, reference: float, spare: list[Sums]) -> list[Binning] | list[StokesBinning]:
-    """What `BinMap.prepare` makes: of each half (`halves_of`), one for all signals or one for each. ``reference``: unit of the
-    variance, K^2; ``spare``: see `Binning`.
+@dataclass
+class Prepared:
+    """An observation's pointing, weights and sums.
+
+    ``binnings``: of each half (`halves_of`), one for all signals or one for each with noise of its own. ``directions``: where the
+    map tells how scans cross.
+    """
+
+    binnings: list[Binning] | list[StokesBinning]
+    directions: Directions | None
+
+
+def prepared(step: BinMap, observation: Observation, reference: float, spare: list[Sums]) -> Prepared:
+    """What `BinMap.prepare` makes. ``reference``: unit of the variance, K^2; ``spare``: see `Binning`.
 
     Raises PipelineError where noise is wanted from the scatter of samples that a window has changed.
     """
@@ -130,8 +144,20 @@ def binnings(step: BinMap, observation: Observation, reference: float, spare: li
         observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
     if "white" not in observation.components and step.noise == "net" and step.contents == "all":
         observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
+    made: list[Any]
     if step.stokes == "IQU":
-        return stokes_binnings(step, observation, step.grid, (weight, noise, window), seen, spare)
+        made = stokes_binnings(step, observation, step.grid, (weight, noise, window), seen, spare)
+    else:
+        made = binnings(step, observation, (weight, noise, window), seen, spare)
+    directions = Directions.of(observation, step.grid, made[0].pointing, seen) if step.crosslinking else None
+    return Prepared(made, directions)
+
+
+def binnings(
+    step: BinMap, observation: Observation, levels: tuple[Any, Any, Any], seen: NDArray[np.bool_], spare: list[Sums]
+) -> list[Binning]:
+    """Of each half (`halves_of`), one binning for all signals or one for each; arguments as of `stokes_binnings`."""
+    weight, noise, window = levels
     alike = step.noise == "net" and not window.size and bool((weight == weight[0]).all() and (noise == noise[0]).all())
     pointing = step.grid.pointing(observation)
     signals = 1 if step.contents == "hits" else len(observation.signals)
@@ -169,27 +195,30 @@ def weights_of(step: BinMap, observation: Observation, reference: float) -> tupl
     return weight, weight**2 * variance
 
 
-def add_signals(step: BinMap, block: Block, state: list[Any], reference: float) -> None:
+def add_signals(step: BinMap, block: Block, state: Prepared, reference: float) -> None:
     """Add all signals of a block to this thread's sums; zeros where only the hits are wanted."""
+    signals: list[Any]
     if step.contents == "hits":
         nothing = block.buffer("nothing", block.shape)
         nothing.fill(0)
         signals = [nothing]
     else:
-        window, unfiltered = state[0].window[block.samples], block.observation.unfiltered
+        window, unfiltered = state.binnings[0].window[block.samples], block.observation.unfiltered
         whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
         signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
         if window.size:  # no filter, no window, acted on these
             signals = [
                 signal * window if name in unfiltered else signal for name, signal in zip(block.signals, signals, strict=True)
             ]
+    if state.directions is not None:
+        state.directions.add(signals, block)
     if step.stokes == "IQU":
-        for binning in state:
-            binning.add(tuple(signals), block)
+        for polarized in state.binnings:
+            polarized.add(tuple(signals), block)  # type: ignore[union-attr]
         return
-    for binnings in halves(step, state):
+    for half in halves(step, list(state.binnings)):
         left = signals
-        for binning in binnings:
+        for binning in half:
             count = 1 + binning.n_others
             add_block(step, block, tuple(left[:count]), binning, reference)
             left = left[count:]
@@ -222,16 +251,22 @@ def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], binning: Bin
         add_list(signals, start - begin, index, *how)
 
 
-def add_scan(step: BinMap, data: Data, observation: Observation, state: list[Any]) -> None:
+def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared) -> None:
     """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples that are too large."""
     if step.label not in data.partial:
         signals = () if step.contents == "hits" else observation.signals
         n, of_scans = step.grid.n_pixels, step.split == "scans"
         polarized = step.stokes == "IQU"
         made = StokesSums(n, signals, of_scans) if polarized else MapSums(n, signals, step.noise == "scatter", of_scans)
+        made.coverage = Coverage.empty(n, step.crosslinking, step.scan_hits)
         data.add(step.label, made)
     sums: Any = data.partial[step.label]
-    binned, dropped = sums.add(observation, halves(step, state), step.label)
+    before = sums.hits.sum(axis=0) if step.scan_hits else None
+    binned, dropped = sums.add(observation, halves(step, list(state.binnings)), step.label)
+    if state.directions is not None:
+        sums.coverage.add_directions(state.directions)
+    if before is not None:
+        sums.coverage.add_hits(sums.hits.sum(axis=0) - before, f"{step.label}, {observation.name}")
     sums.unknown_variance |= step.weights == "inverse_variance" and not (observation.focalplane.net > 0).all()
     every, tally = observation.n_detectors * observation.n_samples, observation.tally
     tally.count(step.label, "samples binned", binned, every)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.scan_hits import ScanHits
 from zonda.core.numerics.chunks import empty
 from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
@@ -40,6 +41,7 @@ def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any
         product = (stokes_map_of if polarized else map_of)(step, grid, layout, sums, stream)  # type: ignore[arg-type]
         product.band = data.scene.instrument.band
         if stream == MAIN:
+            _with_coverage(product, grid, sums)
             state_choices(step, product, sums, data.tally)
         if step.smooth is not None:
             product = product.smoothed(layout["fwhm"] if step.smooth == "beam" else float(step.smooth))
@@ -83,6 +85,20 @@ def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: Map
         planes[0], planes[1], planes[2], planes[3], header=None, pixel=size, nside=grid.nside, nest=grid.nest,
         pixels=grid.pixels_covered[keep], **common,
     )  # fmt: skip
+
+
+def _with_coverage(product: MapProduct, grid: Grid, sums: MapSums | StokesSums) -> None:
+    """Give a map how its scans cross, and their hits, where these were asked for."""
+    coverage = sums.coverage
+    planes, pixels = coverage.mean_directions(), coverage.pixels
+    if isinstance(grid, HealpixGrid):  # the product's pixels are those with hits
+        keep = np.flatnonzero(sums.hits.any(axis=0))
+        planes = None if planes is None else planes[:, keep]
+        pixels = None if pixels is None else [np.searchsorted(keep, some).astype(np.int32) for some in pixels]
+    if planes is not None:
+        product.directions = planes.reshape(2, *product.hits.shape)
+    if pixels is not None:
+        product.scan_hits = ScanHits(list(sums.scans), pixels, coverage.hits)
 
 
 def state_choices(step: MapParameters, product: MapProduct, sums: MapSums | StokesSums, tally: Tally) -> None:

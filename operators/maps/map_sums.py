@@ -10,7 +10,7 @@ import numpy as np
 from zonda.core.data import Observation
 from zonda.core.types import Floats
 
-from .pixel_sums import MOST, PixelSums, refuse_overflow, zeros
+from .pixel_sums import MOST, PixelSums, zeros
 from .sums import DATA, HITS, NOISE, Binning, Sums
 
 
@@ -44,6 +44,11 @@ class MapSums(PixelSums):
         self._largest = np.zeros(4)
         self._largest_of = dict.fromkeys(self.others, 0.0)
         self._deepest = [0, 0]
+
+    @property
+    def hits(self) -> Sums:
+        """See `PixelSums.hits`."""
+        return self.sums[:, :, HITS]
 
     def add(self, observation: Observation, halves: Sequence[Sequence[Binning]], place: str) -> tuple[int, Sums]:
         """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.
@@ -113,8 +118,7 @@ class MapSums(PixelSums):
     def arrays(self) -> dict[str, Any]:
         """Numbers of the pixels with hits, and their sums."""
         found = self._about() | {
-            "n_pixels": self.sums.shape[1], "largest": self._largest, "largest_of": dict(self._largest_of),
-            "scatter": bool(self.scatters),
+            "largest": self._largest, "largest_of": dict(self._largest_of), "scatter": bool(self.scatters),
         }  # fmt: skip
         for k in range(2):
             pixels = np.flatnonzero(self.sums[k, :, HITS])
@@ -160,9 +164,8 @@ class MapSums(PixelSums):
         """No sum can have overflowed."""
         largest = max(float(self._largest.max()), *self._largest_of.values(), 0.0)
         if sum(self._deepest) * largest >= MOST:
-            refuse_overflow(
-                self.sums[:, :, HITS], largest, max(float(self._largest[DATA]), *self._largest_of.values(), 0.0), place
-            )
+            highest = max(float(self._largest[DATA]), *self._largest_of.values(), 0.0)
+            self._refuse_overflow(largest, highest, place)
 
 
 def _nothing(half: Sums) -> Sums:

@@ -54,6 +54,11 @@ class MapParameters(MapMaker):
     """Keep two halves of the samples apart and make a noise map of their difference: even and odd scans (`scans` or true; needs
     two), even and odd detectors, the first and the second half of each scan, samples of rising and of falling
     azimuth, or inner and outer detectors (`radii`)."""
+    crosslinking: bool = False
+    """Keep the directions in which detectors moved through each pixel: 0 where they crossed evenly, 1 where all moved along one
+    line."""
+    scan_hits: bool = False
+    """Keep the hits of each scan in each pixel."""
     smooth: Angle | Literal["beam"] | None = None
     """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam; the resolution is then that of both, added in
     quadrature."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
@@ -13,6 +14,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import empty
 from zonda.core.product import Product
 
+from .coverage import Coverage
 from .sums import FLAGGED, VALUE, Sums
 
 MOST = 2.0**62
@@ -32,6 +34,8 @@ class PixelSums(Product):
         Names of the observations, and their sample rates, Hz.
     unknown_variance
         A scan's weights are uniform because every NET is zero.
+    coverage
+        Directions of motion, and the hits of each observation.
     """
 
     def __init__(self, signals: Sequence[str], of_scans: bool) -> None:
@@ -40,6 +44,12 @@ class PixelSums(Product):
         self.scans: list[str] = []
         self.rates: set[float] = set()
         self.unknown_variance = False
+        self.coverage = Coverage()
+
+    @property
+    @abstractmethod
+    def hits(self) -> Sums:
+        """(2, n_pixels) samples in each pixel."""
 
     @property
     def shift(self) -> int:
@@ -58,34 +68,32 @@ class PixelSums(Product):
         self.scans += other.scans
         self.rates |= other.rates
         self.unknown_variance |= other.unknown_variance
+        self.coverage += other.coverage
 
     def _about(self) -> dict[str, Any]:
         """What `_with_about` takes."""
         return {
             "signals": list(self.signals), "of_scans": self.of_scans, "scans": list(self.scans), "rates": sorted(self.rates),
-            "unknown_variance": self.unknown_variance,
+            "unknown_variance": self.unknown_variance, "n_pixels": self.hits.shape[1], "coverage": self.coverage.arrays(),
         }  # fmt: skip
 
     def _with_about(self, arrays: Mapping[str, Any]) -> Self:
         self.scans, self.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
         self.unknown_variance = bool(arrays["unknown_variance"])
+        self.coverage = Coverage.of(arrays["coverage"], int(arrays["n_pixels"]))
         return self
+
+    def _refuse_overflow(self, largest: float, highest: float, place: str) -> None:
+        """Raise PipelineError where a sum may have overflowed: ``largest`` term of any, ``highest`` of those of the data."""
+        deepest = float(self.hits.sum(axis=0).max(initial=0))
+        if deepest * largest >= MOST:
+            raise PipelineError(
+                f"{deepest:.0f} samples in one pixel, each up to {highest / VALUE:.3g} K, overflow the map's fixed-point sums",
+                place=place,
+                cure="make smaller pixels, or put a HighpassFilter before",
+            )
 
 
 def zeros(n_pixels: int, columns: int) -> NDArray[np.int64]:
     """(2, n_pixels, columns) zeros that take no memory until they are written."""
     return empty((2 * n_pixels, columns), np.int64).reshape(2, n_pixels, columns)
-
-
-def refuse_overflow(hits: Sums, largest: float, highest: float, place: str) -> None:
-    """Raise PipelineError where a sum may have overflowed.
-
-    ``hits`` (2, n_pixels), ``largest`` term of any sum, ``highest`` of those of the data.
-    """
-    deepest = float(hits.sum(axis=0).max(initial=0))
-    if deepest * largest >= MOST:
-        raise PipelineError(
-            f"{deepest:.0f} samples in one pixel, each up to {highest / VALUE:.3g} K, overflow the map's fixed-point sums",
-            place=place,
-            cure="make smaller pixels, or put a HighpassFilter before",
-        )

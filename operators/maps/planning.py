@@ -34,6 +34,12 @@ class BinMapPlanning(Planning[BinMap]):
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, two halves, the products of all signals; and the pointing, twice while it is laid out."""
         others = len(observation.signals) - 1
+        more = (96 if self.operator.crosslinking else 0) + (40 if self.operator.scan_hits else 0)
+        samples = 144 * observation.n_samples if self.operator.crosslinking else 0
+        return more * self.operator.grid.n_pixels + samples + self._sums(observation, others)
+
+    def _sums(self, observation: Observation, others: int) -> int:
+        """Of ``others`` signals beside the first."""
         if self.operator.stokes == "IQU":  # hits, six sums and three for each signal, in two threads and two halves
             return (32 * (7 + 3 * (1 + others)) + 240 * (1 + others)) * self.operator.grid.n_pixels + 250 * observation.n_samples
         return (128 + 72 * others) * self.operator.grid.n_pixels + 150 * observation.n_samples

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 
-from .pixel_sums import PixelSums, refuse_overflow, zeros
+from .pixel_sums import PixelSums, zeros
 from .stokes_sums import DATA, HIT, MATRIX, StokesBinning
 from .sums import Sums
 
@@ -35,6 +35,11 @@ class StokesSums(PixelSums):
         self.noise: NDArray[np.int64] | None = None
         self._largest = 0.0
         self._largest_of = dict.fromkeys(self.signals, 0.0)
+
+    @property
+    def hits(self) -> Sums:
+        """See `PixelSums.hits`."""
+        return self.matrix[:, :, HIT]
 
     def add(self, observation: Observation, halves: Sequence[StokesBinning], place: str) -> tuple[int, Sums]:
         """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.
@@ -96,8 +101,7 @@ class StokesSums(PixelSums):
     def arrays(self) -> dict[str, Any]:
         """Numbers of the pixels with hits, and their sums."""
         found = self._about() | {
-            "n_pixels": self.matrix.shape[1], "largest": self._largest, "largest_of": dict(self._largest_of),
-            "own_noise": self.noise is not None,
+            "largest": self._largest, "largest_of": dict(self._largest_of), "own_noise": self.noise is not None,
         }  # fmt: skip
         for k in range(2):
             pixels = np.flatnonzero(self.matrix[k, :, HIT])
@@ -143,4 +147,4 @@ class StokesSums(PixelSums):
     def _check(self, place: str) -> None:
         """No sum can have overflowed."""
         highest = max(self._largest_of.values())
-        refuse_overflow(self.matrix[:, :, HIT], max(self._largest, highest), highest, place)
+        self._refuse_overflow(max(self._largest, highest), highest, place)

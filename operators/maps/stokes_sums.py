@@ -88,21 +88,17 @@ class StokesBinning:
         """Add a block's ``signals``, each (n_det, n), to this thread's sums."""
         sums, dropped, largest = self._of_thread()
         detectors, samples, plane = block.detectors, block.samples, block.observation.focalplane
-        used = np.flatnonzero(self.use[detectors] & block.observation.good_detectors[detectors])
-        dropped[FLAGGED] += (samples.stop - samples.start) * (detectors.stop - detectors.start - used.size)
-        for rows in np.split(used, range(TILE_DETECTORS, used.size, TILE_DETECTORS)):
-            which = rows + detectors.start
-            xi, eta = plane.xi[which], plane.eta[which]
+        used = self.use[detectors] & block.observation.good_detectors[detectors]
+        dropped[FLAGGED] += (samples.stop - samples.start) * int(np.count_nonzero(~used))
+        for rows, start, stop in tiles(block, used):
+            which, first = rows + detectors.start, start - samples.start
+            index = np.empty((rows.size, stop - start), np.int32)
+            turn = np.empty((2, *index.shape))
+            self.grid.pixels(self.pointing, start, stop, plane.xi[which], plane.eta[which], index)
+            self.angles.fill(which, start, turn[0], turn[1])
             of_rows = self.weight[which], self.noise[which], self.efficiency[which]
-            for start in range(samples.start, samples.stop, TILE_SAMPLES):
-                stop = min(start + TILE_SAMPLES, samples.stop)
-                index = np.empty((rows.size, stop - start), np.int32)
-                turn = np.empty((2, *index.shape))
-                self.grid.pixels(self.pointing, start, stop, xi, eta, index)
-                self.angles.fill(which, start, turn[0], turn[1])
-                which_ones = self.good[start:stop], self.window[start:stop], *of_rows
-                first = start - samples.start
-                add_stokes(signals, first, rows, index, turn[0], turn[1], *which_ones, self.own_noise, sums, dropped, largest)
+            which_ones = self.good[start:stop], self.window[start:stop], *of_rows
+            add_stokes(signals, first, rows, index, turn[0], turn[1], *which_ones, self.own_noise, sums, dropped, largest)
 
     def _of_thread(self) -> tuple[Sums, Sums, Floats]:
         """(sums (n_pixels, columns), dropped (4,), largest (2,): of A and N, of b)."""
@@ -124,6 +120,14 @@ class StokesBinning:
             self.spare.append(sums)
             yield pixels, found, dropped, largest
         self.parts.clear()
+
+
+def tiles(block: Block, used: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], int, int]]:
+    """Of a block, in pieces that stay in the cache: rows of the detectors that are ``used`` (n_det,), first and last sample."""
+    rows = np.flatnonzero(used)
+    for some in np.split(rows, range(TILE_DETECTORS, rows.size, TILE_DETECTORS)):
+        for start in range(block.samples.start, block.samples.stop, TILE_SAMPLES):
+            yield some, start, min(start + TILE_SAMPLES, block.samples.stop)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

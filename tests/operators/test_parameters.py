@@ -192,8 +192,13 @@ def same(a: Any, b: Any) -> bool:
         return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
     if isinstance(a, list | tuple):
         return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    if isinstance(a, np.ndarray):
-        return isinstance(b, np.ndarray) and a.shape == b.shape and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return (
+            isinstance(a, np.ndarray)
+            and isinstance(b, np.ndarray)
+            and a.shape == b.shape
+            and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+        )
     return bool(a == b or (a != a and b != b))
 
 
@@ -439,6 +444,8 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "condition_limit": ({"stokes": "IQU"}, {"condition_limit": 3.0}),
         "contents": ({}, {"contents": "hits"}),
         "half_difference": ({}, {"half_difference": False}),
+        "crosslinking": ({}, {"crosslinking": True}),
+        "scan_hits": ({}, {"scan_hits": True}),
         "smooth": ({}, {"smooth": "beam"}),
         "product": ({}, {"product": "chart"}),
     },

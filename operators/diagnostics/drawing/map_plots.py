@@ -146,6 +146,19 @@ def plot_coverage(
     return ax  # type: ignore[no-any-return]
 
 
+def plot_crosslinking(values: AnyFloats, wcs: Any, *, ax: Any = None, title: str = "") -> Axes:
+    """How scan directions cross: `MapArrays.crosslinking` (ny, nx), NaN in grey. Other arguments as `plot_map`."""
+    import matplotlib as mpl
+
+    axes = located(wcs)
+    ax = map_axes(values.shape, axes)[0] if ax is None else ax
+    colours = mpl.colormaps["cividis_r"].with_extremes(bad="0.85")
+    label = "0: directions cross evenly, 1: one direction"
+    _show(ax, axes, np.ma.masked_invalid(values), label, cmap=colours, norm=mpl.colors.Normalize(0, 1))
+    _head(ax, title or "Crosslinking")
+    return ax  # type: ignore[no-any-return]
+
+
 def _count_samples(ax: Any, per_beam: float) -> None:
     """A second scale of the colour bar, in samples per pixel."""
     bar = ax.bar_axes

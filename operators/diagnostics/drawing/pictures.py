@@ -17,7 +17,7 @@ from ..series import Modes, Spectrum, TimeStream, unit_of_stream
 from .canvas import DPI
 from .flat_map import FlatMap
 from .map_layout import map_axes
-from .map_plots import SHOWN, contour_text, plot_circle, plot_contours, plot_coverage, plot_map
+from .map_plots import SHOWN, contour_text, plot_circle, plot_contours, plot_coverage, plot_crosslinking, plot_map
 from .plot_modes import plot_modes
 from .plots import ScanTrack, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .png import png_of
@@ -114,6 +114,13 @@ def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int) -> lis
         beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
         text += f" Integration time: of all detectors together, in the area of the telescope's beam {beam}."
     return [Sketch(file, "Coverage", text, ax)]
+
+
+def draw_crosslinking(file: str, product: FlatMap) -> list[Sketch]:
+    """How evenly scan directions cross in each pixel."""
+    product = product.cropped()
+    text = "The size of the mean of exp(2iψ), ψ the direction in which detectors move through a pixel."
+    return [Sketch(file, "Crosslinking", text, plot_crosslinking(product.planes["crosslinking"], product.sky))]
 
 
 def draw_scan(tracks: Sequence[ScanTrack]) -> list[Sketch]:

@@ -18,14 +18,14 @@ def test_pictures_and_report(tmp_path):
         zonda.HalfWavePlate(frequency="1 Hz"),
         zonda.WhiteNoise(),
         zonda.Efficiency(),
-        zonda.BinMap(pixel="60 arcsec", stokes="IQU"),
+        zonda.BinMap(pixel="60 arcsec", stokes="IQU", crosslinking=True),
         zonda.Plots(),
         zonda.Report(),
     ]
     data = zonda.Pipeline(steps).run(scene, output=tmp_path)
     made = {path.name for path in tmp_path.glob("*.png")}
-    assert {"map.png", "map_Q.png", "map_U.png", "map_P.png", "noise_map_Q.png", "coverage.png"} <= made
-    assert not any(name.startswith("coverage_") for name in made)  # Q and U have the hits of I
+    assert {"map.png", "map_Q.png", "map_U.png", "map_P.png", "noise_map_Q.png", "coverage.png", "crosslinking.png"} <= made
+    assert not any(name.startswith(("coverage_", "crosslinking_")) for name in made)  # Q and U have the hits of I
     assert list(maps_of(data.products)) == ["map", "map_Q", "map_U"]
     assert list(maps_of(data.products, split=False)) == ["map"]
     text = (tmp_path / "report.html").read_text(encoding="utf-8")

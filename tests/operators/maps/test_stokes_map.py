@@ -322,7 +322,7 @@ def test_a_campaign_of_two_workers_gives_the_bits_of_one_run(tmp_path):
             zonda.HalfWavePlate(frequency="1 Hz"),
             zonda.WhiteNoise(),
             zonda.Efficiency(),
-            zonda.BinMap(pixel="60 arcsec", stokes="IQU"),
+            zonda.BinMap(pixel="60 arcsec", stokes="IQU", crosslinking=True, scan_hits=True),
             zonda.SaveMap(),
         ]
         folder = tmp_path / how.get("engine", "one")
@@ -332,7 +332,9 @@ def test_a_campaign_of_two_workers_gives_the_bits_of_one_run(tmp_path):
             zonda.Pipeline(steps).run(scene, output=folder)
         with fits.open(next(folder.rglob("map.fits"))) as file:
             found.append({hdu.name: np.array(hdu.data) for hdu in file if hdu.is_image})
-    assert {"I", "Q", "U", "COV_QU", "HALF_DIFFERENCE_U"} <= found[0].keys()
+            found[-1]["SCAN_HITS"] = np.array(file["SCAN_HITS"].data)
+    assert {"I", "Q", "U", "COV_QU", "HALF_DIFFERENCE_U", "CROSSLINKING"} <= found[0].keys()
+    assert set(found[0]["SCAN_HITS"]["SCAN"]) == {0, 1, 2}
     assert np.isfinite(found[0]["Q"]).sum() > 20
     for name, values in found[0].items():
         np.testing.assert_array_equal(values, found[1][name], err_msg=name)
