@@ -22,7 +22,7 @@ from .operator import Operator
 from .output import Output, Progress
 from .run import arguments
 from .run.ahead import Ahead
-from .run.bands import check_steps, data_of_bands, distribute, gather, hand_over, points
+from .run.bands import data_of_bands, distribute, gather, hand_over, of_one_band, points, use_recorded
 from .run.budget import check_kept_memory, divided, least_memory, longest_of, with_scan_ahead
 from .run.execution import Execution
 from .run.order import check_order
@@ -171,17 +171,17 @@ class Pipeline:
 
     def _of_bands(self, data: Data) -> Bands:
         """The pipeline and the data of each band (`core.run.bands`): this one, and all data, where there is one."""
+        use_recorded(data, self.operators)
         found = data_of_bands(data)
         if not found:
             return [(self, data)]
-        check_steps(self.operators)
         made = []
         for own in found.values():
             pipeline = Pipeline(
                 self.operators, runs=self._asked, only=self.only, name=self.name, description=self.description,
                 precision=self.precision,
             )  # fmt: skip
-            pipeline.operators = [o for o in pipeline.operators if not points(o) and (not isinstance(o, Output) or o.one_band)]
+            pipeline.operators = [o for o in pipeline.operators if of_one_band(o) and (not isinstance(o, Output) or o.one_band)]
             made.append((pipeline, own))
         return made
 

@@ -14,6 +14,7 @@ from ..data import Data
 from ..errors import InputError, PipelineError
 from ..observation import Observation
 from ..operator import Operator
+from ..scene import WithScene
 from ..signal import MAIN, product_name, stream_of
 from ..tally import Tally
 
@@ -35,15 +36,24 @@ def points(operator: Operator) -> bool:
     return "boresight" in operator.provides
 
 
-def check_steps(operators: list[Operator]) -> None:
-    """Refuse steps that observe with one band alone (`PipelineError`)."""
+def of_one_band(operator: Operator) -> bool:
+    """Whether a step acts on each band's data: all but those that only point, which is done once for all bands.
+
+    A step that points and reads streams too observes the scans of all bands first, and then each band's data (`Data.band`).
+    """
+    return operator.provides != {"boresight"}
+
+
+def use_recorded(data: Data, operators: Sequence[Operator]) -> None:
+    """Give the scene the instrument and the site of recorded data that a step reads."""
     for operator in operators:
-        if points(operator) and operator.provides != {"boresight"}:
-            raise PipelineError(
-                "reads the detectors' streams, which it cannot for a camera of several bands",
-                place=operator.label,
-                cure="give the scene an instrument with one band: one run for each",
-            )
+        if isinstance(operator, WithScene):
+            given, own = data.scene, operator.own_scene(data.scene.instrument)
+            data.scene = given.model_copy(update={what: own[what] for what in ("site", "instrument")})
+            for what in ("instrument", "site"):
+                one, other = own[what].name, getattr(given, what).name
+                text = f"{one}, the file's" + ("" if one == other else f"; the scene's {other} is not used")
+                data.tally.state(operator.label, what, text)
 
 
 def distribute(data: Data, bands: Sequence[Data]) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import PrivateAttr
+from numpy.typing import NDArray
 
 from zonda.core import flags
 from zonda.core.configuration.time import Instant
@@ -15,10 +15,10 @@ from zonda.core.errors import InputError
 from zonda.core.observation import Observation
 from zonda.core.signal import Component
 
-from .recorded_files import RecordedFiles, RecordedScan
+from .recorded_files import File, RecordedFiles, RecordedScan, Scan
 from .recorded_pointing import boresights, middle, state_celestial
+from .recorded_scan import RecordedInstrument, joined
 from .recorded_stream import RecordedStream
-from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 
 if TYPE_CHECKING:
@@ -36,6 +36,19 @@ MOMENT = 1.0
 """s between the scene's time and the first file's from which the two are not the same."""
 
 
+SAME_DIRECTION = 1e-9
+"""Largest difference of the boresights (quaternions) of files that are bands of one scan."""
+
+
+@dataclass(frozen=True)
+class _Band:
+    """What a scan has of a band: the file, the camera, the rows of its detectors."""
+
+    part: RecordedScan
+    camera: RecordedInstrument
+    rows: NDArray[np.intp]
+
+
 class _Provides:
     """What a `LoadTOD` makes: no stream where none is wanted."""
 
@@ -44,7 +57,7 @@ class _Provides:
 
 
 class LoadTOD(RecordedFiles):
-    """Recorded scans with their streams, one from each file: TOAST's HDF5 (what `SaveTOD` writes, too) or `SaveTOD`'s FITS.
+    """Recorded scans with their streams: TOAST's HDF5 (what `SaveTOD` writes, too) or `SaveTOD`'s FITS.
 
     Pointing, focal plane, flags, intervals, noise and weather are those of the file, and so are instrument and site: a pipeline
     with this step needs neither. The stream enters as the component `recorded`: alone it is the signal, which filters and map
@@ -60,25 +73,26 @@ class LoadTOD(RecordedFiles):
     provides: ClassVar[Any] = _Provides()
     knows_means: ClassVar[bool] = True
 
-    _scans: dict[int, RecordedScan] = PrivateAttr(default_factory=dict)
-
     def check(self, data: Data) -> list[str]:
         """What is in the files."""
         return _look(self, data)
 
     def observe(self, data: Data) -> None:
-        """Append an observation for each file; the scene's instrument and site become those of the files."""
-        self._scans.update(_append(self, data))
+        """Append an observation for each scan; the scene's instrument and site become those of the files.
+
+        Where the camera has several bands, the scans of each band then get the flags of their own files.
+        """
+        if not data.band:
+            self._scans.update(_append(self, data))
+            return
+        for observation in data.observations:
+            if file := self.file_of(observation):
+                observation.flags = file.flags.copy()
 
     def prepare(self, observation: Observation) -> RecordedStream | None:
         """Open the file, and find each detector's level. None: nothing of this scan is read."""
         stream = self.open(observation)
         return stream and stream.levelled(observation.n_detectors, observation.n_samples)
-
-    def open(self, observation: Observation) -> RecordedStream | None:
-        """The stream of an observation, to be read; None: it is not of these files, or none is wanted."""
-        scan = self._scans.get(observation.index)
-        return None if scan is None or self.signal is None else _opened(self, scan, observation)
 
     def exec(self, block: Block, state: RecordedStream | None) -> None:
         """Read a block; add it to ``recorded``."""
@@ -111,9 +125,9 @@ def _look(step: LoadTOD, data: Data) -> list[str]:
     return lines + ([f"and {len(found) - MOST_TOLD} more scans"] if len(found) > MOST_TOLD else [])
 
 
-def _append(step: LoadTOD, data: Data) -> dict[int, RecordedScan]:
-    """Append the observations; the scans by the observations' numbers."""
-    given, found = data.scene, dict[int, RecordedScan]()
+def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
+    """Append the observations; the files of each by its number."""
+    given, found = data.scene, dict[int, list[File]]()
     own = step.own_scene(given.instrument)
     if abs(given.time.seconds_since(own["time"])) > MOMENT:
         raise InputError(
@@ -122,65 +136,69 @@ def _append(step: LoadTOD, data: Data) -> dict[int, RecordedScan]:
             cure="leave time out of the pipeline, and nights out of a campaign",
         )
     data.scene = given.model_copy(update={"site": own["site"], "instrument": own["instrument"]})
-    for path in step.files:
-        scan = step.scan(path, given.instrument)
-        _check_alike(scan, own["instrument"], f"{step.label}, {path.name}")
-        observation = _observation(step, data, scan)
-        for what in ("instrument", "site"):
-            one, other = own[what].name, getattr(given, what).name
-            text = f"{one}, the file's" + ("" if one == other else f"; the scene's {other} is not used")
-            observation.tally.state(step.label, what, text)
-        found[observation.index] = scan
+    for scan in step.scans(given.instrument):
+        observation = _observation(step, data, _of_bands(step, scan, own["instrument"]))
+        found[observation.index] = [
+            File(
+                part.path,
+                {part.tod.names[row]: row for rows in part.rows for row in rows.tolist()},
+                flags.from_file(part.tod.flags, step.flag_mask),
+            )
+            for part in scan
+        ]
         data.observations.append(observation)
     return found
 
 
-def _opened(step: LoadTOD, scan: RecordedScan, observation: Observation) -> RecordedStream:
-    """The open stream, with the rows of the observation's detectors."""
-    order = {scan.tod.names[row]: row for row in scan.rows.tolist()}
-    rows = np.array([order[name] for name in observation.focalplane.names], np.intp)
-    opened = reader(scan.path)
-    try:
-        return RecordedStream(opened, str(step.signal), rows, np.uint8(step.detector_mask))
-    except BaseException:
-        opened.close()
-        raise
+def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument) -> list[_Band]:
+    """What a scan has of each of the camera's bands. Raises InputError where it is of another camera, or lacks a band."""
+    place = f"{step.label}, {scan[0].path.name}"
+    every = [_Band(part, *each) for part in scan for each in zip(part.cameras, part.rows, strict=True)]
+    bands = {band.camera.band.name: band for band in every}
+    for name, camera in instrument.cameras.items():
+        of = bands.get(name)
+        if of is None or of.camera.name != camera.name or not np.isclose(of.camera.band.centre, camera.band.centre, rtol=1e-3):
+            what = ", ".join(f"{b.camera.name} at {b.camera.band.centre / 1e9:.4g} GHz" for b in every)
+            first = f"{camera.name} at {camera.band.centre / 1e9:.4g} GHz"
+            cure = "load the files of one instrument, all bands of each scan; or choose a band"
+            raise InputError(f"was recorded with {what}, the first scan with {first}", place=place, cure=cure)
+    if instrument.bands and len(bands) > len(instrument.bands):
+        text = f"has the bands {', '.join(bands)}, the first scan {', '.join(instrument.cameras)}"
+        raise InputError(text, place=place, cure="begin with a scan of all bands; or choose a band")
+    for part in scan[1:]:
+        for name in ("boresight_azel", "boresight_radec"):
+            one, other = getattr(scan[0].tod, name), getattr(part.tod, name)
+            if one.shape != other.shape or not np.allclose(one, other, rtol=0, atol=SAME_DIRECTION):
+                text = f"looks elsewhere than {scan[0].path.name}, which has the same times ({name})"
+                raise InputError(text, place=f"{step.label}, {part.path.name}", cure="load them one after the other")
+    return [bands[name] for name in instrument.cameras]
 
 
-def _check_alike(scan: RecordedScan, instrument: Instrument, place: str) -> None:
-    """Refuse files of several instruments in one run."""
-    own = scan.instrument
-    same = own.name == instrument.name and np.isclose(own.band.centre, instrument.band.centre, rtol=1e-3)
-    if not same:
-        what = f"{own.name} at {own.band.centre / 1e9:.4g} GHz"
-        first = f"{instrument.name} at {instrument.band.centre / 1e9:.4g} GHz"
-        cure = "load the files of one instrument and band; one run for each"
-        raise InputError(f"was recorded with {what}, the first file with {first}", place=place, cure=cure)
-
-
-def _observation(step: LoadTOD, data: Data, scan: RecordedScan) -> Observation:
-    tod, scene, place = scan.tod, data.scene, f"{step.label}, {scan.path}"
-    start, plane = Instant.parse(tod.start), scan.instrument.focalplane()
+def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
+    """A scan; where the camera has several bands, their detectors follow each other."""
+    part, scene = bands[0].part, data.scene
+    tod, place = part.tod, f"{step.label}, {part.path}"
+    start, plane = Instant.parse(tod.start), joined([b.camera for b in bands], place).focalplane()
     if (np.diff(tod.seconds) <= 0).any():
         row = int(np.flatnonzero(np.diff(tod.seconds) <= 0)[0]) + 1
         raise InputError(f"the times do not increase at sample {row}", place=place, cure="leave out the samples that repeat")
-    tolerance = step.interpolation_error * float(plane.fwhm.min())
+    tolerance = step.interpolation_error * float(tod.columns.get("fwhm", plane.fwhm).min())
     found = boresights(tod, start, scene.site, step.celestial, tolerance, place)
     good = flags.good(sample_flags := flags.from_file(tod.flags, step.flag_mask), flags.EXCLUDE_SAMPLE)
-    centre = _centre(step, tod, scene, found.radec, good)
-    dead = np.where(tod.detector_flags[scan.rows] & np.uint8(step.detector_mask), np.uint8(flags.INVALID), np.uint8(0))
+    flagged = np.concatenate([b.part.tod.detector_flags[b.rows] for b in bands])
+    dead = np.where(flagged & np.uint8(step.detector_mask), np.uint8(flags.INVALID), np.uint8(0))
     observation = Observation(
-        name=_unique(tod.name, [o.name for o in data.observations]),
+        name=_unique(tod.name, bands, data),
         index=len(data.observations),
         site=scene.site,
-        instrument=scan.instrument,
+        instrument=bands[0].camera if len(bands) == 1 else scene.instrument,
         focalplane=plane,
         start=start,
         seconds=tod.seconds,
         sample_rate=tod.sample_rate,
         boresight_azel=found.azel,
         boresight_radec=found.radec,
-        centre=centre,
+        centre=_centre(step, tod, scene, found.radec, good),
         seed=scene.seed,
         flags=sample_flags,
         detector_flags=dead,
@@ -189,7 +207,7 @@ def _observation(step: LoadTOD, data: Data, scan: RecordedScan) -> Observation:
         hwp_angle=tod.hwp_angle,
     )
     tally = observation.tally
-    tally.state(step.label, "noise of the detectors", scan.noise)
+    tally.state(step.label, "noise of the detectors", part.noise)
     tally.count(step.label, "samples that the file's flags exclude", int((~good).sum()), good.size)
     tally.count(step.label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead))
     state_celestial(step.label, observation, found, tod.sample_rate)
@@ -207,8 +225,11 @@ def _centre(step: LoadTOD, tod: TimeOrderedData, scene: Any, radec: Any, good: A
     return middle(radec, good)
 
 
-def _unique(name: str, others: Iterable[str]) -> str:
-    taken, number, found = {*others}, 2, name
+def _unique(name: str, bands: list[_Band], data: Data) -> str:
+    """The scan's name, of several bands without that of the first, and as no other scan has it."""
+    if len(bands) > 1:
+        name = name.removesuffix(f"-{bands[0].camera.band.name}")
+    taken, number, found = {o.name for o in data.observations}, 2, name
     while found in taken:
         found, number = f"{name}.{number}", number + 1
     return found

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,48 +12,67 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field, PrivateAttr, field_validator
 
 from zonda.core import flags
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
-from zonda.core.configuration.units import Fraction
+from zonda.core.configuration.units import Fraction, Hertz
 from zonda.core.errors import InputError
 from zonda.core.operator import Operator
 
 from .noise_table import NoiseTable, read_noise
-from .recorded_scan import instrument_of, rows_of_band, site_of
+from .recorded_scan import RecordedInstrument, instrument_of, is_near, joined, rows_of_bands, site_of
+from .recorded_stream import RecordedStream
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Instrument
+    from zonda.core.observation import Observation
 
-NEW_SCANS = 64
+NEW_SCANS = 8
 """Files whose pointing is kept after it was read."""
+
+MOST_FILES = 4096
+"""Files of which it is kept to which scan they belong."""
 
 
 @dataclass(frozen=True)
 class RecordedScan:
-    """A file, all but its streams; the rows of the band that is used; names of its streams."""
+    """A file, all but its streams: its cameras of one band each, and the rows of their detectors."""
 
     path: Path
     tod: TimeOrderedData
-    rows: NDArray[np.intp]
-    instrument: Instrument
+    cameras: tuple[RecordedInstrument, ...]
+    rows: tuple[NDArray[np.intp], ...]
     noise: str
+
+
+@dataclass(frozen=True)
+class File:
+    """A file of a scan that is read: the rows of its detectors, and its flags of samples (n_samp,)."""
+
+    path: Path
+    rows: dict[str, int]
+    flags: flags.Flags
+
+
+Scan = list[RecordedScan]
+"""The files of one scan: one, or several with different bands."""
 
 
 class RecordedFiles(Operator):
     """The parameters of `LoadTOD`."""
 
     file: InputPath | list[InputPath]
-    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files are the scans of one run, in this order."""
+    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files are the scans of one run, in this order. Files
+    with the same times and other bands are one scan."""
     signal: str | None = "signal"
     """Name of the stream; none: no stream is read, the file's pointing alone is used."""
-    band: str | None = None
-    """Centre of the band whose detectors are used, e.g. 93 GHz, where the file has detectors of several."""
+    band: Hertz | None = Field(None, gt=0)
+    """Centre of the only band whose detectors are used, e.g. 93 GHz; none: all bands, each with maps of its own."""
     noise: InputPath | None = None
     """Table that `zonda noise` wrote: NET, knee and slope of each detector, above those of the file."""
     celestial: Literal["recorded", "recomputed"] | None = None
@@ -67,6 +87,9 @@ class RecordedFiles(Operator):
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
     """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
 
+    _scans: dict[int, list[File]] = PrivateAttr(default_factory=dict)
+    """By the observations' numbers."""
+
     @field_validator("file")
     @classmethod
     def _some_files(cls, value: Any) -> Any:
@@ -80,9 +103,15 @@ class RecordedFiles(Operator):
         return None if isinstance(value, str) and value.strip().lower() == "none" else value
 
     def own_scene(self, given: Instrument | None) -> Mapping[str, Any]:
-        """Instrument, site and start of the first file; what it does not state of the instrument is that of ``given``."""
-        scan = self.scan(self.files[0], given)
-        return {"site": site_of(scan.tod), "instrument": scan.instrument, "time": Instant.parse(scan.tod.start)}
+        """Instrument, site and start of the first scan; what it does not state of the instrument is that of ``given``.
+
+        The camera has all bands of that scan; only one where ``given`` is the camera of a band.
+        """
+        scan = next(self.scans(given))
+        cameras = [camera for part in scan for camera in part.cameras]
+        chosen = next((camera for camera in cameras if camera.has_the_detectors_of(given)), None)
+        instrument = chosen or joined(cameras, f"{self.label}, {scan[0].path}")
+        return {"site": site_of(scan[0].tod), "instrument": instrument, "time": Instant.parse(scan[0].tod.start)}
 
     def scene(self, **more: Any) -> Any:
         """A `Scene` of the file, for `Pipeline.run`: its instrument, site and start, and ``more`` (seed, target, weather).
@@ -98,7 +127,47 @@ class RecordedFiles(Operator):
         """The files in their order."""
         return list(self.file) if isinstance(self.file, list) else [self.file]
 
-    def scan(self, path: Path, given: Instrument | None) -> RecordedScan:
+    def open(self, observation: Observation) -> RecordedStream | None:
+        """The stream of an observation of one band, to be read; None: it is not of these files, or none is wanted."""
+        file = self.file_of(observation)
+        if file is None or self.signal is None:
+            return None
+        opened = reader(file.path)
+        try:
+            rows = np.array([file.rows[name] for name in observation.focalplane.names], np.intp)
+            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask))
+        except BaseException:
+            opened.close()
+            raise
+
+    def file_of(self, observation: Observation) -> File | None:
+        """The file with the detectors of an observation of one band; None: it is not of these files."""
+        first = observation.focalplane.names[0]
+        return next((file for file in self._scans.get(observation.index, ()) if first in file.rows), None)
+
+    def scans(self, given: Instrument | None) -> Iterator[Scan]:
+        """The scans in the order of their first files."""
+        return ([self._part(path, given) for path in paths] for paths in self._by_scan())
+
+    def _by_scan(self) -> list[list[Path]]:
+        """The files of each scan: those with the same times and other bands."""
+        found: list[list[Path]] = []
+        open_ones: dict[Any, list[tuple[set[int], list[Path]]]] = {}
+        told = [(path, *_told(path, _stamp(path))) for path in self.files]
+        if (wanted := self.band) is not None:  # where no file has it, the first is refused
+            told = [one for one in told if any(is_near(mhz * 1e6, wanted) for mhz in one[2])] or told[:1]
+        for path, times, bands in told:
+            same = open_ones.setdefault(times, [])
+            beside = next(((known, paths) for known, paths in same if bands and not known & bands), None)
+            if beside is None:
+                beside = set(), []
+                same.append(beside)
+                found.append(beside[1])
+            beside[0].update(bands)
+            beside[1].append(path)
+        return found
+
+    def _part(self, path: Path, given: Instrument | None) -> RecordedScan:
         """All but the stream of a file. Raises InputError where it cannot be used."""
         place = f"{self.label}, {path}"
         tod, streams = _head(path, _stamp(path))
@@ -106,10 +175,10 @@ class RecordedFiles(Operator):
             have = ", ".join(sorted(streams)) or "none"
             cure = f"set signal to one of: {have}; or signal: none for the pointing alone"
             raise InputError(f"has no stream {self.signal!r}", place=place, cure=cure)
-        rows = rows_of_band(tod, self.band, place)
+        rows = rows_of_bands(tod, self.band, place)
         table = read_noise(self.noise) if self.noise is not None else None
-        tod, noise = _with_noise(tod, table, rows, place)
-        return RecordedScan(path, tod, rows, instrument_of(tod, rows, given, place), noise)
+        tod, noise = _with_noise(tod, table, np.concatenate(rows), place)
+        return RecordedScan(path, tod, tuple(instrument_of(tod, r, given, place) for r in rows), tuple(rows), noise)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -118,6 +187,15 @@ def _stamp(path: Path) -> tuple[int, int]:
     except OSError as err:
         raise InputError(f"cannot be read: {err.strerror}", place=str(path), cure="was it moved or removed?") from None
     return stat.st_size, stat.st_mtime_ns
+
+
+@lru_cache(maxsize=MOST_FILES)
+def _told(path: Path, stamp: tuple[int, int]) -> tuple[tuple[str, bytes], frozenset[int]]:
+    """Telescope and times of a file, in short; its bands, MHz."""
+    tod, _ = _head(path, stamp)
+    every = rows_of_bands(tod, None, str(path)) if "band_centre" in tod.columns else []
+    centres = (round(float(np.median(tod.columns["band_centre"][rows])) / 1e6) for rows in every)
+    return (tod.telescope, hashlib.sha256(tod.times.tobytes()).digest()), frozenset(centres)
 
 
 @lru_cache(maxsize=NEW_SCANS)

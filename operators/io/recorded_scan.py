@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from pydantic import PrivateAttr
 
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.focalplane import Focalplane
-from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.instrument import Band, CameraBand, Instrument, Telescope
 from zonda.core.registry import sites
 from zonda.core.scene import HIGHER, NEAR, distance
 from zonda.core.site import Site
@@ -20,25 +21,43 @@ from zonda.core.types import Floats
 from .time_ordered_data import TimeOrderedData
 
 LIGHT = 299792458.0
-SAME_BAND = 1e-3
-"""Relative difference of centres up to which detectors are of one band."""
+SAME_BAND = 1e-2
+"""Relative difference of neighbouring centres up to which detectors are of one band."""
+NEAR_BAND = 0.05
+"""Relative difference of centres up to which a band is the one that was named."""
 
 NO_NOISE = "the file states none: NET 0, and all detectors weigh the same"
 
 
 class RecordedInstrument(Instrument):
-    """A camera whose detectors are those of a file."""
+    """A camera whose detectors are those of files."""
 
-    _plane: Focalplane = PrivateAttr()
+    _planes: dict[str, Focalplane] = PrivateAttr(default_factory=dict)
+    """The detectors of each band, by its name."""
+
+    @property
+    def cameras(self) -> dict[str, Instrument]:
+        """By name of the band, the camera that has this band alone."""
+        found = super().cameras
+        for name, camera in found.items():
+            assert isinstance(camera, RecordedInstrument)
+            camera._planes = {name: self._planes[name]}
+        return found
 
     def focalplane(self) -> Focalplane:
-        """The file's detectors."""
-        return self._plane.copy()
+        """The files' detectors; several bands follow each other."""
+        planes = list(self._planes.values())
+        return planes[0].copy() if len(planes) == 1 else Focalplane.of_bands(self._planes, suffix=False)
+
+    def has_the_detectors_of(self, other: Instrument | None) -> bool:
+        """Whether the other is recorded too, and has the same detectors."""
+        return isinstance(other, RecordedInstrument) and self.focalplane().names == other.focalplane().names
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RecordedInstrument) or self.model_dump() != other.model_dump():
             return False
-        return all(np.array_equal(v, vars(other._plane)[k]) for k, v in vars(self._plane).items())
+        pairs = zip(self._planes.values(), other._planes.values(), strict=True)
+        return all(np.array_equal(v, vars(theirs)[k]) for ours, theirs in pairs for k, v in vars(ours).items())
 
     def __hash__(self) -> int:
         return hash((self.name, self.detectors))
@@ -62,50 +81,80 @@ def site_of(tod: TimeOrderedData) -> Site:
     return Site(**given)
 
 
-def rows_of_band(tod: TimeOrderedData, band: str | None, place: str) -> NDArray[np.intp]:
-    """Rows of the detectors of one band; ``band``: its centre in GHz, where the file has several.
+def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[NDArray[np.intp]]:
+    """Rows of the detectors of each band, in the order of their centres; ``band``: centre [Hz] of the only one that is used.
 
-    Raises InputError for a file of several bands where none is chosen, or one that is not there.
+    Raises InputError where there is no such band.
     """
-    every = np.arange(tod.n_detectors)
     centre = tod.columns.get("band_centre")
     if centre is None:
-        return every
-    centres = _distinct(centre)
-    names = ", ".join(f"{c / 1e9:.4g} GHz" for c in centres)
+        return [np.arange(tod.n_detectors)]
+    order = np.argsort(centre, kind="stable")
+    steps = np.flatnonzero(np.diff(centre[order]) > SAME_BAND * centre[order][:-1]) + 1
+    every = [np.sort(rows) for rows in np.split(order, steps)]
     if band is None:
-        if len(centres) > 1:
-            cure = f"set band, e.g. band: {centres[0] / 1e9:.4g} GHz: one run for each"
-            raise InputError(f"has detectors of {len(centres)} bands: {names}", place=place, cure=cure)
         return every
-    try:
-        wanted = float(band.lower().removesuffix("ghz")) * 1e9
-    except ValueError:
-        raise InputError(f"{band!r} is no frequency", place=place, cure=f"choose the centre of a band: {names}") from None
-    rows = np.flatnonzero(np.abs(centre / wanted - 1) < 0.05)
-    near = [c for c in centres if abs(c / wanted - 1) < 0.05]
+    centres = [float(np.median(centre[rows])) for rows in every]
+    cure = f"choose the centre of a band: {', '.join(f'{c / 1e9:.4g} GHz' for c in centres)}"
+    near = [rows for rows, c in zip(every, centres, strict=True) if is_near(c, band)]
     if len(near) != 1:
-        raise InputError(f"has no band, or more than one, at {wanted / 1e9:g} GHz", place=place, cure=f"choose from: {names}")
-    return rows
+        raise InputError(f"has no band, or more than one, at {band / 1e9:g} GHz", place=place, cure=cure)
+    return near
 
 
-def _distinct(centres: Floats) -> list[float]:
-    found: list[float] = []
-    for centre in np.unique(centres):
-        if not found or centre / found[-1] - 1 > SAME_BAND:
-            found.append(float(centre))
-    return found
+def is_near(centre: float, band: float) -> bool:
+    """Whether ``band`` [Hz] names a band of this centre [Hz]."""
+    return abs(centre / band - 1) < NEAR_BAND
+
+
+def joined(cameras: Sequence[RecordedInstrument], place: str) -> RecordedInstrument:
+    """One camera of cameras of one band each, in the order of their centres. Raises InputError where two have one band."""
+    if len(cameras) == 1:
+        return cameras[0]
+    cameras = sorted(cameras, key=lambda camera: camera.band.centre)
+    first, bands = cameras[0], []
+    for camera in cameras:
+        own = {key: value for key, value in camera.model_dump(mode="json").items() if key in CameraBand.model_fields}
+        own |= camera.band.model_dump(mode="json", exclude_none=True)
+        bands.append(CameraBand.model_validate(own | {"name": _plain(camera.band.name)}))
+    names = [band.name for band in bands]
+    if len(set(names)) < len(names):
+        raise InputError(f"several bands are called {names[0]}", place=place, cure="set band, the centre of the one to be used")
+    planes = dict(zip(names, (camera.focalplane() for camera in cameras), strict=True))
+    made = first.model_copy(update={
+        "band": None, "bands": bands, "pixels": "overlaid", "fwhm": None,
+        "field_of_view": max(camera.field_of_view for camera in cameras),
+    })  # fmt: skip
+    made._planes = planes
+    try:
+        made.focalplane()
+    except InputError as err:
+        raise InputError(err.message, place=place, cure="give every detector a name of its own") from None
+    return made
+
+
+def _plain(name: str) -> str:
+    """A name that products and files can bear."""
+    return re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
+
+
+def band_of(instrument: Instrument | None, centre: float) -> Instrument | None:
+    """The camera, of one band, that ``instrument`` has nearest to ``centre`` [Hz]."""
+    if instrument is None or not instrument.bands:
+        return instrument
+    return min(instrument.cameras.values(), key=lambda camera: abs(camera.band.centre - centre))
 
 
 def instrument_of(tod: TimeOrderedData, rows: NDArray[np.intp], given: Instrument | None, place: str) -> RecordedInstrument:
-    """The camera that the file describes; what it does not state is taken from ``given``, the scene's.
+    """The camera of one band that the file describes; what it does not state is taken from ``given``, the scene's.
 
     Raises InputError where neither states the beam, or a column is not finite.
     """
     columns = {name: values[rows] for name, values in tod.columns.items()}
+    given = band_of(given, float(np.median(columns.get("band_centre", np.zeros(1)))))
     plane = _focalplane(tod, columns, rows, given, place)
     fwhm = float(np.median(plane.fwhm))
-    band = _band(columns, given, place)
+    band = _band(tod, columns, given, place)
     diameter = tod.metadata.get("telescope_diameter")
     if diameter is None:
         diameter = 1.22 * LIGHT / band.centre / fwhm if given is None else given.telescope.diameter
@@ -131,12 +180,12 @@ def instrument_of(tod: TimeOrderedData, rows: NDArray[np.intp], given: Instrumen
         sample_rate=f"{tod.sample_rate!r} Hz",
         provenance="the file of time-ordered data",
     )
-    made._plane = plane
+    made._planes = {band.name: plane}
     return made
 
 
-def _band(columns: Mapping[str, Floats], given: Instrument | None, place: str) -> Band:
-    """The passband: flat, of the file's centre and width."""
+def _band(tod: TimeOrderedData, columns: Mapping[str, Floats], given: Instrument | None, place: str) -> Band:
+    """The passband: flat, of the file's centre and width. It has the name that a file of zonda states, or f150 at 150 GHz."""
     if not {"band_centre", "band_width"} <= set(columns):
         if given is None:
             cure = "give the scene an instrument with its band"
@@ -149,7 +198,13 @@ def _band(columns: Mapping[str, Floats], given: Instrument | None, place: str) -
         cure = "mend bandcenter and bandwidth, or leave them out and give the scene an instrument"
         raise InputError(f"states a band of {width / 1e9:g} GHz about {centre / 1e9:g} GHz", place=place, cure=cure)
     low, high = centre - width / 2, centre + width / 2
-    return Band(name=f"{centre / 1e9:.4g} GHz", low=f"{low!r} Hz", high=f"{high!r} Hz", provenance="flat, of the file's width")
+    own = str(tod.metadata.get("band", "")) if len(columns["band_centre"]) == tod.n_detectors else ""
+    return Band(
+        name=_plain(own) or f"f{int(round(centre / 1e9, 6) + 0.5):03d}",
+        low=f"{low!r} Hz",
+        high=f"{high!r} Hz",
+        provenance="flat, of the file's width",
+    )
 
 
 def _focalplane(

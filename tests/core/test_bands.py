@@ -198,12 +198,25 @@ def test_the_plan_of_a_file_with_several_bands(tmp_path: Path) -> None:
     assert zonda.load(again).scene().instrument == zonda.load(file).scene().instrument
 
 
-def test_steps_that_read_streams_from_files_are_refused() -> None:
-    class Reader(zonda.PointingStare):
-        provides = frozenset({"boresight", "signal"})
+def test_a_step_that_points_and_makes_a_stream_observes_all_bands_and_then_each() -> None:
+    seen = []
 
-    with pytest.raises(ZondaError, match="cannot for a camera of several bands"):
-        zonda.Pipeline([Reader(), zonda.BinMap()]).run(scene("f090", "f150"))
+    class Reader(zonda.PointingStare):
+        provides = frozenset({"boresight", zonda.Component("recorded", "calibrated")})
+
+        def observe(self, data: Any) -> None:
+            seen.append(data.band)
+            if not data.band:
+                super().observe(data)
+
+        def exec(self, block: Any, state: Any) -> None:
+            block.new("recorded")[...] = block.observation.instrument.band.centre / 1e11
+
+    data = zonda.Pipeline([Reader(), zonda.BinMap(pixel="1 arcmin")]).run(scene("f090", "f150"), threads=1)
+    assert seen == ["", "f090", "f150"]
+    for name, camera in data.scene.instrument.cameras.items():
+        found = data[f"map_{name}"].signal
+        np.testing.assert_allclose(found[np.isfinite(found)], camera.band.centre / 1e11, rtol=1e-6)  # float32
 
 
 def test_a_product_name_that_a_band_takes_is_refused() -> None:

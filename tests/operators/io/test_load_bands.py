@@ -1,0 +1,179 @@
+"""Recorded data of cameras with several bands: one run gives the maps of all of them, each as it is alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import zonda
+from zonda.core.configuration.pipeline_file import parse
+from zonda.core.errors import InputError
+from zonda.core.flags import INVALID
+from zonda.operators.io.save_tod import load_tod, save_tod
+
+pytestmark = pytest.mark.filterwarnings("ignore:Pointing")
+
+CAMERA = {
+    "name": "camera",
+    "telescope": {"name": "dish", "diameter": "6 m"},
+    "bands": [
+        {"name": "f090", "low": "77 GHz", "high": "106 GHz", "net": "300 uK s(1/2)", "detectors": 7, "knee": "0.3 Hz"},
+        {"name": "f150", "low": "130 GHz", "high": "170 GHz", "net": "360 uK s(1/2)", "detectors": 12, "fwhm": "1.5 arcmin"},
+    ],
+    "pixels": "overlaid",
+    "field_of_view": "1 deg",
+    "main_beam_efficiency": 0.7,
+    "illumination_efficiency": 0.9,
+    "sample_rate": "40 Hz",
+}
+SCENE = {"site": "atacama", "instrument": CAMERA, "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
+SCAN = {"throw": "4 deg", "speed": "1 deg/s", "acceleration": "1 deg/s2", "scan_duration": "30 s", "check_limits": "warn"}
+MAP = zonda.BinMap(pixel="5 arcmin")
+PLANES = ("signal", "hits", "weights", "noise")
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: Any) -> Any:
+    """Two scans of two bands, each saved to a file of its own, behind a filter."""
+    folder = tmp_path_factory.mktemp("night")
+    steps = [
+        zonda.PointingBackAndForth(scans=2, **SCAN),
+        zonda.AtmosphereLayers(layers=1),
+        zonda.WhiteNoise(),
+        zonda.PinkNoise(),
+        zonda.Efficiency(),
+        zonda.HighpassFilter(frequency="0.2 Hz"),
+        zonda.SaveTOD(),
+        MAP,
+    ]
+    data = zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=folder, threads=1)
+    return data, sorted(folder.glob("tod_*"))
+
+
+def load(file: Any, *steps: Any, scene: Any = None, threads: int = 1, **load: Any) -> Any:
+    step = zonda.LoadTOD(file=file, **load)
+    return zonda.Pipeline([step, *(steps or (MAP,))]).run(scene or step.scene(), threads=threads)
+
+
+def one_file(files: list[Path], to: Path) -> Path:
+    """A scan's bands in one file, as other packages write them."""
+    tods = [load_tod(path) for path in files]
+    first = tods[0]
+    for name in ("quats", "offsets", "detector_flags"):
+        setattr(first, name, np.concatenate([getattr(tod, name) for tod in tods]))
+    first.names = [name for tod in tods for name in tod.names]
+    first.columns = {name: np.concatenate([tod.columns[name] for tod in tods]) for name in first.columns}
+    first.streams = {"signal": np.concatenate([tod.streams["signal"] for tod in tods])}
+    first.name, first.metadata = "whole", {k: v for k, v in first.metadata.items() if k != "band"}
+    return save_tod(to, first)
+
+
+def same(one: Any, other: Any, planes: tuple[str, ...] = PLANES) -> None:
+    for plane in planes:
+        np.testing.assert_array_equal(getattr(one, plane), getattr(other, plane), err_msg=plane)
+
+
+def test_the_saved_night_gives_the_maps_of_both_bands(night: Any) -> None:
+    data, files = night
+    found = load(files)
+    assert [o.name for o in found.observations] == [o.name for o in data.observations]
+    for band in ("f090", "f150"):
+        one, other = found[f"map_{band}"], data[f"map_{band}"]
+        same(one, other, PLANES[1:])
+        assert one.wcs.to_header_string() == other.wcs.to_header_string()
+        np.testing.assert_allclose(one.signal, other.signal, rtol=0, atol=1e-8)  # filtered samples of millikelvins in float32
+        assert np.nanstd(other.signal) > 1e-5
+    camera = found.scene.instrument
+    assert {name: (c.detectors, c.knee, c.fwhm) for name, c in camera.cameras.items()} == {
+        name: (c.detectors, c.knee, pytest.approx(c.beam_fwhm)) for name, c in data.scene.instrument.cameras.items()
+    }
+
+
+def test_order_of_files_and_threads_change_nothing(night: Any) -> None:
+    _, files = night
+    one = load(files)
+    for other in (load(files[::2] + files[1::2]), load(files, threads=2)):
+        for band in ("f090", "f150"):
+            same(one[f"map_{band}"], other[f"map_{band}"])
+
+
+def test_a_band_has_the_bits_that_it_has_alone(night: Any, tmp_path: Path) -> None:
+    _, files = night
+    whole = [one_file(files[2 * k : 2 * k + 2], tmp_path / f"{k}.h5") for k in range(2)]
+    steps = [zonda.HighpassFilter(frequency="0.5 Hz"), zonda.CommonModeFilter(), MAP]
+    both, apart = load(whole, *steps), load(files, *steps)
+    for number, (name, centre) in enumerate({"f092": "92 GHz", "f150": "150 GHz"}.items()):  # named by their centres
+        alone = load(whole, *steps, band=centre)
+        same(alone["map"], both[f"map_{name}"])
+        own = ("f090", "f150")[number]
+        same(alone["map"], apart[f"map_{own}"])
+        same(alone["map"], load(files, *steps, band=centre)["map"])
+        same(alone["map"], load(files[number::2], *steps)["map"])
+
+
+def test_another_instrument_in_the_scene_is_not_used(night: Any) -> None:
+    _, files = night
+    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-06-25T07:00")
+    found = load(files, scene=scene)
+    same(found["map_f150"], load(files)["map_f150"])
+    assert ("LoadTOD", "instrument", "camera, the file's; the scene's mustang2 is not used") in list(found.tally)
+
+
+def test_every_band_has_the_flags_of_its_file(night: Any, tmp_path: Path) -> None:
+    _, files = night
+    tod = load_tod(files[1])
+    tod.flags[200:300] |= INVALID
+    flagged = save_tod(tmp_path / "flagged.h5", tod)
+    found, whole = load([files[0], flagged]), load(files[:2])
+    same(found["map_f090"], whole["map_f090"])
+    assert whole["map_f150"].hits.sum() - found["map_f150"].hits.sum() == 100 * 12
+
+
+def test_a_twin_of_both_bands(night: Any) -> None:
+    """On the recorded pointing, with the NETs of the file; a band's numbers are those that it draws alone."""
+    _, files = night
+    steps = [zonda.WhiteNoise(), zonda.Efficiency(), MAP]
+    twin, alone = load(files, *steps, signal="none"), load(files[1::2], *steps, signal="none")
+    same(twin["map_f150"], alone["map"])
+    for band, net in (("f090", 3e-4), ("f150", 3.6e-4)):
+        found = twin[f"map_{band}"]
+        good = found.hits > 20
+        np.testing.assert_allclose(found.noise[good], net * np.sqrt(40 / found.hits[good]), rtol=1e-6)
+
+
+def test_a_pipeline_file_is_checked_planned_and_run(night: Any, tmp_path: Path) -> None:
+    from zonda.core import cli
+
+    _, files = night
+    listed = ", ".join(map(str, files))
+    path = tmp_path / "bands.yaml"
+    path.write_text(f"operators:\n  - LoadTOD: {{file: [{listed}]}}\n  - BinMap: {{pixel: 5 arcmin}}\n  - SaveMap\n")
+    file = parse(path.read_text())
+    assert parse(file.resolved_yaml()).scene().model_dump() == file.scene().model_dump()
+    for command in ("check", "plan", "run"):
+        more = ["--output", str(tmp_path / "out")] if command == "run" else []
+        assert cli.main([command, str(path), *more]) == 0, command
+    assert cli.main(["run", str(path), "--output", str(tmp_path / "workers"), "--workers", "2"]) == 0
+    for band in ("f090", "f150"):
+        one, other = (fits.getdata(tmp_path / folder / f"map_{band}.fits") for folder in ("out", "workers"))
+        np.testing.assert_array_equal(one, other)
+        assert np.isfinite(one).any()
+
+
+def test_what_does_not_fit_together(night: Any, tmp_path: Path) -> None:
+    _, files = night
+    with pytest.raises(InputError, match="first scan with camera at 150 GHz") as caught:
+        load(files[:3])  # the second scan lacks a band
+    assert "all bands of each scan" in caught.value.cure
+    tod = load_tod(files[1])
+    tod.boresight_radec = tod.boresight_radec[:, [1, 0, 3, 2]]
+    elsewhere = save_tod(tmp_path / "elsewhere.h5", tod)
+    with pytest.raises(InputError, match="looks elsewhere than"):
+        load([files[0], elsewhere])
+    with pytest.raises(InputError, match="at 220 GHz") as caught:
+        load(files, band="220 GHz")
+    assert "91.5 GHz" in caught.value.cure
