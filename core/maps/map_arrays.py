@@ -142,7 +142,8 @@ class MapArrays:
             return self.pixel**2
         if self.projection == "CAR":
             return 2 * self.pixel * math.sin(self.pixel / 2) * np.cos(self.latitudes)[:, None]
-        return self.pixel**2 * np.cos(self.distance()) ** 3
+        cosine = np.cos(self.distance())
+        return self.pixel**2 * cosine * cosine * cosine  # numpy's power takes four times as long
 
     @property
     def resolution(self) -> float:

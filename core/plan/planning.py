@@ -24,7 +24,8 @@ class Planning(Generic[O]):
     Attributes
     ----------
     of
-        The class of the operator; those derived from it inherit its planning.
+        The class of the operator, or ``module:class`` where it need not be imported for the planning of others; classes derived
+        from it inherit its planning.
     cost
         What it costs, where that is the same for every scene.
     knobs
@@ -37,7 +38,7 @@ class Planning(Generic[O]):
         What lessens its `memory`, in a few words (``choose a larger pixel``), for a run that does not fit.
     """
 
-    of: ClassVar[type[Operator]]
+    of: ClassVar[type[Operator] | str]
     cost: ClassVar[Cost | None] = None
     knobs: ClassVar[tuple[Knob, ...]] = ()
     reads_streams: ClassVar[bool] = False
@@ -94,6 +95,6 @@ def planning_class(operator: type[Operator]) -> type[Planning[Any]]:
                 found: type[Planning[Any]] = planning.get(cls.__name__)
             except RegistryError:
                 continue
-            if found.of is cls:
+            if found.of in (cls, f"{cls.__module__}:{cls.__qualname__}"):
                 return found
     return Planning

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,6 @@ from .averaging import shares
 from .drawing import in_time_order
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
-from .screens import AtmosphereScreens
 from .turbulence.geometry import ScanPlane, axes, crossing, rays
 from .turbulence.levels import FIDELITIES
 from .turbulence.nodes import Layer, differential_rms, spread_evenly
@@ -372,10 +372,10 @@ def _slopes(context: Context, a: Calibrated) -> list[Effect]:
     ]  # fmt: skip
 
 
-class ScreensPlanning(Planning[AtmosphereScreens]):
+class ScreensPlanning(Planning[Any]):
     """A cost for the whole run."""
 
-    of = AtmosphereScreens
+    of = "zonda.operators.atmosphere.screens:AtmosphereScreens"
     cost = Cost(once=0.3, kernel="python")
     holds = 100_000_000
     """The fields and the tiles of the turbulence about them."""

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from zonda.core.data import Observation
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Estimate
 from zonda.core.plan.planning import Planning
 
-from .compare_maps import CompareMaps
-from .compare_streams import LEAST_SEGMENTS, CompareStreams
 from .map_spectra import MapSpectrum
-from .measure_figures import MeasureFigures
-from .mode_spectrum import ModeSpectrum
 from .plot_operators import Plots
 from .power_spectrum import CHUNK, PowerSpectrum
 from .report import Report
@@ -47,19 +45,19 @@ class TransferFunctionPlanning(Planning[TransferFunction]):
     """Fourier transforms of the maps."""
 
 
-class MeasureFiguresPlanning(Planning[MeasureFigures]):
+class MeasureFiguresPlanning(Planning[Any]):
     """A cost for the whole run, without that of the signals that the metrics need."""
 
-    of = MeasureFigures
+    of = "zonda.operators.diagnostics.measure_figures:MeasureFigures"
     cost = Cost(once=0.1, kernel="python")
     holds = 20_000_000
     """Smoothed maps, and Fourier transforms of maps."""
 
 
-class ModeSpectrumPlanning(Planning[ModeSpectrum]):
+class ModeSpectrumPlanning(Planning[Any]):
     """It reads the streams twice; its cost is that of the covariance."""
 
-    of = ModeSpectrum
+    of = "zonda.operators.diagnostics.mode_spectrum:ModeSpectrum"
     reads_streams = True
 
     def _rows(self, observation: Observation) -> int:
@@ -76,10 +74,10 @@ class ModeSpectrumPlanning(Planning[ModeSpectrum]):
         return Estimate((), Cost(fixed=1e-9 * rows**3, per_sample=5e-9 + 1e-10 * rows**2 / context.first.n_detectors))
 
 
-class CompareMapsPlanning(Planning[CompareMaps]):
+class CompareMapsPlanning(Planning[Any]):
     """A cost for the whole run."""
 
-    of = CompareMaps
+    of = "zonda.operators.diagnostics.compare_maps:CompareMaps"
     cost = Cost(once=0.5, kernel="python")
     holds = 60_000_000
     """Planes and Fourier transforms of two maps."""
@@ -113,15 +111,17 @@ class PowerSpectrumPlanning(Planning[PowerSpectrum]):
         return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.operator.detectors / context.first.n_detectors) * 14))
 
 
-class CompareStreamsPlanning(Planning[CompareStreams]):
+class CompareStreamsPlanning(Planning[Any]):
     """It reads two streams of the detectors it looks at; its cost is that of their transforms."""
 
-    of = CompareStreams
+    of = "zonda.operators.diagnostics.compare_streams:CompareStreams"
     reads_streams = True
 
     def memory(self, observation: Observation) -> int:
         """Segments of a detector and their transforms, and the spectra of all."""
         count = min(observation.n_detectors, self.operator.detectors)
+        from .compare_streams import LEAST_SEGMENTS
+
         length = min(observation.n_samples / LEAST_SEGMENTS, self.operator.segment * observation.sample_rate)
         return round(16 * observation.n_samples + (64 * CHUNK + 16 * count) * length)
 

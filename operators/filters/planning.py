@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +17,8 @@ from zonda.core.plan.planning import Planning
 from .baseline import ROWS
 from .bessel import amplitude
 from .common_mode import CommonModeFilter
-from .despline import Despline
-from .detrend import Detrend
 from .gram import MOST_COPIED
-from .ground import GroundFilter
 from .highpass import HighpassFilter
-from .polynomial import PolynomialFilter
-from .taper import Taper
 
 LANCZOS = 0.5e-9
 """Seconds per sample of one Lanczos step, which reads the stream once."""
@@ -76,10 +72,10 @@ class HighpassPlanning(Planning[HighpassFilter]):
         return Estimate((effect,), cost, _left_in(context))
 
 
-class DetrendPlanning(Planning[Detrend]):
+class DetrendPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = Detrend
+    of = "zonda.operators.filters.detrend:Detrend"
 
     def memory(self, observation: Observation) -> int:
         """The polynomials; the pointing of a mask; parts in float64."""
@@ -91,10 +87,10 @@ class DetrendPlanning(Planning[Detrend]):
         return Estimate((), Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=4e-9 + 2e-9 * functions))
 
 
-class PolynomialPlanning(Planning[PolynomialFilter]):
+class PolynomialPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = PolynomialFilter
+    of = "zonda.operators.filters.polynomial:PolynomialFilter"
 
     def memory(self, observation: Observation) -> int:
         """The polynomials; the pointing of a mask; parts in float64."""
@@ -107,10 +103,10 @@ class PolynomialPlanning(Planning[PolynomialFilter]):
         return Estimate((), cost, _left_in(context))
 
 
-class GroundPlanning(Planning[GroundFilter]):
+class GroundPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = GroundFilter
+    of = "zonda.operators.filters.ground:GroundFilter"
 
     def memory(self, observation: Observation) -> int:
         """The trend, twice; bins; parts in float64."""
@@ -128,10 +124,10 @@ def _left_in(context: Context) -> dict[str, float]:
     return {m: size[m] + context.mean_emission for m in size} | context.sky_error(1.0)
 
 
-class DesplinePlanning(Planning[Despline]):
+class DesplinePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = Despline
+    of = "zonda.operators.filters.despline:Despline"
     cost = Cost(fixed=0.01, per_time=1e-7, per_sample=1.4e-8)
 
     def memory(self, observation: Observation) -> int:
@@ -139,10 +135,10 @@ class DesplinePlanning(Planning[Despline]):
         return 8 * (5 + ROWS) * observation.n_samples
 
 
-class TaperPlanning(Planning[Taper]):
+class TaperPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = Taper
+    of = "zonda.operators.filters.taper:Taper"
     cost = Cost(fixed=0.001, per_time=2e-8, per_sample=1e-9)
 
     def memory(self, observation: Observation) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from zonda.core.observation import Observation
@@ -11,9 +13,6 @@ from zonda.core.plan.estimate import Cost, Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency
-from .ground_pickup import GroundPickup
-from .half_wave_plate import HalfWavePlate
-from .leakage import Leakage
 from .quotient import AT_ONCE
 
 
@@ -36,10 +35,10 @@ class EfficiencyPlanning(Planning[Efficiency]):
         return Estimate((), Cost(0.005, 1e-8, 0.9e-9))
 
 
-class GroundPlanning(Planning[GroundPickup]):
+class GroundPlanning(Planning[Any]):
     """It has no coarser form."""
 
-    of = GroundPickup
+    of = "zonda.operators.optics.ground_pickup:GroundPickup"
 
     def traits(self, observation: Observation) -> Traits:
         """Its rms."""
@@ -64,10 +63,10 @@ class GroundPlanning(Planning[GroundPickup]):
         return step.rms * (1 + 3 * step.scatter) * float(np.max(ends**step.power)) * calibration(observation)
 
 
-class HalfWavePlatePlanning(Planning[HalfWavePlate]):
+class HalfWavePlatePlanning(Planning[Any]):
     """Angles of one plate; what they do is done where the sky is sampled and mapped."""
 
-    of = HalfWavePlate
+    of = "zonda.operators.optics.half_wave_plate:HalfWavePlate"
     cost = Cost(0.001, 3e-8, 0.0)
 
     def memory(self, observation: Observation) -> int:
@@ -75,10 +74,10 @@ class HalfWavePlatePlanning(Planning[HalfWavePlate]):
         return 8 * observation.n_samples
 
 
-class LeakagePlanning(Planning[Leakage]):
+class LeakagePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = Leakage
+    of = "zonda.operators.optics.leakage:Leakage"
 
     def memory(self, observation: Observation) -> int:
         """The plate's angles."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +16,8 @@ from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
 from .brightness import conversion
-from .cmb import CMBSky, read_spectrum
 from .convolved import beam_widths, brightness_on, grid_of
 from .grid import Grid
-from .point_sources import Catalogue, PointSources, Sources
 from .resample import extremes
 from .skymap import SkyMap
 
@@ -134,10 +133,10 @@ class SkyPlanning(Planning[SkyMap]):
         return Effect("sampling order", tuple(choices), bound, text)
 
 
-class SourcesPlanning(Planning[PointSources]):
+class SourcesPlanning(Planning[Any]):
     """Exact but for the beam, which is one for the band."""
 
-    of = PointSources
+    of = "zonda.operators.sky.point_sources:PointSources"
 
     def traits(self, observation: Observation) -> Traits:
         """Brightness of the brightest source in the smallest beam."""
@@ -161,23 +160,29 @@ class SourcesPlanning(Planning[PointSources]):
         return Estimate((effect,), cost)
 
     def _catalogue_size(self) -> int:
+        from .point_sources import Catalogue
+
         return len(Catalogue.read(self.operator).flux)
 
     def _seen(self, observation: Observation) -> tuple[Floats, int]:
         """Power of the sources that come into view, K_RJ sr; and how long the lists of them are."""
+        from .point_sources import Catalogue, Sources
+
         catalogue = Catalogue.read(self.operator)
         power = catalogue.brightness(observation.instrument.band, self.operator.scale)
         found = Sources.of(catalogue, power, observation)
         return power[np.unique(found.number)], len(found.number)
 
 
-class CMBPlanning(Planning[CMBSky]):
+class CMBPlanning(Planning[Any]):
     """It has no coarser form. The map is not drawn for it."""
 
-    of = CMBSky
+    of = "zonda.operators.sky.cmb:CMBSky"
 
     def traits(self, observation: Observation) -> Traits:
         """Four and a half standard deviations of the sky, which is larger than 1 K_RJ per K_CMB nowhere."""
+        from .cmb import read_spectrum
+
         spectra = read_spectrum(str(self.operator.spectrum))
         ell = np.arange(spectra.shape[1])
         return Traits(peak=4.5 * math.sqrt(float(((2 * ell + 1) * spectra[0]).sum()) / (4 * math.pi)))

@@ -5,7 +5,7 @@ import pytest
 
 import zonda
 from zonda.core.instrument import Band, Instrument, Telescope
-from zonda.operators.atmosphere.closed_form import KNOTS, between_knots, layer_spectrum
+from zonda.operators.atmosphere.closed_form import KNOTS, WAVE_NUMBERS, between_knots, layer_spectrum
 from zonda.operators.atmosphere.turbulence.beams import Aperture
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, mixture
 from zonda.operators.atmosphere.turbulence.nodes import Layer
@@ -50,6 +50,18 @@ def test_its_sum_of_gaussians_is_fine_enough():
     seen = fine > 1e-12 * fine[0]
     assert f[seen].max() > 0.15
     np.testing.assert_allclose(layer_spectrum(layer(), f[seen], np.array([speed])), fine[seen], rtol=1e-6)
+
+
+def test_many_speeds_share_one_table():
+    """Against the sum over the speeds; the error is that of `test_between_knots_it_is_the_law_itself` times (h / 0.059)^2."""
+    f, speeds = np.geomspace(0.004, 50, 100), np.geomspace(5.0, 20.0, 64)
+    found = layer_spectrum(layer(), f, speeds)
+    direct = np.mean([layer_spectrum(layer(), f, np.array([v])) for v in speeds], axis=0)
+    assert f.size * speeds.size > WAVE_NUMBERS
+    seen = direct > 1e-6 * direct[0]
+    # h = ln(50 / 0.004 x 4) / 640 = 0.017: 0.012 times 0.083
+    np.testing.assert_allclose(found[seen], direct[seen], rtol=1e-3)
+    assert not np.array_equal(found, direct)
 
 
 # ---- between knots
