@@ -12,7 +12,7 @@ from ..data import Data, Observation
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
-from ..run.bands import check_steps, data_of_bands, distribute, points
+from ..run.bands import data_of_bands, distribute, of_one_band, points
 from ..run.signals import note_signals
 from ..scene import Scene
 from ..signal import is_stream
@@ -29,14 +29,13 @@ def observed(operators: Sequence[Operator], scene: Scene, band: str = "") -> Dat
     """What operators observe; of a camera of several bands this ``band``, its detectors where they are in the whole camera."""
     data = Data(scene=scene)
     if band:
-        check_steps([*operators])
         for operator in filter(points, operators):
             operator.observe(data)
         bands = data_of_bands(data)
         distribute(data, [*bands.values()])
         for scan, whole in zip(bands[band].observations, data.observations, strict=True):
             scan.tally.update(whole.tally)
-        data, operators = bands[band], [o for o in operators if not points(o)]
+        data, operators = bands[band], [o for o in operators if of_one_band(o)]
     for operator in operators:
         operator.observe(data)
     return data
