@@ -38,6 +38,9 @@ SPOILT = "samples not finite"
 ROWS = 32
 """Detectors that are worked on in float64 at a time."""
 
+AT_ONCE = 1024
+"""Samples whose functions stay in the first cache for all rows: those of a scan of half an hour exceed the second."""
+
 DETERMINED = 1e-14
 """Eigenvalues of B_g B_g^T below this share of the largest count as zero."""
 
@@ -106,19 +109,30 @@ class Fit:
 
         Returns how many samples were not finite; they stay as they were.
         """
-        spoilt = 0
+        plain, spoilt = np.ones(len(rows), bool), 0
         for d, row in enumerate(rows):
+            finite = np.isfinite(row)
+            plain[d] = finite.all() and not (masked is not None and masked[d].any())
+            if plain[d]:
+                continue
             use, inverse = self.use, self.inverse
-            if not (finite := np.isfinite(row)).all():
+            if not finite.all():
                 use = use & finite
                 inverse = self.basis.inverse(use)
                 spoilt += int(np.count_nonzero(~finite))
             if masked is not None and masked[d].any():
                 use, inverse = self._outside(use, inverse, masked[d])
-            sums = np.zeros(self.basis.size)
-            _sums(row, use, self.basis.first, self.basis.weights, sums)
-            _subtract(row, self.basis.first, self.basis.weights, inverse @ sums)
+            self._remove(rows, np.array([d]), use, inverse)
+        self._remove(rows, np.flatnonzero(plain), self.use, self.inverse)
         return spoilt
+
+    def _remove(self, rows: Floats, which: NDArray[np.intp], use: Mask, inverse: Floats) -> None:
+        """Equation (1) on the ``rows`` of these numbers, all of which use the same samples."""
+        basis, sums = self.basis, np.zeros((len(which), self.basis.size))
+        _sums(rows, which, use, basis.first, basis.weights, sums)
+        for own in sums:
+            own[:] = inverse @ own
+        _subtract(rows, which, basis.first, basis.weights, sums)
 
     def _outside(self, use: Mask, inverse: Floats, masked: Mask) -> tuple[Mask, Floats]:
         """Samples to use outside of a mask (N,), and their inverse; those that are given where equation (2) forbids it."""
@@ -164,17 +178,43 @@ def _normal(use, first, weights, normal):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _sums(row, use, first, weights, sums):  # type: ignore[no-untyped-def]
-    """sums += B_g x_g."""
-    for t in range(use.size):
-        if use[t]:
-            for i in range(weights.shape[1]):
-                sums[first[t] + i] += weights[t, i] * row[t]
+def _sums(rows, which, use, first, weights, sums):  # type: ignore[no-untyped-def]
+    """sums (n_row, K) += B_g x_g of the ``rows`` of the numbers ``which`` (n_row,)."""
+    taps, n = weights.shape[1], use.size
+    for low in range(0, n, AT_ONCE):
+        high = min(low + AT_ONCE, n)
+        k = 0
+        while k + 4 <= which.size:  # side by side: a sum waits for its last term
+            a, b, c, d = rows[which[k]], rows[which[k + 1]], rows[which[k + 2]], rows[which[k + 3]]
+            p, q, r, s = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
+            for t in range(low, high):
+                if use[t]:
+                    for i in range(taps):
+                        at, w = first[t] + i, weights[t, i]
+                        p[at] += w * a[t]
+                        q[at] += w * b[t]
+                        r[at] += w * c[t]
+                        s[at] += w * d[t]
+            k += 4
+        while k < which.size:
+            row, own = rows[which[k]], sums[k]
+            for t in range(low, high):
+                if use[t]:
+                    for i in range(taps):
+                        own[first[t] + i] += weights[t, i] * row[t]
+            k += 1
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _subtract(row, first, weights, coefficients):  # type: ignore[no-untyped-def]
-    """row -= B^T coefficients."""
-    for t in range(row.size):
-        for i in range(weights.shape[1]):
-            row[t] -= weights[t, i] * coefficients[first[t] + i]
+def _subtract(rows, which, first, weights, coefficients):  # type: ignore[no-untyped-def]
+    """Subtract B^T ``coefficients`` (n_row, K) from the ``rows`` of the numbers ``which`` (n_row,)."""
+    taps, n = weights.shape[1], first.size
+    for low in range(0, n, AT_ONCE):
+        high = min(low + AT_ONCE, n)
+        for k in range(which.size):
+            row, own = rows[which[k]], coefficients[k]
+            for t in range(low, high):
+                value = row[t]
+                for i in range(taps):
+                    value -= weights[t, i] * own[first[t] + i]
+                row[t] = value

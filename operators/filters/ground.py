@@ -120,16 +120,16 @@ class Template:
 
     def remove(self, rows: Floats) -> int:
         """Equation (1) on ``rows`` (n_det, n) in place. Returns how many samples were not finite; they stay as they were."""
-        spoilt = 0
-        for row in rows:
-            one = self
-            if not (finite := np.isfinite(row)).all():
-                one = Template.of(self.bins, self.raw, self.use & finite)
-                spoilt += int(np.count_nonzero(~finite))
-            if one.trend is not None:
+        finite = np.isfinite(rows)
+        whole = finite.all(axis=1)
+        if self.trend is not None and whole.all():
+            self.trend.remove(rows)
+        for row, fine, complete in zip(rows, finite, whole, strict=True):
+            one = self if complete else Template.of(self.bins, self.raw, self.use & fine)
+            if one.trend is not None and not whole.all():
                 one.trend.remove(row[None])
             _remove_bins(row, one.use, one.bins, one.share)
-        return spoilt
+        return int(np.count_nonzero(~finite))
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

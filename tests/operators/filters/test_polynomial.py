@@ -13,7 +13,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.flags import INVALID, PROCESSING
 from zonda.core.intervals import ranges
 from zonda.operators.filters.detrend import Detrend
-from zonda.operators.filters.polynomial import PolynomialFilter
+from zonda.operators.filters.polynomial import Pieces, PolynomialFilter
 from zonda.plugins.checks import scenes
 
 N = 6000
@@ -114,6 +114,21 @@ def test_samples_that_are_not_finite_are_bridged_and_stay(bench):
 def test_a_scan_without_the_interval(bench):
     with pytest.raises(PipelineError, match=r"no interval 'throw_leftright'; it has scanning, throw"):
         bench.run([PolynomialFilter(interval="throw_leftright")], scan(bench), {"signal": np.ones((3, N))})
+
+
+def test_rows_together_have_the_bits_of_rows_alone():
+    """Whatever their number: four are summed side by side, spoilt and masked ones by themselves."""
+    rng = np.random.default_rng(4)
+    rows, masked = rng.normal(size=(11, 3000)), np.zeros((11, 3000), bool)
+    rows[2, 70], masked[5, 100:200] = np.nan, True
+    use = rng.random(3000) < 0.9
+    pieces = Pieces.of([slice(0, 1100), slice(1200, 3000)], 3, use)
+    together = rows.copy()
+    assert pieces.remove(together, masked) == 1
+    for d, row in enumerate(rows):
+        alone = row[None].copy()
+        pieces.remove(alone, masked[d : d + 1])
+        np.testing.assert_array_equal(together[d], alone[0])
 
 
 def test_on_an_azimuth_scan_turnarounds_are_in_no_map():
