@@ -15,7 +15,7 @@ from zonda.core.numerics.projection import pixel_matrix, share_outside
 from . import plate_carree
 from .grid import MOST_PIXELS, Grid, HealpixGrid, TangentGrid, covered_healpix, covering_extent, in_frame
 from .mosaic import MOST_FIELDS, whole_of
-from .plate_carree import PlateCarreeGrid, box_about, box_of, grid_of_box, layout_about
+from .plate_carree import PlateCarreeGrid, box_about, box_of, grid_of_box, layout_about, middle_of
 
 if TYPE_CHECKING:
     from .parameters import MapParameters
@@ -59,7 +59,7 @@ def layout_of(
     if step.projection == "CAR" and not step.nside:
         found["pixel"] = step.pixel
         if step.width is not None:
-            found["box"] = box_about(step, (found["fields"][0][0], found["fields"][0][1]))
+            found["box"] = box_about(step, middle_of(found["fields"], step.pixel))
         else:
             found["box"] = box_of(step, observations, found.get("box"))
         found["middle"] = layout_about(found)
@@ -123,10 +123,11 @@ def checked(step: MapParameters, grid: Image) -> Image:
 
 def outside(step: MapParameters, observations: Sequence[Observation]) -> str:
     """The share of the samples outside an image of a given width."""
-    longitude, latitude, *_ = whole_of(fields_of(step, observations, []), step.label)
+    fields = fields_of(step, observations, [])
     if step.projection == "CAR":
-        car = grid_of_box(box_about(step, (longitude, latitude)), step.pixel, step.frame)
+        car = grid_of_box(box_about(step, middle_of(fields, step.pixel)), step.pixel, step.frame)
         return f"samples outside the map: about {percent(plate_carree.share_outside(car, observations), 2)}"
+    longitude, latitude, *_ = whole_of(fields, step.label)
     grid = image_grid(step, (longitude, latitude), (0.0, 0.0))
     scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in observations)
     return f"samples outside the map: about {percent(share_outside(scans, pixel_matrix(grid.wcs), grid.shape), 2)}"

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -116,10 +117,18 @@ def share_outside(grid: PlateCarreeGrid, observations: Sequence[Observation]) ->
     return beyond / looked if looked else 0.0
 
 
+def middle_of(fields: Sequence[Sequence[float]], pixel: float) -> tuple[float, float]:
+    """(longitude, latitude) [rad] of the only one of some fields (`map_layout.fields_of`), else the middle of all of them."""
+    if len(fields) == 1:
+        return fields[0][0], fields[0][1]
+    boxes = [_box(longitude, 0.0, latitude, latitude, pixel) for longitude, latitude, *_ in fields]
+    return centre_of(reduce(lambda one, other: _joined(one, other, pixel), boxes), pixel)
+
+
 def layout_about(found: Mapping[str, Any]) -> tuple[float, float]:
     """(longitude, latitude) [rad] of the map: its only target, else the middle of the box."""
-    fields = found["fields"]
-    return (fields[0][0], fields[0][1]) if len(fields) == 1 else centre_of(found["box"], found["pixel"])
+    fields, pixel = found["fields"], found["pixel"]
+    return middle_of(fields, pixel) if len(fields) == 1 else centre_of(found["box"], pixel)
 
 
 def _around(longitude: Floats, latitude: Floats, reach: float, pixel: float) -> Box:

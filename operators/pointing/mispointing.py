@@ -53,7 +53,9 @@ class Mispointing(Operator):
         """Note the true boresight of every scan that there is."""
         for observation in data.observations:
             x, y = self.errors(observation)
-            observation.pointed_radec = beside(observation.sky_boresight, x, y)
+            turned = observation.derotate("boresight_azel")[2]  # of the focal plane: xi is not along the azimuth then
+            cosine, sine = np.cos(turned), np.sin(turned)
+            observation.pointed_radec = beside(observation.sky_boresight, x * cosine - y * sine, y * cosine + x * sine)
             rms = np.degrees([np.sqrt(np.mean(x * x)), np.sqrt(np.mean(y * y))]) * 3600
             what = f"{observation.name}: rms error towards azimuth and elevation"
             observation.tally.state(self.label, what, f"{rms[0]:.3g} and {rms[1]:.3g} arcsec")

@@ -59,8 +59,6 @@ class PointingSchedule(ScheduleParameters):
             text = f"the schedule begins {rows[0].start}, the weather is that of {scene.time}: set the scene's time"
             warnings.warn(f"{self.label}: {text}", stacklevel=3)
         moved, sampled = LargestMotion(scene.instrument.telescope), SamplesPerBeam()
-        if self.turnaround == "constant_acceleration":  # its jerk has no bound
-            moved.limits = {q: limit for q, limit in moved.limits.items() if q[1] < 3}
         for row in rows:
             observation = scan_of(self, data, row, rate, moved)
             sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)

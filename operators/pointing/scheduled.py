@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
@@ -49,8 +49,8 @@ class ScheduleParameters(Operator):
     flag_turnarounds: bool = True
     """Flag the samples in turnarounds, so that no map uses them."""
     elevation_nods: list[Angle] = Field(default_factory=list, max_length=100)
-    """Offsets in elevation to which the telescope goes in turn before each scan, e.g. [1 deg, -1 deg, 0 deg]; flagged
-    irregular."""
+    """Offsets in elevation to which the telescope goes in turn before each scan, the last of them 0, e.g. [1 deg, -1 deg, 0 deg];
+    flagged irregular."""
     elevation_speed: AngularSpeed = quantity("1 deg/s", gt=0)
     """Largest speed of nods."""
     elevation_acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)
@@ -62,6 +62,13 @@ class ScheduleParameters(Operator):
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
     """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
 
+    @field_validator("elevation_nods")
+    @classmethod
+    def _to_the_scan(cls, value: list[float]) -> list[float]:
+        if value and value[-1] != 0:
+            raise ValueError("nods end at the elevation of the scan: write 0 deg as the last of them")
+        return value
+
 
 def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: LargestMotion) -> Observation:
     """The observation of a row, sampled at ``rate`` [Hz]."""
@@ -69,7 +76,7 @@ def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: 
     mount = step.speed / math.cos(row.elevation)
     sweep = Sweep(row.azimuth[1] - row.azimuth[0], mount, step.acceleration, step.turnaround == "smooth")
     nod = Nod(tuple(step.elevation_nods), step.elevation_speed, step.elevation_acceleration)
-    ahead = int(nod.duration * rate)
+    ahead = math.ceil(nod.duration * rate * (1 - 1e-12))
     seconds = np.arange(ahead + max(int(row.duration * rate * (1 + 1e-12)), 1)) / rate
     delay = ahead / rate
     start = row.start.shifted(-delay)
@@ -97,7 +104,8 @@ def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: 
     centre = _centre(data, row, transform, delay)
     samples = Samples(seconds, rate, boresight, flags, intervals)
     observation = observed(step.label, scene, len(data.observations), transform, centre, samples)
-    _check_motion(step, observation, track, place, moved)
+    _check_motion(step, observation.name, track, (0.0, delay), False, place, moved)
+    _check_motion(step, observation.name, track, (delay, len(seconds) / rate), sweep.smooth, place, moved)
     observation.tally.state(step.label, f"{observation.name}: row of the schedule", row.label)
     what = "samples in turnarounds" + (", flagged" if step.flag_turnarounds else ", used")
     observation.tally.count(step.label, what, int(turning.sum()), len(seconds))
@@ -130,20 +138,29 @@ def _check_elevation(horizontal: Floats, telescope: Telescope, place: str) -> No
         )
 
 
-def _check_motion(step: ScheduleParameters, observation: Observation, track: Track, place: str, moved: LargestMotion) -> None:
-    """Compare the track with the telescope's limits."""
-    length = observation.n_samples / observation.sample_rate
-    coarse = min(observation.sample_rate, POINTS / length)
+def _check_motion(
+    step: ScheduleParameters, name: str, track: Track, part: tuple[float, float], smooth: bool, place: str, moved: LargestMotion
+) -> None:
+    """Compare a part of the track, from begin to end [s], with the telescope's limits.
+
+    A scan begins at full speed: from the nod to the scan there is no motion to compare. Not ``smooth``: its jerk has no bound.
+    """
+    begin, end = part
+    if end <= begin:
+        return
+    limits = {q: limit for q, limit in moved.limits.items() if smooth or q[1] < 3}
 
     def at(step: float) -> Floats:
-        return track(np.arange(max(round(length / step), 1), dtype=np.float64) * step)
+        return track(begin + np.arange(max(round((end - begin) / step), 1), dtype=np.float64) * step)
 
-    found = motion(at(1 / coarse), coarse, moved.limits, at)
-    over = excess(found, moved.limits)
+    coarse = POINTS / (end - begin)
+    found = motion(at(1 / coarse), coarse, limits, at)
+    found = {q: peak._replace(second=begin + peak.second) for q, peak in found.items() if smooth or q[1] < 3}
+    over = excess(found, limits)
     if over and step.check_limits == "error":
         cure = "lower speed or acceleration, or set check_limits: warn"
         raise PointingError(moved.too_fast(next(iter(over)), found), place=place, cure=cure)
-    moved.add(observation.name, found)
+    moved.add(name, found)
 
 
 def _turned(quaternions: Floats, angle: float) -> Floats:

@@ -17,8 +17,9 @@ from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.numerics.projection import directions
 from zonda.core.numerics.sphere import separation
 from zonda.operators.maps.bin_map import BinMap
-from zonda.operators.maps.map_layout import checked
+from zonda.operators.maps.map_layout import checked, grid_of, layout_of
 from zonda.operators.maps.plate_carree import Box, _box, _joined, centre_of, grid_of_box, rows_of
+from zonda.plugins.checks import scenes
 
 
 def full_sky(degrees: float) -> Any:
@@ -119,6 +120,23 @@ def test_a_map_of_given_size_and_one_across_the_meridian(bench: Any) -> None:
         assert where[0, 0] >= 0
         lon, lat = np.radians(grid.wcs.wcs_pix2world(x, y, 0))
         assert separation(lon, lat, (angle, 0.0)) < math.radians(0.05)
+
+
+@pytest.mark.parametrize("longitudes", [(40.0, 44.0), (359.0, 3.0), (10.0, 150.0)])
+def test_a_map_of_given_size_lies_about_the_middle_of_several_targets(longitudes: tuple[float, float]) -> None:
+    """As in TAN, not about the first target; across the meridian, and for targets too far apart for a tangent plane."""
+    scans = [scenes.scan(3, 50), scenes.scan(3, 50)]
+    for scan, longitude in zip(scans, longitudes, strict=True):
+        scan.centre = (math.radians(longitude), math.radians(20))
+    step = BinMap(projection="CAR", pixel="1 arcmin", width="4 deg")
+    layout = layout_of(step, scans, None)
+    assert layout is not None
+    middle = (longitudes[0] + longitudes[1] + (360 if longitudes[1] < longitudes[0] else 0)) / 2 % 360
+    np.testing.assert_allclose(np.degrees(layout["middle"]), (middle, 20), atol=1 / 60)
+    grid = grid_of(step, layout)
+    ny, nx = grid.shape
+    lon, lat = grid.wcs.wcs_pix2world((nx - 1) / 2, (ny - 1) / 2, 0)
+    np.testing.assert_allclose(((lon - middle + 180) % 360 - 180, lat - 20), 0, atol=1 / 60)
 
 
 boxes = st.tuples(st.integers(0, 719), st.integers(0, 300), st.integers(1, 200), st.integers(1, 40))

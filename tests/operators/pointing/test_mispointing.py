@@ -8,6 +8,7 @@ import pytest
 import zonda
 from zonda.core.data import Data
 from zonda.core.numerics.projection import boresights
+from zonda.core.numerics.quaternions import multiply
 from zonda.operators.pointing.mispointing import Mispointing, beside
 from zonda.plugins.checks import scenes
 
@@ -49,6 +50,20 @@ def test_it_turns_towards_azimuth_and_elevation():
     there = directions(observation.boresight_radec, np.array([30 * ARCSEC]), np.array([-20 * ARCSEC])).reshape(n, 3)
     np.testing.assert_allclose(boresights(turned).T, there, atol=1e-10)
     np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.7, np.pi / 2, -2.5])
+def test_the_error_is_along_azimuth_and_elevation_however_the_focal_plane_is_turned(rotation):
+    """A turn of the focal plane about the boresight leaves the true boresight where it is: it turns no direction on the sky."""
+    plain, turned = scenes.scan(1, 20), scenes.scan(1, 20)
+    about = np.array([[0.0, 0.0, np.sin(rotation / 2), np.cos(rotation / 2)]])
+    turned.boresight_azel, turned.boresight_radec = (multiply(q, about) for q in (plain.boresight_azel, plain.boresight_radec))
+    for observation in (plain, turned):
+        data = Data(scenes.scene(scenes.camera(1)))
+        data.observations.append(observation)
+        Mispointing(offset=("10 arcsec", "4 arcsec"), jitter_rms="3 arcsec").observe(data)
+    np.testing.assert_allclose(boresights(turned.pointed_radec), boresights(plain.pointed_radec), atol=1e-14)
+    np.testing.assert_allclose(multiply(plain.pointed_radec, about), turned.pointed_radec, atol=1e-14)
 
 
 def test_a_source_is_mapped_beside_its_place(tmp_path):

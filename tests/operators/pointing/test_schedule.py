@@ -7,6 +7,7 @@ import pytest
 
 import zonda
 import zonda.testing
+from zonda.core.configuration.calls import ParameterError
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.data import Data
@@ -14,6 +15,7 @@ from zonda.core.errors import InputError, PointingError
 from zonda.core.flags import IRREGULAR, TURNAROUND
 from zonda.core.intervals import samples_in
 from zonda.core.numerics.quaternions import conjugate, from_angles, multiply
+from zonda.core.registry import instruments
 from zonda.core.scene import Scene
 from zonda.operators.pointing.constant_elevation import Nod, Sweep
 from zonda.operators.pointing.schedule import PointingSchedule
@@ -155,6 +157,41 @@ def test_nods_come_before_the_scan(tmp_path):
     assert np.abs(np.diff(elevation)).max() * 40 <= 0.5 * (1 + 1e-9)
     assert samples_in(one.intervals["elnod"], one.seconds)[: ahead - 1].all()
     assert not samples_in(one.intervals["scanning"], one.seconds)[:ahead].any()
+
+
+def test_nods_end_where_the_scan_is(tmp_path):
+    """Whatever the rate, the elevation of the scan is reached before it begins; a list that ends elsewhere is refused."""
+    nods = {"elevation_speed": "0.5 deg/s", "elevation_acceleration": "1 deg/s2", "sample_rate": "7.3 Hz"}
+    one, _ = scans(version_5(tmp_path / "a.ecsv"), elevation_nods=["1 deg", "0 deg"], **nods)
+    steps = np.abs(np.diff(one.elevation))
+    assert np.degrees(steps).max() <= 0.5 / 7.3 * (1 + 1e-9)
+    last = int(np.flatnonzero(one.flags & IRREGULAR)[-1])
+    assert np.degrees(steps[last]) <= 1 / 7.3**2 / 2  # from rest to rest: no more than the last sample's way
+    assert np.degrees(steps[last - 1]) > 0
+    with pytest.raises(ParameterError, match="write 0 deg as the last"):
+        PointingSchedule(schedule=tmp_path / "a.ecsv", elevation_nods=["1 deg", "-1 deg"])
+
+
+@pytest.mark.parametrize("turnaround", ["smooth", "constant_acceleration"])
+def test_limits_hold_for_nods_and_scans_not_for_what_lies_between_them(tmp_path, turnaround):
+    """The scan begins at full speed, as in TOAST: that step is none that the mount makes; too fast a nod is told."""
+    act = instruments.create("act_150ghz")
+    limits = {
+        "azimuth_speed_max": "5 deg/s",
+        "azimuth_acceleration_max": "5 deg/s2",
+        "elevation_acceleration_max": "0.9 deg/s2",
+        "elevation_jerk_max": "9 deg/s3",
+    }
+    scene = Scene(site=SITE, instrument=act.varied(telescope=limits), time="2025-03-01T06:00")
+    given = {**FAST, "check_limits": "error", "turnaround": turnaround, "elevation_nods": ["1 deg", "0 deg"]}
+    path = version_5(tmp_path / "a.ecsv")
+    data = Data(scene)
+    PointingSchedule(schedule=path, elevation_acceleration="0.8 deg/s2", **given).observe(data)
+    said = {what: text for _, what, text in data.observations[0].tally}["largest acceleration of the axes"]
+    assert "azimuth 0.8 deg/s2 (16 %" in said
+    assert "elevation 0.8 deg/s2 (88.9 %" in said
+    with pytest.raises(PointingError, match="acceleration of the elevation axis of 1 deg/s2"):
+        PointingSchedule(schedule=path, elevation_acceleration="1 deg/s2", **given).observe(Data(scene))
 
 
 def test_a_nod_that_never_reaches_its_speed():
