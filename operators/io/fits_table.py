@@ -20,7 +20,7 @@ from zonda.core.maps.map_file import ascii_text
 from zonda.core.storage.files import writing
 from zonda.core.storage.fits_files import COMPRESSED, check_size, opened
 from zonda.core.stream_names import UNITS
-from zonda.core.types import AnyFloats
+from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 
 from .time_ordered_data import TimeOrderedData
@@ -256,6 +256,12 @@ class Reader:
 
     def flags(self, detectors: NDArray[np.intp], samples: slice) -> None:
         """The file has no flags of single samples of detectors."""
+
+    def noise(self, model: str | None) -> dict[str, Floats]:
+        """The file has no noise models. Raises InputError where one is asked for."""
+        if model is not None:
+            raise InputError("is FITS, which has no noise models", place=self.place, cure="leave noise_model out")
+        return {}
 
     def close(self) -> None:
         """Close the file."""

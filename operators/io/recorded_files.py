@@ -21,6 +21,7 @@ from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Fraction, Hertz
 from zonda.core.errors import InputError
 from zonda.core.operator import Operator
+from zonda.core.types import Floats
 
 from .noise_table import NoiseTable, read_noise
 from .recorded_scan import RecordedInstrument, instrument_of, is_near, joined, rows_of_bands, site_of
@@ -75,6 +76,9 @@ class RecordedFiles(Operator):
     """Centre of the only band whose detectors are used, e.g. 93 GHz; none: all bands, each with maps of its own."""
     noise: InputPath | None = None
     """Table that `zonda noise` wrote: NET, knee and slope of each detector, above those of the file."""
+    noise_model: str | None = None
+    """Noise model of a TOAST file, e.g. el_noise: its spectra give NET, knee and slope. Where absent: what the focal
+    plane states, or else fitted to `noise_model`."""
     celestial: Literal["recorded", "recomputed"] | None = None
     """Where the boresight is on the sky: as recorded (``boresight_radec``), or recomputed from azimuth, elevation and time. Where
     absent: as recorded where the file has it."""
@@ -171,6 +175,9 @@ class RecordedFiles(Operator):
         """All but the stream of a file. Raises InputError where it cannot be used."""
         place = f"{self.label}, {path}"
         tod, streams = _head(path, _stamp(path))
+        stated = "net" in tod.columns
+        if self.noise_model is not None or not stated:
+            tod = replace(tod, columns=tod.columns | _fitted(path, _stamp(path), self.noise_model))
         if self.signal is not None and self.signal not in streams:
             have = ", ".join(sorted(streams)) or "none"
             cure = f"set signal to one of: {have}; or signal: none for the pointing alone"
@@ -178,6 +185,8 @@ class RecordedFiles(Operator):
         rows = rows_of_bands(tod, self.band, place)
         table = read_noise(self.noise) if self.noise is not None else None
         tod, noise = _with_noise(tod, table, np.concatenate(rows), place)
+        if table is None and "net" in tod.columns and (self.noise_model is not None or not stated):
+            noise = f"fitted to the file's {self.noise_model or 'noise_model'}"
         return RecordedScan(path, tod, tuple(instrument_of(tod, r, given, place) for r in rows), tuple(rows), noise)
 
 
@@ -204,6 +213,16 @@ def _head(path: Path, stamp: tuple[int, int]) -> tuple[TimeOrderedData, Mapping[
     opened = reader(path)
     opened.close()
     return opened.tod, opened.streams
+
+
+@lru_cache(maxsize=NEW_SCANS)
+def _fitted(path: Path, stamp: tuple[int, int], model: str | None) -> Mapping[str, Floats]:
+    """The noise of a model of a file."""
+    opened = reader(path)
+    try:
+        return opened.noise(model)
+    finally:
+        opened.close()
 
 
 def _with_noise(

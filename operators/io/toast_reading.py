@@ -19,11 +19,15 @@ from zonda.core.storage.hdf5_files import check_size, checked
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 
+from . import toast_noise
 from .time_ordered_data import TimeOrderedData
 from .toast_hdf5 import COLUMNS, FLAGS_ARE, OFFSETS, WEATHER
 
 KIND, CURE = "HDF5 in TOAST's layout", "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it"
 AGAIN = "save it again with TOAST 3.0 or later, or with SaveTOD"
+
+DEFAULT_MODEL = "noise_model"
+"""Name of the noise model that TOAST's operators make and read where no other is asked for."""
 
 PARTS = {
     "instrument": "no instrument",
@@ -78,6 +82,20 @@ class Reader:
             return None
         with reading(self.place, KIND, CURE):
             return np.asarray(_rectangle(found, detectors, samples), np.uint8)
+
+    def noise(self, model: str | None) -> dict[str, Floats]:
+        """`TimeOrderedData.columns` of the noise of a model of the file; None: of `DEFAULT_MODEL`, nothing where there is none.
+
+        Raises InputError where there is no model of this name, or it cannot be used.
+        """
+        have = toast_noise.models(self._file)
+        if model is None and DEFAULT_MODEL not in have:
+            return {}
+        if model is not None and model not in have:
+            cure = f"choose from: {', '.join(have)}" if have else "leave noise_model out"
+            raise InputError(f"has no noise model {model!r} (/metadata)", place=self.place, cure=cure)
+        with reading(self.place, KIND, CURE):
+            return toast_noise.columns_of_model(self._file["metadata"][model or DEFAULT_MODEL], self.tod.names, self.place)
 
     def close(self) -> None:
         """Close the file."""

@@ -444,3 +444,22 @@ def test_toasts_own_files_of_two_bands_give_toasts_own_maps(two_bands, tmp_path,
         # tenths of a kelvin of atmosphere: float32 keeps 3e-8 K a sample; what FLAC has rounded, both have read
         np.testing.assert_allclose(signal, expected, rtol=0, atol=3e-8)
         assert np.std(expected[hits > 0]) > 1e-3
+
+
+def test_noise_models_of_toast_are_read(two_bands, tmp_path):
+    """NET, knee and slope of the spectra that TOAST mixes and scales (ElevationNoise); the focal plane states others."""
+    azel = toast.ops.PointingDetectorSimple(boresight="boresight_azel", quats="quats_azel")
+    toast.ops.ElevationNoise(
+        noise_model="noise_model", out_model="el_noise", detector_pointing=azel, noise_a=0.5, noise_c=0.9
+    ).apply(two_bands)
+    (o, *_) = two_bands.obs
+    path = toast.io.save_hdf5(o, str(tmp_path), detdata=["signal"], force_serial=True)
+    step = LoadTOD(file=path, noise_model="el_noise")
+    plane = step.scene().instrument.focalplane()
+    stated = LoadTOD(file=path).scene().instrument.focalplane()
+    scaled = [np.sqrt(o["el_noise"].psd(d)[-1] / o["noise_model"].psd(d)[-1]) for d in plane.names]
+    assert max(scaled) > 1.1  # that of a flagged detector is left as it is
+    # of float32 spectra
+    np.testing.assert_allclose(plane.net, stated.net * np.array(scaled, float), rtol=1e-5)
+    np.testing.assert_allclose(plane.knee, stated.knee, rtol=1e-4)
+    np.testing.assert_allclose(plane.slope, stated.slope, rtol=1e-4)

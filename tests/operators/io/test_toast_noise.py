@@ -1,0 +1,102 @@
+"""The noise models of TOAST files: NET, knee and slope fitted to their power spectra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import zonda
+from zonda.core.errors import InputError
+from zonda.core.made_up import Given, Points, made_up_scene
+from zonda.operators.io.toast_noise import fit
+
+TRUTH = [(3e-4, 0.1, 1e-3, 1.0), (3e-4, 5.0, 1e-4, 2.5), (1e-3, 0.01, 1e-5, 1.3)]
+"""NET, knee, minimum frequency, slope."""
+
+
+def toasts(f: Any, net: float, knee: float, low: float, slope: float) -> Any:
+    """As toast.noise_sim.AnalyticNoise."""
+    return net**2 * (f**slope + knee**slope) / (f**slope + low**slope)
+
+
+def ours(f: Any, net: float, knee: float, low: float, slope: float) -> Any:
+    return net**2 * (1 + (knee / np.maximum(f, low)) ** slope)
+
+
+@pytest.mark.parametrize("form", [toasts, ours])
+@pytest.mark.parametrize("truth", TRUTH)
+def test_the_spectrum_that_was_written_comes_back(form: Any, truth: Any) -> None:
+    f = np.geomspace(1e-6, 50, 100)
+    found = fit(f, form(f, *truth).astype("f4").astype(float), "here")
+    np.testing.assert_allclose(found, truth, rtol=1e-5)  # TOAST stores spectra in float32, 6e-8
+
+
+def test_a_measured_spectrum_and_a_white_one() -> None:
+    """Of 20 000 linear frequencies with 20 degrees of freedom each: NET to 1 %, knee and slope to some standard errors."""
+    f, draw = np.arange(1, 20001) * 2.5e-3, np.random.default_rng(0)
+    scatter = draw.chisquare(20, len(f)) / 20
+    net, knee, _, slope = fit(f, ours(f, 3e-4, 5.0, 1e-4, 2.0) * scatter, "here")
+    assert abs(net / 3e-4 - 1) < 0.01
+    assert abs(knee / 5.0 - 1) < 0.1
+    assert abs(slope / 2.0 - 1) < 0.1
+    white = fit(f, 1e-6 * scatter, "here")
+    assert abs(white[0] / 1e-3 - 1) < 0.01
+    assert white[1] == 0
+
+
+def write_model(file: Any, names: list[str], spectra: Any, units: str = "K2 s", model: str = "measured") -> None:
+    """As `toast.noise.Noise.save_hdf5`: half of the detectors share their second spectrum."""
+    group, f = file["metadata"].create_group(model), np.geomspace(1e-5, 10, 120)
+    group.attrs["class"], group.attrs["psd_units"] = "toast.noise.Noise", units
+    keys = [name.encode() for name in names] + [b"common"]
+    rows = [spectra(f, k) for k in range(len(keys))]
+    group.create_dataset("0a", data=np.vstack([f, rows]).astype("f4"))
+    group.create_dataset("0a_keys", data=np.array(keys, "S16"))
+    mix = [(name.encode(), name.encode(), 1.0) for name in names] + [(name.encode(), b"common", 2.0) for name in names[::2]]
+    group.create_dataset("mixing_matrix", data=np.array(mix, "S16, S16, f4"))
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    zonda.Pipeline([Points(), Given(), zonda.SaveTOD()]).run(made_up_scene(), output=tmp_path, threads=1)
+    (path,) = tmp_path.glob("tod_*.h5")
+    return path
+
+
+def test_a_model_of_the_file_is_chosen_by_name(saved: Path) -> None:
+    """Each detector's spectrum is that which TOAST mixes for it: its own, and four times the common one for every second."""
+    with h5py.File(saved, "a") as file:
+        names = [row["name"].decode() for row in file["instrument/focalplane"][:]]
+        write_model(file, names, lambda f, k: ours(f, 1e-3 * (1 + k), 0.2, 1e-3, 1.0) if k < len(names) else 0 * f + 1e-6)
+    step = zonda.LoadTOD(file=saved, noise_model="measured")
+    data = zonda.Data(step.scene())
+    step.observe(data)
+    (observation,) = data.observations
+    own = 1e-6 * (1 + np.arange(len(names))) ** 2
+    expected = np.sqrt(own + np.where(np.arange(len(names)) % 2 == 0, 4e-6, 0))
+    np.testing.assert_allclose(observation.focalplane.net, expected, rtol=1e-5)
+    np.testing.assert_allclose(observation.focalplane.knee, 0.2 * own / expected**2, rtol=1e-4)  # slope 1
+    assert ("noise of the detectors", "fitted to the file's measured") in [(what, text) for _, what, text in observation.tally]
+
+
+def test_models_that_cannot_be_used(saved: Path) -> None:
+    with h5py.File(saved, "a") as file:
+        names = [row["name"].decode() for row in file["instrument/focalplane"][:]]
+        write_model(file, names, lambda f, k: 0 * f + 1e-6, units="V2 s", model="volts")
+        write_model(file, names, lambda f, k: 0 * f - 1e-6, model="negative")
+        write_model(file, names[1:], lambda f, k: 0 * f + 1e-6, model="one_lacks")
+    wrong = {
+        "none_such": "has no noise model 'none_such'",
+        "volts": "spectra in 'V2 s', not in K2 s",
+        "negative": "not positive and finite",
+        "one_lacks": f"has no spectrum of detector {names[0]}",
+    }
+    for model, message in wrong.items():
+        with pytest.raises(InputError, match=message) as caught:
+            zonda.LoadTOD(file=saved, noise_model=model).scene()
+        assert saved.name in caught.value.place
+        assert caught.value.cure
