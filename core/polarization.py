@@ -59,8 +59,8 @@ class PolarizationAngles:
     gamma: Floats
 
     @classmethod
-    def of(cls, observation: Observation, pole: Floats) -> PolarizationAngles:
-        """``pole``: ICRS direction (3,)."""
+    def of(cls, observation: Observation, boresight: Floats, pole: Floats) -> PolarizationAngles:
+        """``boresight``: (n_samp, 4), as recorded or where it is in fact (`Observation`); ``pole``: ICRS direction (3,)."""
         plane = observation.focalplane
         quaternions = detector_quaternions(plane.xi, plane.eta, plane.polarization_angle)
         axes = np.ascontiguousarray(np.moveaxis(rotation_matrices(quaternions)[:, :, :2], 2, 1))
@@ -68,7 +68,7 @@ class PolarizationAngles:
         chi, plate = observation.hwp_angle, np.zeros((2, 0))
         if chi is not None:
             plate = np.stack([np.cos(4 * chi), np.sin(4 * chi)])
-        return cls(seen_from(observation.boresight_radec, pole), axes, plate, np.stack([np.cos(turn), -np.sin(turn)], axis=1))
+        return cls(seen_from(boresight, pole), axes, plate, np.stack([np.cos(turn), -np.sin(turn)], axis=1))
 
     @property
     def nbytes(self) -> int:

@@ -55,7 +55,7 @@ def stokes_binnings(
     plane, (weight, noise, window) = observation.focalplane, levels
     check_polarized(step, observation)
     own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
-    angles = PolarizationAngles.of(observation, frame_rotation(step.frame)[2])
+    angles = PolarizationAngles.of(observation, observation.boresight_radec, frame_rotation(step.frame)[2])
     pointing, signals = grid.pointing(observation), len(observation.signals)
     return [
         StokesBinning(

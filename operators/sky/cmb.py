@@ -24,7 +24,8 @@ from zonda.core.operator import Operator
 from zonda.core.storage.files import reading
 from zonda.core.types import Floats
 
-from .skymap import SkyMap
+from .skymap import SkyMap, show_input
+from .state import SkyState
 
 HIGHEST = 30_000
 """Multipole above which a spectrum is not read."""
@@ -47,7 +48,7 @@ class CMBSky(Operator):
     realization: int | None = Field(None, ge=0)
     """Number of the sky: the same for every seed. Where absent the seed draws it, and in a campaign every entry has another."""
 
-    _skies: dict[int, SkyMap] = PrivateAttr(default_factory=dict)
+    _skies: dict[int, tuple[SkyMap, float]] = PrivateAttr(default_factory=dict)
 
     @field_validator("nside")
     @classmethod
@@ -60,34 +61,33 @@ class CMBSky(Operator):
         """Up to which multipole the spectrum reaches; raises InputError where it is wrong."""
         return [f"{self.spectrum} reaches multipole {read_spectrum(str(self.spectrum)).shape[1] - 1}"]
 
-    def prepare(self, observation: Observation) -> Any:
-        """See `SkyMap`."""
-        rms = float(np.std(self.sky(observation.seed).map.table.data["I"]))  # type: ignore[union-attr]
+    def prepare(self, observation: Observation) -> tuple[SkyMap, SkyState]:
+        """The step that samples the map, and what that one knows of the scan."""
+        sky, rms = self.sky(observation.seed)
         observation.tally.state(self.label, "rms of the sky before the beam", f"{1e6 * rms:.4g} uK_CMB, nside {self.nside}")
-        return self.sky(observation.seed).prepare(observation)
+        return sky, sky.prepare(observation)
 
-    def exec(self, block: Block, state: Any) -> None:
+    def exec(self, block: Block, state: tuple[SkyMap, SkyState]) -> None:
         """See `SkyMap`."""
-        self.sky(block.observation.seed).exec(block, state)
+        state[0].exec(block, state[1])
 
-    def collect(self, data: Data, observation: Observation, state: Any) -> None:
+    def collect(self, data: Data, observation: Observation, state: tuple[SkyMap, SkyState]) -> None:
         """See `SkyMap`."""
-        self.sky(observation.seed).collect(data, observation, state)
+        state[0].collect(data, observation, state[1])
 
     def finalize(self, data: Data) -> None:
         """See `SkyMap`."""
-        self.sky(data.scene.seed).finalize(data)
+        show_input(self.label, data)
 
-    def sky(self, seed: int) -> SkyMap:
-        """The step that samples the map of a seed."""
+    def sky(self, seed: int) -> tuple[SkyMap, float]:
+        """The step that samples the map of a seed, and the map's rms, K_CMB."""
         number = seed if self.realization is None else self.realization
         if number not in self._skies:
-            key = stream_key(number, "CMBSky", self.label)
-            maps = draw(read_spectrum(str(self.spectrum)), self.nside, key)
+            maps = draw(read_spectrum(str(self.spectrum)), self.nside, stream_key(number, "CMBSky", self.label))
             found = SkyMap(map=_table(maps, self.nside))
             found._label = self.label
             self._skies.clear()
-            self._skies[number] = found
+            self._skies[number] = found, float(np.std(maps[0]))
         return self._skies[number]
 
 

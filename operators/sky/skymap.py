@@ -58,7 +58,7 @@ class SkyMap(SkyParameters):
         if not grid.reached(observation, float(widths.max(initial=0.0))):
             observation.tally.state(self.label, f"{observation.name}: not convolved", "no detector reaches the input map")
             return SkyState(grid, sky, [], index)
-        angles = None if sky.polarization is None else PolarizationAngles.of(observation, grid.axis)
+        angles = None if sky.polarization is None else PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
         state = SkyState(grid, sky, [with_beam(sky, self, float(fwhm)) for fwhm in widths], index, angles)
         state.tell(observation.tally, self.label)
         return state
@@ -80,9 +80,7 @@ class SkyMap(SkyParameters):
 
     def finalize(self, data: Data) -> None:
         """Keep the input of the first observation as the product ``input``, or ``input.LABEL`` of a further map."""
-        found = data.take(self.label)
-        if found is not None:
-            _show(self.label, data, found.image)
+        show_input(self.label, data)
 
 
 def _count(step: SkyMap, observation: Observation, state: SkyState) -> None:
@@ -99,6 +97,13 @@ def _count(step: SkyMap, observation: Observation, state: SkyState) -> None:
         )
     if behind:
         observation.tally.count(step.label, "samples more than 90 deg from the input map's centre", behind, total)
+
+
+def show_input(label: str, data: Data) -> None:
+    """Make the partial product of the step ``label`` a product (`SkyMap.finalize`)."""
+    found = data.take(label)
+    if found is not None:
+        _show(label, data, found.image)
 
 
 def _show(label: str, data: Data, image: Image) -> None:

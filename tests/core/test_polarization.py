@@ -26,7 +26,7 @@ def an_observation(plate=False):
 
 def angles(o, pole=NORTH):
     found = np.empty((2, o.n_detectors, o.n_samples))
-    PolarizationAngles.of(o, pole).fill(np.arange(o.n_detectors), 0, *found)
+    PolarizationAngles.of(o, o.boresight_radec, pole).fill(np.arange(o.n_detectors), 0, *found)
     return found
 
 
@@ -66,7 +66,7 @@ def test_an_axis_to_the_south_sees_q_and_one_to_the_south_east_u():
 @pytest.mark.parametrize("cuts", [[0, 600], [0, 1, 130, 513, 600]])
 def test_bits_depend_neither_on_blocks_nor_on_which_detectors(cuts):
     o = an_observation(plate=True)
-    whole, of = angles(o), PolarizationAngles.of(o, NORTH)
+    whole, of = angles(o), PolarizationAngles.of(o, o.boresight_radec, NORTH)
     for d in ([0, 1, 2], [3], [4, 5, 6]):
         for start, stop in pairwise(cuts):
             part = np.empty((2, len(d), stop - start))

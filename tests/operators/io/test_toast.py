@@ -329,7 +329,7 @@ def test_weights_are_those_of_toasts_compiled_kernel(polarized):
     found = loaded.obs[0].detdata["weights"]
     theirs = np.array([found[name] for name in o.focalplane.names])
     ours = np.empty((2, o.n_detectors, o.n_samples))
-    PolarizationAngles.of(o, np.array([0.0, 0.0, 1.0])).fill(np.arange(o.n_detectors), 0, *ours)
+    PolarizationAngles.of(o, o.boresight_radec, np.array([0.0, 0.0, 1.0])).fill(np.arange(o.n_detectors), 0, *ours)
     ours *= o.focalplane.polarization_efficiency[:, None]
     np.testing.assert_array_equal(theirs[..., 0], 1.0)
     # rounding of angles up to 4 chi, 25 rad, in TOAST's kernel

@@ -35,7 +35,7 @@ def observation(n_det=24, n=4000, efficiency=0.9, seed=0):
 
 def angles(o, frame="icrs"):
     found = np.empty((2, o.n_detectors, o.n_samples))
-    PolarizationAngles.of(o, frame_rotation(frame)[2]).fill(np.arange(o.n_detectors), 0, *found)
+    PolarizationAngles.of(o, o.boresight_radec, frame_rotation(frame)[2]).fill(np.arange(o.n_detectors), 0, *found)
     return o.focalplane.polarization_efficiency[:, None] * found
 
 

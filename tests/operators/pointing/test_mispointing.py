@@ -108,6 +108,30 @@ def test_the_jitter_dims_a_source(tmp_path):
     assert abs(seen[1].mean() / seen[0].mean() - share) < 4 * error
 
 
+def test_polarization_is_seen_at_the_true_pointing():
+    """The same bits as of a telescope that looks there and says so; by the recorded angles they would differ in places."""
+    x, y = np.meshgrid(np.arange(64.0), np.arange(64.0))
+    sky = zonda.SkyMap(
+        map=np.stack([1e-3 * (1 + x / 64), 4e-4 * np.cos(y / 9), 3e-4 * np.sin(x / 7)]), unit="K_RJ", pixel_size="6 arcsec",
+        centre="5h00m00s 20d00m00s", polarization_convention="cosmo",
+    )  # fmt: skip
+    camera = scenes.camera(6).model_copy(update={"polarization": "pairs"})
+    streams = []
+    for told in (False, True):
+        observation = scenes.scan(6, 400, radius=1.0, instrument=camera)
+        observation.focalplane.polarization_efficiency[:] = 1.0
+        observation.focalplane.polarization_angle[:] = np.arange(6) * 0.5
+        x, y = 60 * ARCSEC * np.cos(np.arange(400) / 50), 40 * ARCSEC * np.sin(np.arange(400) / 70)
+        moved = beside(observation.boresight_radec, x, y)
+        if told:
+            observation.boresight_radec = moved
+        else:
+            observation.pointed_radec = moved
+        streams.append(scenes.run([sky], observation, keep=("sky",)).observations[0].detdata["sky"])
+    assert np.ptp(streams[0]) > 1e-4
+    np.testing.assert_array_equal(*streams)
+
+
 def test_each_scan_has_an_error_of_its_own():
     scene = scenes.scene(scenes.camera(3))
     data = Data(scene)

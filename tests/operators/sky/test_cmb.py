@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import zonda
+from zonda.core.block import Block
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.random import stream_key
+from zonda.operators.sky import cmb
 from zonda.operators.sky.cmb import CMBSky, draw, read_spectrum
 from zonda.plugins.checks import scenes
 
@@ -55,7 +57,7 @@ def test_the_stream_is_the_map_in_the_bands_kelvin(tmp_path):
     found = scenes.run([step], observation, keep=("sky",)).observations[0].detdata["sky"]
     ell = np.arange(LMAX + 1)
     fwhm = float(observation.focalplane.fwhm[0])
-    alm = healpy.map2alm(step.sky(observation.seed).map.table.data["I"].astype(np.float64), lmax=LMAX, iter=5)
+    alm = healpy.map2alm(step.sky(observation.seed)[0].map.table.data["I"].astype(np.float64), lmax=LMAX, iter=5)
     beam = np.exp(-ell * (ell + 1) * fwhm**2 / (16 * np.log(2)))
     smooth = healpy.alm2map(healpy.almxfl(alm, beam), 1024)
     ra, dec = observation.ra, observation.dec
@@ -66,11 +68,30 @@ def test_the_stream_is_the_map_in_the_bands_kelvin(tmp_path):
 
 def test_seeds_and_realizations(tmp_path):
     path = theory(tmp_path / "t.txt", polarized=False)
-    seeded = [CMBSky(spectrum=path, nside=16).sky(seed).map.table.data["I"] for seed in (1, 2, 1)]
+    seeded = [CMBSky(spectrum=path, nside=16).sky(seed)[0].map.table.data["I"] for seed in (1, 2, 1)]
     assert not np.array_equal(seeded[0], seeded[1])
     np.testing.assert_array_equal(seeded[0], seeded[2])
-    fixed = [CMBSky(spectrum=path, nside=16, realization=4).sky(seed).map.table.data["I"] for seed in (1, 2)]
+    fixed = [CMBSky(spectrum=path, nside=16, realization=4).sky(seed)[0].map.table.data["I"] for seed in (1, 2)]
     np.testing.assert_array_equal(*fixed)
+
+
+def test_scans_of_other_seeds_may_be_prepared_meanwhile(tmp_path):
+    """The state has what `exec` needs: a scan keeps the sky of its seed while another scan's is drawn; none is drawn again."""
+    path, found = theory(tmp_path / "t.txt", polarized=False), []
+    for others in (False, True):
+        step, observation = CMBSky(spectrum=path, nside=64), scenes.scan(3, 200, radius=60.0)
+        state = step.prepare(observation)
+        if others:
+            another = scenes.scan(3, 200, radius=60.0)
+            another.seed = observation.seed + 1
+            step.prepare(another)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(cmb, "draw", None)
+            block = Block(observation, slice(0, 3), slice(0, 200))
+            step.exec(block, state)
+        found.append(block.detdata["sky"])
+    assert np.ptp(found[0]) > 0
+    np.testing.assert_array_equal(*found)
 
 
 def test_without_a_spectrum_it_is_refused():

@@ -36,7 +36,7 @@ def seen(o, values=(STOKES_I, Q, U), frame="icrs", turn=None):
     """What the detectors see of I, Q and U (each a number or (n_det, n_samp)) of the meridians of a frame."""
     pole = frame_rotation(frame)[2] if turn is None else turn[2]
     cosine, sine = np.empty((2, o.n_detectors, o.n_samples))
-    PolarizationAngles.of(o, pole).fill(np.arange(o.n_detectors), 0, cosine, sine)
+    PolarizationAngles.of(o, o.boresight_radec, pole).fill(np.arange(o.n_detectors), 0, cosine, sine)
     i, q, u = values
     return i + o.focalplane.polarization_efficiency[:, None] * (q * cosine + u * sine)
 
