@@ -17,6 +17,7 @@ from .intervals import Intervals, runs
 from .notebook import html_table
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
+from .shared import SharedScan
 from .tally import Tally
 from .types import AnyFloats
 
@@ -99,6 +100,8 @@ class Observation:
         What was counted or approximated.
     hwp_angle
         (n_samp,) rad, of a half-wave plate in the focal plane (`core.polarization`); None: there is none.
+    shared
+        What the bands of a camera share of the scan; None: there is one band.
     output
         Folder (Path) for files that are written while the scan runs (see `Data.output`).
     """
@@ -133,6 +136,7 @@ class Observation:
     windows: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     hwp_angle: NDArray[np.float64] | None = None
     pointed_radec: NDArray[np.float64] | None = None
+    shared: SharedScan | None = None
 
     def __post_init__(self) -> None:
         if not self.flags.size:

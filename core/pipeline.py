@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,10 +20,9 @@ from .observation import Observation
 from .operator import Operator
 from .output import Output, Progress
 from .run import arguments
-from .run.ahead import Ahead
 from .run.bands import data_of_bands, distribute, gather, hand_over, of_one_band, points, use_recorded
-from .run.budget import check_kept_memory, divided, least_memory, longest_of, with_scan_ahead
-from .run.execution import Execution
+from .run.budget import least_memory, longest_of, products_of
+from .run.in_turn import Band, Budget, execute
 from .run.order import check_order
 from .run.schedule import Chain
 from .run.settings import Settings, Timer
@@ -164,8 +162,7 @@ class Pipeline:
             timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
         bands = self._of_bands(data)
         self._observe(data, bands, timer)
-        for number, (pipeline, own) in enumerate(bands):
-            pipeline._execute(own, settings, tuple(keep), timer, memory, fresh=not number)
+        self._execute(bands, settings, tuple(keep), timer, memory)
         self._finish(data, bands, timer)
         return data
 
@@ -219,10 +216,10 @@ class Pipeline:
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
         bands = self._of_bands(data)
         self._observe(data, bands, timer, outputs=False, prefix=part.prefix)
-        for pipeline, own in bands:
+        for _, own in bands:
             if part.scans is not None:
                 own.observations = [own.observations[k] for k in part.scans]
-            pipeline._execute(own, settings, (), timer, memory, fresh=False)
+        self._execute(bands, settings, (), timer, memory, fresh=False)
         gather(data, [own for _, own in bands])
         data.provenance["timings"] = timer.rows()
         manager().hook.zonda_pipeline_end(pipeline=self, data=data)
@@ -254,11 +251,17 @@ class Pipeline:
     def least_memory(self, observations: Sequence[Observation]) -> int:
         """Bytes with which a process runs the pipeline over these observations on one thread, libraries included."""
         if len(self._pointed) > 1:
-            shares = ((p, [o for o in observations if o.instrument == own.scene.instrument]) for p, own in self._pointed)
-            return max(pipeline.least_memory(scans) for pipeline, scans in shares)
+            shares = [(p, [o for o in observations if o.instrument == own.scene.instrument]) for p, own in self._pointed]
+            products = [products_of(p.chain, longest_of(scans)) for p, scans in shares]
+            each = zip(shares, products, strict=True)
+            return max(p._least_memory(scans, sum(products) - mine) for (p, scans), mine in each)
+        return self._least_memory(observations)
+
+    def _least_memory(self, observations: Sequence[Observation], others: int = 0) -> int:
+        """As `least_memory`, of one band; ``others``: bytes of the products of other bands."""
         observation = longest_of(observations)
         note_signals([observation], self.signals.components, self.signals.formed)
-        return least_memory(self.chain, observation, Settings(dtype=self._dtype))
+        return least_memory(self.chain, observation, Settings(dtype=self._dtype, others=others))
 
     @property
     def _dtype(self) -> type[np.floating[Any]]:
@@ -282,52 +285,26 @@ class Pipeline:
         return data, settings
 
     def _execute(
-        self, data: Data, settings: Settings, keep: tuple[str, ...], timer: Timer, memory: int | None, fresh: bool = True
+        self, bands: Bands, settings: Settings, keep: tuple[str, ...], timer: Timer, memory: int | None, fresh: bool = True
     ) -> None:
-        """Run all observations in order; the next one is prepared while one is executed."""
+        """Run all observations with all bands."""
+        for pipeline, own in bands:
+            pipeline._make_ready(own)
+        parts = [Band(replace(pipeline.chain, keep=keep), own, pipeline._watch) for pipeline, own in bands]
+        execute(parts, settings, timer, Budget(memory, fresh, self.name))
+
+    def _make_ready(self, data: Data) -> None:
+        """Note in the observations what is made of them, and let outputs see them."""
         if not data.observations:
             raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
-        hooks, chain = manager().hook, replace(self.chain, keep=keep)
         for observation in data.observations:
             observation.output, observation.focalplane = data.output, observation.focalplane.copy()
         note_signals(data.observations, self.signals.components, self.signals.formed)
         self._watch(data, "pointing")
-        listeners = hooks.zonda_before_operator.get_hookimpls() or hooks.zonda_after_operator.get_hookimpls()
-        ahead = Ahead(settings.threads > 1 and not listeners)  # who listens hears of one observation after the other
-        settings = self._divided(chain, data, settings, ahead, memory, fresh)
-        calls = hooks.zonda_before_operator, hooks.zonda_after_operator
-        executions = [Execution(chain, o, settings, timer, *calls) for o in data.observations]
         for name, signal in self.signals.runs.items():
             if self.signals.not_linear and signal.modes == "full":
                 text = f"its own from {self.signals.not_linear} on, which is not linear, instead of those of the complete signal"
                 data.tally.state(name, "modes", text)
-        try:
-            for execution, following in zip(executions, [*executions[1:], None], strict=True):
-                execution.run(data, ahead, following)
-                data.tally.update(execution.observation.tally)
-                self._watch(data, "scan")
-        finally:
-            ahead.close()
-
-    def _divided(self, chain: Chain, data: Data, settings: Settings, ahead: Ahead, memory: int | None, fresh: bool) -> Settings:
-        """The settings with the memory that is left for streams and blocks."""
-        kept = 8 * len(chain.keep) * sum(o.n_detectors * o.n_samples for o in data.observations)
-        if memory is not None and settings.asked is None:
-            check_kept_memory(kept, available_memory(), self.name)
-            return settings
-        settings = replace(settings, kept=kept)
-        longest, most = longest_of(data.observations), settings.memory
-        settings = divided(chain, longest, settings, self.name, fresh)
-        if memory is not None:
-            settings = replace(settings, memory=min(settings.memory, most))
-        if ahead.on and len(data.observations) > 1:
-            less = with_scan_ahead(chain, longest, settings)
-            ahead.on, settings = less is not None, less or settings
-        if settings.threads < data.threads and fresh:
-            text = f"{settings.threads} of {data.threads} threads work: more do not fit in the memory budget"
-            warnings.warn(f"{self.name}: {text}", stacklevel=3)
-        data.threads = settings.threads
-        return settings
 
     def _finish(self, data: Data, bands: Bands, timer: Timer) -> None:
         """Finish the products of all bands, and let the outputs act."""

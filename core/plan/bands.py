@@ -78,7 +78,8 @@ def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
 
 
 def _added(predictions: list[Prediction]) -> Prediction:
-    """Bands follow each other: times add up, memory does not."""
+    """Bands follow each other scan by scan: times add up, and of their memory that of maps, which grow beside each other."""
+    products = sum(p.products for p in predictions)
     seconds: dict[str, float] = {}
     for p in predictions:
         for label, used in p.seconds.items():
@@ -86,7 +87,8 @@ def _added(predictions: list[Prediction]) -> Prediction:
     return dataclasses.replace(
         predictions[0],
         seconds=seconds,
-        bytes=max(p.bytes for p in predictions),
+        bytes=max(p.bytes - p.products for p in predictions) + products + max(p.shared for p in predictions),
+        products=products,
         unknown=tuple(dict.fromkeys(label for p in predictions for label in p.unknown)),
         startup=max(p.startup for p in predictions),
     )

@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from ..mapmaker import makes_products
 from ..output import Output
 from ..run.budget import BASE
 from ..run.schedule import Chain, schedule
 from ..run.settings import Settings
+from ..shared import room_for
 from ..storage import user_cache
 from .context import Context
 from .estimate import Cost
@@ -121,4 +123,7 @@ def predict(
             seconds[label] = factors[cost.kernel] * (work.times.get(label, 1.0) * (each + again) + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     startup = factors[STARTUP.kernel] * STARTUP.once
-    return Prediction(seconds, BASE + max(held + found.bytes, after), unknown, startup, work.times, factors)
+    products = sum(planning_of(o).memory(longest) for o in during if makes_products(o))
+    shared = room_for(longest.n_detectors, longest.n_samples)
+    size = BASE + max(held + found.bytes, after)
+    return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared)

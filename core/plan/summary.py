@@ -23,6 +23,10 @@ class Prediction:
     times: Mapping[str, float] = field(default_factory=dict)
     """How often each operator does its work, by label (`context.Work`)."""
     factors: Mapping[str, float] = field(default_factory=dict)
+    products: float = 0.0
+    """Bytes that steps add up over all scans, part of ``bytes``."""
+    shared: float = 0.0
+    """Bytes that may be kept for another band of the camera, not part of ``bytes``."""
 
     @property
     def total(self) -> float:

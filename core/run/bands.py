@@ -15,6 +15,7 @@ from ..errors import InputError, PipelineError
 from ..observation import Observation
 from ..operator import Operator
 from ..scene import WithScene
+from ..shared import SharedScan, room_for
 from ..signal import MAIN, product_name, stream_of
 from ..tally import Tally
 
@@ -58,8 +59,9 @@ def use_recorded(data: Data, operators: Sequence[Operator]) -> None:
 
 def distribute(data: Data, bands: Sequence[Data]) -> None:
     """Give each band its detectors of all scans, and what is laid out for it; what pointing tells is told once."""
+    shared = [SharedScan(room_for(scan.n_detectors // len(bands), scan.n_samples)) for scan in data.observations]
     for number, own in enumerate(bands):
-        own.observations = [_of_band(scan, number, own) for scan in data.observations]
+        own.observations = [_of_band(scan, number, own, part) for scan, part in zip(data.observations, shared, strict=True)]
         own.layouts = _of(data.layouts, own.band)
     for scan in data.observations:
         data.tally.update(scan.tally)
@@ -107,7 +109,7 @@ def _key(band: str) -> str:
     return f"@{band}"
 
 
-def _of_band(scan: Observation, number: int, own: Data) -> Observation:
+def _of_band(scan: Observation, number: int, own: Data, shared: SharedScan) -> Observation:
     """A scan with one band's detectors."""
     band = own.band
     plane = scan.focalplane.of_band(number)
@@ -120,5 +122,5 @@ def _of_band(scan: Observation, number: int, own: Data) -> Observation:
     return replace(
         scan, name=f"{scan.name}-{band}", instrument=own.scene.instrument, focalplane=plane, flags=scan.flags.copy(),
         detector_flags=scan.detector_flags[scan.focalplane.band == number], intervals=dict(scan.intervals), smooth={}, detdata={},
-        noise_levels={}, closed_forms={}, windows={}, quoted_net=None, expected_load=None, tally=Tally(),
+        noise_levels={}, closed_forms={}, windows={}, quoted_net=None, expected_load=None, tally=Tally(), shared=shared,
     )  # fmt: skip

@@ -18,6 +18,7 @@ BASE = 230_000_000
 
 
 KEPT = "kept streams"
+OTHERS = "maps of other bands, and what all share"
 FEWER = "keep fewer streams, of fewer or shorter scans"
 
 
@@ -50,7 +51,7 @@ def divided(chain: Chain, observation: Observation, settings: Settings, place: s
     """
     budget = settings.asked or resident_memory() + available_memory() // 2
     parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
-    parts[KEPT] = settings.kept
+    parts |= {KEPT: settings.kept, OTHERS: settings.others + shared_bytes(observation)}
     parts.update((o.label, planning_of(o).memory(observation)) for o in chain.steps)
     fixed = sum(parts.values())
     left = replace(settings, memory=max(budget - fixed, 1))
@@ -60,8 +61,18 @@ def divided(chain: Chain, observation: Observation, settings: Settings, place: s
         found = schedule(chain, observation, left)
     if fixed + found.least > budget:
         _refuse(chain, parts, found.least, budget, left.threads, place)
-    products = sum(parts[o.label] for o in chain.steps if makes_products(o))
+    products = products_of(chain, observation) + settings.others
     return replace(left, least=found.least, ceiling=budget - products, asked=budget)
+
+
+def products_of(chain: Chain, observation: Observation) -> int:
+    """Bytes of what steps add up over all scans."""
+    return sum(planning_of(o).memory(observation) for o in chain.steps if makes_products(o))
+
+
+def shared_bytes(observation: Observation) -> int:
+    """Bytes that may be kept for the bands that observe a scan after another (`core.shared`)."""
+    return observation.shared.room if observation.shared is not None else 0
 
 
 def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) -> Settings | None:
@@ -81,7 +92,7 @@ def check_kept_memory(size: int, free: int, place: str) -> None:
 
 def least_memory(chain: Chain, observation: Observation, settings: Settings) -> int:
     """Bytes with which a process runs these steps over an observation on one thread, libraries included."""
-    held = sum(planning_of(o).memory(observation) for o in chain.steps)
+    held = sum(planning_of(o).memory(observation) for o in chain.steps) + settings.others + shared_bytes(observation)
     return _with_margin(BASE + held + schedule(chain, observation, replace(settings, threads=1)).least)
 
 

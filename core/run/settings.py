@@ -41,6 +41,8 @@ class Settings:
         Memory to use again.
     kept
         Bytes of the streams of all scans that the user wants to have at the end.
+    others
+        Bytes of the products of the other bands of a camera, which grow scan by scan beside those of this one.
     """
 
     threads: int = 1
@@ -53,6 +55,7 @@ class Settings:
     asked: int | None = None
     least: int = 0
     kept: int = 0
+    others: int = 0
 
 
 @dataclass

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -11,11 +11,12 @@ from zonda.core.instrument import SPEED_OF_LIGHT
 from zonda.core.types import Floats
 
 from .fluctuations import AtNodes, OfDetectors, times, units_fit
-from .model import AtmosphereModel
+from .model import AtmosphereModel, ExpectedLoad
 from .response import Response, delay_per_vapour
 from .turbulence.beams import rayleigh_distance, widened
 from .turbulence.lines_of_sight import LinesOfSight
 from .turbulence.sampling import Drifting, DriftingLayers
+from .turbulence.together import Layers, Together
 
 PLANES = {
     "transverse": "transverse to the mean line of sight",
@@ -28,7 +29,7 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     """The fluctuations of an observation, stated in its log."""
     parameters, observation, chosen, law = model.parameters, model.observation, model.resolution(), model.fluctuation
     law.check(model.pwv, label)
-    turbulence = drifting_layers(model)
+    turbulence = _layers_of(model, label)
     path = turbulence.paths[chosen.step]
     shares = np.array([layer.amplitude for layer in model.layers])
     heights = np.array([layer.height for layer in model.layers])
@@ -61,18 +62,67 @@ def height_of_vapour(model: AtmosphereModel) -> float:
     return float(shares @ np.array([layer.height for layer in model.layers]) / shares.sum())
 
 
-def drifting_layers(model: AtmosphereModel, points: tuple[Floats, Floats] | None = None) -> DriftingLayers:
-    """The layers that are simulated, over the whole scan, to be looked at from focal-plane ``points``, by default the nodes."""
-    chosen, omit = model.resolution(), model.parameters.omit
-    parts = zip(model.turbulence, model.layers, chosen.steps, strict=True)
-    drifting = [Drifting(field, layer.height, layer.amplitude, layer.wind, step) for field, layer, step in parts]
-    drifting = [one for number, one in enumerate(drifting) if number not in omit]
+def _layers_of(model: AtmosphereModel, label: str) -> Layers:
+    """The layers at the nodes; where bands of one camera see them alike, evaluated once for all of these."""
+    shared = model.observation.shared
+    if shared is None:
+        return drifting_layers(model)
+
+    def make(announced: Mapping[str, ExpectedLoad]) -> dict[str, Layers]:
+        return _of_bands([load.model() for load in announced.values()], label, shared.claim)
+
+    return shared.made(label, make)[model.observation.name]
+
+
+def _of_bands(models: Sequence[AtmosphereModel], label: str, claim: Callable[[int], bool]) -> dict[str, Layers]:
+    """By name of the band's scan its layers, those of bands that look at the same points and times together."""
+    found: dict[str, Layers] = {}
+    for first in models:
+        if first.observation.name in found:
+            continue
+        group = [model for model in models if model is first or _looks_alike(first, model)]
+        layers = drifting_layers(first, others=group[1:])
+        together = Together(layers, len(group), claim)
+        for number, model in enumerate(group):
+            found[model.observation.name] = together.of(number) if len(group) > 1 else layers
+            others = [other.observation.instrument.band.name for other in group if other is not model]
+            text = f"evaluated once with that of {', '.join(others)}" if others else "evaluated by itself: other nodes or steps"
+            model.observation.tally.state(label, "turbulence beside other bands", text)
+    return found
+
+
+def _looks_alike(one: AtmosphereModel, other: AtmosphereModel) -> bool:
+    """Whether two bands look at the layers from the same points at the same times."""
+    a, b, p, q = one.resolution(), other.resolution(), one.observation, other.observation
+    pairs = (a.nodes, b.nodes), (p.focalplane, q.focalplane)
+    same = a.step == b.step and a.nodes.shape == b.nodes.shape and repr(one.parameters) == repr(other.parameters)
+    if not same or p.boresight_azel is not q.boresight_azel:
+        return False
+    return all(np.array_equal(x.xi, y.xi) and np.array_equal(x.eta, y.eta) for x, y in pairs)
+
+
+def drifting_layers(
+    model: AtmosphereModel, points: tuple[Floats, Floats] | None = None, others: Sequence[AtmosphereModel] = ()
+) -> DriftingLayers:
+    """The layers that are simulated, over the whole scan, to be looked at from focal-plane ``points``, by default the nodes.
+
+    ``others``: models of bands that look alike, for which they are evaluated at once (`DriftingLayers.of_bands`).
+    """
+    chosen = model.resolution()
+    drifting, *more = (_drifting(one) for one in (model, *others))
     first, count = times(slice(0, model.observation.n_samples), chosen.step)
     kind = np.float64 if chosen.nodes.shape else np.float32
     span = first, first + count
     return DriftingLayers(
-        model.observation, model.plane, points or (chosen.nodes.xi, chosen.nodes.eta), drifting, chosen.step, span, kind
+        model.observation, model.plane, points or (chosen.nodes.xi, chosen.nodes.eta), drifting, chosen.step, span, kind, more
     )
+
+
+def _drifting(model: AtmosphereModel) -> list[Drifting]:
+    """The layers that are simulated, as one band sees them."""
+    parts = zip(model.turbulence, model.layers, model.resolution().steps, strict=True)
+    drifting = [Drifting(field, layer.height, layer.amplitude, layer.wind, step) for field, layer, step in parts]
+    return [one for number, one in enumerate(drifting) if number not in model.parameters.omit]
 
 
 def state_drawn(model: AtmosphereModel, label: str, state: AtNodes | OfDetectors) -> None:

@@ -61,7 +61,7 @@ class AtmosphereLayers(LayerParameters):
         """Note the start of the run and its scans, which share one drifting atmosphere; announce the load to map makers."""
         self._models = self._models.of_run(data)  # one of its own: copies of this step may be at work in other threads
         for observation in data.observations:
-            observation.expected_load = ExpectedLoad(self._models, self, observation)
+            ExpectedLoad(self._models, self, observation).announce()
 
     def configure(self, observation: Observation) -> None:
         """Set the smooth means: noise levels that follow from the load need them before any step is prepared."""

@@ -193,6 +193,12 @@ class ExpectedLoad:
     def __call__(self) -> tuple[float, float]:
         return expected_load(self.models, self.parameters, self.observation)
 
+    def announce(self) -> None:
+        """Let other steps know, and the other bands of the camera (`core.shared`)."""
+        self.observation.expected_load = self
+        if self.observation.shared is not None:
+            self.observation.shared.announce(self.parameters.label, self.observation.name, self)
+
     def model(self) -> AtmosphereModel:
         """The model that the observation was, or will be, drawn from."""
         return self.models.of(self.parameters, self.observation)

@@ -11,6 +11,7 @@ import zonda
 from zonda.core.errors import ZondaError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.plan.planning import planning_of
 from zonda.core.registry import bands
 
 BANDS: dict[str, dict[str, Any]] = {
@@ -241,3 +242,36 @@ def test_a_campaign_adds_up_each_band(tmp_path: Path) -> None:
     page = (tmp_path / "campaign" / "report.html").read_text(encoding="utf-8")
     assert f"central_rms {name}" in page
     assert "scan-001-f090" in page
+
+
+def test_the_forecast_knows_that_maps_of_all_bands_grow_beside_each_other(tmp_path: Path) -> None:
+    """`zonda plan`: the largest band without its maps, the maps of all, and what is kept for bands to come."""
+    file = tmp_path / "two.yaml"
+    lines = "\n".join(
+        [
+            "site: llano_de_chajnantor", "time: 2022-08-01T23:00", "target: 260d -10d",
+            "instrument: {name: x, telescope: {name: d, diameter: 6 m}, detectors: 7, field_of_view: 20 arcmin,",
+            "  main_beam_efficiency: 0.8, illumination_efficiency: 0.9, net: 1 mK s(1/2), sample_rate: 50 Hz,",
+            "  bands: [so_93ghz, so_145ghz]}",
+            "operators: [PointingDaisy: {scan_duration: 20 s}, WhiteNoise, Efficiency, BinMap: {pixel: 2 arcsec}, SaveMap]",
+        ]
+    )  # fmt: skip
+    file.write_text(lines)
+    made = zonda.plan(zonda.load(file))
+    each = [p.summary.prediction for p in made.plans.values()]
+    whole = made.summary.prediction
+    maps = sum(p.products for p in each)
+    assert maps > 10e6
+    assert whole.bytes == max(p.bytes - p.products for p in each) + maps + 4 * 7 * 50 * 20
+
+
+def test_what_bands_hold_for_each_other_counts_in_the_budget() -> None:
+    """The least that a worker needs: more than the most of the bands alone, by the maps of the other and what is shared."""
+    steps = pipeline().operators
+    made = {names: zonda.Pipeline(steps) for names in (("f090",), ("f150",), ("f090", "f150"))}
+    scans = {names: one.point(scene(*names), {}, Path()).observations for names, one in made.items()}
+    least = {names: one.least_memory(scans[names]) for names, one in made.items()}
+    maps = planning_of(made["f090",].operators[-1]).memory(scans["f090",][0])
+    more = least["f090", "f150"] - max(least["f090",], least["f150",])
+    # rounded up to MB with a margin of 5 %; what is shared is one stream, 19 x 1500 float32
+    assert abs(more - 1.05 * (maps + 4 * PIXELS * 1500)) <= 1e6

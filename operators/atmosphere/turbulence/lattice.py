@@ -16,6 +16,7 @@ kernels are, and how well the covariance holds: `levels`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -99,34 +100,63 @@ class Turbulence:
             return self.aperture.variance(self.outer_scale)
         return float(beam_correlation(0.0, self.outer_scale, self.sigma)[0])
 
+    def alike(self, other: Turbulence) -> bool:
+        """Whether another field is a convolution of the same random numbers with kernels of the same shapes."""
+        if len(self.levels) != len(other.levels) or not np.array_equal(self._keys, other._keys):
+            return False
+        pairs = zip(self.levels, other.levels, strict=True)
+        return self.fidelity is other.fidelity and all(_same_taps(a.kernel, b.kernel) for a, b in pairs)
+
     def region(self, i0: int, i1: int, j0: int, j1: int) -> Field:
         """The field at lattice points i0 <= i < i1, j0 <= j < j1 (any integers). Shape (i1 - i0, j1 - j0), float32."""
-        pad = self.fidelity.taps // 2
-        boxes = [(i0, i1, j0, j1)]
-        for _ in self.levels[1:]:
-            a, b, c, d = boxes[-1]
-            boxes.append(((a >> 1) - pad + 1, ((b - 1) >> 1) + pad + 1, (c >> 1) - pad + 1, ((d - 1) >> 1) + pad + 1))
-        field: Field | None = None
-        for k in range(len(self.levels) - 1, -1, -1):
-            a, b, c, d = boxes[k]
-            here = np.zeros((b - a, d - c), np.float32)
-            if field is not None:
-                _upsample(field, boxes[k + 1][0], boxes[k + 1][2], self.weights, here, a, c)
-            kernel = self.levels[k].kernel
-            if kernel is not None:
-                radius = len(kernel) - 1
-                noise = lattice_normals(self._keys[k], a - radius, b + radius, c - radius, d + radius)
-                _convolve(noise, kernel, here)
-            field = here
-        assert field is not None
-        return field
+        found: Field = _regions([self], i0, i1, j0, j1)[0]
+        return found
 
     def coefficients(self, i0: int, i1: int, j0: int, j1: int) -> Field:
         """Cubic B-spline coefficients at lattice points, so that the spline passes through the field. As `region`."""
-        h = PREFILTER
-        out = np.empty((i1 - i0, j1 - j0), np.float32)
-        _prefilter(self.region(i0 - h, i1 + h, j0 - h, j1 + h), prefilter_taps(), out)
-        return out
+        found: Field = coefficients([self], i0, i1, j0, j1)[0]
+        return found
+
+
+def coefficients(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -> Field:
+    """`Turbulence.coefficients` of fields that are `alike`, (n_field, i1 - i0, j1 - j0): each has the bits that it has alone."""
+    h = PREFILTER
+    out = np.empty((len(fields), i1 - i0, j1 - j0), np.float32)
+    for field, made in zip(_regions(fields, i0 - h, i1 + h, j0 - h, j1 + h), out, strict=True):
+        _prefilter(field, prefilter_taps(), made)
+    return out
+
+
+def _regions(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -> Field:
+    """`Turbulence.region` of fields that are `alike`, (n_field, i1 - i0, j1 - j0): their random numbers are drawn once."""
+    first = fields[0]
+    pad = first.fidelity.taps // 2
+    boxes = [(i0, i1, j0, j1)]
+    for _ in first.levels[1:]:
+        a, b, c, d = boxes[-1]
+        boxes.append(((a >> 1) - pad + 1, ((b - 1) >> 1) + pad + 1, (c >> 1) - pad + 1, ((d - 1) >> 1) + pad + 1))
+    coarse: Field | None = None
+    for k in range(len(boxes) - 1, -1, -1):
+        a, b, c, d = boxes[k]
+        here = np.zeros((len(fields), b - a, d - c), np.float32)
+        if coarse is not None:
+            for source, target in zip(coarse, here, strict=True):
+                _upsample(source, boxes[k + 1][0], boxes[k + 1][2], first.weights, target, a, c)
+        kernels = [kernel for field in fields if (kernel := field.levels[k].kernel) is not None]
+        if kernels:
+            radius = len(kernels[0]) - 1
+            noise = lattice_normals(first._keys[k], a - radius, b + radius, c - radius, d + radius)
+            _convolve(noise, np.stack(kernels), here)
+        coarse = here
+    assert coarse is not None
+    return coarse
+
+
+def _same_taps(one: Field | None, other: Field | None) -> bool:
+    """Whether two kernels have the same taps, whatever they weigh: sums are then made in the same order."""
+    if one is None or other is None:
+        return one is other
+    return one.shape == other.shape and np.array_equal(one == 0, other == 0)
 
 
 # No fastmath in the kernels: a compiler that may fuse or reorder could give a point other bits at the end of a row. What is
@@ -157,12 +187,40 @@ def _add_symmetric(row, taps, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
-def _convolve(noise, kernel, out):  # type: ignore[no-untyped-def]
-    """out += noise * kernel; ``noise`` has R more cells on every side, ``kernel`` is a symmetric quadrant (R + 1, R + 1)."""
-    radius = kernel.shape[0] - 1
+def _add_two_symmetric(row, taps, others, out, other):  # type: ignore[no-untyped-def]
+    """`_add_symmetric` with two sets of taps: to ``out`` and to ``other`` at once, each in the same order."""
+    radius, n = taps.size - 1, nb.uint64(out.size)
+    middle, one, two = row[radius:], taps[0], others[0]
+    for j in range(n):
+        out[j] += one * middle[j]
+        other[j] += two * middle[j]
+    k = 1
+    while k + 3 <= radius:
+        a, b, c, d = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
+        e, f, g, h = others[k], others[k + 1], others[k + 2], others[k + 3]
+        a0, b0, c0, d0 = row[radius - k :], row[radius - k - 1 :], row[radius - k - 2 :], row[radius - k - 3 :]
+        a1, b1, c1, d1 = row[radius + k :], row[radius + k + 1 :], row[radius + k + 2 :], row[radius + k + 3 :]
+        for j in range(n):
+            p, q, r, s = a0[j] + a1[j], b0[j] + b1[j], c0[j] + c1[j], d0[j] + d1[j]
+            out[j] = fused(c, r, fused(d, s, fused(a, p, fused(b, q, out[j]))))
+            other[j] = fused(g, r, fused(h, s, fused(e, p, fused(f, q, other[j]))))
+        k += 4
+    while k <= radius:
+        one, two, left, right = taps[k], others[k], row[radius - k :], row[radius + k :]
+        for j in range(n):
+            p = left[j] + right[j]
+            out[j], other[j] = fused(one, p, out[j]), fused(two, p, other[j])
+        k += 1
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False)
+def _convolve(noise, kernels, out):  # type: ignore[no-untyped-def]
+    """out[b] += noise * kernels[b]; ``noise`` has R more cells on every side, the kernels are symmetric quadrants (R + 1, R + 1)
+    whose taps are zero in the same places."""
+    number, radius = kernels.shape[0], kernels.shape[1] - 1
     rows = np.empty(noise.shape[1], np.float32)
     m = nb.uint64(rows.size)
-    for i in range(out.shape[0]):
+    for i in range(out.shape[1]):
         for di in range(radius + 1):
             above, below = noise[i + radius - di], noise[i + radius + di]
             if di == 0:
@@ -171,11 +229,14 @@ def _convolve(noise, kernel, out):  # type: ignore[no-untyped-def]
             else:
                 for j in range(m):
                     rows[j] = above[j] + below[j]
-            taps = kernel[di]
             size = radius + 1
-            while size > 1 and taps[size - 1] == 0:  # the kernel is cut to a circle
+            while size > 1 and kernels[0, di, size - 1] == 0:  # the kernel is cut to a circle
                 size -= 1
-            _add_symmetric(rows[radius + 1 - size :], taps[:size], out[i])
+            row = rows[radius + 1 - size :]
+            for b in range(0, number - 1, 2):
+                _add_two_symmetric(row, kernels[b, di, :size], kernels[b + 1, di, :size], out[b, i], out[b + 1, i])
+            if number % 2:
+                _add_symmetric(row, kernels[number - 1, di, :size], out[number - 1, i])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)

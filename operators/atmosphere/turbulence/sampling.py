@@ -1,34 +1,32 @@
 """Evaluation of the layers along lines of sight, at a step in time of each layer's own, from tiles of their lattices.
 
 A layer's spline coefficients are made in tiles that overlap by the three cells a cubic spline needs, so that every point is
-interpolated from one tile. Tiles are kept up to `BYTES_KEPT`; any tile has the same bits whenever it is made, and a point
+interpolated from one tile. Tiles are kept (`tiles`); any tile has the same bits whenever it is made, and a point
 the same bits whichever points it is evaluated with. Where a scan sweeps over few cells they are made as one piece; over a strip
 along the wind, in slabs as wide as that, since squares would hold more than is used; along a narrow path that turns, in strips.
+
+Bands of one camera whose detectors and steps are the same look through the same cells of the same lattices, each with kernels
+of its own: random numbers, positions, cells and weights are found once for all of them.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.columns import four_columns_at
-from zonda.core.compilation.jit import nb
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
 from zonda.core.types import Floats
 
 from .geometry import ScanPlane, rim
+from .interpolation import boxes_of, extent, interpolate, mark
 from .lattice import Turbulence
-from .levels import Field
 from .lines_of_sight import LinesOfSight
-
-_Key = tuple[int, tuple[int, int, int, int]]
+from .tiles import Tiles
 
 SQUARE, STRIP = (8, 8), (5, 10)
 """Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the path is narrow."""
@@ -42,25 +40,17 @@ SLAB, WIDEST, LONGEST = 1 << 16, 1024, 1 << 10
 DENSE = 1.5
 """Slabs serve where all that they hold is at most this many times what is swept over at `TIMES_AT_ONCE` times after another."""
 
-APRON = 3
-"""Cells by which tiles overlap."""
-
 ONE_PIECE = 1 << 16
 """Cells of a layer, with `AROUND` more on every side, up to which all that a scan sweeps over is made as one piece."""
 
 AROUND, SPARE = 20, 2
 """Cells about the made ones that the pyramid works out too, about; and those beyond what the rim of the points sweeps over."""
 
-BYTES_KEPT = 512 << 20
-"""Memory of the tiles that are kept."""
-
 CELLS_IN_ALL = 2e10
 """Lattice points of one scan beyond which the run is refused."""
 
 TIMES_AT_ONCE = 2048
 """Coarse times whose tiles are held at once."""
-
-_CHUNK, _RUN = 256, 16
 
 _WHOLE = 30
 """Side of the only tile, as a power of two of cells: none is so large."""
@@ -77,46 +67,17 @@ class Drifting:
     step: int
 
 
-class Tiles:
-    """The coefficients of several layers, as many as `BYTES_KEPT` allow. Safe for threads."""
+@dataclass(frozen=True)
+class Sheet:
+    """A layer as several bands see it that step through it alike: ``fields[k]`` is that of ``bands[k]``."""
 
-    def __init__(self) -> None:
-        self._kept: dict[_Key, tuple[Field, int]] = {}
-        self._making: dict[_Key, Future[tuple[Field, int]]] = {}
-        self._lock = threading.Lock()
-        self._free = BYTES_KEPT
+    layer: Drifting
+    bands: tuple[int, ...]
+    fields: tuple[Turbulence, ...]
 
-    def get(self, field: Turbulence, layer: int, box: tuple[int, int, int, int]) -> tuple[Field, int]:
-        """Coefficients of a layer and their address: of the cells low <= i < high, low <= j < high of a box, with the apron."""
-        key = (layer, box)
-        kept = self._kept.get(key)
-        if kept is not None:
-            return kept
-        with self._lock:
-            kept = self._kept.get(key)
-            if kept is not None:
-                return kept
-            mine = key not in self._making
-            making = self._making.setdefault(key, Future())
-        if not mine:
-            return making.result()
-        try:
-            a, b, c, d = box
-            tile = field.coefficients(a, b + APRON, c, d + APRON)
-            made = tile, tile.ctypes.data
-        except BaseException as error:
-            making.set_exception(error)
-            with self._lock:
-                del self._making[key]
-            raise
-        with self._lock:
-            self._free -= tile.nbytes
-            while self._free < 0 and self._kept:  # the oldest goes first; a thread that works with it still holds it
-                self._free += self._kept.pop(next(iter(self._kept)))[0].nbytes
-            self._kept[key] = made
-            del self._making[key]
-        making.set_result(made)
-        return made
+    def of(self, bands: Sequence[int]) -> tuple[int, ...]:
+        """Which of its fields are those of some bands."""
+        return tuple(k for k, band in enumerate(self.bands) if band in bands)
 
 
 class DriftingLayers:
@@ -139,6 +100,8 @@ class DriftingLayers:
         First time that may be evaluated, and the one after the last.
     dtype
         What the splines over the lattices are summed in: float32 is right to 1e-7 of each layer.
+    others
+        The same layers as further bands see them, of which the first has number 1.
 
     Raises
     ------
@@ -157,26 +120,27 @@ class DriftingLayers:
         step: int,
         span: tuple[int, int],
         dtype: type = np.float64,
+        others: Sequence[Sequence[Drifting]] = (),
     ) -> None:
         first, stop = span
-        self._drifting, self._step, self._tiles = list(drifting), step, Tiles()
+        self._sheets, self._step, self._tiles = _sheets([drifting, *others]), step, Tiles()
         self.paths: dict[int, LinesOfSight] = {}
-        for own in sorted({step, *(d.step for d in drifting)}):
+        for own in sorted({step, *(s.layer.step for s in self._sheets)}):
             low, high = (first, stop) if own == step else _coarse(first, stop, own // step)
             self.paths[own] = LinesOfSight(observation, plane, own, low, high - low)
         self._constants: list[NDArray[np.floating]] = [
-            np.array([1 / 6, 2 / 3, 0.5, 1.0, d.amplitude], dtype) for d in self._drifting
+            np.array([1 / 6, 2 / 3, 0.5, 1.0, s.layer.amplitude], dtype) for s in self._sheets
         ]
-        self._places = [_place(plane, d, self.paths[d.step].seconds) for d in self._drifting]
+        self._places = [_place(plane, s.layer, self.paths[s.layer.step].seconds) for s in self._sheets]
         swept = self._swept(*rim(*points))
         self._slabs = [_slab(box, cells) for box, cells in swept]
         self._sides = [STRIP if box[1] - box[0] < NARROW else SQUARE for box, _ in swept]
         self._pieces = [_widened(box) for box, _ in swept]
-        self.cells = sum(cells for _, cells in swept)
-        """Lattice points swept over, about."""
+        self.cells = sum(cells for sheet, (_, cells) in zip(self._sheets, swept, strict=True) if 0 in sheet.bands)
+        """Lattice points swept over, about, of one band."""
         if self.cells > CELLS_IN_ALL:
             worst = max(range(len(swept)), key=lambda n: swept[n][1])
-            field = drifting[worst].field
+            field = self._sheets[worst].fields[0]
             raise InputError(
                 f"the lines of sight sweep over {self.cells:.1e} lattice points of the turbulence "
                 f"({field.spacing:g} m for a beam of {field.sigma:.3g} m), the limit is {CELLS_IN_ALL:.0e}",
@@ -186,46 +150,59 @@ class DriftingLayers:
 
     def __call__(self, xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
         """The sum of the layers and the sine of the elevation, each (len(xi), count), from time ``first``."""
+        total, sine = self.of_bands((0,), xi, eta, first, count)
+        return total[0], sine
+
+    def of_bands(self, bands: tuple[int, ...], xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
+        """As a call: the sums that some bands see, (len(bands), len(xi), count), and the sine."""
         stop = first + count
-        total, sine = np.zeros((len(xi), count)), np.empty((len(xi), count))
+        total, sine = np.zeros((len(bands), len(xi), count)), np.empty((len(xi), count))
         for own, path in self.paths.items():
             ratio = own // self._step
+            through = [k for k, band in enumerate(bands) if any(s.layer.step == own and band in s.bands for s in self._sheets)]
+            if ratio > 1 and not through:
+                continue
             low, high = (first, stop) if ratio == 1 else _coarse(first, stop, ratio)
-            values = total if ratio == 1 else np.empty((len(xi), high - low))
+            values = total if ratio == 1 else np.empty((len(bands), len(xi), high - low))
             for start in range(low, high, TIMES_AT_ONCE):
                 end = min(start + TIMES_AT_ONCE, high)
                 x, y, up = path(xi, eta, start, end - start)
-                part, boxes = np.zeros(x.shape), _boxes(x, y)
-                for n, layer in enumerate(self._drifting):
-                    if layer.step == own:
-                        self._add(n, x, y, boxes, start - path.first, part)
-                values[:, start - low : end - low] = part
+                part, places = np.zeros((len(bands), *x.shape)), (x, y, boxes_of(x, y))
+                for n, sheet in enumerate(self._sheets):
+                    if sheet.layer.step == own and sheet.of(bands):
+                        self._add(n, bands, places, start - path.first, part)
+                values[:, :, start - low : end - low] = part
                 if ratio == 1:
                     sine[:, start - low : end - low] = up
-            if ratio > 1:
-                fine = DetectorField(spline_coefficients(values), ratio, (high - low) * ratio)
+            for k in through if ratio > 1 else ():
+                fine = DetectorField(spline_coefficients(values[k]), ratio, (high - low) * ratio)
                 # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has its time -PAD.
                 offset = first - (low + SPLINE_MARGIN + PAD) * ratio
-                total += fine.evaluate(slice(0, len(xi)), slice(offset, offset + count))
+                total[k] += fine.evaluate(slice(0, len(xi)), slice(offset, offset + count))
         return total, sine
 
-    def _add(self, n: int, x: Floats, y: Floats, boxes: Floats, start: int, out: Floats) -> None:
-        """out += layer ``n`` at the positions (x, y) per metre of height, at times from number ``start`` of its path."""
-        layer, sides, (matrix, i, j) = self._drifting[n], self._sides[n], self._places[n]
+    def _add(self, n: int, bands: tuple[int, ...], places: tuple[Floats, Floats, Floats], start: int, out: Floats) -> None:
+        """out[k] += layer ``n`` as bands[k] sees it, at times from number ``start`` of its path.
+
+        ``places``: positions (x, y) per metre of height, and their boxes.
+        """
+        sheet, sides, (matrix, i, j), (x, y, boxes) = self._sheets[n], self._sides[n], self._places[n], places
         i, j = i[start : start + x.shape[1]], j[start : start + x.shape[1]]
-        low_i, high_i, low_j, high_j = _extent(matrix, boxes, i, j)
+        which = sheet.of(bands)
+        rows = np.array([bands.index(sheet.bands[k]) for k in which], np.int64)
+        low_i, high_i, low_j, high_j = extent(matrix, boxes, i, j)
         piece = self._pieces[n]
         if piece and piece[0] <= low_i <= high_i < piece[1] and piece[2] <= low_j <= high_j < piece[3]:
-            tile, address = self._tiles.get(layer.field, n, piece)
+            tile, address = self._tiles.get(sheet.fields, n, which, piece)
             addresses, held = np.array([[address]], np.uint64), [tile]
-            sides, origin, width = (_WHOLE, _WHOLE), (piece[0], piece[2]), tile.shape[1]
+            sides, origin = (_WHOLE, _WHOLE), (piece[0], piece[2])
         else:
             slab = self._slabs[n]
             if slab and slab[0] <= low_i <= high_i < slab[1]:
                 sides = _WHOLE, slab[2]
             first_i, first_j = low_i >> sides[0], low_j >> sides[1]
             wanted = np.zeros(((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8)
-            _mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
+            mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
             begin, across = first_i << sides[0], 1 << sides[0]
             if slab and sides[0] == _WHOLE:
                 wanted = wanted.max(axis=0, keepdims=True)
@@ -234,29 +211,47 @@ class DriftingLayers:
             for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
                 k, m = begin + a * across, (first_j + b) << sides[1]
                 box = (k, k + across, m, m + (1 << sides[1]))
-                tile, addresses[a, b] = self._tiles.get(layer.field, n, box)
+                tile, addresses[a, b] = self._tiles.get(sheet.fields, n, which, box)
                 held.append(tile)  # or it might be dropped while it is read
-            origin, width = (begin, first_j << sides[1]), (1 << sides[1]) + APRON
-        _interpolate(matrix, x, y, i, j, *sides, *origin, width, addresses, self._constants[n], out)
+            origin = begin, first_j << sides[1]
+        interpolate(matrix, x, y, i, j, *sides, *origin, held[0].shape, addresses, self._constants[n], rows, out)
 
     def _swept(self, xi: Floats, eta: Floats) -> list[tuple[tuple[int, int, int, int], float]]:
         """For each layer the first and last cells, across and along the wind, that the lines of sight of the rim (xi, eta) of
         the points reach; and about how many lattice points they sweep over."""
-        whole = [(1 << 62, -(1 << 62), 1 << 62, -(1 << 62))] * len(self._drifting)
-        cells = [0.0] * len(self._drifting)
+        whole = [(1 << 62, -(1 << 62), 1 << 62, -(1 << 62))] * len(self._sheets)
+        cells = [0.0] * len(self._sheets)
         for own, path in self.paths.items():
             for start in range(0, path.count, TIMES_AT_ONCE):
                 count = min(TIMES_AT_ONCE, path.count - start)
                 x, y, _ = path(xi, eta, path.first + start, count)
-                boxes = _boxes(x, y)
-                for n, layer in enumerate(self._drifting):
-                    if layer.step == own:
+                boxes = boxes_of(x, y)
+                for n, sheet in enumerate(self._sheets):
+                    if sheet.layer.step == own:
                         matrix, i, j = self._places[n]
-                        a, b, c, d = _extent(matrix, boxes, i[start : start + count], j[start : start + count])
+                        a, b, c, d = extent(matrix, boxes, i[start : start + count], j[start : start + count])
                         cells[n] += (b - a + 2.0 * AROUND) * (d - c + 2.0 * AROUND)
                         k, m, p, q = whole[n]
                         whole[n] = min(k, a), max(m, b), min(p, c), max(q, d)
         return [(box, min(number, _cells_of(box))) for box, number in zip(whole, cells, strict=True)]
+
+
+def _sheets(of_bands: Sequence[Sequence[Drifting]]) -> list[Sheet]:
+    """Layer by layer what bands see alike; where they step through it otherwise, or on another lattice, each by itself."""
+    found: list[Sheet] = []
+    for together in zip(*of_bands, strict=True):
+        left = list(enumerate(together))
+        while left:
+            _, layer = left[0]
+            mine = [(band, d) for band, d in left if d is layer or _seen_alike(layer, d)]
+            found.append(Sheet(layer, tuple(band for band, _ in mine), tuple(d.field for _, d in mine)))
+            left = [(band, d) for band, d in left if band not in found[-1].bands]
+    return found
+
+
+def _seen_alike(one: Drifting, other: Drifting) -> bool:
+    places = one.height == other.height and one.amplitude == other.amplitude and np.array_equal(one.wind, other.wind)
+    return places and one.step == other.step and one.field.alike(other.field)
 
 
 def _cells_of(box: tuple[int, int, int, int]) -> float:
@@ -293,101 +288,3 @@ def _place(plane: ScanPlane, layer: Drifting, seconds: Floats) -> tuple[Floats, 
     d = layer.field.spacing
     i, j = (np.asarray((b + v * seconds) / d, np.float64) for b, v in zip(start, velocity, strict=True))
     return matrix.ravel() / d, i, j
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _boxes(x, y):  # type: ignore[no-untyped-def]
-    """Middles and half widths of what `_RUN` successive positions span: (n, runs, 4) x, y, half x, half y."""
-    out = np.empty((x.shape[0], (x.shape[1] + _RUN - 1) // _RUN, 4))
-    for n in range(x.shape[0]):
-        for r in range(out.shape[1]):
-            a, b = x[n, r * _RUN], y[n, r * _RUN]
-            c, d = a, b
-            for t in range(r * _RUN + 1, min((r + 1) * _RUN, x.shape[1])):
-                a, c = min(a, x[n, t]), max(c, x[n, t])
-                b, d = min(b, y[n, t]), max(d, y[n, t])
-            out[n, r, 0], out[n, r, 1], out[n, r, 2], out[n, r, 3] = (a + c) / 2, (b + d) / 2, (c - a) / 2, (d - b) / 2
-    return out
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _cells(a, b, box, first, last):  # type: ignore[no-untyped-def]
-    """First and last cells, one of rounding included, at which the 4 coefficients of a x + b y + (first .. last) begin."""
-    middle, half = a * box[0] + b * box[1], abs(a) * box[2] + abs(b) * box[3]
-    rounding = 1e-9 * (abs(middle) + half) + 1e-9
-    low, high = middle - half + min(first, last) - rounding, middle + half + max(first, last) + rounding
-    return np.int64(np.floor(low)) - 1, np.int64(np.floor(high)) - 1
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _extent(matrix, boxes, i, j):  # type: ignore[no-untyped-def]
-    """First and last cells: across low, high, along low, high. The drift (i, j) is steady, so its ends bound it."""
-    low_i = low_j = np.int64(1 << 62)
-    high_i = high_j = -low_i
-    for n in range(boxes.shape[0]):
-        for r in range(boxes.shape[1]):
-            t, last = r * _RUN, min((r + 1) * _RUN, i.size) - 1
-            a, b = _cells(matrix[0], matrix[1], boxes[n, r], i[t], i[last])
-            c, d = _cells(matrix[2], matrix[3], boxes[n, r], j[t], j[last])
-            low_i, high_i, low_j, high_j = min(low_i, a), max(high_i, b), min(low_j, c), max(high_j, d)
-    return low_i, high_i, low_j, high_j
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _mark(matrix, boxes, i, j, side_i, side_j, first_i, first_j, wanted):  # type: ignore[no-untyped-def]
-    """Set 1 where a tile is wanted; (first_i, first_j) is the first tile."""
-    for n in range(boxes.shape[0]):
-        for r in range(boxes.shape[1]):
-            t, last = r * _RUN, min((r + 1) * _RUN, i.size) - 1
-            a, b = _cells(matrix[0], matrix[1], boxes[n, r], i[t], i[last])
-            c, d = _cells(matrix[2], matrix[3], boxes[n, r], j[t], j[last])
-            for k in range(a >> side_i, (b >> side_i) + 1):
-                for m in range(c >> side_j, (d >> side_j) + 1):
-                    wanted[k - first_i, m - first_j] = 1
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, width, addresses, constants, out):  # type: ignore[no-untyped-def]
-    """out += amplitude * the cubic B-spline whose coefficients lie at ``addresses`` (uint64, one for each tile).
-
-    (low_i, low_j): the first cell of the first tile; ``width``: cells in a row of a tile. ``constants``: 1/6, 2/3, 1/2, 1 and the
-    amplitude, of the type that the spline is summed in.
-    """
-    a, b, c, d = matrix[0], matrix[1], matrix[2], matrix[3]
-    inside_i, inside_j = nb.int32((1 << side_i) - 1), nb.int32((1 << side_j) - 1)
-    width, columns_of_tiles = nb.int32(width), nb.int32(addresses.shape[1])
-    shift_i, shift_j = nb.int32(side_i), nb.int32(side_j)
-    # Cells are counted from the first tile's, in 32 bits: what the box of one call holds fits.
-    origin_i, origin_j = float(low_i), float(low_j)
-    stride, flat = nb.uint64(width), addresses.reshape(-1)
-    sixth, two_thirds, half, one, amplitude = constants[0], constants[1], constants[2], constants[3], constants[4]
-    tile, inside = np.empty(_CHUNK, np.int32), np.empty(_CHUNK, np.int32)
-    kind = constants.dtype
-    u, v, sums = np.empty(_CHUNK, kind), np.empty(_CHUNK, kind), np.empty(4 * _CHUNK, kind)
-    w0, w1, w2, w3 = np.empty(_CHUNK, kind), np.empty(_CHUNK, kind), np.empty(_CHUNK, kind), np.empty(_CHUNK, kind)
-    for n in range(x.shape[0]):
-        for start in range(0, x.shape[1], _CHUNK):
-            count = nb.uint64(min(_CHUNK, x.shape[1] - start))
-            px, py, pi, pj, row = x[n][start:], y[n][start:], i[start:], j[start:], out[n][start:]
-            for t in range(count):
-                p, q = a * px[t] + b * py[t] + pi[t], c * px[t] + d * py[t] + pj[t]
-                fp, fq = np.floor(p), np.floor(q)
-                u[t], v[t] = p - fp, q - fq
-                k, m = nb.int32(fp - 1 - origin_i), nb.int32(fq - 1 - origin_j)
-                tile[t] = nb.int32(nb.int32((k >> shift_i) * columns_of_tiles) + (m >> shift_j))
-                inside[t] = nb.int32(nb.int32((k & inside_i) * width) + (m & inside_j))
-            for t in range(count):
-                p = u[t]
-                q = one - p
-                w0[t], w1[t] = amplitude * (q * q * q * sixth), amplitude * (two_thirds - p * p * (one - p * half))
-                w2[t], w3[t] = amplitude * (two_thirds - q * q * (one - q * half)), amplitude * (p * p * p * sixth)
-            for t in range(count):
-                where = flat[nb.uint64(tile[t])] + nb.uint64(4) * nb.uint64(inside[t])
-                four_columns_at(where, stride, w0[t], w1[t], w2[t], w3[t], sums, nb.uint64(4) * t)
-            for t in range(count):
-                p = v[t]
-                q = one - p
-                w0[t], w1[t] = q * q * q * sixth, two_thirds - p * p * (one - p * half)
-                w2[t], w3[t] = two_thirds - q * q * (one - q * half), p * p * p * sixth
-            for t in range(count):
-                row[t] += w0[t] * sums[4 * t] + w1[t] * sums[4 * t + 1] + w2[t] * sums[4 * t + 2] + w3[t] * sums[4 * t + 3]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from zonda.operators.atmosphere.fluctuations import AtNodes, OfDetectors
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.model import beam_sigma
 from zonda.operators.atmosphere.parameters import Wind
-from zonda.operators.atmosphere.turbulence import sampling
+from zonda.operators.atmosphere.turbulence import sampling, tiles
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
 from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, scan_planes
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
@@ -249,13 +250,13 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
         return whole(o := observe(300.0, 10.0, scan=4.0), operator(layers=2).prepare(o))
 
     made: list[tuple[int, int]] = []
-    coefficients = Turbulence.coefficients
+    coefficients = tiles.coefficients
 
-    def watched(self: Turbulence, i0: int, i1: int, j0: int, j1: int) -> Any:
+    def watched(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -> Any:
         made.append((i1 - i0, j1 - j0))
-        return coefficients(self, i0, i1, j0, j1)
+        return coefficients(fields, i0, i1, j0, j1)
 
-    monkeypatch.setattr(Turbulence, "coefficients", watched)
+    monkeypatch.setattr(tiles, "coefficients", watched)
     expected = series()
     assert len(made) == 2  # a piece for each layer
     monkeypatch.setattr(sampling, "SPARE", -1)  # of the path's end nothing is in the piece: the others' tiles serve
@@ -270,7 +271,7 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(fluctuations, "TIMES_AT_ONCE", times)
         monkeypatch.setattr(fluctuations, "POINTS_AT_ONCE", times)
         monkeypatch.setattr(sampling, "LONGEST", longest)
-        monkeypatch.setattr(sampling, "BYTES_KEPT", kept)
+        monkeypatch.setattr(tiles, "BYTES_KEPT", kept)
         monkeypatch.setattr(sampling, "TIMES_AT_ONCE", times)
         made.clear()
         np.testing.assert_array_equal(series(), expected)

@@ -1,0 +1,62 @@
+"""What the bands of a camera share of one scan: found out by the band that needs it first, and released after the last.
+
+Nothing that a band computes may depend on the others: what is shared has the bits that each band would make by itself.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+ROOM = 256 << 20
+"""Bytes that may be kept for bands to come; less than one stream of a band takes."""
+
+
+def room_for(n_detectors: int, n_samples: int) -> int:
+    """Bytes that are kept of one scan at most."""
+    return min(ROOM, 4 * n_detectors * n_samples)
+
+
+class SharedScan:
+    """One scan of a camera with several bands, which are executed one after the other. Safe for threads.
+
+    Parameters
+    ----------
+    room
+        Bytes that may be kept for bands to come (`claim`).
+    """
+
+    def __init__(self, room: int) -> None:
+        self._free = self.room = room
+        self._announced: dict[str, dict[str, Any]] = {}
+        self._made: dict[str, Any] = {}
+        self._lock = threading.RLock()
+
+    def announce(self, label: str, band: str, part: Any) -> None:
+        """Say what a band adds to what the step ``label`` makes for all; in `Operator.observe`, in the order of the bands."""
+        self._announced.setdefault(label, {})[band] = part
+
+    def made(self, label: str, make: Callable[[Mapping[str, Any]], T]) -> T:
+        """What the step ``label`` made for all bands; the first one that asks makes it, of what was announced by each."""
+        with self._lock:
+            if label not in self._made:
+                self._made[label] = make(self._announced.get(label, {}))
+            found: T = self._made[label]
+            return found
+
+    def claim(self, size: int) -> bool:
+        """Whether ``size`` bytes more may be kept; a negative size gives back."""
+        with self._lock:
+            if size > self._free:
+                return False
+            self._free -= size
+            return True
+
+    def forget(self) -> None:
+        """Release what was made: the last band has observed the scan."""
+        with self._lock:
+            self._made.clear()
+            self._free = self.room
