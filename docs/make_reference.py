@@ -26,6 +26,7 @@ FOLDERS = {
     "maps": "Maps",
     "diagnostics": "Diagnostics",
     "io": "Files",
+    "interop": "Other packages",
 }
 SCENE = {
     Site: "site",
@@ -34,6 +35,12 @@ SCENE = {
     Band: "instrument.band",
     CameraBand: "instrument.bands",
 }
+
+
+def folder_of(cls: type) -> str:
+    """``filters`` of zonda.operators.filters.highpass, ``interop`` of zonda.interop.toast_operator."""
+    parts = cls.__module__.split(".")
+    return parts[2] if parts[1] == "operators" else parts[1]
 
 
 def page() -> str:
@@ -48,7 +55,7 @@ def page() -> str:
     ]
     for folder, title in FOLDERS.items():
         lines += ["", f"## {title}"]
-        for cls in sorted((c for c in classes if c.__module__.split(".")[2] == folder), key=lambda c: c.__name__):
+        for cls in sorted((c for c in classes if folder_of(c) == folder), key=lambda c: c.__name__):
             lines += ["", f"### {cls.__name__}", "", own_doc(cls), ""]
             needs, gives = (", ".join(f"`{n}`" for n in sorted(names)) or "nothing" for names in (cls.requires, cls.provides))
             lines += [f"Requires {needs}; provides {gives}.", "", *table(cls, but="name")]

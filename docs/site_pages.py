@@ -243,7 +243,7 @@ def api_pages() -> dict[str, str]:
     from zonda.core.configuration import units
     from zonda.core.registry import operators
 
-    folders = of_reference("FOLDERS")
+    folders, folder_of = of_reference("FOLDERS"), of_reference("folder_of")
     public = [name for name in zonda.__all__ if not name.startswith("_")]
     quantities = [name for name in public if hasattr(units, name)]
     raised = [name for name, cls in vars(errors).items() if isinstance(cls, type) and issubclass(cls, errors.ZondaError)]
@@ -261,7 +261,7 @@ def api_pages() -> dict[str, str]:
     lists += [("Units of parameters", "units", quantities), ("Errors", "errors", raised)]
     found = [operators.get(c.name) for c in operators.candidates() if c.distribution == "zonda"]
     for folder, title in folders.items():
-        classes = sorted((c for c in found if c.__module__.split(".")[2] == folder), key=lambda c: c.__name__)
+        classes = sorted((c for c in found if folder_of(c) == folder), key=lambda c: c.__name__)
         pages[f"api/{folder}.md"] = f"# {title}\n\n" + "".join(map(operator, classes))
         lists.append((title, folder, [c.__name__ for c in classes]))
     pages["api/index.md"] = index(lists)

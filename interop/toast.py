@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from zonda.operators.io.toast_hdf5 import FLAGS_ARE, WEATHER, azimuth_elevation,
 from zonda.operators.io.toast_reading import columns_of, offsets_of
 
 from .packages import needed
-from .scans import Scan, Source, scan_of
+from .scans import Source, scan_of
 
 EXTRA = "toast"
 
@@ -46,26 +46,30 @@ def to_toast(source: Source, stream: str = "signal", *, scan: str | int | None =
     source, stream, scan
         As for `zonda.interop.sotodlib.to_axismanager`.
     comm
-        A `toast.Comm` whose groups have one process each. Where absent: ``toast.Comm()``.
+        A `toast.Comm`. Where absent: ``toast.Comm()``. In a group of several processes each calls this with the same scan and
+        holds its share of the detectors.
 
     Raises
     ------
     InputError
-        The stream was not kept or is not in the file; a group of ``comm`` has several processes.
+        The stream was not kept or is not in the file.
     """
-    comm = toast.Comm() if comm is None else comm
-    if comm.group_size != 1:
-        cure = "use toast.Comm(groupsize=1)"
-        raise InputError(f"a group of {comm.group_size} processes", place="zonda.interop.toast", cure=cure)
     found = scan_of(source, stream, scan)
-    tod = found.tod
+    ob = unfilled(found.tod, toast.Comm() if comm is None else comm)
+    fill(ob, stream, found.tod.detector_flags, lambda row: (found.tod.streams[stream][row], found.spoilt[row]))
+    return ob
+
+
+def unfilled(tod: TimeOrderedData, comm: Any) -> Any:
+    """A `toast.Observation` of all but the streams of a scan."""
     band = str(tod.metadata.get("band", ""))
     session = toast.instrument.Session(
         tod.name.removesuffix(f"-{band}"), start=_datetime(tod.times[0]), end=_datetime(tod.times[-1])
     )
     ob = toast.Observation(comm, _telescope(tod), n_samples=tod.n_samples, name=tod.name, session=session)
     _fill_shared(ob, tod)
-    _fill_detectors(ob, found)
+    if (noise := _noise(tod, list(ob.local_detectors))) is not None:
+        ob["noise_model"] = noise
     for name, spans in tod.intervals.items():
         at = np.searchsorted(tod.seconds, np.reshape(spans, (-1, 2)))
         stamps = tod.times[np.minimum(at, tod.n_samples - 1)]
@@ -112,29 +116,40 @@ def _fill_shared(ob: Any, tod: TimeOrderedData) -> None:
         ob.shared[name].set(np.ascontiguousarray(values), fromrank=0)
 
 
-def _fill_detectors(ob: Any, scan: Scan) -> None:
+def fill(ob: Any, stream: str, flags: Any, row_of: Callable[[int], tuple[AnyFloats, Any]]) -> None:
+    """Give an observation its stream [K] and the flags of detectors and single samples.
+
+    ``flags``: (n_det,) of detectors. ``row_of``: values (n_samp,) of a detector by its number, and which of them (n_samp,) cannot
+    be used.
+    """
     import astropy.units as u
 
-    tod = scan.tod
-    ob.detdata.create(scan.stream, dtype=np.float64, units=u.K)
+    rows = {name: row for row, name in enumerate(ob.all_detectors)}
+    ob.detdata.create(stream, dtype=np.float64, units=u.K)
     ob.detdata.create("flags", dtype=np.uint8)
-    for row, name in enumerate(tod.names):
-        ob.detdata[scan.stream][name] = tod.streams[scan.stream][row]
-        ob.detdata["flags"][name] = tod.detector_flags[row] | np.where(scan.spoilt[row], np.uint8(INVALID), np.uint8(0))
-    ob.update_local_detector_flags(dict(zip(tod.names, tod.detector_flags.tolist(), strict=True)))
-    noise = nominal_noise(tod)
-    if noise is not None:
-        frequency, psd = noise
-        ob["noise_model"] = toast.noise.Noise(
-            detectors=tod.names,
-            freqs=dict.fromkeys(tod.names, frequency * u.Hz),
-            psds={name: row * u.K**2 * u.s for name, row in zip(tod.names, psd, strict=True)},
-            indices={name: name_uid(name) for name in tod.names},
-            detweights={
-                name: weight / u.K**2
-                for name, weight in zip(tod.names, 1 / (tod.columns["net"] ** 2 * tod.sample_rate), strict=True)
-            },
-        )
+    for name in ob.local_detectors:
+        ob.detdata[stream][name], spoilt = row_of(rows[name])
+        ob.detdata["flags"][name] = flags[rows[name]] | np.where(spoilt, np.uint8(INVALID), np.uint8(0))
+    ob.update_local_detector_flags({name: int(flags[rows[name]]) for name in ob.local_detectors})
+
+
+def _noise(tod: TimeOrderedData, local: list[str]) -> Any:
+    """The nominal noise of the detectors that a process holds; None: it is not known."""
+    import astropy.units as u
+
+    nominal = nominal_noise(tod)
+    if nominal is None:
+        return None
+    frequency, psd = nominal
+    weights = 1 / (tod.columns["net"] ** 2 * tod.sample_rate)
+    rows = {name: tod.names.index(name) for name in local}
+    return toast.noise.Noise(
+        detectors=local,
+        freqs=dict.fromkeys(local, frequency * u.Hz),
+        psds={name: psd[row] * u.K**2 * u.s for name, row in rows.items()},
+        indices={name: name_uid(name) for name in local},
+        detweights={name: weights[row] / u.K**2 for name, row in rows.items()},
+    )
 
 
 def from_toast(ob: Any, stream: str | None = "signal") -> TimeOrderedData:

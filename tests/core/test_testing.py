@@ -94,12 +94,14 @@ def test_the_cmb_keeps_the_contract(tmp_path):
 
 OF_OTHER_SCANS = {"LoadTOD", "Mispointing"}
 """The kit has no scan for them: one brings its own, the other changes where those of another step point."""
+NEED_OTHERS = {"ToastOperator"}
+"""They need packages that are not installed with the tests; tests/interop has them."""
 
 
 def test_none_is_forgotten():
     own = {c.name for c in operators.candidates() if c.distribution == "zonda"}
     files = {"SkyMap", "PointingRecorded", "PointingSchedule", "PointSources", "CMBSky"}
-    assert own == {*BUILT_IN, *files, *OF_OTHER_SCANS}
+    assert own == {*BUILT_IN, *files, *OF_OTHER_SCANS, *NEED_OTHERS}
 
 
 class Good(Operator):

@@ -1,7 +1,11 @@
 """A survey-like scan of two bands: turnarounds, trimmed ends, a dead and an opaque detector, kept in Python and in files."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 import zonda
 from zonda.core.flags import DEAD, OPAQUE, SUN_UP
@@ -48,3 +52,34 @@ def survey(tmp_path_factory):
     ]
     folder = tmp_path_factory.mktemp("survey")
     return zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=folder, keep=["signal"], threads=1)
+
+
+SECTIONS = re.split(r"^## ", (Path(__file__).parents[2] / "docs" / "interop.md").read_text(), flags=re.MULTILINE)
+
+
+@pytest.fixture
+def examples(tmp_path, monkeypatch):
+    """Run all Python of a section of docs/interop.md, one block after the other, beside the my.yaml that it speaks of (and
+    data of two bands where it names them). Returns the names that it defines."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(section, pixels):
+        scan = {"PointingBackAndForth": SCAN | {"scan_duration": "20 s", "flag_turnarounds": True}}
+        steps = [scan, "WhiteNoise", "Efficiency", {"BinMap": pixels}, "SaveTOD"]
+        scene = SCENE | {"instrument": "act_150ghz", "operators": steps}
+        Path("my.yaml").write_text(yaml.safe_dump(scene))
+        loaded = zonda.load("my.yaml")
+        data = loaded.pipeline().run(loaded.scene(), output="out/before", keep=["signal"])
+        bands = loaded.pipeline().run(zonda.Scene(**SCENE), output="out/bands", keep=["signal"])
+        (text,) = (each for each in SECTIONS if each.startswith(f"{section}\n"))
+        names = {"zonda": zonda, "data": data}
+        for block in re.findall(r"```py\n(.*?)```", text, re.DOTALL):
+            data = names["data"]
+            if "f090" in block:
+                names["data"] = bands
+            exec(compile(block, "docs/interop.md", "exec"), names)
+            if "f090" in block:
+                names["data"] = data
+        return names
+
+    return run

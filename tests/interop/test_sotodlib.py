@@ -159,3 +159,15 @@ def test_errors_name_cause_and_cure(survey, tmp_path):
     (tmp_path / "no.h5").write_bytes(b"nothing")
     with pytest.raises(InputError, match=r"no\.h5"):
         to_axismanager(tmp_path / "no.h5")
+
+
+def test_the_page_does_what_it_says(examples):
+    """All code of docs/interop.md on sotodlib; its map is zonda's where so3g counts the same hits."""
+    names = examples("sotodlib", {"projection": "CAR", "pixel": "2 arcmin"})
+    assert sorted(set(names["whole"].det_info.band)) == ["f090", "f150"]
+    ours, hits = names["data"]["map"], np.asarray(names["matrix"].to_weights()[0, 0])
+    same = (hits == ours.hits) & (hits > 0)
+    assert np.abs(hits - ours.hits).sum() < 2e-4 * ours.hits.sum()
+    largest = np.nanmax(np.abs(ours.signal))
+    # the file's signal, rounded to float32, of the same samples
+    np.testing.assert_allclose(names["signal"][same], ours.signal[same], rtol=0, atol=1e-6 * largest)

@@ -7,6 +7,7 @@ import dataclasses
 import os
 
 import astropy.units as u
+import healpy
 import numpy as np
 import pytest
 
@@ -191,3 +192,12 @@ def test_errors_name_cause_and_cure(survey, data):
     data.obs[0].detdata.create("power", units=u.W)
     with pytest.raises(InputError, match="in 'W', not in kelvin"):
         from_toast(data.obs[0], "power")
+
+
+def test_the_page_does_what_it_says(examples, tmp_path):
+    """All code of docs/interop.md on TOAST; its map, in a file, is that of the data that were read back."""
+    names = examples("TOAST", {"nside": 1024})
+    theirs = healpy.read_map(tmp_path / "theirs_hits.fits", dtype=None)
+    assert theirs.sum() == names["data"]["map"].hits.sum() > 0
+    # the last block adds the atmosphere's emission, kelvins, and noise
+    assert names["found"].obs[0].detdata["signal"].data.mean() > 1

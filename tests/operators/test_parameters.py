@@ -520,6 +520,9 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
     "Report": {"central_diameter": ({}, {"central_diameter": "30 arcsec"})},
 }  # fmt: skip
 
+NEED_OTHERS = {"ToastOperator"}
+"""Steps that need packages which are not installed with the tests; tests/interop has them."""
+
 CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
     "SkyMap": ["SkyMap"],
@@ -664,8 +667,10 @@ def known() -> dict[str, Any]:
 
 def test_no_operator_and_no_parameter_is_left_out() -> None:
     own = {c.name: operators for c in operators.candidates() if c.distribution == "zonda"}
-    assert set(own) == set(CASES)
+    assert set(own) == set(CASES) | NEED_OTHERS
     for name, registry in own.items():
+        if name in NEED_OTHERS:
+            continue
         assert set(registry.get(name).model_fields) - {"name"} == set(CASES[name]), name
 
 

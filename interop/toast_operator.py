@@ -1,0 +1,270 @@
+"""An operator of TOAST as a step of a pipeline."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, JsonValue, model_validator
+
+from zonda.core.block import Block
+from zonda.core.configuration.diagnostics import nearest
+from zonda.core.configuration.values import refusal
+from zonda.core.data import Data
+from zonda.core.errors import InputError, PipelineError
+from zonda.core.flags import DETECTOR_MASK, PROCESSING
+from zonda.core.numerics.smooth import SmoothField
+from zonda.core.observation import Observation
+from zonda.core.operator import Operator
+from zonda.core.signal import MAIN
+from zonda.core.stream import Stream
+from zonda.core.types import AnyFloats
+from zonda.operators.io.time_ordered_data import TimeOrderedData
+
+from .packages import needed
+
+EXTRA = "toast"
+ALONE = threading.Lock()
+"""TOAST works on one scan at a time, with threads of its own (OMP_NUM_THREADS)."""
+
+
+class ToastOperator(Operator):
+    """Let an operator of TOAST 3 act on the signal of each scan, e.g. a filter. Needs the extra toast.
+
+    For example ``ToastOperator: {operator: PolyFilter, traits: {order: 3, view: throw}}``. It is given what TOAST reads from a
+    file of `SaveTOD`: one scan of one band with all detectors and samples in float64, flags, intervals, pointing, weather and
+    nominal noise. Samples that are not finite are flagged for it. What it flags no map uses. Its random numbers, if any, are
+    TOAST's: they follow from the trait `realization` and the names of scan and detectors, not from the scene's seed.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+
+    operator: str
+    """Its name in `toast.ops`, e.g. PolyFilter, GroundFilter, CommonModeFilter."""
+    traits: dict[str, JsonValue] = Field(default_factory=dict)
+    """Its traits by name; what has a unit as text (`1 deg`). A trait that is an operator: {operator: NAME, traits: ...}."""
+
+    @model_validator(mode="after")
+    def _traits(self) -> ToastOperator:
+        """Errors at their place in the file, where TOAST is installed; where it is not, the run and `zonda check` say so."""
+        if find_spec("toast") is not None:
+            try:
+                made(self.operator, self.traits)
+            except InputError as err:
+                raise refusal(err) from None
+        return self
+
+    def observe(self, data: Data) -> None:
+        """Raises InputError where TOAST is not installed."""
+        needed("toast.ops", EXTRA)
+
+    def check(self, data: Data) -> list[str]:
+        """Raises InputError where TOAST is not installed, PipelineError where a scan lacks what the operator needs."""
+        self.observe(data)
+        for scan in data.observations[:1]:
+            whole = scan.instrument
+            camera = next(iter(whole.cameras.values())) if whole.bands else whole
+            flags = np.zeros(0, np.uint8)
+            self.prepare(replace(scan, instrument=camera, focalplane=camera.focalplane(), detector_flags=flags))
+        return []
+
+    def prepare(self, observation: Observation) -> None:
+        """Raises PipelineError where the scan lacks what the operator needs."""
+        _check_needs(self, observation)
+
+    def measure(self, stream: Stream, model: Any = None) -> Changed:
+        """What TOAST's operator makes of a signal. ``model`` is not used: each signal is acted on by itself."""
+        return _changed(self, stream)
+
+    def exec(self, block: Block, state: Changed) -> None:
+        """Put what was made in the signal's place."""
+        block.detdata["signal"][...] = state.values[block.detectors, block.samples]
+        block.means.pop("signal", None)
+        if state.mean is not None:
+            block.means["signal"] = state.mean
+
+
+@dataclass(frozen=True)
+class Changed:
+    """A signal that TOAST changed: values (n_det, n_samp), and the mean that stands beside them, if it is still there."""
+
+    values: AnyFloats
+    mean: SmoothField | None
+
+
+WHAT = {"shared": "shared data", "intervals": "intervals", "detdata": "detector data", "meta": "metadata"}
+
+
+def _check_needs(step: ToastOperator, observation: Observation) -> None:
+    """Raises PipelineError where the scan lacks what the operator needs."""
+    ob = _unfilled(observation)
+    operator = made(step.operator, step.traits)
+    try:
+        wanted, makes = operator.requires(), operator.provides()
+    except Exception:  # SimAtmosphere of TOAST 3.0.6 cannot say it
+        return
+    for kind, there in {"shared": ob.shared, "intervals": ob.intervals, "detdata": ("signal", "flags"), "meta": ob}.items():
+        for name in wanted[kind]:
+            if name is not None and name not in there and name not in makes[kind]:
+                names = [n for n in there if not (kind == "intervals" and n == ob.intervals.all_name)]
+                raise PipelineError(
+                    f"toast.ops.{step.operator} needs {name!r} of {WHAT[kind]}, which the scan does not have",
+                    place=f"{step.label}, {observation.name}",
+                    cure=f"name another in its traits: {', '.join(map(str, names)) or 'there is none'}",
+                )
+
+
+def _apply(step: ToastOperator, ob: Any, observation: Observation) -> None:
+    """Let it act. Raises PipelineError with what it says where it cannot."""
+    import toast
+
+    shape, place = ob.detdata["signal"].data.shape, f"{step.label}, {observation.name}"
+    data = toast.Data(ob.comm)
+    data.obs.append(ob)
+    try:
+        made(step.operator, step.traits).apply(data)
+    except Exception as err:  # of any kind, also mistakes of TOAST's own
+        cure = "see the description of its traits in TOAST's documentation"
+        raise PipelineError(f"toast.ops.{step.operator}: {type(err).__name__}: {err}", place=place, cure=cure) from err
+    finally:
+        there = list(data.obs)
+        data.obs.clear()  # else they are emptied with it
+    same = len(there) == 1 and there[0] is ob and "signal" in ob.detdata
+    if not same or ob.detdata["signal"].data.shape != shape:
+        cure = "save the streams (SaveTOD) and go on in TOAST"
+        raise PipelineError(
+            f"toast.ops.{step.operator} leaves other detectors, samples or streams than it was given", place=place, cure=cure
+        )
+
+
+def _changed(step: ToastOperator, stream: Stream) -> Changed:
+    """See `ToastOperator.measure`."""
+    observation, mean = stream.observation, stream.means.get("signal")
+    with ALONE:
+        ob, spoilt = _filled(stream, mean)
+        before, sums = ob.detdata["flags"].data.copy(), _sums(ob)
+        _apply(step, ob, observation)
+        if np.array_equal(sums, _sums(ob)) and np.array_equal(before, ob.detdata["flags"].data):
+            observation.tally.state(step.label, "no effect", f"{step.operator} left the signal and its flags as they were")
+        values = np.array(ob.detdata["signal"].data)
+        values[spoilt] = np.nan
+        values[_newly_flagged(step.label, stream, ob, before)] = np.nan
+    if mean is not None and not _is_left(values, mean, observation):
+        mean = None
+    if mean is not None:
+        for row, each in enumerate(values):
+            each -= mean.evaluate(slice(row, row + 1), slice(0, len(each)))[0]
+    return Changed(values.astype(stream.dtype), mean)
+
+
+def made(name: str, traits: Mapping[str, Any]) -> Any:
+    """An operator of `toast.ops`. Raises InputError where there is none of that name or no such trait, or where it takes no such
+    value."""
+    ops = needed("toast.ops", EXTRA)
+    known = {n: v for n, v in vars(ops).items() if isinstance(v, type) and issubclass(v, ops.Operator)}
+    if (cls := known.get(name.removeprefix("toast.ops."))) is None:
+        cure = nearest(name, list(known)) or "give the name of a class of toast.ops, e.g. PolyFilter"
+        raise InputError(f"toast.ops has no operator {name!r}", cure=cure)
+    own = cls.class_traits()  # type: ignore[attr-defined]
+    for trait in traits:
+        if trait not in own:
+            cure = nearest(trait, list(own)) or f"choose from: {', '.join(sorted(own))}"
+            raise InputError(f"toast.ops.{name} has no trait {trait!r}", cure=cure)
+    if traits.get("det_data", "signal") != "signal":
+        raise InputError("there is no stream for TOAST but the signal", cure="leave det_data out")
+    values = {trait: _value(own[trait], value, f"toast.ops.{name}, trait {trait}") for trait, value in traits.items()}
+    if "det_data" in own:
+        values["det_data"] = "signal"
+    traitlets = needed("traitlets", EXTRA)
+    try:
+        return cls(**values)
+    except (traitlets.TraitError, ValueError, TypeError) as err:
+        raise InputError(f"toast.ops.{name}: {err}", cure="correct its traits") from None
+
+
+def _value(trait: Any, value: Any, place: str) -> Any:
+    """A trait's value from what a file says."""
+    import astropy.units as u
+    import toast.traits as kinds
+
+    if isinstance(value, Mapping) and "operator" in value:
+        return made(str(value["operator"]), value.get("traits") or {})
+    try:
+        if isinstance(trait, kinds.Quantity) and isinstance(value, str):
+            return u.Quantity(value)
+        if isinstance(trait, kinds.Unit) and isinstance(value, str):
+            return u.Unit(value)
+    except (ValueError, TypeError) as err:
+        raise InputError(f"{place}: {err}", cure="give a number with a unit, e.g. 1 deg") from None
+    return value
+
+
+def _unfilled(observation: Observation) -> Any:
+    """The scan in TOAST, on this process alone, without its signal."""
+    from . import toast as bridge
+
+    mpi = needed("toast.mpi", EXTRA)
+    comm = bridge.toast.Comm(world=mpi.MPI.COMM_SELF) if mpi.use_mpi else bridge.toast.Comm()
+    return bridge.unfilled(TimeOrderedData.of(observation), comm)
+
+
+def _filled(stream: Stream, mean: SmoothField | None) -> tuple[Any, Any]:
+    """The scan in TOAST with all of its signal, 0 where that is not finite; and where (n_det, n_samp) it is not."""
+    from . import toast as bridge
+
+    ob, spoilt = _unfilled(stream.observation), np.zeros(stream.shape, bool)
+
+    def row_of(row: int) -> tuple[AnyFloats, Any]:
+        values = stream.array[row].astype(np.float64)
+        if mean is not None:
+            values += mean.evaluate(slice(row, row + 1), slice(0, len(values)))[0]
+        spoilt[row] = ~np.isfinite(values)
+        values[spoilt[row]] = 0.0
+        return values, spoilt[row]
+
+    bridge.fill(ob, "signal", TimeOrderedData.of(stream.observation).detector_flags, row_of)
+    return ob, spoilt
+
+
+def _sums(ob: Any) -> AnyFloats:
+    """(n_det, 2) by which a changed signal is known."""
+    values = np.asarray(ob.detdata["signal"].data)
+    return np.stack([values.sum(axis=1), np.abs(values).sum(axis=1)], axis=1)
+
+
+def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
+    """(n_det, n_samp) single samples that no map may use any more. The complete signal decides which whole detectors, and which
+    instants of all of them, are flagged."""
+    observation = stream.observation
+    own = np.array([ob.local_detector_flags[name] for name in ob.local_detectors], np.uint8) & np.uint8(DETECTOR_MASK)
+    used, good = observation.good_detectors, observation.good_samples
+    new = (ob.detdata["flags"].data & ~before & np.uint8(DETECTOR_MASK)) != 0
+    new[:, ~good] = False
+    new[~used | (own != 0)] = False
+    instants = new[used].all(axis=0) | (good & ((np.asarray(ob.shared["flags"].data) & ~observation.flags & 15) != 0))
+    if stream.signal == MAIN:
+        dead = used & (own != 0)
+        observation.detector_flags[dead] |= own[dead]
+        observation.flags[instants] |= PROCESSING
+        tally = observation.tally
+        tally.count(label, "detectors that TOAST flagged", int(dead.sum()), observation.n_detectors)
+        tally.count(label, "instants that TOAST flagged", int(instants.sum()), observation.n_samples)
+        tally.count(label, "further single samples that TOAST flagged", int((new & ~instants).sum()), new.size)
+    return new & ~instants
+
+
+def _is_left(values: AnyFloats, mean: SmoothField, observation: Observation) -> bool:
+    """Whether the mean is still in the signal: what is left is nearer to it than to nothing."""
+    with_it, without, good = 0.0, 0.0, observation.good_samples
+    for row in np.flatnonzero(observation.good_detectors):
+        part = values[row, good]
+        rest = part - mean.evaluate(slice(row, row + 1), slice(0, len(good)))[0, good]
+        with_it, without = with_it + float(np.nansum(rest * rest)), without + float(np.nansum(part * part))
+    return with_it < without
