@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ..errors import InputError
+from ..numerics.projection import pixel_matrix, wcs_frame_rotation
+from ..polarization import between_meridians, turned_by
 from ..types import Floats
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from ..storage.fits_image import Cards
+
+ROWS = 256
+"""Of an image whose Q and U are turned at a time."""
 
 
 @dataclass
@@ -25,11 +33,28 @@ class Image:
         FITS keywords with a two-dimensional celestial WCS; a dict that `astropy.io.fits.Header` takes.
     unit
         Unit of ``values``, e.g. ``K_RJ``.
+    polarization, axis
+        (2, ny, nx) Q and U beside them, COSMO, from the meridians through the ICRS direction ``axis`` (3,); `stokes` turns them
+        to those of the image's frame. None: there are none.
     """
 
     values: Floats
     header: Cards | Header
     unit: str = "K_RJ"
+    polarization: Floats | None = None
+    axis: Floats | None = None
+
+    def stokes(self, which: str) -> Image:
+        """I, Q or U as an image of its own, COSMO, from the meridians of its frame; NaN where I is.
+
+        Raises InputError for an image without Q and U, and for other names.
+        """
+        if self.polarization is None or self.axis is None:
+            raise InputError("the image has no Q and U", place="image.stokes", cure="give a map of I, Q and U")
+        if which not in ("I", "Q", "U"):
+            raise InputError(f"{which!r} is none of I, Q and U", place="image.stokes", cure="write image.stokes('Q')")
+        plain = replace(self, polarization=None, axis=None)
+        return plain if which == "I" else replace(plain, values=_turned(self.polarization, self.axis, self, "QU".index(which)))
 
     @property
     def wcs(self) -> Any:
@@ -43,3 +68,16 @@ class Image:
         from .picture import Shown, draw
 
         return draw(Shown(self.values, self.wcs, self.unit, title), ax, limit)
+
+
+def _turned(q_and_u: Floats, axis: Floats, image: Image, number: int) -> Floats:
+    """Q or U (ny, nx) from the meridians of an image's own frame, some rows at a time."""
+    to_sky, pole = np.linalg.inv(pixel_matrix(image.wcs)), wcs_frame_rotation(image.wcs)[2]
+    found: Floats = np.empty_like(image.values, np.float64)
+    for start in range(0, len(found), ROWS):
+        rows = slice(start, start + ROWS)
+        y, x = np.indices(found[rows].shape, np.float64)
+        rays = np.stack([x, y + start, np.ones_like(x)], axis=2) @ to_sky.T
+        turn = between_meridians(rays / np.linalg.norm(rays, axis=2, keepdims=True), axis, pole)
+        found[rows] = turned_by(q_and_u[:, rows], turn)[number]
+    return np.where(np.isfinite(image.values), found, np.nan)

@@ -24,6 +24,7 @@ MEANINGS = {
     "half_difference_u": "U of the difference of two halves",
 }
 """Of the planes of a file."""
+IQU = ("I", "Q", "U")
 CONVENTION = "COSMO"
 """In which Q and U of maps are: angles from south to east."""
 

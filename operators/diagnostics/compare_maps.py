@@ -19,11 +19,12 @@ from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
 
-from .comparison.files import plane_of, read_plane, write_comparison
+from .comparison.files import plane_of, read_planes, write_comparison
 from .comparison.noise import with_noise
 from .comparison.planes import Plane
 from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
-from .series import about, key_of
+from .comparison.stokes import on_meridians_of, planes_of, products_of
+from .series import about, key_of, plane_key
 from .transfer_function import window_of
 
 
@@ -32,6 +33,10 @@ class CompareMaps(Output):
 
     Both are brought to one beam (the wider one) and one grid (that of the map with the smaller pixels), see
     `comparison.planes`. Fidelity is \\|reference\\| / max(\\|difference\\|, `threshold` x rms of the difference), as for ALMA.
+    Of maps of I, Q and U each plane is compared, Q and U from the meridians of the map's frame (`comparison.stokes`):
+    ``comparison_Q`` and ``comparison_U`` stand beside ``comparison``, which is of I. Where one of the two has no Q and U, I alone
+    is compared.
+
     Makes the product ``comparison`` (a `Comparison`), or one under this step's own name where it has one; where there is an
     output folder, it is written there as ``comparison.fits`` and as tables of spectra and profiles (ECSV). `Plots` and `Report`
     show it.
@@ -60,30 +65,53 @@ class CompareMaps(Output):
 
     def finalize(self, data: Data) -> None:
         """Raises PipelineError where a map is missing, InputError where the two cannot be compared."""
-        reference = self._reference(data)
-        product = _product(data, self.map, self.label)
-        plane = covered(plane_of(product, self.map), product, self.least_coverage)
-        fwhm = self.beam or resolution(plane, reference, product)
-        if self.noise == "half_difference":
-            noisy = data.products.get(self.map.rpartition("/")[2], product)  # of a signal without noise: that of the complete map
-            plane = with_noise(plane, noisy, fwhm) if isinstance(noisy, MapProduct) else plane
-        found = compare(reference, plane, Settings(fwhm or None, self.threshold, self.bins), self.label)
-        for note in found.notes:
-            data.tally.state(self.label, *note.split(": ", 1) if ": " in note else ("grid", note))
-        _tell(self.label, data, found)
-        key = key_of(self, "comparison")
-        data.products[key] = found
-        if data.output is not None:
-            write_comparison(found, product_path(data.output, data.named(key)), about(data))
+        references, maps = _references(self, data), products_of(_product(data, self.map, self.label), self.map)
+        both = [plane for plane in maps if plane in references]
+        if len(both) < max(len(maps), len(references)):
+            which = "reference" if len(references) == 1 else "map"
+            data.tally.state(self.label, "Q and U", f"not compared: the {which} has none")
+        references = on_meridians_of(plane_of(maps["I"][1], self.map), {plane: references[plane] for plane in both})
+        for plane in both:
+            _compare(self, data, plane, references[plane], maps[plane])
 
-    def _reference(self, data: Data) -> Plane:
-        if self.file is None:
-            return plane_of(_product(data, self.reference, self.label), self.reference)
-        plane, _ = read_plane(self.file)
-        if plane.unit in ("K_RJ", ""):
-            return replace(plane, unit="K_RJ")
-        pixel, beam = plane.pixel**2, math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2
-        return plane.scaled(to_kelvin_rj(plane.unit, data.scene.instrument.band, pixel, 0.0, beam), "K_RJ")
+
+def _compare(step: CompareMaps, data: Data, which: str, reference: Plane, product: tuple[str, Any]) -> None:
+    """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and the map."""
+    name, found = product
+    plane = covered(plane_of(found, name), found, step.least_coverage)
+    fwhm = step.beam or resolution(plane, reference, found)
+    if step.noise == "half_difference":
+        noisy = data.products.get(step.map.rpartition("/")[2])  # of a signal without noise: the noise of the complete map
+        noisy = noisy if isinstance(noisy, MapProduct) else found
+        noisy = noisy.stokes(which) if noisy.polarization is not None else noisy
+        plane = with_noise(plane, noisy, fwhm) if isinstance(noisy, MapProduct) else plane
+    made = compare(reference, plane, Settings(fwhm or None, step.threshold, step.bins), step.label)
+    of = "" if which == "I" else f"{which}: "
+    for note in made.notes:
+        what, text = note.split(": ", 1) if ": " in note else ("grid", note)
+        data.tally.state(step.label, of + what, text)
+    _tell(step.label, of, data, made)
+    key = plane_key(key_of(step, "comparison"), which)
+    data.products[key] = made
+    if data.output is not None:
+        write_comparison(made, product_path(data.output, data.named(key)), about(data))
+
+
+def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
+    """The planes of the reference, K_RJ."""
+    if step.file is None:
+        return planes_of(_product(data, step.reference, step.label), step.reference)
+    read = read_planes(step.file)
+    for note in read.notes:
+        data.tally.state(step.label, "Q and U", note)
+    return {which: _in_kelvin(plane, data) for which, plane in read.planes.items()}
+
+
+def _in_kelvin(plane: Plane, data: Data) -> Plane:
+    if plane.unit in ("K_RJ", ""):
+        return replace(plane, unit="K_RJ")
+    pixel, beam = plane.pixel**2, math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2
+    return plane.scaled(to_kelvin_rj(plane.unit, data.scene.instrument.band, pixel, 0.0, beam), "K_RJ")
 
 
 def resolution(plane: Plane, reference: Plane, product: Any) -> float:
@@ -109,8 +137,8 @@ def _product(data: Data, name: str, place: str) -> Any:
     raise PipelineError(f"there is no map {name!r}", place=place, cure=f"name one of these: {', '.join(known)}")
 
 
-def _tell(label: str, data: Data, found: Comparison) -> None:
+def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
     f = found.figures
-    data.tally.state(label, "gain of the map", f"{f['gain']:.4g} +- {f['gain error']:.2g}")
-    data.tally.state(label, "correlation", f"{f['correlation']:.4f}")
-    data.tally.state(label, "rms of the difference", f"{f['rms difference']:.3e} {found.unit}")
+    data.tally.state(label, f"{of}gain of the map", f"{f['gain']:.4g} +- {f['gain error']:.2g}")
+    data.tally.state(label, f"{of}correlation", f"{f['correlation']:.4f}")
+    data.tally.state(label, f"{of}rms of the difference", f"{f['rms difference']:.3e} {found.unit}")

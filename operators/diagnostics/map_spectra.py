@@ -14,6 +14,7 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_sources
+from zonda.core.maps.stokes import IQU
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.transforms import gaussian_taps
 from zonda.core.output import Output
@@ -23,7 +24,11 @@ from zonda.core.types import Floats
 
 from .comparison.radial import RadialSpectra, radial_spectra, ring_edges
 from .series import about, key_of
+from .stokes_spectra import on_the_plane, sphere_spectra
 from .transfer_function import window_of
+
+HALVES = {"": "", "_E": " (E)", "_B": " (B)"}
+"""How the spectra of the half-difference are called."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class MapSpectra:
             Column("wavenumber", 1 / s.scale, "rad-1", "mean over the ring's modes"),
             *(Column(plain[n], p, "K2 sr", "power spectral density") for n, p in s.power.items()),
             *(Column(f"{plain[n]}_white", p, "K2 sr", "of independent pixels with the map's noise") for n, p in s.white.items()),
+            *(Column(n.replace("/", "_"), p, "K2 sr", "cross power spectral density") for n, p in s.cross.items()),
             Column("modes", s.modes, "", "independent modes; relative standard error of the power: modes^-1/2"),
         ]
 
@@ -62,6 +68,10 @@ class MapSpectrum(Output):
     Of the map and of what holds noise alone (half the difference of two halves of the samples, the source-free map), or of the
     `maps` that are named. Makes the product ``map_spectra`` (a `MapSpectra`), or one under this step's own name where it has
     one; where there is an output folder, it is written there as a table (ECSV).
+
+    Of maps of I, Q and U the spectra are those of I (``map``), E and B (``map_E``, ``map_B``), with the cross spectra ``map_TE``,
+    ``map_TB`` and ``map_EB``, in COSMO's convention; name ``map_Q`` for that of Q. Spectra of a HEALPix map are those of its
+    spherical harmonics (healpy), of one map at a time.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -78,44 +88,73 @@ class MapSpectrum(Output):
     """Width of the window's cosine edge; where absent, it reaches to the middle."""
 
     def finalize(self, data: Data) -> None:
-        """Raises PipelineError where there is no TAN map."""
-        found = map_spectra(maps_of(data.products), self.maps, self.label, (self.bins, self.least_coverage, self.taper))
+        """Raises PipelineError where there is no map, or none of which there is a spectrum."""
+        found = map_spectra(data.products, Wanted(self.maps, self.bins, self.least_coverage, self.taper), self.label)
         key = key_of(self, "map_spectra")
         data.products[key] = found
         if data.output is not None:
             write_ecsv(product_path(data.output, data.named(key), ".ecsv"), found.columns(), about(data))
 
 
-def map_spectra(
-    maps: Mapping[str, MapProduct], wanted: list[str], place: str, settings: tuple[int, float, float | None]
-) -> MapSpectra:
-    """Spectra of ``wanted`` maps. ``settings``: rings, least coverage, taper [rad]. Raises PipelineError about ``place``."""
-    bins, least, taper = settings
-    flat = {name: product for name, product in maps.items() if product.projection == "TAN" and product.contents == "all"}
-    if missing := [name for name in wanted if name not in flat]:
-        cure = f"name some of these: {', '.join(flat)}" if flat else "leave nside, projection and contents of the map out"
+@dataclass(frozen=True)
+class Wanted:
+    """What is asked for: names of maps (empty: the map and what holds noise alone), rings, least coverage, taper [rad]."""
+
+    maps: list[str]
+    bins: int
+    least: float
+    taper: float | None
+
+
+def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapSpectra:
+    """Spectra of maps among the products of a run. Raises PipelineError about ``place``."""
+    whole = {name: product for name, product in maps_of(products, split=False).items() if product.contents == "all"}
+    flat = {name: product for name, product in whole.items() if product.projection == "TAN"}
+    flat |= {name: product for name, product in maps_of(flat).items() if name not in whole}
+    names = wanted.maps or [name for name in whole if "/" not in name][:1]
+    if len(names) == 1 and names[0] in whole and whole[names[0]].projection == "HEALPix":
+        product = whole[names[0]]
+        found = sphere_spectra(names[0], product, wanted.bins, wanted.least, place)
+        return MapSpectra(found, {name: name for name in found.power}, product.fwhm)
+    if missing := [name for name in names if name not in flat]:
+        cure = f"name some of these: {', '.join(flat)}" if flat else "leave projection and contents of the map out"
         raise PipelineError(f"there is no TAN map {missing[0]!r}", place=place, cure=cure)
-    names = wanted or [name for name in flat if "/" not in name][:1]
     if not names:
-        raise PipelineError(
-            "there is no TAN map of the signal", place=place, cure="leave nside, projection and contents of the map out"
-        )
+        raise PipelineError("there is no map of the signal", place=place, cure="leave projection and contents of the map out")
+    return _of_planes(flat, names, wanted, place)
+
+
+def _of_planes(flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted, place: str) -> MapSpectra:
+    """Spectra of TAN maps, of polarized ones those of I, E and B."""
     first = flat[names[0]]
-    planes: dict[str, Floats] = {name: flat[name].signal for name in names}
-    noise = {name: flat[name].noise for name in names if not name.startswith("noiseless/")}
-    if not wanted:
+    planes: dict[str, Floats] = {}
+    noise: dict[str, Floats] = {}
+    polarized: dict[str, tuple[str, str]] = {}
+
+    def add(name: str, product: MapProduct, plane: str = "signal") -> None:
+        planes[name] = getattr(product, plane)
+        if product.polarization is not None:
+            polarized[name] = f"{name}_Q", f"{name}_U"
+            q_and_u = np.stack([getattr(product.stokes(which), plane) for which in "QU"])
+            planes.update(zip(polarized[name], on_the_plane(product, q_and_u), strict=True))
+
+    for name in names:
+        add(name, flat[name])
+        if not name.startswith("noiseless/"):
+            own = [flat[name]] if name not in polarized else [flat[name].stokes(which) for which in IQU]
+            noise |= dict(zip((name, *polarized.get(name, ())), (product.noise for product in own), strict=True))
+    if not wanted.maps:
         for of, (product, plane) in noise_sources(flat, names[0]).items():
-            key = "half_difference" if of == "half_difference" else f"source_free/{names[0]}"
-            planes[key] = getattr(product, plane)
+            add("half_difference" if of == "half_difference" else f"source_free/{names[0]}", product, plane)
     if any(values.shape != first.signal.shape for values in planes.values()):
         raise PipelineError("the maps have different grids", place=place, cure="name maps of one step")
-    window = window_of(first, None, taper, least)
-    known = {name: np.where(window > 0, values, np.nan) for name, values in noise.items() if name == names[0] or wanted}
+    window = window_of(first, None, wanted.taper, wanted.least)
+    known = {name: np.where(window > 0, values, np.nan) for name, values in noise.items()}
     sigma = first.smoothed_by / FWHM_PER_SIGMA
     side = gaussian_taps(sigma / first.pixel)
     left = 2 * float(side @ side) - side[0] ** 2  # what smoothing leaves of the noise of independent pixels: (sum K^2)^(1/2)
     white = {name: np.nan_to_num(values) / left for name, values in known.items() if np.isfinite(values).any()}
-    edges = ring_edges(first.signal.shape, first.pixel, bins)
-    spectra = radial_spectra(planes, window, first.pixel, edges, white, sigma)
-    words: dict[str, Any] = {"half_difference": f"half the difference, {first.difference}"}
-    return MapSpectra(spectra, {name: str(words.get(name, name)) for name in planes}, first.fwhm)
+    edges = ring_edges(first.signal.shape, first.pixel, wanted.bins)
+    spectra = radial_spectra(planes, window, first.pixel, edges, white, sigma, polarized)
+    words = {f"half_difference{end}": f"half the difference{more}, {first.difference}" for end, more in HALVES.items()}
+    return MapSpectra(spectra, {name: words.get(name, name) for name in spectra.power}, first.fwhm)

@@ -201,6 +201,8 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
     for name, image in data.products.items():
         if isinstance(image, Image) and "/" not in name:
             yield Drawing(f"input {name}", draw_input, partial(_input, name, image), True)
+            for plane in ("Q", "U") if image.polarization is not None else ():
+                yield Drawing(f"input {name}_{plane}", draw_input, partial(_input, name, image, plane), True)
     for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
         if not name.startswith("source_free/") and maps[name].contents == "all":
             yield Drawing(f"map {name}", draw_map, partial(_map, name, maps[name], style))
@@ -256,7 +258,8 @@ def _plain(header: Any) -> dict[str, Any]:
     return {key: header[key] for key in header if key and isinstance(header[key], bool | int | float | str)}
 
 
-def _input(name: str, image: Image) -> tuple[Any, ...]:
+def _input(name: str, image: Image, plane: str = "") -> tuple[Any, ...]:
+    image, name = (image.stokes(plane), f"{name}_{plane}") if plane else (image, name)
     step = -(-max(image.values.shape) // LARGEST)
     values, axes, header = image.values[::step, ::step], SkyAxes.of(image.header), _plain(image.header)
     if step > 1 and axes is not None:
@@ -264,7 +267,7 @@ def _input(name: str, image: Image) -> tuple[Any, ...]:
     elif step > 1:
         every = (slice(None, None, step), slice(None, None, step))
         header = _plain(image.wcs.slice(every).to_header(relax=True))
-    return product_path("", name).name, np.asarray(values, np.float32), axes, header
+    return product_path("", name).name, np.asarray(values, np.float32), axes, header, plane
 
 
 def _flat(

@@ -157,6 +157,11 @@ def key_of(step: Operator, usual: str) -> str:
     return step.name or (usual if step.label == type(step).__name__ else step.label)
 
 
+def plane_key(key: str, plane: str) -> str:
+    """Name of a product of I, Q or U: ``key``, ``key_Q``, ``key_U``."""
+    return key if plane == "I" else f"{key}_{plane}"
+
+
 @dataclass
 class Modes(Record):
     """Principal components of the detectors' streams (`components`).

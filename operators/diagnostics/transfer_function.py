@@ -32,6 +32,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.stokes import IQU
 from zonda.core.notebook import html_table
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
@@ -41,7 +42,7 @@ from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
 from .comparison.radial import tapered
-from .series import key_of
+from .series import key_of, plane_key
 
 NO_POWER = 1e-12
 """Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
@@ -53,7 +54,8 @@ class TransferFunction(Output):
     The map of the sky alone is compared with the same map binned without filters: the ratio of their cross spectrum to the
     spectrum of the latter, in rings of equal width in the logarithm of the scale. The two signals are made for this step, unless
     `runs` has them. Makes the product ``transfer_function`` (a `Transfer`), or one under this step's own name where it has one;
-    where there is an output folder, it is written there as a table (ECSV).
+    where there is an output folder, it is written there as a table (ECSV). Of a map of I, Q and U each plane has its own:
+    ``transfer_function_Q`` and ``transfer_function_U`` stand beside ``transfer_function``, which is of I.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -93,16 +95,19 @@ class TransferFunction(Output):
         after, before = (_map(data, name, self.map, self.label) for name in self.shown)
         window = window_of(before, self.radius, self.taper, self.least_coverage)
         edges = _edges(self, before, window)
-        rings = compare(before.signal, after.signal, window, before.pixel, edges)
-        data.tally.count(self.label, "rings without modes or power: NaN", int(np.count_nonzero(~np.isfinite(rings.transfer))))
         data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
         if self.modes == "full":
             what = "of the complete data" if self.shown[0] else "of the complete data, which are the sky alone"
             data.tally.state(self.label, "singular modes", what)
-        key = key_of(self, "transfer_function")
-        found = data.products[key] = Transfer(rings, edges, self.modes, before.fwhm, self.label, self.map)
-        if data.output is not None:
-            found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
+        for plane in ("I",) if before.polarization is None else IQU:
+            a, b = (m if m.polarization is None else m.stokes(plane) for m in (before, after))
+            rings = compare(a.signal, b.signal, window, before.pixel, edges)
+            empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
+            data.tally.count(self.label, plane_key("rings without modes or power: NaN", plane), empty)
+            key, of = (plane_key(name, plane) for name in (key_of(self, "transfer_function"), self.map))
+            found = data.products[key] = Transfer(rings, edges, self.modes, before.fwhm, self.label, of)
+            if data.output is not None:
+                found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
 
 
 def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:

@@ -127,12 +127,12 @@ class Brightness:
     def nbytes(self) -> int:
         return self.values.nbytes + self.covered.nbytes + (0 if self.polarization is None else self.polarization.nbytes)
 
-    def image(self, label: str) -> Image:
-        """As a product for pictures and comparisons; NaN where nothing is known. ``label``: the operator's."""
+    def image(self, label: str, axis: Floats) -> Image:
+        """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's; ``axis``: the grid's."""
         header = self.wcs.to_header(relax=True)
         header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
         values = np.where(self.covered, self.values, np.nan) if self.covered.size else self.values
-        return Image(values, header, "K_RJ")
+        return Image(values, header, "K_RJ", self.polarization, axis)
 
 
 def on_own_pixels(grid: Grid, found: Conversion, scale: float, place: str) -> Brightness:

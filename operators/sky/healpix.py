@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.maps.stokes_names import columns_of_q_and_u
 from zonda.core.types import Floats
 
 from . import stokes
@@ -41,7 +42,7 @@ def read_healpix(hdu: Any, place: str, wanted: Wanted) -> HealpixMap:
     notes |= stokes.of_columns(names, int(explicit), place)
     unit, factor = unit_of(place, header, f"TUNIT{1 + int(explicit)}", wanted.unit, notes)
     beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
-    columns, polarized = [int(explicit)], stokes.q_and_u(names) if wanted.polarized else None
+    columns, polarized = [int(explicit)], columns_of_q_and_u(names) if wanted.polarized else None
     if polarized is not None:
         _check_same_unit(header, columns + polarized, place, wanted)
         columns += polarized

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.stokes_names import columns_of_q_and_u
 from zonda.core.numerics import tangent
 from zonda.core.storage.files import check_memory, reading
 from zonda.core.storage.fits_files import check_size, opened
@@ -87,7 +88,7 @@ def _told(found: T, text: object) -> T:
 def _extensions(path: Path, hdus: Any, first: Any, place: str) -> Floats | None:
     """(2, ny, nx) Q and U of a file that has them as extensions beside its ``first`` image; None where it has none."""
     images = [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2]
-    found = stokes.q_and_u([hdu.name for hdu in images])
+    found = columns_of_q_and_u([hdu.name for hdu in images])
     if found is None:
         return None
     for k in found:

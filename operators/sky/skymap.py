@@ -18,6 +18,9 @@ from .convolved import beam_widths, brightness_on, grid_of, with_beam
 from .parameters import SkyParameters
 from .state import SkyState
 
+POLARIZED = ("polarization", "axis")
+"""Fields of an `Image` of I, Q and U."""
+
 
 class InputImage(Product):
     """The input of the first observation."""
@@ -30,12 +33,14 @@ class InputImage(Product):
 
     def arrays(self) -> Mapping[str, Any]:
         """See `Product.arrays`."""
-        return {"values": self.image.values, "header": dict(self.image.header.items())}
+        polarized = {} if self.image.polarization is None else {key: getattr(self.image, key) for key in POLARIZED}
+        return {"values": self.image.values, "header": dict(self.image.header.items()), **polarized}
 
     @classmethod
     def of(cls, arrays: Mapping[str, Any]) -> InputImage:
         """See `Product.of`."""
-        return cls(Image(arrays["values"], Cards(arrays["header"].items())))
+        polarized = {key: arrays[key] for key in POLARIZED if key in arrays}
+        return cls(Image(arrays["values"], Cards(arrays["header"].items()), **polarized))
 
 
 class SkyMap(SkyParameters):
@@ -73,7 +78,7 @@ class SkyMap(SkyParameters):
     def collect(self, data: Data, observation: Observation, state: SkyState) -> None:
         _count(self, observation, state)
         if self.label not in data.partial:
-            image = state.sky.image(self.label)
+            image = state.sky.image(self.label, state.grid.axis)
             data.add(self.label, InputImage(image))
             if not data.laid_out:  # pictures of it may be begun
                 _show(self.label, data, image)

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.stokes_names import along_axis, is_polarized
 from zonda.core.types import Floats
 
 STOKES = "Stokes parameters"
 """Key of the note about them."""
-
-_NAMES = {1: "I", 2: "Q", 3: "U", 4: "V"}
-"""Values of a FITS axis STOKES (Greisen & Calabretta 2002); those below zero are correlations."""
-_POLARIZED = re.compile(r"(STOKES[ _-]?)?[QUV]([ _-].*)?", re.IGNORECASE)
-"""Names of columns and extensions: Q_POLARISATION (healpy), Q_STOKES (Planck), STOKES_Q, Q."""
-
-
-def is_polarized(name: str) -> bool:
-    """Whether a column or an extension of this name holds Q, U or V."""
-    return _POLARIZED.fullmatch(name.strip()) is not None
 
 
 def of_columns(names: Sequence[str], read: int, place: str) -> dict[str, str]:
@@ -61,7 +51,7 @@ def plane(header: Any, axis: int, length: int, wanted: int | None, place: str) -
     InputError
         There is no I on the axis.
     """
-    found = _along(header, axis, length)
+    found = along_axis(header, axis, length)
     if "I" not in found and wanted is None:
         message = f"its axis STOKES has {', '.join(found)} and no I"
         raise InputError(message, place=place, cure=f"give a map of I, or correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}")
@@ -73,22 +63,6 @@ def plane(header: Any, axis: int, length: int, wanted: int | None, place: str) -
     return number, {STOKES: f"plane {number} of {length} is read, {as_what}; {_not_used(unused)}"}
 
 
-def _along(header: Any, axis: int, length: int) -> list[str]:
-    """What each plane along the FITS axis STOKES is."""
-    first, step, pixel = (float(header.get(f"{key}{axis}", 1.0)) for key in ("CRVAL", "CDELT", "CRPIX"))
-    return [_NAMES.get(round(first + (n + 1 - pixel) * step), "a correlation") for n in range(length)]
-
-
-def q_and_u(names: Sequence[str]) -> list[int] | None:
-    """Which of the columns or extensions of these names hold Q and U; None where they are not both there."""
-    letters = [_letter(name) for name in names]
-    return [letters.index("Q"), letters.index("U")] if {"Q", "U"} <= set(letters) else None
-
-
-def _letter(name: str) -> str:
-    return re.sub(r"^STOKES[ _-]?", "", name.strip().upper())[:1] if is_polarized(name) else ""
-
-
 def planes_of_q_and_u(header: Any, shape: Sequence[int], plane: tuple[int, ...]) -> list[tuple[int, ...]] | None:
     """Indices of the planes of Q and U beside that of I, ``plane``, in a cube; None where there are none.
 
@@ -97,7 +71,7 @@ def planes_of_q_and_u(header: Any, shape: Sequence[int], plane: tuple[int, ...])
     for k, length in enumerate(shape[:-2]):
         axis = len(shape) - k
         if str(header.get(f"CTYPE{axis}", "")).strip().upper() == "STOKES":
-            found = _along(header, axis, length)
+            found = along_axis(header, axis, length)
             if found[plane[k]] == "I" and {"Q", "U"} <= set(found):
                 return [(*plane[:k], found.index(name), *plane[k + 1 :]) for name in ("Q", "U")]
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,6 +58,9 @@ def compare(
     REFERENCE and MAP are FITS files (images in any projection, or HEALPix tables), or two folders with the maps of runs, of which
     those of the same name are compared. The reference is taken to be without error: put the truth first. Both maps are smoothed
     to one beam; the one with the larger pixels is interpolated (cubic splines) onto the pixels of the other.
+
+    Of maps of I, Q and U (an axis STOKES, extensions, or columns of a HEALPix table) each plane is compared, Q and U from the
+    meridians of MAP's frame.
     """
     from zonda.core.configuration.units import Unit
     from zonda.operators.diagnostics.comparison.statistics import Settings
@@ -115,25 +119,41 @@ def _compare(
     """One comparison, printed and written to ``folder``. ``given``: unit, frequency [Hz], whether the reference is a sky."""
     from zonda.core.storage.files import atomic_path
     from zonda.operators.diagnostics.comparison import statistics
-    from zonda.operators.diagnostics.comparison.files import read_plane, write_comparison
+    from zonda.operators.diagnostics.comparison.files import read_planes, write_comparison
+    from zonda.operators.diagnostics.comparison.stokes import on_meridians_of
     from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
     from zonda.operators.diagnostics.drawing.pictures import Style, printed
+    from zonda.operators.diagnostics.series import plane_key
 
-    (reference, nu), (other, second_nu) = (read_plane(path, _name(path, paths)) for path in paths)
-    reference = replace(reference, fwhm=0.0) if given[2] else reference
-    reference, other = _in_one_unit(reference, other, given[0], given[1] or nu or second_nu)
-    found = statistics.compare(reference, other, settings)
-    click.echo("\n".join(lines(found)))
+    read = [read_planes(path, _name(path, paths)) for path in paths]
+    maps = read[1].planes
+    references = on_meridians_of(maps["I"], read[0].planes)
+    both, written = [plane for plane in maps if plane in references], []
     levels, formats = look
     style = Style(0.0, 0.0, 0.0, levels, formats)
-    written = write_comparison(found, folder / "comparison", {})
-    for picture in printed(draw_comparison, style, "comparison", found, levels):
-        for kind, content in picture.files.items():
-            path = folder / f"{picture.name}.{kind}"
-            with atomic_path(path) as temporary:
-                temporary.write_bytes(content)
-            written.append(path)
+    for plane in both:
+        reference = replace(references[plane], fwhm=0.0) if given[2] else references[plane]
+        one, other = _in_one_unit(reference, maps[plane], given[0], given[1] or read[0].frequency or read[1].frequency)
+        found = statistics.compare(one, other, settings)
+        click.echo("\n".join([*([f"Stokes {plane}"] if len(both) > 1 else []), *lines(found), *([""] if len(both) > 1 else [])]))
+        name = plane_key("comparison", plane)
+        written += write_comparison(found, folder / name, {})
+        for picture in printed(draw_comparison, style, name, found, levels):
+            for kind, content in picture.files.items():
+                path = folder / f"{picture.name}.{kind}"
+                with atomic_path(path) as temporary:
+                    temporary.write_bytes(content)
+                written.append(path)
+    for note in [*read[0].notes, *read[1].notes] or _without(references, maps, paths):
+        click.echo(f"Q and U: {note}")
     click.echo("\n" + "\n".join(map(str, written)))
+
+
+def _without(references: Mapping[str, Plane], maps: Mapping[str, Plane], paths: tuple[Path, Path]) -> list[str]:
+    """Says that one of two files has no Q and U, where the other has."""
+    if references.keys() == maps.keys():
+        return []
+    return [f"not compared: {_name(paths['Q' in references], paths)} has none"]
 
 
 def _name(path: Path, paths: tuple[Path, Path]) -> str:

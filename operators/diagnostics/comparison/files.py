@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.on_plane import on_plane
+from zonda.core.maps.stokes import IQU
+from zonda.core.maps.stokes_names import along_axis, columns_of_q_and_u
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
@@ -29,39 +32,57 @@ from .statistics import Comparison
 MOST = 2000
 """Points along each side of the plane onto which a HEALPix map is brought."""
 FRAMES = {"C": "icrs", "Q": "icrs", "ICRS": "icrs", "G": "galactic"}
+NOISES = {"NOISE": "noise I", "COV_II": "noise I", "COV_QQ": "noise Q", "COV_UU": "noise U"}
+"""Of a file's extensions and columns: standard errors, or variances."""
 CURE = "give a FITS file with a two-dimensional image that has a celestial WCS, or with a HEALPix table"
 
 
-def read_plane(path: Path, name: str = "") -> tuple[Plane, float | None]:
-    """The first image or HEALPix table of a FITS file with its noise (extension or column NOISE); RESTFRQ [Hz] or None.
+@dataclass(frozen=True)
+class ReadMap:
+    """What a FITS file holds.
 
-    Axes of length one are dropped. A file without BUNIT has no unit (an empty text), one without BMAJ no known beam.
+    Attributes
+    ----------
+    planes
+        I, and Q and U where they are there, by these letters.
+    frequency
+        RESTFRQ, Hz; None: not stated.
+    notes
+        Why Q and U that are in the file are not taken.
+    """
+
+    planes: dict[str, Plane]
+    frequency: float | None
+    notes: list[str]
+
+
+def read_planes(path: Path, name: str = "") -> ReadMap:
+    """The first image or HEALPix table of a FITS file with its noise (extension or column NOISE, or COV_II); Q and U beside it.
+
+    Q and U are further planes along an axis STOKES, extensions or columns with their names. They are taken as COSMO or IAU by
+    POLCCONV; of a HEALPix table without it as COSMO, of an image without it not at all. Axes of length one are dropped. A file
+    without BUNIT has no unit (an empty text), one without BMAJ no known beam.
 
     Raises
     ------
     InputError
-        Unreadable; no image of the sky in it; a cube; an unknown unit; a HEALPix table without NSIDE, ORDERING or COORDSYS.
+        Unreadable; no image of the sky in it; a cube of something else; an unknown unit; a HEALPix table without NSIDE, ORDERING
+        or COORDSYS.
     """
     place = str(path)
     with opened(path, place, "check the file, e.g. with fitsverify, or copy it again") as hdus:
-        noise = None
         for hdu in hdus:
-            if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2:
+            image = hdu.is_image and hdu.header.get("NAXIS", 0) >= 2
+            if image or ("NSIDE" in hdu.header and "ORDERING" in hdu.header):
                 check_size(path, hdu, place)
-                header, values = _celestial(hdu, place)
-                if "NOISE" in hdus and hdus["NOISE"].is_image and hdus["NOISE"].shape == hdu.shape:
-                    noise = np.asarray(hdus["NOISE"].data, np.float64).reshape(values.shape)
-                return _plane(name or path.name, values, noise, header, hdu.header, hdu.header.get("BUNIT"), place)
-            if "NSIDE" in hdu.header and "ORDERING" in hdu.header:
-                check_size(path, hdu, place)
-                header, planes, unit = _healpix(hdu, place)
-                return _plane(name or path.name, planes["signal"], planes.get("noise"), header, hdu.header, unit, place)
+                header, values, unit = _images(hdus, hdu, place) if image else _healpix(hdu, place)
+                return _read(name or path.name, (header, values), (hdu.header, unit), bool(image), place)
     raise InputError("is not a map: it holds no image of two axes and no HEALPix table", place=place, cure=CURE)
 
 
-def _plane(
-    name: str, values: Floats, noise: Floats | None, header: Any, about: Any, unit: Any, place: str
-) -> tuple[Plane, float | None]:
+def _read(name: str, found: tuple[Any, dict[str, Floats]], told: tuple[Any, Any], image: bool, place: str) -> ReadMap:
+    """``found``: celestial header and planes; ``told``: header of the file and unit."""
+    (header, values), (about, unit) = found, told
     text = str(unit or "").strip()
     label, factor = parse_unit(text, place=place, temperature_scale=about.get("TEMPSCAL")) if text else ("", 1.0)
     axes = [about.get("BMAJ"), about.get("BMIN", about.get("BMAJ"))]
@@ -69,28 +90,53 @@ def _plane(
     fwhm = math.radians(math.sqrt(axes[0] * axes[1])) if good else None
     frequency = about.get("RESTFRQ", about.get("RESTFREQ"))
     hertz = float(frequency) if isinstance(frequency, int | float) and frequency > 0 else None
-    plane = Plane(name, np.asarray(values, np.float64), header, "", fwhm, noise)
-    return plane.scaled(factor, label), hertz
+    convention, notes = str(about.get("POLCCONV", "" if image else "COSMO")).strip().upper(), []
+    if "Q" in values and convention not in ("COSMO", "IAU"):
+        notes.append(f"not compared: {name} has them and no POLCCONV; set that header key to COSMO or IAU")
+        values = {key: plane for key, plane in values.items() if key not in ("Q", "U")}
+    planes: dict[str, Plane] = {}
+    for key in IQU:
+        if key in values:
+            sign = -1.0 if key == "U" and convention == "IAU" else 1.0
+            noise = values.get(f"noise {key}")
+            plane = Plane(name if key == "I" else f"{name} {key}", sign * values[key], header, "", fwhm, noise)
+            planes[key] = plane.scaled(factor, label)
+    return ReadMap(planes, hertz, notes)
 
 
-def _celestial(hdu: Any, place: str) -> tuple[Any, Floats]:
-    """Header of the celestial axes, and the image."""
+def _images(hdus: Any, hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any]:
+    """Header of the celestial axes, planes and their noise, unit: of a plane or a cube of Stokes parameters, or of extensions."""
     from astropy.wcs import WCS
 
-    values = np.asarray(hdu.data, np.float64)
-    long = [n for n in values.shape[:-2] if n > 1]
-    if long:
+    header, values = hdu.header, np.asarray(hdu.data, np.float64)
+    ny, nx = values.shape[-2:]
+    long = [k for k, n in enumerate(values.shape[:-2]) if n > 1]
+    axis = values.ndim - long[0] if long else 0
+    if long and (len(long) > 1 or str(header.get(f"CTYPE{axis}", "")).strip().upper() != "STOKES"):
         sides = " x ".join(str(n) for n in reversed(values.shape))
         raise InputError(f"is a cube of {sides} pixels, not a map", place=place, cure="cut one plane out of it")
-    wcs = WCS(hdu.header)
+    wcs = WCS(header)
     if not wcs.has_celestial:
-        kinds = ", ".join(str(hdu.header.get(f"CTYPE{k}", "none")) for k in (1, 2))
+        kinds = ", ".join(str(header.get(f"CTYPE{k}", "none")) for k in (1, 2))
         raise InputError(f"is not a map: it has no celestial coordinates (CTYPE: {kinds})", place=place, cure=CURE)
-    return wcs.celestial.to_header(relax=True), values.reshape(values.shape[-2:])
+    names = along_axis(header, axis, values.shape[long[0]]) if long else ["I"]
+    found = {key: plane for key, plane in zip(names, values.reshape(-1, ny, nx), strict=True) if key in ("I", "Q", "U")}
+    if "I" not in found:
+        raise InputError(f"its axis STOKES has {', '.join(names)} and no I", place=place, cure="give a map of I, Q and U")
+    alike = [other for other in hdus if other.is_image and other.shape == hdu.shape]
+    letters = columns_of_q_and_u([str(other.name) for other in alike])
+    for key, number in zip(("Q", "U"), letters or (), strict=False):
+        found.setdefault(key, np.asarray(alike[number].data, np.float64).reshape(ny, nx))
+    for other in alike if not long else ():
+        if (of := NOISES.get(str(other.name).upper())) is not None:
+            noise = np.asarray(other.data, np.float64).reshape(ny, nx)
+            found[of] = noise if other.name.upper() == "NOISE" else np.sqrt(noise)
+    both = found.keys() >= {"Q", "U"}
+    return wcs.celestial.to_header(relax=True), {k: v for k, v in found.items() if both or k[-1] == "I"}, header.get("BUNIT")
 
 
 def _healpix(hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any]:
-    """A HEALPix table on a plane about its middle: header, ``signal`` and perhaps ``noise``, unit."""
+    """A HEALPix table on a plane about its middle: header, planes and perhaps their noise, unit."""
     import healpy
 
     header, names = hdu.header, [str(n).upper() for n in hdu.columns.names]
@@ -99,10 +145,12 @@ def _healpix(hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any]:
         cure = "set the header key COORDSYS to C (ICRS) or G (galactic)"
         raise InputError("the coordinate system of the HEALPix map is missing or unknown", place=place, cure=cure)
     explicit = names[0] in ("PIXEL", "PIXELS", "PIX", "INDEX")
-    columns = {"signal": int(explicit)} | ({"noise": names.index("NOISE")} if "NOISE" in names else {})
+    columns = {"I": int(explicit), **dict(zip(("Q", "U"), columns_of_q_and_u(names) or (), strict=False))}
+    columns |= {key: names.index(name) for name, key in NOISES.items() if name in names and key[-1] in columns}
     planes = {key: np.asarray(hdu.data.field(k), np.float64).ravel() for key, k in columns.items()}
-    pixels = np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else np.arange(planes["signal"].size)
-    seen = np.isfinite(planes["signal"]) & ~healpy.mask_bad(planes["signal"])
+    planes = {key: np.sqrt(plane) if names[columns[key]].startswith("COV") else plane for key, plane in planes.items()}
+    pixels = np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else np.arange(planes["I"].size)
+    seen = np.isfinite(planes["I"]) & ~healpy.mask_bad(planes["I"])
     if not seen.any():
         raise InputError("no pixel has a value", place=place, cure="give a map that is not NaN everywhere")
     order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
@@ -121,7 +169,7 @@ def _on_plane(nside: int, nest: bool, pixels: Any, planes: Mapping[str, Floats],
     reach = float(np.arccos(np.clip((directions @ middle).min() / np.linalg.norm(middle), -1, 1)))
     ones = np.ones(len(pixels))
     product = MapProduct(
-        planes["signal"], ones.astype(np.int64), ones, ones, None, None, (centre[0], centre[1]), side, frame,
+        next(iter(planes.values())), ones.astype(np.int64), ones, ones, None, None, (centre[0], centre[1]), side, frame,
         nside=nside, nest=nest, pixels=pixels,
     )  # fmt: skip
     made, wcs = on_plane(product, dict(planes), size=int(min(MOST, max(8.0, 2 * reach / side + 2))))

@@ -7,13 +7,19 @@ With a window w and the Fourier transform m_k of w (m - <m>_w), and pixels of ar
 the mean over the modes of ring i: the power spectral density, so that white noise of standard error n per pixel has
 P = n^2 A whatever the window. Its relative standard error is N_i^(-1/2), N_i = n_i / (2 c) independent modes as in
 `transfer_function`, equation (3). The coherence of two maps is Re sum a b* / (sum |a|^2 sum |b|^2)^(1/2).
+
+Of Q and U on parallel axes, those of the plane, with phi the angle of k from south to east (COSMO; Seljak 1997, equation 17),
+
+    E_k = Q_k cos 2 phi + U_k sin 2 phi,    B_k = -Q_k sin 2 phi + U_k cos 2 phi;                            (2)
+
+cross spectra are A / sum w^2 mean_i Re a_k b_k*. The window mixes some of E into B on scales near its own.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +57,8 @@ class RadialSpectra:
         (n,) of maps whose noise is known: what independent pixels of that noise have, behind the smoothing; NaN without modes.
     coherence
         (n,) of the first two maps; NaN of one map alone.
+    cross
+        (n,) cross spectra by name (``map_TE``: of I and E), unit^2 sr; they have signs.
     """
 
     edges: Floats
@@ -59,6 +67,7 @@ class RadialSpectra:
     modes: Floats
     white: dict[str, Floats]
     coherence: Floats
+    cross: dict[str, Floats] = field(default_factory=dict)
 
     @property
     def scale(self) -> Floats:
@@ -87,6 +96,7 @@ def radial_spectra(
     edges: Floats,
     noise: Mapping[str, Floats] | None = None,
     smoothing: float = 0.0,
+    polarized: Mapping[str, tuple[str, str]] | None = None,
 ) -> RadialSpectra:
     """Equation (1) of maps (ny, nx); pixels that are NaN in one of them count in none.
 
@@ -102,6 +112,9 @@ def radial_spectra(
         (ny, nx) standard errors of some of the maps, of independent pixels before the smoothing.
     smoothing
         Standard deviation of the Gaussian that they are smoothed with, rad.
+    polarized
+        Names of Q and U among the maps, by the name NAME of their I: in their place stand NAME_E and NAME_B, equation (2), whose
+        noise is the mean of both, and the cross spectra NAME_TE, NAME_TB and NAME_EB (T where there is an I).
     """
     known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
     window = np.where(known, window, 0.0)
@@ -112,7 +125,16 @@ def radial_spectra(
         kept = np.where(known, values, 0.0)
         mean = float((kept * window).sum() / window.sum()) if square else 0.0
         transforms[name] = np.fft.fft2((kept - mean) * window)
-    k = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n, pixel) for n in window.shape), indexing="ij"))
+    north, west = np.meshgrid(*(np.fft.fftfreq(n, pixel) for n in window.shape), indexing="ij")
+    k = np.hypot(north, west)
+    pairs: dict[str, tuple[str, str]] = {}
+    for name, (q, u) in (polarized or {}).items():
+        q_k, u_k = transforms.pop(q), transforms.pop(u)
+        angle = 2 * np.arctan2(west, north)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        transforms[f"{name}_E"], transforms[f"{name}_B"] = q_k * cosine + u_k * sine, u_k * cosine - q_k * sine
+        t, e, b = ({"T": name, "E": f"{name}_E", "B": f"{name}_B"}[letter] for letter in "TEB")
+        pairs |= {f"{name}_{both}": two for both, two in (("TE", (t, e)), ("TB", (t, b)), ("EB", (e, b))) if two[0] in transforms}
     count, n = len(edges) - 1, np.searchsorted(edges, k, "right") - 1
     ring = np.where((n >= 0) & (n < count), n, count).ravel()
 
@@ -125,12 +147,16 @@ def radial_spectra(
         power = {name: area * summed(np.abs(values) ** 2) / number for name, values in transforms.items()}
         first, second = (list(transforms.values()) * 2)[:2]
         cross = summed((first * second.conj()).real) / np.sqrt(summed(np.abs(first) ** 2) * summed(np.abs(second) ** 2))
+        crosses = {name: area * summed((transforms[a] * transforms[b].conj()).real) / number for name, (a, b) in pairs.items()}
         wavenumber = summed(k) / number
         passed = summed(np.exp(-((2 * np.pi * k * smoothing) ** 2))) / number
     white = {name: area * float((np.where(known, window * n, 0.0) ** 2).sum()) * passed for name, n in (noise or {}).items()}
+    for name, (q, u) in (polarized or {}).items():
+        if q in white and u in white:
+            white[f"{name}_E"] = white[f"{name}_B"] = (white.pop(q) + white.pop(u)) / 2
     if len(maps) < 2:
         cross = np.full(count, math.nan)
-    return RadialSpectra(edges, wavenumber, power, number / 2 / correlated, white, cross)
+    return RadialSpectra(edges, wavenumber, power, number / 2 / correlated, white, cross, crosses)
 
 
 @dataclass(frozen=True)

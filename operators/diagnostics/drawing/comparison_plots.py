@@ -131,6 +131,10 @@ def plot_radial_spectra(
             level, known = found.white[name] / ARCSEC**2, np.isfinite(found.white[name])
             ax.plot(scale[known], level[known], "--", color=colour, linewidth=1.0, label=f"white level of {name}")
             values.append(level[known])
+    for name, power in found.cross.items():
+        if name.endswith("_TE"):
+            good = np.isfinite(power) & (power != 0)
+            ax.plot(scale[good], np.abs(power[good]) / ARCSEC**2, ":", color="0.4", linewidth=1.2, label=f"|{name}|")
     ax.set_xscale("log")
     ax.set_yscale("log")
     every = np.concatenate(values) if values else np.ones(1)

@@ -58,10 +58,11 @@ def printed(draw: Callable[..., list[Sketch]], style: Style, *arguments: Any) ->
     return made
 
 
-def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any]) -> list[Sketch]:
-    """The input map (ny, nx), K_RJ."""
-    ax = plot_map(values, header if axes is None else axes, title="Input: the sky before the beam")
-    return [Sketch(file, "Input", "The input map, before beam, opacity and filters.", ax)]
+def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any], plane: str = "") -> list[Sketch]:
+    """The input map (ny, nx), K_RJ, or its ``plane``, Q or U."""
+    of = f" ({plane})" if plane else ""
+    ax = plot_map(values, header if axes is None else axes, title=f"Input{of}: the sky before the beam")
+    return [Sketch(file, f"Input{of}", "The input map, before beam, opacity and filters.", ax)]
 
 
 def draw_map(file: str, signal: str, key: str, product: FlatMap, style: Style, snr: AnyFloats | None = None) -> list[Sketch]:
@@ -168,8 +169,9 @@ def draw_transfer(file: str, transfer: Any) -> list[Sketch]:
         "their cross spectrum to the spectrum of the latter, with the standard error from the scatter of the modes (bars); "
         f"dashed, the ratio of amplitudes. Dotted, the beam. Singular modes of {whose}."
     )
-    ax = plot_transfer(transfer, title=f"Transfer function, singular modes of {whose}")
-    return [Sketch(file, "Transfer function", caption, ax)]
+    of = "" if transfer.map == "map" else f" of {transfer.map}"
+    ax = plot_transfer(transfer, title=f"Transfer function{of}, singular modes of {whose}")
+    return [Sketch(file, f"Transfer function{of}", caption, ax)]
 
 
 def draw_own(file: str, product: Drawable) -> list[Sketch]:

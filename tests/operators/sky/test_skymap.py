@@ -469,7 +469,8 @@ def test_spectral_index_of_a_kelvin_map_is_refused(made, save):
 def test_of_several_input_images_the_first_stays(made, save):
     first, second = (SkyMap(file=save(np.full((20, 20), v), made.tan_header((20, 20)), f"{v}.fits")) for v in (1.0, 2.0))
     scan = made.observation(np.full(30, np.radians(75)), np.radians(20))
-    one, other = (InputImage(o.prepare(scan).sky.image("SkyMap")) for o in (first, second))
+    states = [o.prepare(scan) for o in (first, second)]
+    one, other = (InputImage(state.sky.image("SkyMap", state.grid.axis)) for state in states)
     one += other
     back = InputImage.of(one.arrays()).image
     np.testing.assert_array_equal(back.values, np.ones((20, 20)))
