@@ -177,7 +177,7 @@ class RecordedFiles(Operator):
         tod, streams = _head(path, _stamp(path))
         stated = "net" in tod.columns
         if self.noise_model is not None or not stated:
-            tod = replace(tod, columns=tod.columns | _fitted(path, _stamp(path), self.noise_model))
+            tod = replace(tod, columns={**tod.columns, **_fitted(path, _stamp(path), self.noise_model)})
         if self.signal is not None and self.signal not in streams:
             have = ", ".join(sorted(streams)) or "none"
             cure = f"set signal to one of: {have}; or signal: none for the pointing alone"

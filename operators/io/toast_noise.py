@@ -112,10 +112,13 @@ def fit(frequency: Floats, power: Floats, place: str) -> Floats:
         level, knee, low, slope = p
         return level + np.logaddexp(0.0, slope * (knee - np.maximum(x, low)))
 
+    def away(p: Any, form: Any) -> Any:
+        return share * (form(p) - y)
+
     knee = float(x[np.flatnonzero(y - white > np.log(2.0))[-1]]) if top - white > np.log(2.0) else float(x[0])
     limits = [white - 5, x[0] - 20, x[0] - 20, 0.05], [white + 5, x[-1] + 5, x[-1], STEEPEST]
     tried = [
-        least_squares(lambda p, form: share * (form(p) - y), np.clip(start, *limits), args=(form,), bounds=limits)
+        least_squares(away, np.clip(start, *limits), args=(form,), bounds=limits)
         for form in (toast, own)
         for low in (x[0] - 5.0, x[0] + 1.0)
         for start in ([white, knee, min(low, knee - 0.1), slope] for slope in (1.0, 2.0))

@@ -49,9 +49,9 @@ class PointingRecorded(Operator):
     """Recorded scan: times and directions of the boresight, read from a file.
 
     HDF5 in TOAST's layout (what `SaveTOD` writes, too) or with datasets ``time``, ``az`` and ``el`` (or ``ra`` and ``dec``,
-    ICRS; attribute ``units``), a FITS table with such columns, or CSV that begins with ``time [s], az [deg], el [deg]``; a
-    column ``flags`` is kept, and the intervals of TOAST's layout. Azimuth and elevation are where the beam looks: the pointing
-    model is applied.
+    ICRS; attribute ``units``), a FITS table with such columns, CSV that begins with ``time [s], az [deg], el [deg]``; a column
+    ``flags`` is kept, and TOAST's intervals. An antenna log of ASTE (DESHIMA's ``.ant``): scans alone are used. Azimuth and
+    elevation are where the beam looks: the pointing model is applied.
 
     Times need not be a perfect comb. Pointing and atmosphere follow them as they are; noise and filters count samples. Gaps
     and rows that are not numbers become flagged samples: their noise and atmosphere go on, no map uses them, filters bridge
@@ -61,7 +61,7 @@ class PointingRecorded(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
 
     file: InputPath
-    """HDF5, FITS table or CSV."""
+    """HDF5, FITS table, CSV or antenna log of ASTE."""
     clock: Clock = "unix"
     """What times count: seconds since 1970 UTC (unix), days (mjd, UTC), or seconds since the scene's time (scene). Files of
     `SaveTOD` carry their own start."""

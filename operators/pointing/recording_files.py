@@ -1,4 +1,4 @@
-"""Recorded pointing in files: HDF5 (TOAST's layout and plain datasets), FITS tables and CSV."""
+"""Recorded pointing in files: HDF5 (TOAST's layout and plain datasets), FITS tables, CSV and ASTE's antenna logs."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from zonda.core.intervals import Intervals
 from zonda.core.storage import fits_files, hdf5_files
 from zonda.core.types import Floats
 
+from .antenna_log import BEGINS, read_log
 from .recording import Recording, longest_rising
 
 ALIASES = {
@@ -33,7 +34,7 @@ ALIASES = {
 
 Clock = Literal["unix", "mjd", "scene"]
 
-CURE = "give HDF5, a FITS table or CSV"
+CURE = "give HDF5, a FITS table, CSV or an antenna log of ASTE"
 
 Columns = Mapping[str, tuple[Any, str | None]]
 """By name in small letters: values and unit."""
@@ -84,6 +85,9 @@ def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recordi
     try:
         with path.open("rb") as file:
             magic = file.read(9)
+        if magic == BEGINS:
+            start, seconds, azimuth, elevation, bits = read_log(path, place)
+            return Recording(start, seconds, azimuth, elevation, "azel", _flags(bits, "toast", mask))
         kind = _hdf5 if magic.startswith(b"\x89HDF") else _fits if magic.startswith(b"SIMPLE  =") else _csv
         return _recording(kind(path, place), clock, mask, place)
     except OSError as err:
