@@ -7,25 +7,28 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, ValidationInfo, field_validator, model_serializer, model_validator
 from pydantic_core import PydanticCustomError
 
 from .array_table import OF_INSTRUMENT, ArrayTable, read_array, stated_by
 from .band import NO_BAND, PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
+from .configuration.diagnostics import nearest
 from .configuration.files import InputPath, find
 from .configuration.parameters import Parameters, named, named_or_written, quantity
 from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
 from .configuration.values import mistake, refusal
 from .errors import InputError, ZondaError
 from .focalplane import Focalplane
-from .layouts import hexagonal_packing, rings, wafers
-from .registry import bands, instruments
+from .layouts import Layout, hexagonal_packing, rings, wafers
+from .registry import RegistryError, bands, instruments, layouts
 from .types import Floats
 from .variants import LIKE, variant
 
 __all__ = ["SPEED_OF_LIGHT", "Band", "CameraBand", "Instrument", "Telescope", "hexagonal_packing"]
 
+
+LATTICES = {"hexagon": hexagonal_packing, "rings": rings}
+"""Layouts without wafers, by name: functions of the number of pixels that return their places."""
 
 ARRAY = 0.475
 """Radius of an array of one of several bands, in units of the distance between the centres of two that are neighbours."""
@@ -86,8 +89,9 @@ class Instrument(Parameters):
     """Number of detectors. Of several bands, that of each."""
     field_of_view: Angle = Field(ge=0, le=1.0)
     """Diameter of the circle that holds all detectors."""
-    layout: Literal["hexagon", "rings", "wafers"] = "hexagon"
-    """Pixels on a hexagonal lattice from the centre outward, on rings, or on hexagonal wafers that share them equally."""
+    layout: str = "hexagon"
+    """`hexagon`: pixels on a hexagonal lattice from the centre outward; `rings`; `wafers`: on hexagonal wafers that share them
+    equally; or a registered layout (`zonda plugins`)."""
     wafers: int = Field(1, ge=1, le=1000)
     """Number of wafers, for `layout: wafers`."""
     focalplane_table: InputPath | None = Field(None, alias="focalplane")
@@ -164,14 +168,15 @@ class Instrument(Parameters):
         own = bool(self.bands) and self.bands[k].detectors is not None
         at: tuple[str | int, ...] = ("bands", k, "detectors") if own else ("detectors",)
         who = f"detectors of {band} is" if band else "detectors is"
-        share = self._pair * (self.wafers if self.layout == "wafers" else 1)
+        number_of_wafers = self._wafers
+        share = self._pair * number_of_wafers
         below = number // share * share
         cure = f"write {below} or {below + share}" if below else f"write {share}"
         if self.polarization == "pairs" and number % 2:
             text = f"polarization: pairs needs an even number of detectors, two in each pixel; {who} {number}"
             raise mistake(text, "", cure, at=at)
         if number % share:
-            text = f"{self.wafers} wafers share their pixels equally; {who} {number}, no multiple of {share}"
+            text = f"{number_of_wafers} wafers share their pixels equally; {who} {number}, no multiple of {share}"
             raise mistake(text, "", f"{cure}, or layout: hexagon", at=at)
 
     def _table_fits(self, path: Path) -> Instrument:
@@ -203,6 +208,13 @@ class Instrument(Parameters):
         return {band.name: band.detectors or self.detectors for band in self.bands} or {self.band.name: self.detectors}
 
     @property
+    def _wafers(self) -> int:
+        """Wafers that share the pixels of a band equally."""
+        if self.layout in LATTICES:
+            return 1
+        return self.wafers if self.layout == "wafers" else int(getattr(layouts.get(self.layout), "wafers", 1))
+
+    @property
     def _pair(self) -> int:
         """Detectors of a pixel in one band."""
         return 2 if self.polarization == "pairs" else 1
@@ -216,6 +228,19 @@ class Instrument(Parameters):
             except ZondaError as err:
                 raise refusal(err) from None
         return path
+
+    @field_validator("layout")
+    @classmethod
+    def _known_layout(cls, name: str) -> str:
+        if name in (*LATTICES, "wafers"):
+            return name
+        try:
+            layouts.get(name)
+        except RegistryError as err:
+            label = nearest(name, [*LATTICES, "wafers", *layouts], err.label)
+            cure = f"write hexagon, rings, wafers or a registered layout: {', '.join(layouts)}"
+            raise mistake(f"unknown layout {name!r}" if name not in layouts else err.message, label, cure) from None
+        return layouts.registered(name)
 
     @field_validator("band", mode="before")
     @classmethod
@@ -282,27 +307,32 @@ class Instrument(Parameters):
             return read_array(self.focalplane_table).plane(self.band.name, stated)
         pair, n = self._pair, self.detectors
         pixels = n // pair
-        x, y, wafer = self._pixels(pixels)
-        reach = float(np.hypot(x, y).max())
-        scale = math.tan(self.field_of_view / 2) / reach if reach > 0 else 0.0
+        layout = self._pixels(pixels)
+        scale = math.tan(self.field_of_view / 2) / layout.reach if layout.reach > 0 else 0.0
         width = len(str(pixels - 1))
         stated["minimum_frequency"] = stated.pop("pink_minimum_frequency")
-        angle = np.add.outer(np.pi / 4 * (np.arange(pixels) % 2), [0.0, np.pi / 2]).ravel() if pair == 2 else np.zeros(n)
+        axes = np.pi / 4 * (np.arange(pixels) % 2) if layout.angle is None else layout.angle
+        angle = np.add.outer(axes, [0.0, np.pi / 2]).ravel() if pair == 2 else np.zeros(n)
         return Focalplane(
             names=[f"d{k:0{width}d}{side}" for k in range(pixels) for side in ("AB" if pair == 2 else ("",))],
-            xi=np.repeat(x * scale, pair),
-            eta=np.repeat(y * scale, pair),
+            xi=np.repeat(layout.x * scale, pair),
+            eta=np.repeat(layout.y * scale, pair),
             polarization_angle=angle,
             polarization_efficiency=np.full(n, float(pair == 2)),
-            wafer=np.repeat(wafer, pair),
+            wafer=np.repeat(layout.wafer, pair),
             **{key: np.full(n, value) for key, value in stated.items()},
         )
 
-    def _pixels(self, number: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
-        """Places of pixels, in units of the layout, and the wafer of each."""
+    def _pixels(self, number: int) -> Layout:
+        """Places and wafers of pixels."""
         if self.layout == "wafers":
-            return wafers(number, self.wafers)
-        return *(hexagonal_packing if self.layout == "hexagon" else rings)(number), np.zeros(number, np.int64)
+            return Layout(*wafers(number, self.wafers))
+        if self.layout in LATTICES:
+            return Layout(*LATTICES[self.layout](number), np.zeros(number, np.int64))
+        made: Layout = layouts.get(self.layout)(number)
+        if not len(made.x) == len(made.y) == len(made.wafer) == number:
+            raise InputError(f"the layout {self.layout} gives {len(made.x)} places for {number} pixels", place=self.name)
+        return made
 
     def _of_several_bands(self) -> Focalplane:
         planes = {name: camera.focalplane() for name, camera in self.cameras.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,36 @@ from .types import Floats
 
 GAP = 0.03
 """Of wafers: distance between their edges, beyond one pitch, in units of the distance between their centres."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where ``n`` pixels lie: what a registered layout (entry points ``zonda.layouts``), called with their number, returns.
+
+    The callable may have an attribute ``wafers``: a number that divides that of the pixels.
+
+    Attributes
+    ----------
+    x, y
+        (n,) places on the tangent plane, towards increasing azimuth and elevation, in a unit of its own.
+    wafer
+        (n,) whole numbers: the wafer of each.
+    angle
+        (n,) angles of the axes of A from +y towards +x [rad], for pairs of polarized detectors; None: 0 and 45 deg in turn.
+    radius
+        That of the field of view in the same unit; None: the distance of the farthest pixel.
+    """
+
+    x: Floats
+    y: Floats
+    wafer: NDArray[np.int64]
+    angle: Floats | None = None
+    radius: float | None = None
+
+    @property
+    def reach(self) -> float:
+        """``radius``, or what stands for it."""
+        return float(np.hypot(self.x, self.y).max()) if self.radius is None else self.radius
 
 
 def hexagonal_packing(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -21,6 +21,7 @@ operators = Registry("operator", "zonda.operators zonda.mapmakers", "zonda.core.
 instruments = Registry("instrument", "zonda.instruments", "zonda.core.instrument:Instrument")
 sites = Registry("site", "zonda.sites", "zonda.core.site:Site")
 bands = Registry("band", "zonda.bands", "zonda.core.instrument:Band")
+layouts = Registry("layout", "zonda.layouts", classes=True)  # functions of a number of pixels: core.layouts.Layout
 noise_models = Registry("noise model", "zonda.noise_models")
 spectra = Registry("spectra", "zonda.spectra")
 checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
@@ -45,7 +46,7 @@ register = operators.register
 """Decorator: register an operator for this process, in scripts and notebooks. Packages use entry points."""
 
 registries = (
-    operators, instruments, sites, bands, noise_models, weather_sources, ground_weather, spectra, checks, metrics,
+    operators, instruments, layouts, sites, bands, noise_models, weather_sources, ground_weather, spectra, checks, metrics,
     planning, products, sections,
 )  # fmt: skip
 

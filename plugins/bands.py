@@ -5,7 +5,7 @@ from __future__ import annotations
 from zonda.core.instrument import Band
 
 PAPER = "van Marrewijk, Morris et al. 2024, Table 1"
-ROUND = "flat, with round edges after public descriptions; give a file of your own for the measured band"
+ROUND = "stand-in: flat, with round edges after public descriptions; give a file of your own for the measured band"
 
 EDGES = {
     # name: (GHz, GHz, provenance)

@@ -10,13 +10,14 @@ from typing import NamedTuple
 from zonda.core.instrument import Instrument, Telescope
 
 PAPER = "van Marrewijk, Morris et al. 2024, Table 1"
-ROUND = "round values after public descriptions of the instrument; efficiencies, NET and knee are our assumptions"
+ROUND = "stand-in: every number is round, after public descriptions of the instrument; efficiencies, NET and knee are assumed"
 NO_PINK = "it gives no pink-noise level: knee and slope are our choice"
 
 # Limits of the axes. AtLAST: "3 deg/s scanning and 1 deg/s2 acceleration" (Mroczkowski et al. 2025, A&A 694, A142), taken on the
 # sky, as the paper's own scans need them. GBT: 36 deg/min in azimuth (17 in the cold; Minter, GBT keyhole memo). APEX: an ALMA
-# antenna, 6 and 3 deg/s (Saito et al. 2011 for the ACA's). Round values after public descriptions: GBT's elevation and
-# accelerations, LMT, ACT, SPT, SO LAT and FYST (one design, 3 deg/s and 6 deg/s2 in azimuth; Parshley et al. 2018), SO SAT,
+# antenna, 6 and 3 deg/s (Saito et al. 2011 for the ACA's). FYST: limits of its control system, 3 deg/s and 6 deg/s2 in azimuth,
+# 1.5 deg/s in elevation (ccatobs/fyst-trajectories, src/fyst_trajectories/site.py); the same for the SO LAT, which is one design
+# (Parshley et al. 2018). Round values after public descriptions: GBT's elevation and accelerations, LMT, ACT, SPT, SO SAT,
 # CMB-S4's (3 deg/s2 of its reference scans). None is known to us where none stands.
 TELESCOPES = {
     "GBT": Telescope(
@@ -106,6 +107,7 @@ CAMERAS = {
     "mustang2": Camera(
         # 223 detectors fill 4.2 arcmin, which makes the pitch about 16 arcsec; 1.9 f-lambda as quoted (12.6 arcsec) would span
         # only 3.3 arcmin. Count and field are kept, the pitch follows.
+        # The observatory's page says 223 feedhorns, 4.2 arcmin, 75 to 105 GHz and 9 arcsec (greenbankobservatory.org, MUSTANG-2).
         "MUSTANG-2 on the 100 m Green Bank Telescope",
         *("GBT", "4.2 arcmin", 0.3, 0.8, "0.5 Hz", "100 Hz"),
         (Channel("mustang2_90ghz", 223, "1.7 mK s(1/2)", "8.5 arcsec"),),
@@ -163,7 +165,7 @@ CAMERAS = {
             Channel("so_225ghz", 6_000, "0.2 mK s(1/2)", "11 arcmin"),
             Channel("so_280ghz", 6_000, "0.2 mK s(1/2)", "9 arcmin"),
         ),
-        f"aperture: van Marrewijk, Morris et al. 2024; else {ROUND}",
+        f"aperture: van Marrewijk, Morris et al. 2024; {ROUND}",
     ),
     "spt": Camera(
         "SPT-3G on the 10 m South Pole Telescope",
@@ -194,8 +196,11 @@ CAMERAS = {
         "a camera like LABOCA on the 12 m Atacama Pathfinder Experiment",
         *("APEX", "11.4 arcmin", 0.6, 0.9, "0.1 Hz", "25 Hz"),
         (Channel("laboca_345ghz", 295, "2 mK s(1/2)", "19 arcsec"),),
-        "detectors, field, beam (19.2 arcsec), band of 60 GHz about 345 GHz: Siringo et al. 2009, A&A 497, 945; "
-        "stand-in: NET, about 75 mJy s(1/2) in this beam; stand-in: efficiencies and knee, assumed",
+        "detectors: 295 bolometers, Siringo et al. 2009, A&A 497, 945, abstract; "
+        "layout: a hexagonal lattice, 37 arcsec between neighbours, 38 to 40 in maps of the beams (crush/config/laboca/*.rcp, "
+        "attipaci/crush, 982ba3f), its outline round here; "
+        "stand-in: field of view, beam (19.2 arcsec), band of 60 GHz about 345 GHz: Siringo et al. 2009, not verified; "
+        "stand-in: NET: about 75 mJy s(1/2) in this beam, not verified; stand-in: efficiencies, knee and sample rate: assumed",
     ),
     "hexagonal_array": Camera(
         "a generic hexagonal array on a 6 m telescope",

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import zonda
+from zonda.core import registry
 from zonda.core.errors import ZondaError
-from zonda.core.layouts import hexagon, hexagonal_packing, rings, wafers
+from zonda.core.layouts import Layout, hexagon, hexagonal_packing, rings, wafers
+from zonda.core.registry import instruments
 
 CAMERA: dict[str, Any] = {
     "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"},
@@ -88,6 +90,38 @@ def test_overlaid_bands_fill_the_same_field_each_by_itself() -> None:
         assert len(own) == count
         assert 2 * np.arctan(own.radius) == pytest.approx(np.radians(1))
         np.testing.assert_array_equal(own.xi, camera.cameras[name].focalplane().xi)
+
+
+def test_a_layout_of_a_plugin_has_places_angles_and_wafers() -> None:
+    def cross(number: int) -> Layout:
+        return Layout(np.arange(number) - 1.5, np.zeros(number), np.arange(number) // 2, np.full(number, 0.3), radius=3.0)
+
+    cross.wafers = 2  # type: ignore[attr-defined]
+    registry.layouts.register(cross)
+    plane = zonda.Instrument(**CAMERA, detectors=8, layout="cross", polarization="pairs").focalplane()
+    scale = np.tan(np.radians(0.5)) / 3
+    np.testing.assert_allclose(plane.xi, np.repeat([-1.5, -0.5, 0.5, 1.5], 2) * scale)
+    np.testing.assert_allclose(plane.polarization_angle, np.tile([0.3, 0.3 + np.pi / 2], 4))
+    np.testing.assert_array_equal(plane.wafer, [0, 0, 0, 0, 1, 1, 1, 1])
+    with pytest.raises(ZondaError, match="2 wafers share their pixels equally; detectors is 6, no multiple of 4"):
+        zonda.Instrument(**CAMERA, detectors=6, layout="cross", polarization="pairs")
+    registry.layouts.register(lambda number: cross(number + 1), name="cross")
+    with pytest.raises(ZondaError, match="the layout cross gives 9 places for 8 pixels"):
+        zonda.Instrument(**CAMERA, detectors=8, layout="cross").focalplane()
+
+
+def test_an_unknown_layout() -> None:
+    with pytest.raises(ZondaError, match=r"unknown layout 'ring'(.|\n)*did you mean 'rings'"):
+        zonda.Instrument(**CAMERA, detectors=7, layout="ring")
+    with pytest.raises(ZondaError, match=r"unknown layout 'so_lat_m'(.|\n)*did you mean 'so_lat_"):
+        zonda.Instrument(**CAMERA, detectors=7, layout="so_lat_m")
+
+
+def test_a_published_layout_with_fewer_pixels_keeps_its_wafers() -> None:
+    whole, part = (instruments.create("so_lat_mf").varied(detectors=n).cameras["f090"].focalplane() for n in (10_320, 288))
+    for k in range(12):
+        one, other = (np.stack([p.xi[p.wafer == k], p.eta[p.wafer == k]]).mean(axis=1) for p in (whole, part))
+        assert np.degrees(np.abs(one - other)).max() < 0.05  # of 2 deg: both fill the field, by 2 % of stretch
 
 
 @pytest.mark.parametrize(

@@ -201,3 +201,37 @@ def test_the_page_does_what_it_says(examples, tmp_path):
     assert theirs.sum() == names["data"]["map"].hits.sum() > 0
     # the last block adds the atmosphere's emission, kelvins, and noise
     assert names["found"].obs[0].detdata["signal"].data.mean() > 1
+
+
+def of_toast(made, centre):
+    """xi and eta as tangents and gamma of a layout that TOAST made, moved to a quaternion ``centre``."""
+    from toast import qarray
+    from toast.instrument_coords import quat_to_xieta
+
+    quats = qarray.mult(centre, np.array([made[name]["quat"] for name in sorted(made)]))
+    xi, eta, gamma = quat_to_xieta(quats)
+    z = np.sqrt(1 - xi**2 - eta**2)
+    return xi / z, eta / z, gamma
+
+
+def test_published_layouts_are_those_that_toast_makes():
+    """As sotodlib/toast/sim_focalplane.py composes the wafers of an SO SAT: seven in hexagons, each of three rhombi, turned."""
+    from toast import qarray
+    from toast.instrument_sim import hex_layout, rhomb_xieta_row_col, rhombus_hex_layout
+
+    from zonda.plugins.layouts import LAYOUTS
+
+    scale, axis = np.radians(0.09668), np.array([0.0, 0.0, 1.0])
+    found = LAYOUTS["so_sat"](7 * 430)
+    places = hex_layout(
+        7, 2 * 128.4 * scale * u.rad, "", "", np.zeros(7) * u.rad, center=qarray.from_axisangle(axis, np.radians(150))
+    )
+    angles = [22.5 + 45 * (rhomb_xieta_row_col(144, p)[0] % 2) for p in range(144)] * u.deg
+    for wafer, turn in enumerate((240, 0, 300, 180, 120, 60, 60)):
+        centre = qarray.mult(places[f"{wafer}"]["quat"], qarray.from_axisangle(axis, np.radians(turn)))
+        xi, eta, gamma = of_toast(rhombus_hex_layout(144, 11 * 5.3 * scale * u.rad, "", "", pol=angles), centre)
+        pins = [144 + 66, 144 + 66 + 10]
+        own = found.wafer == wafer
+        np.testing.assert_allclose(found.x[own], np.delete(xi, pins), atol=1e-12)
+        np.testing.assert_allclose(found.y[own], np.delete(eta, pins), atol=1e-12)
+        np.testing.assert_allclose(np.sin(found.angle[own] - np.delete(gamma, pins)), 0, atol=1e-12)  # an axis, not a direction

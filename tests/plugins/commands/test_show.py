@@ -30,7 +30,7 @@ def test_a_camera_of_two_bands(tmp_path: Path) -> None:
     assert rows["f150"][-2:] == ["0.1", "1"]
     assert "detectors     1716, hexagon layout, pixels shared, polarized" in text
     sources, stand_ins = text.split("stand-ins")
-    assert "arXiv:2503.14451" in sources
+    assert "detectors: 2012 in PA4, 1716 in PA5" in sources
     assert "NET: 300 uK_CMB" in stand_ins
     assert (tmp_path / "act.png").read_bytes().startswith(b"\x89PNG")
 
@@ -38,7 +38,7 @@ def test_a_camera_of_two_bands(tmp_path: Path) -> None:
 def test_stand_ins_are_told_from_sources() -> None:
     sources, stand_ins = split_provenance(instruments.create("apex"))
     assert any("Siringo" in text for text in sources)
-    assert "NET, about 75 mJy s(1/2) in this beam" in stand_ins
+    assert "NET: about 75 mJy s(1/2) in this beam, not verified" in stand_ins
     assert not any("stand-in" in text for text in sources + stand_ins)
 
 
