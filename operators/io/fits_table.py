@@ -134,14 +134,17 @@ def _samples_table(tod: TimeOrderedData) -> Any:
     from astropy.io import fits
 
     azimuth, elevation = azimuth_elevation(tod.boresight_azel)
+    pointing = [
+        ("AZ", "D", "rad", azimuth),
+        ("EL", "D", "rad", elevation),
+        ("BORESIGHT_AZEL", "4D", None, tod.boresight_azel),
+        ("BORESIGHT_RADEC", "4D", None, tod.boresight_radec),
+    ]
     column = fits.Column
     columns = [
         column("SECONDS", "D", unit="s", array=tod.seconds),
         column("TIME", "D", unit="s", array=tod.times),
-        column("AZ", "D", unit="rad", array=azimuth),
-        column("EL", "D", unit="rad", array=elevation),
-        column("BORESIGHT_AZEL", "4D", array=tod.boresight_azel),
-        column("BORESIGHT_RADEC", "4D", array=tod.boresight_radec),
+        *(column(name, kind, unit=unit, array=values) for name, kind, unit, values in pointing if len(values)),
         column("FLAGS", "B", array=tod.flags),
         *([] if tod.hwp_angle is None else [column("HWP_ANGLE", "D", unit="rad", array=tod.hwp_angle)]),
     ]
@@ -289,6 +292,10 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
     return tod
 
 
+def _quaternions(samples: Any, name: str) -> Floats:
+    return np.asarray(_native(samples[name]) if name in samples.names else np.zeros((0, 4)), np.float64)
+
+
 def _native(values: Any) -> Any:
     """The same numbers in the machine's order of bytes."""
     array = np.asarray(values)
@@ -319,8 +326,8 @@ def _read(file: Any) -> TimeOrderedData:
         telescope=header["TELESCOP"],
         field_of_view=float(np.radians(header["FOV"])),
         site=(header["SITE"], float(np.radians(header["SITELAT"])), float(np.radians(header["SITELON"])), header["SITEALT"]),
-        boresight_azel=_native(samples["BORESIGHT_AZEL"]),
-        boresight_radec=_native(samples["BORESIGHT_RADEC"]),
+        boresight_azel=_quaternions(samples, "BORESIGHT_AZEL"),
+        boresight_radec=_quaternions(samples, "BORESIGHT_RADEC"),
         flags=flags,
         detector_flags=detector_flags,
         names=[str(d) for d in detectors["NAME"]],

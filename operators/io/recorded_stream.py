@@ -74,7 +74,10 @@ class RecordedStream:
         return spoilt
 
     def read(self, detectors: slice, samples: slice) -> tuple[Floats, int]:
-        """(n, m) float64 K at absolute detectors and samples, NaN where the file flags one; how many these are."""
+        """(n, m) float64 K at absolute detectors and samples, NaN where the file flags one.
+
+        How many these are, too, but for detectors that the file excludes altogether.
+        """
         rows = self.rows[detectors]
         values = np.array(self.file.read(self.name, rows, samples), np.float64)
         if self._factor != 1.0:
@@ -84,7 +87,7 @@ class RecordedStream:
             return values, 0
         bad = (flagged & self.mask) != 0
         values[bad] = np.nan
-        return values, int(np.count_nonzero(bad & ~bad.all(axis=1, keepdims=True)))
+        return values, int(np.count_nonzero(bad[(self.file.tod.detector_flags[rows] & self.mask) == 0]))
 
 
 def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Floats, Floats]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +213,33 @@ def test_flags_and_their_masks(saved: Any, tmp_path: Path) -> None:
     every = load(path, MAP, load={"flag_mask": 4 | 32, "detector_mask": 64 | 7})
     assert every["map"].hits.sum() == 18 * (n - 50) - 30
     assert load(path, MAP, load={"flag_mask": 0, "detector_mask": 0})["map"].hits.sum() == 19 * n
+
+
+@pytest.mark.parametrize("memory", [5_000_000, 1 << 30])
+def test_flagged_samples_are_counted_whatever_the_blocks(saved: Any, tmp_path: Path, memory: int) -> None:
+    """All of a detector's, where the file flags each of its samples but not the detector; none of those of an excluded one."""
+
+    def flag(file: Any) -> None:
+        flags = np.zeros(file["detdata/flags"].shape, np.uint8)
+        flags[3, 500:510], flags[4], flags[6] = 1, 1, 1
+        file["detdata/flags"][...] = flags
+        file.attrs.modify("observation_detector_flags", json.dumps({f"d{k:02d}": 1 if k == 6 else 0 for k in range(19)}))
+
+    path = changed(saved["Filtered"][0], tmp_path / "flagged.h5", flag)
+    data = load(path, MAP, memory=memory)
+    n = data.observations[0].n_samples
+    assert data.tally.get("LoadTOD", "samples of single detectors that the file flags") == 10 + n
+
+
+def test_a_file_of_either_format_may_lack_azimuth_and_elevation(saved: Any, tmp_path: Path) -> None:
+    """They are computed on loading; in FITS an absent column is no column of zeros."""
+    whole, found = load_tod(saved["Raw"][0]), []
+    for name in ("a.fits", "a.h5"):
+        save_tod(tmp_path / name, replace(whole, boresight_azel=np.zeros((0, 4))))
+        assert load_tod(tmp_path / name).boresight_azel.shape == (0, 4)
+        found.append(load(tmp_path / name, MAP).observations[0].boresight_azel)
+    np.testing.assert_array_equal(*found)
+    np.testing.assert_allclose(np.abs((found[0] * whole.boresight_azel).sum(axis=1)), 1, atol=1e-12)
 
 
 def test_other_units_are_kelvin(saved: Any, tmp_path: Path) -> None:
