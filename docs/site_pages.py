@@ -67,9 +67,11 @@ def on_files(files: Any, config: Any) -> Any:
         for name, content in tutorial(notebook).items():
             add(f"tutorials/{name}", content)
     text = GALLERY
-    for pipeline in sorted((DOCS / "gallery").glob("*.yaml")):
+    for pipeline in sorted((DOCS / "gallery").glob("*.yaml"), key=lambda path: int(path.stem.partition("_")[0])):
         add(f"gallery/{pipeline.stem}.png", cached(pipeline, gallery_picture)["picture.png"])
         text += gallery_entry(pipeline)
+    code = (DOCS / "gallery" / "filament.py").read_text("utf-8")
+    text += f"\n## filament.fits\n\n```python\n{code}```\n"
     add("gallery/index.md", text)
     return files
 
@@ -198,11 +200,31 @@ def gallery_picture(path: Path) -> dict[str, bytes]:
 
     with TemporaryDirectory() as folder:
         shutil.copy(ROOT / "pipelines" / "data" / "merging_cluster.fits", Path(folder) / "my_cluster.fits")
+        if "filament.fits" in path.read_text("utf-8"):
+            subprocess.run([sys.executable, DOCS / "gallery" / "filament.py"], cwd=folder, check=True)
         zonda = Path(sys.executable).with_name("zonda")
         done = subprocess.run([zonda, "run", path, "--output", "out"], cwd=folder, capture_output=True, text=True)
         if done.returncode:
             raise SystemExit(f"{path.relative_to(ROOT)}: {done.stderr}")
-        return {"picture.png": (Path(folder) / "out" / header(path)["picture"]).read_bytes()}
+        return {"picture.png": beside([Path(folder) / "out" / name for name in header(path)["picture"].split(", ")])}
+
+
+def beside(pictures: list[Path]) -> bytes:
+    """One picture, or several in rows of two."""
+    from io import BytesIO
+
+    from PIL import Image
+
+    if len(pictures) == 1:
+        return pictures[0].read_bytes()
+    parts = [Image.open(path).convert("RGB") for path in pictures]
+    width, height = (max(getattr(p, side) for p in parts) for side in ("width", "height"))
+    whole = Image.new("RGB", (2 * width, -(-len(parts) // 2) * height), "white")
+    for k, part in enumerate(parts):
+        whole.paste(part, (k % 2 * width, k // 2 * height))
+    made = BytesIO()
+    whole.quantize(256).save(made, "png", optimize=True)
+    return made.getvalue()
 
 
 # -- the gallery ----------------------------------------------------------------------------------
@@ -210,7 +232,8 @@ def gallery_picture(path: Path) -> dict[str, bytes]:
 GALLERY = """# Gallery
 
 Each figure is made by the pipeline beside it while this site is built. Save one as `my.yaml`, change it, `zonda run my.yaml`: the
-figure is in `out/my`. `my_cluster.fits` is the input map that comes with zonda (`pipelines/data/merging_cluster.fits`), or yours.
+figure is in `out/my`. `my_cluster.fits` is the input map that comes with zonda (`pipelines/data/merging_cluster.fits`), or yours;
+`filament.fits` is made by [a few lines of Python](#filamentfits).
 """
 
 

@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import json
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,12 @@ def blocks(language):
 def in_a_folder_with_a_map(folder, monkeypatch):
     (folder / "my_cluster.fits").write_bytes((ROOT / "pipelines" / "data" / "merging_cluster.fits").read_bytes())
     monkeypatch.chdir(folder)
+
+
+def with_a_filament(text):
+    """The map of the gallery that a text names, in the current folder."""
+    if "filament.fits" in text:
+        runpy.run_path(str(ROOT / "docs" / "gallery" / "filament.py"))
 
 
 def with_recorded_data(folder, text):
@@ -93,6 +100,7 @@ def test_yaml(text, tmp_path, monkeypatch, capsys):
     with_recorded_data(tmp_path, text)
     with_files_of_the_page(tmp_path, text)
     with_survey_data(tmp_path, text)
+    with_a_filament(text)
     (tmp_path / "page.yaml").write_text(text)
     status = cli.main(["check", "page.yaml"])
     out, err = capsys.readouterr()

@@ -267,7 +267,7 @@ def _input(name: str, image: Image, plane: str = "") -> tuple[Any, ...]:
     elif step > 1:
         every = (slice(None, None, step), slice(None, None, step))
         header = _plain(image.wcs.slice(every).to_header(relax=True))
-    return product_path("", name).name, np.asarray(values, np.float32), axes, header, plane
+    return product_path("", name).name, np.asarray(values, np.float32), axes, header, bool(plane)
 
 
 def _flat(

@@ -14,10 +14,10 @@ from zonda.core.numerics.angles import angle_text
 from zonda.core.types import AnyFloats
 
 from ..series import Modes, Spectrum, TimeStream, unit_of_stream
-from .canvas import DPI
+from .canvas import DPI, unit_of
 from .flat_map import FlatMap
 from .map_layout import map_axes
-from .map_plots import SHOWN, contour_text, plot_circle, plot_contours, plot_coverage, plot_crosslinking, plot_map
+from .map_plots import SHOWN, contour_text, plot_circle, plot_contours, plot_coverage, plot_crosslinking, plot_map, plot_plain
 from .plot_modes import plot_modes
 from .plots import ScanTrack, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .png import png_of
@@ -58,10 +58,17 @@ def printed(draw: Callable[..., list[Sketch]], style: Style, *arguments: Any) ->
     return made
 
 
-def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any], plane: str = "") -> list[Sketch]:
-    """The input map (ny, nx), K_RJ, or its ``plane``, Q or U."""
-    of = f" ({plane})" if plane else ""
-    ax = plot_map(values, header if axes is None else axes, title=f"Input{of}: the sky before the beam")
+def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any], signed: bool = False) -> list[Sketch]:
+    """The input map (ny, nx), K_RJ; ``signed``: Q or U, with zero in the middle of the colours."""
+    of = "" if file == "input" else f" ({file})"
+    title, where = f"Input{of}: the sky before the beam", header if axes is None else axes
+    if signed:
+        top = float(np.nanpercentile(np.abs(values), 99.7)) or 1.0
+        factor, unit = unit_of(top)
+        label = f"Rayleigh–Jeans brightness [{unit}]"
+        ax = plot_plain(values * factor, where, (-top * factor, top * factor), "RdBu_r", label, title=title)
+    else:
+        ax = plot_map(values, where, title=title)
     return [Sketch(file, f"Input{of}", "The input map, before beam, opacity and filters.", ax)]
 
 
@@ -169,7 +176,7 @@ def draw_transfer(file: str, transfer: Any) -> list[Sketch]:
         "their cross spectrum to the spectrum of the latter, with the standard error from the scatter of the modes (bars); "
         f"dashed, the ratio of amplitudes. Dotted, the beam. Singular modes of {whose}."
     )
-    of = "" if transfer.map == "map" else f" of {transfer.map}"
+    of = "" if file == "transfer_function" else f" ({file.removeprefix('transfer_function_')})"
     ax = plot_transfer(transfer, title=f"Transfer function{of}, singular modes of {whose}")
     return [Sketch(file, f"Transfer function{of}", caption, ax)]
 

@@ -107,8 +107,8 @@ def test_pictures_of_the_planes(made):
     wanted = {f"{stem}{which}.png" for stem in ("input", "map", "transfer_function", "comparison") for which in ("", "_Q", "_U")}
     assert wanted <= names
     page = (made[1] / "report.html").read_text(encoding="utf-8")
-    assert "Input (Q)" in page
-    assert "Transfer function of map_U" in page
+    assert "Input (input_Q)" in page
+    assert "Transfer function (U)" in page
 
 
 def test_a_map_of_i_is_compared_with_i_of_the_reference():
