@@ -77,7 +77,7 @@ def place_of_signal(operators: Sequence[Operator]) -> int | None:
 
 def _calibrated(operators: Sequence[Operator]) -> frozenset[str]:
     """What these steps provide, where all of it is sky or enters calibrated; else nothing."""
-    made = [name for o in operators for name in o.provides if name != "boresight"]
+    made = [name for o in operators if not changes_components(o) for name in o.provides if name != "boresight"]
     known = all(name == "sky" or (isinstance(name, Component) and name.enters == "calibrated") for name in made)
     return frozenset(made) if known else frozenset()
 
@@ -100,6 +100,14 @@ def forms(operator: Operator) -> bool:
 def filters(operator: Operator) -> bool:
     """Whether it changes signals."""
     return MAIN in operator.provides and MAIN in operator.requires
+
+
+def changes_components(operator: Operator) -> bool:
+    """Whether it changes streams that other steps make, before a signal is formed of them, and makes none: it reads all that it
+    provides, and is no part of any signal itself."""
+    return (
+        MAIN not in operator.provides and bool(operator.provides) and operator.provides <= operator.requires | operator.optional
+    )
 
 
 def makes_products(operator: Operator) -> bool:

@@ -65,8 +65,9 @@ def makers(what: str) -> list[str]:
     """Installed operators that provide ``what`` and do not need it themselves."""
 
     def makes(step: Any) -> bool:
-        provides, requires = (n if isinstance(n, frozenset) else frozenset() for n in (step.provides, step.requires))
-        return what in provides - requires  # a property says nothing before there is an operator
+        declared = (step.provides, step.requires, step.optional)
+        provides, requires, optional = (n if isinstance(n, frozenset) else frozenset() for n in declared)
+        return what in provides - requires - optional  # a property says nothing before there is an operator
 
     return operators_that(makes)
 

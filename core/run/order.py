@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..configuration.diagnostics import nearest
-from ..mapmaker import forms, place_of_signal
+from ..mapmaker import changes_components, forms, place_of_signal
 from ..operator import Operator
 from ..output import Output
 from ..registry import makers
@@ -66,7 +66,8 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                     "it must require exactly one",
                 )
             )
-        have |= operator.provides
+        if not changes_components(operator):
+            have |= operator.provides
     if operators and not any("boresight" in o.provides | o.requires for o in operators):
         cure = f"{' or '.join(makers('boresight'))} would"
         problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step", cure))

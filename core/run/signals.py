@@ -16,7 +16,7 @@ from itertools import combinations
 
 from ..configuration.diagnostics import nearest
 from ..errors import PipelineError
-from ..mapmaker import MapMaker, acts, filters, forms, with_calibrated_signal
+from ..mapmaker import MapMaker, acts, changes_components, filters, forms, with_calibrated_signal
 from ..observation import Observation
 from ..operator import Operator
 from ..output import Output
@@ -232,7 +232,7 @@ def _generators(operators: Sequence[Operator]) -> list[Operator]:
     for operator in operators:
         if MAIN in operator.provides | operator.requires:
             break
-        if operator.provides - {"boresight"}:
+        if operator.provides - {"boresight"} and not changes_components(operator):
             found.append(operator)
     return found
 

@@ -21,12 +21,13 @@ class Leakage(Operator):
 
     with the share l, its direction beta, a detector's angle gamma and the plate's chi, all in the focal plane, and the
     polarization efficiency p. It is the monopole leakage gamma_1 + i gamma_2 = l exp(2 i beta) of Hu, Hedman & Zaldarriaga
-    (2003, Phys. Rev. D 67, 043004), constant over the field. All of the signal leaks, the atmosphere and its mean too (and
-    noise, by as much): put it right behind what forms the signal.
+    (2003, Phys. Rev. D 67, 043004), constant over the field. What comes through the optics leaks: the sky and the atmosphere, its
+    mean too. The detectors' noise does not, nor do glitches and what sidelobes pick up of the ground. It changes the components:
+    put it behind those, and behind a half-wave plate, before `Efficiency`.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere"})
+    optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere"})
     linear: ClassVar[bool] = True
 
     share: Fraction = quantity("1 %", ge=0, le=0.5)
@@ -50,4 +51,5 @@ class Leakage(Operator):
         if turn.size:
             plate = turn[block.samples]
             cosine = cosine * np.cos(plate) + sine * np.sin(plate)
-        block.detdata["signal"] *= (1 + cosine).astype(block.dtype)
+        for stream in self.provides & block.detdata.keys():
+            block.detdata[stream] *= (1 + cosine).astype(block.dtype)

@@ -75,19 +75,62 @@ def test_leakage_of_an_unpolarized_sky_is_polarization_of_its_share(plate):
     np.testing.assert_allclose(np.arctan2(u, q) / 2, np.radians(20.0), rtol=0, atol=2e-3)
 
 
-def test_leakage_takes_the_mean_of_the_signal_too():
-    """What stands beside the stream leaks as the stream does: equation (1) on the whole signal."""
-    o = pairs(4, 2048)
-    signal = np.random.default_rng(1).normal(size=(4, 2048)) + 30.0
-    data = run([Leakage(share="5 %", angle="10 deg")], o, signal, keep=("signal",))
-    gain = 1 + 0.8 * 0.05 * np.cos(2 * (o.focalplane.polarization_angle - np.radians(10.0)))
-    np.testing.assert_allclose(data.observations[0].detdata["signal"], gain[:, None] * signal, rtol=1e-14)
+CAMERA = {
+    "name": "pairs", "telescope": {"name": "dish", "diameter": "6 m"}, "detectors": 12, "field_of_view": "6 arcmin",
+    "band": {"name": "b", "low": "130 GHz", "high": "170 GHz"}, "fwhm": "1.4 arcmin", "polarization": "pairs",
+    "net": "1 mK s(1/2)",
+    "main_beam_efficiency": 0.7, "illumination_efficiency": 0.9, "sample_rate": "20 Hz",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("plate", [False, True])
+@pytest.mark.parametrize("calibration", ["mean", "instantaneous"])
+def test_what_comes_through_the_optics_leaks_and_noise_does_not(plate, calibration):
+    """Equation (1) on sky and atmosphere, its mean emission of 15 K included, in each signal; noise keeps its bits."""
+    scene = zonda.Scene(site="green_bank", instrument=CAMERA, time="2024-11-25T07:00", target="75 deg 20 deg", seed=3)
+    leakage = [zonda.Leakage(share="5 %", angle="10 deg")]
+    runs = {"noise": {"only": ["white"]}, "noiseless": {"only": ["sky"]}, "rest": {"without": ["white"]}}
+    keep = ["signal", *(f"signal/{name}" for name in runs)]
+
+    def streams(more):
+        steps = [
+            zonda.PointingDaisy(radius="5 arcmin", speed="60 arcsec/s", scan_duration="20 s"),
+            *([zonda.HalfWavePlate(frequency="1 Hz")] if plate else []),
+            uniform_sky(1.0, 0.0, 0.0),
+            zonda.AtmosphereLayers(pwv="5 mm"),
+            zonda.WhiteNoise(),
+            *more,
+            zonda.Efficiency(calibration=calibration),
+        ]
+        data = zonda.Pipeline(steps, precision="float64", runs=runs).run(scene, keep=keep)
+        return data.observations[0], {name: data.observations[0].detdata[name] for name in keep}
+
+    (o, clean), (_, leaked) = streams([]), streams(leakage)
+    gamma = o.focalplane.polarization_angle[:, None]
+    turned = 2 * (gamma - np.radians(10.0)) if not plate else 4 * o.hwp_angle - 2 * gamma - 2 * np.radians(10.0)
+    gain = 1 + 0.05 * np.cos(turned)
+    assert np.ptp(gain) > 0.08
+    assert clean["signal/rest"].mean() > 10
+    np.testing.assert_array_equal(leaked["signal/noise"], clean["signal/noise"])
+    np.testing.assert_allclose(leaked["signal/noiseless"], gain * clean["signal/noiseless"], rtol=1e-12)
+    if calibration == "mean":  # what leaks of the mean is divided by e^-tau itself, the mean by splines: 1.2e-12
+        np.testing.assert_allclose(leaked["signal/rest"], gain * clean["signal/rest"], rtol=1e-11)
+        np.testing.assert_allclose(leaked["signal"], leaked["signal/rest"] + leaked["signal/noise"], rtol=1e-12)
+    else:  # the mean emission's part that follows the transmission is subtracted as it is calibrated, without the leak
+        np.testing.assert_allclose(leaked["signal/rest"], gain * clean["signal/rest"], rtol=1e-3)
+
+
+def test_leakage_behind_what_forms_the_signal_is_refused():
+    steps = [zonda.PointingStare(scan_duration="5 s"), zonda.WhiteNoise(), zonda.Efficiency(), Leakage()]
+    scene = zonda.Scene(site="green_bank", instrument=CAMERA, time="2024-11-25T07:00", target="75 deg 20 deg", seed=3)
+    with pytest.raises(zonda.ZondaError, match=r"Leakage provides atmosphere only after Efficiency has used it"):
+        zonda.Pipeline(steps).run(scene, keep=["signal"])
 
 
 def test_without_polarized_detectors_neither_has_an_effect_and_the_log_says_so():
-    signal = np.random.default_rng(2).normal(size=(7, 1000))
-    data = run([HalfWavePlate(frequency="2 Hz"), Leakage(share="5 %")], scan(7, 1000), signal, keep=("signal",))
-    np.testing.assert_array_equal(data.observations[0].detdata["signal"], signal)
+    steps = [uniform_sky(1.0, 0.3, -0.2), HalfWavePlate(frequency="2 Hz"), Leakage(share="5 %")]
+    data = run(steps, scan(7, 1000), keep=("sky",))
+    np.testing.assert_allclose(data.observations[0].detdata["sky"], 1.0, rtol=1e-12)
     said = {who for who, what, value in data.tally if (what, value) == ("no effect", "no detector is polarized")}
     assert said == {"HalfWavePlate", "Leakage"}
 
