@@ -121,6 +121,52 @@ def test_a_target_that_is_never_up(here, capsys):
     assert all(w in message for w in ("never rises", "green_bank", "choose another target or site")), message
 
 
+def test_a_target_that_is_never_up_is_told_beside_other_mistakes(here, capsys):
+    text = PIPELINE.replace("+20d00m00s", "-70d00m00s").replace("- BinMap", "- BinMap: {pixel: 5 arcsecs}")
+    (here / "my.yaml").write_text(text)
+    message = refused(capsys, "check")
+    assert "2 mistakes in my.yaml" in message
+    assert "never rises" in message
+    assert "my.yaml:7:5" in message  # of the pointing step
+    assert "unknown unit 'arcsecs'" in message
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"instrument: mustang2": "instrument: mustang3"}, "unknown instrument"),
+        ({"05h00m00s +20d00m00s": "map", "map.fits": "none.fits"}, "no such file"),  # there is no target to point at
+        (
+            {"scan_duration: 2 s": "scan_duration: 2 m", "- SaveMap": "- TimeStreams: {observation: 0}\n  - SaveMap"},
+            "expected a time",
+        ),
+    ],
+)
+def test_where_the_telescope_cannot_be_pointed_nothing_else_is_said(here, capsys, change, told):
+    text = PIPELINE
+    for old, new in change.items():
+        text = text.replace(old, new)
+    (here / "my.yaml").write_text(text)
+    message = refused(capsys, "check")
+    assert told in message
+    assert "1 mistake in my.yaml" in message
+
+
+def test_mistakes_in_the_files_of_several_steps_stand_at_their_parameters(here, capsys, tmp_path_factory):
+    files = tmp_path_factory.mktemp("tables")
+    (files / "night.txt").write_text("no schedule")
+    (files / "sources.csv").write_text("ra [deg], dec [deg], flux [Jy]\n75, 20, 1\n75, 95, 1\n")
+    text = PIPELINE.replace("PointingDaisy: {scan_duration: 2 s}", f"PointingSchedule: {{schedule: {files}/night.txt}}")
+    (here / "my.yaml").write_text(text.replace("SkyMap: {file: map.fits}", f"PointSources: {{catalogue: {files}/sources.csv}}"))
+    for command in ("check", "run"):
+        message = refused(capsys, command)
+        assert "my.yaml:7:34" in message
+        assert "is no schedule" in message
+        assert "my.yaml:8:31" in message
+        assert "dec of row 2 is 95 deg" in message
+        assert "2 mistakes in my.yaml" in message
+
+
 def test_a_target_that_is_up_later(here, capsys):
     (here / "my.yaml").write_text(PIPELINE.replace("2024-11-25T07:00", "2024-11-25T20:00"))
     message = refused(capsys)

@@ -69,14 +69,13 @@ def accuracy(
     meets the target at least cost.
     """
     from ..configuration.pipeline_file import load
-    from ..run.first_look import first_look
     from .metrics import get
     from .settings import knobs_of, shortened
     from .study import Setup, study
 
     file = load(pipeline, settings)
     get(metric)
-    first_look(file.pipeline(), file.scene(), saved=False)
+    file.look(saved=False)
     wanted = _fraction(target)
     if check:
         return _retest(file, pipeline, metric)

@@ -147,7 +147,11 @@ class _Draft:
 
         with within(f"entry {about(entry) or source.file.header.name}"):
             file = _with_budget(source.load(entry.settings), share)
-            first_look(file.pipeline(), scene_of(file, entry.seed, entry.time))
+            scene = scene_of(file, entry.seed, entry.time)
+            if entry.settings:  # the error names the entry, not a line of the file
+                first_look(file.pipeline(), scene)
+            else:
+                file.look(scene=scene)
             made = plan(file, keep=self._pruning.keep, drop=self._pruning.drop, prune_all=self._pruning.prune_all)
         self._files.append(made.apply(file))
         self.pipelines.append(self._files[-1].resolved_yaml(self._folder))

@@ -19,12 +19,11 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
     whether it is on the input maps, of which the headers alone are read. A run begins with the same look.
     """
     file = load(pipeline, settings)
-    from ..run.first_look import first_look
     from ..scene import elsewhere
 
     if note := elsewhere(file.scene()):
         click.echo(f"warning: {note}", err=True)
-    found = first_look(file.pipeline(), file.scene())
+    found = file.look()
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
     for step, lines in zip(file.steps, found, strict=True):
         click.echo(f"  {step.key}")

@@ -104,7 +104,6 @@ def _run_campaign(request: RunRequest) -> None:
 
 def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
     from ..plan import remembered
-    from ..run.first_look import first_look
     from ..storage.files import check_output_folder, write_text
     from ..storage.lock import lock
 
@@ -113,7 +112,7 @@ def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
         raise click.UsageError("--verify measures the whole pipeline: leave --only out")
     if request.only:
         file = load(pipeline, settings, request.only)
-    first_look(file.pipeline(), file.scene())  # minutes of work must not come before a mistake that is seen at once
+    file.look()  # minutes of work must not come before a mistake that is seen at once
     if file.header.accuracy is not None:
         settings = (*settings, *_knobs(file, file.header.accuracy))
         file = load(pipeline, settings, request.only)

@@ -69,6 +69,12 @@ class Diagnostic:
         return "\n".join(parts) + "\n"
 
 
+def refused(err: ZondaError, span: Span) -> Diagnostic:
+    """An error that says what is wrong at ``span``."""
+    message = f"{err.place}: {err.message}" if err.place else err.message
+    return Diagnostic(message, span, getattr(err, "label", ""), err.cure)
+
+
 class ConfigurationError(ZondaError):
     """Everything that is wrong with a configuration, each with its place.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,24 @@ from zonda import __version__
 from ..errors import ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline
+from ..run.first_look import first_look, looks, warn_of_nothing_saved
 from ..scene import Scene
 from ..signal import Signal
 from ..variants import is_variant, written
 from . import yaml_places
+from .diagnostics import ConfigurationError, Diagnostic, refused
 from .header import KEYS, Header
+from .yaml_places import Document
+from .yaml_places import Path as Place
 
 
 @dataclass(frozen=True)
 class Step:
-    """One operator and the name it goes by in the file."""
+    """One operator, the name it goes by in the file, and where it stands there."""
 
     key: str
     operator: Operator
+    at: Place = ()
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,8 @@ class PipelineFile:
         The operators, in order.
     place
         The file's path, or what else the text was called.
+    document
+        The text with its places; None for what was never a file.
     """
 
     header: Header
@@ -50,6 +57,7 @@ class PipelineFile:
     steps: tuple[Step, ...]
     place: str
     _scene: Scene
+    document: Document | None = field(default=None, repr=False, compare=False)
 
     @property
     def operators(self) -> list[Operator]:
@@ -82,6 +90,19 @@ class PipelineFile:
             description=header.description,
             precision=header.precision,
         )
+
+    def look(self, *, saved: bool = True, scene: Scene | None = None) -> list[list[str]]:
+        """As `first_look`; raises `ConfigurationError` with all mistakes of the steps, each at its place in the file."""
+        pipeline, scene = self.pipeline(), scene or self.scene()
+        if self.document is None:
+            return first_look(pipeline, scene, saved=saved)
+        found, refused = looks(pipeline.operators, scene)
+        if refused:
+            mistakes = [refusal(self.document, self.steps[number], err) for number, err in refused]
+            raise ConfigurationError(mistakes, self.place)
+        if saved:
+            warn_of_nothing_saved(pipeline)
+        return found
 
     def resolved_yaml(self, folder: Path | None = None) -> str:
         """The file with every default filled in, which loads again to the same thing.
@@ -118,6 +139,16 @@ class PipelineFile:
 
     def __repr__(self) -> str:
         return f"<PipelineFile {self.place}: {' > '.join(step.key for step in self.steps)}>"
+
+
+def refusal(document: Document, step: Step, err: ZondaError) -> Diagnostic:
+    """An error of a step at the parameter whose file it names, or at the step."""
+    at = document.mark(step.at)
+    for name in type(step.operator).model_fields:
+        value = getattr(step.operator, name)
+        if isinstance(value, os.PathLike) and str(value) in f"{err.place} {err.message}" and (*step.at, name) in document.marks:
+            return refused(err, document.mark((*step.at, name)).value)
+    return refused(err, at.start)
 
 
 def _from_there(value: Any, folder: str) -> Any:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from ..components import Registry
 from ..errors import ZondaError
-from .diagnostics import Diagnostic
+from .diagnostics import Diagnostic, refused
 from .explain import explain
 from .parameters import Parameters
 from .yaml_places import Document, Span
@@ -48,8 +48,7 @@ class Mistakes:
 
     def refused(self, err: ZondaError, span: Span) -> None:
         """Note an error that says what is wrong at ``span``."""
-        message = f"{err.place}: {err.message}" if err.place else err.message
-        self.wrong(message, span, getattr(err, "label", ""), err.cure)
+        self.found.append(refused(err, span))
 
     def named(self, given: dict[str, Any], key: str, names: Registry, at: Place) -> bool:
         """Put what the name stands for in its place; False where there is no such thing."""

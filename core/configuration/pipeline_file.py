@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from ..errors import PipelineError, ZondaError
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
+from ..run.first_look import looks
 from ..run.order import check_order
 from ..scene import Scene, WithScene
 from ..signal import Signal, can_be_named
@@ -28,6 +30,7 @@ from .explain import without_meant
 from .header import KEYS, SCENE_KEYS, Header
 from .loaded import PipelineFile as PipelineFile
 from .loaded import Step as Step
+from .loaded import refusal
 from .locate import locate, read
 from .mistakes import Mistakes
 from .steps import noun, read_steps
@@ -89,7 +92,7 @@ class _Check(Mistakes):
 
     def __init__(self, document: Document, name: str, folder: str | Path | None, found: list[Diagnostic]) -> None:
         super().__init__(document, folder, found)
-        self.name = name
+        self.name, self.band_unknown = name, False
         self.recorded_at: tuple[str, int] = ("operators", 0)  # the step that brings its own site and instrument
         self.tree: dict[Any, Any] = document.value
 
@@ -115,6 +118,8 @@ class _Check(Mistakes):
         if scene is not None and not self.found and self.target_of_map:
             scene = self.targeted(scene, [s.operator for s in steps if s is not None])
         if self.found:
+            if scene is not None and not (self.target_of_map or self.band_unknown):
+                self.look(steps, scene)
             raise ConfigurationError(without_meant(self.found), self.name)
         assert header is not None
         assert scene is not None
@@ -123,7 +128,17 @@ class _Check(Mistakes):
         header = header.model_copy(update={"name": name, "outputs": header.outputs or Path("out") / name})
         own = OWN if recorded is not None else frozenset[str]()
         parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree and k not in own}
-        return PipelineFile(header, parameters, tuple(s for s in steps if s is not None), self.name, scene)
+        made = tuple(s for s in steps if s is not None)
+        return PipelineFile(header, parameters, made, self.name, scene, self.document)
+
+    def look(self, steps: list[Step | None], scene: Scene) -> None:
+        """Add what the steps that could be made would refuse: targets that are not up, files that are wrong."""
+        with warnings.catch_warnings(), suppress(Exception):  # the mistakes that are known come first
+            warnings.simplefilter("ignore")
+            for number, err in looks([None if step is None else step.operator for step in steps], scene)[1]:
+                step = steps[number]
+                if step is not None:
+                    self.found.append(refusal(self.document, step, err))
 
     def sizes(self) -> None:
         """Raise `ConfigurationError` for more steps (of an alias; those written are counted before) or entries than allowed."""
@@ -206,6 +221,7 @@ class _Check(Mistakes):
             own = LIKE in given["instrument"] or given["instrument"].get("bands")  # which say more of an unknown band
             if not own and not self.named(given["instrument"], "band", registry.bands, ("instrument", "band")):
                 given["instrument"]["band"] = {"name": "", "low": "1 Hz", "high": "2 Hz"}  # goes on to find the other mistakes
+                self.band_unknown = True
         if given.get("weather") is not None:
             given["weather"] = self.weather(given["weather"])
         if recorded is not None and not lost:

@@ -85,7 +85,7 @@ def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operato
     made = mistakes.validate(operator, parameters, inner, name)
     if made is None:
         return None, operator.model_construct()
-    return Step(name, made), made
+    return Step(name, made, inner), made
 
 
 def noun(value: Any) -> str:

@@ -244,7 +244,7 @@ def _origin(data: Data) -> Cards:
             ("TELESCOP", ascii_text(scene.instrument.telescope.name)),
             ("INSTRUME", ascii_text(scene.instrument.name)),
             ("SITE", ascii_text(scene.site.name)),
-            ("DATE-OBS", str(scene.time), "start of the first scan, UTC"),
+            ("DATE-OBS", str(min((o.start for o in data.scans), default=scene.time)), "start of the first scan, UTC"),
             ("NSCANS", len(data.scans), "scans"),
         ]
     )

@@ -41,7 +41,6 @@ def plan(
     one_blas_thread()
     ensure_cache()
     from ..configuration.pipeline_file import load
-    from ..run.first_look import first_look
     from .bands import PlanOfBands, as_dict
     from .bands import plan as make
     from .only import only as alone
@@ -55,7 +54,7 @@ def plan(
         click.echo(f"{text}; the plan of the first one:", err=as_json)
     if only:
         file = alone(file, only)
-    first_look(file.pipeline(), file.scene())
+    file.look()
     made = make(file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=True)
     if not audit:
         import json

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from ..data import Data
+from ..errors import ZondaError
 from ..mapmaker import makes_products
 from ..operator import Operator
 from ..pipeline import Pipeline
@@ -23,12 +24,36 @@ def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[
 
     Raises `ZondaError` as the checks do: a target that is not up, a scan that is too fast.
     """
-    data = Data(scene=scene)
-    found = [operator.check(data) for operator in pipeline.operators]
-    if saved and not writes(pipeline.operators):
-        text = f"{pipeline.name}: no step writes a product, so what is computed is lost"
-        warnings.warn(f"{text}; add a step that saves or shows it (`zonda plugins` lists the operators)", stacklevel=2)
+    found, refused = looks(pipeline.operators, scene)
+    for _, err in refused:
+        raise err
+    if saved:
+        warn_of_nothing_saved(pipeline)
     return found
+
+
+def warn_of_nothing_saved(pipeline: Pipeline) -> None:
+    """Warn where no step writes anything."""
+    if not writes(pipeline.operators):
+        text = f"{pipeline.name}: no step writes a product, so what is computed is lost"
+        warnings.warn(f"{text}; add a step that saves or shows it (`zonda plugins` lists the operators)", stacklevel=3)
+
+
+def looks(operators: Sequence[Operator | None], scene: Scene) -> tuple[list[list[str]], list[tuple[int, ZondaError]]]:
+    """What each operator's `check` finds, and every error, with the number of its step.
+
+    None stands for a step that could not be made.
+    """
+    data, found = Data(scene=scene), list[list[str]]()
+    refused: list[tuple[int, ZondaError]] = []
+    for number, operator in enumerate(operators):
+        if operator is None:
+            continue
+        try:
+            found.append(operator.check(data))
+        except ZondaError as err:
+            refused.append((number, err))
+    return found, refused
 
 
 def writes(operators: Iterable[Operator]) -> bool:

@@ -63,8 +63,9 @@ class AtmosphereScreens(Output):
     """Points along each side of the field."""
 
     def check(self, data: Data) -> list[str]:
-        """Refuse a scan that is not there."""
-        data.check_scan(self.observation, self.label)
+        """Refuse a scan that is not there, once the telescope is pointed."""
+        if data.observations:
+            data.check_scan(self.observation, self.label)
         return []
 
     def watch(self, data: Data, done: Progress) -> None:

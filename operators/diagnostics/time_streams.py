@@ -35,8 +35,9 @@ class TimeStreams(Operator):
     """Which scan, counted from 0."""
 
     def check(self, data: Data) -> list[str]:
-        """Refuse a scan that is not there."""
-        data.check_scan(self.observation, self.label)
+        """Refuse a scan that is not there, once the telescope is pointed."""
+        if data.observations:
+            data.check_scan(self.observation, self.label)
         return []
 
     def observe(self, data: Data) -> None:
@@ -49,8 +50,7 @@ class TimeStreams(Operator):
         chosen = np.linspace(0, n - 1, shape[0]).round().astype(int)
         names = [observation.focalplane.names[d] for d in chosen]
         streams: dict[str, Floats] = {name: np.full(shape, np.nan) for name in self.streams}
-        key = key_of(self, "time_streams")
-        return TimeStream(observation.seconds, streams, names, observation.name, self.label, key)
+        return TimeStream(observation.seconds, streams, names, observation.name, self.label, key_of(self, "time_streams"))
 
     def exec(self, block: Block, state: TimeStream | None) -> None:
         if state is None:

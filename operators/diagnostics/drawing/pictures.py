@@ -60,8 +60,8 @@ def printed(draw: Callable[..., list[Sketch]], style: Style, *arguments: Any) ->
 
 def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any], signed: bool = False) -> list[Sketch]:
     """The input map (ny, nx), K_RJ; ``signed``: Q or U, with zero in the middle of the colours."""
-    of = "" if file == "input" else f" ({file})"
-    title, where = f"Input{of}: the sky before the beam", header if axes is None else axes
+    what, where = _named("Input", file, "input"), header if axes is None else axes
+    title = f"{what}: the sky before the beam"
     if signed:
         top = float(np.nanpercentile(np.abs(values), 99.7)) or 1.0
         factor, unit = unit_of(top)
@@ -69,7 +69,7 @@ def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, A
         ax = plot_plain(values * factor, where, (-top * factor, top * factor), "RdBu_r", label, title=title)
     else:
         ax = plot_map(values, where, title=title)
-    return [Sketch(file, f"Input{of}", "The input map, before beam, opacity and filters.", ax)]
+    return [Sketch(file, what, "The input map, before beam, opacity and filters.", ax)]
 
 
 def draw_map(file: str, signal: str, key: str, product: FlatMap, style: Style, snr: AnyFloats | None = None) -> list[Sketch]:
@@ -77,7 +77,7 @@ def draw_map(file: str, signal: str, key: str, product: FlatMap, style: Style, s
     window = product.window()
     shown, how = _shown(product.cropped(window), style)
     title = {"": "Map", "noiseless": "Noiseless map"}.get(signal, f"Map of signal {signal}")
-    title += "" if key == "map" else f" ({key})"
+    title = _named(title, key)
     meaning = {
         "": "Everything: sky, atmosphere and noise, filtered and binned.",
         "noiseless": "The sky alone through the same pointing, filters and binning: what the processing leaves of it.",
@@ -100,7 +100,7 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Ske
         words.setdefault(of, source.difference)
         shown, how = _shown(source.cropped(window), style)
         plane = next(iter(shown.planes))
-        panels.append((shown, _titled(f"Noise: {words[of]}", shown)))
+        panels.append((shown, _titled(_named(f"Noise: {words[of]}", file, "noise"), shown)))
         limits.append(shown.limit(plane, panels[0][0].hits, 99.7))
         rms = shown.central_rms(plane, style.central_diameter / 2)
         if math.isfinite(rms):
@@ -116,7 +116,8 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Ske
 def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int) -> list[Sketch]:
     """Samples per pixel and seconds per beam; ``samples`` in ``pixels`` in all."""
     product = product.cropped()
-    ax = plot_coverage(product.hits, product.sky, per_beam=product.per_beam)
+    what = "Samples per pixel" if product.per_beam is None else "Integration time per beam"
+    ax = plot_coverage(product.hits, product.sky, per_beam=product.per_beam, title=_named(what, file, "coverage"))
     text = f"{samples:,} samples in {pixels:,} pixels of {angle_text(product.pixel)}.".replace(",", "\u202f")
     if product.per_beam is not None:
         beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
@@ -221,6 +222,12 @@ def _resolution(shown: FlatMap) -> str:
         return f" Resolution {beam} FWHM, the beam's."
     whole = angle_text(math.hypot(shown.fwhm, shown.smoothed_by))
     return f" Resolution {whole} FWHM: the beam's {beam} and the smoothing's {smoothing}, added in quadrature."
+
+
+def _named(title: str, key: str, shows: str = "") -> str:
+    """With the product's name; of ``map`` only what is behind it (band, Stokes parameter): ``f150 Q``. ``shows``: before it."""
+    more = key.removeprefix(shows).lstrip("_").removeprefix("map").lstrip("_").replace("_", " ")
+    return f"{title} ({more})" if more else title
 
 
 def _titled(title: str, shown: FlatMap) -> str:

@@ -107,7 +107,7 @@ def test_pictures_of_the_planes(made):
     wanted = {f"{stem}{which}.png" for stem in ("input", "map", "transfer_function", "comparison") for which in ("", "_Q", "_U")}
     assert wanted <= names
     page = (made[1] / "report.html").read_text(encoding="utf-8")
-    assert "Input (input_Q)" in page
+    assert "Input (Q)" in page
     assert "Transfer function (U)" in page
 
 

@@ -15,6 +15,7 @@ from zonda.core.errors import InputError, PointingError
 from zonda.core.flags import IRREGULAR, TURNAROUND
 from zonda.core.intervals import samples_in
 from zonda.core.numerics.quaternions import conjugate, from_angles, multiply
+from zonda.core.pipeline import Pipeline
 from zonda.core.registry import instruments
 from zonda.core.scene import Scene
 from zonda.operators.pointing.constant_elevation import Nod, Sweep
@@ -270,6 +271,16 @@ def test_the_schedule_of_a_campaign_is_that_of_its_pointing_step(tmp_path):
         parse(FILE.format(pointing="PointingStare"), folder=tmp_path)
     with pytest.raises(ConfigurationError, match=r"no such file: .none\.ecsv"):
         parse(FILE.format(pointing="PointingSchedule").replace("a.ecsv", "none.ecsv"), folder=tmp_path)
+
+
+def test_files_begin_when_the_first_scan_does(tmp_path):
+    """DATE-OBS is not the scene's time, which the schedule need not share."""
+    from astropy.io import fits
+
+    scene = Scene(site=SITE, instrument={"like": "act_150ghz", "detectors": 7}, time="2025-03-01T05:00", seed=1)
+    step = PointingSchedule(schedule=version_5(tmp_path / "a.ecsv", ROWS[:1]), **FAST)
+    Pipeline([step, zonda.BinMap(contents="hits", pixel="6 arcmin"), zonda.SaveMap()]).run(scene, output=tmp_path / "out")
+    assert fits.getheader(tmp_path / "out" / "map.fits")["DATE-OBS"] == "2025-03-01T06:00:00Z"
 
 
 def test_check_says_where_sun_and_moon_are(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from zonda.core.maps.map_product import MapProduct
-from zonda.operators.diagnostics.drawing.pictures import Style, draw_coverage, draw_input
+from zonda.operators.diagnostics.drawing.pictures import Style, draw_coverage, draw_input, draw_map, draw_noise
 from zonda.operators.diagnostics.drawing.png import png_of
 from zonda.operators.diagnostics.plot_operators import _flat, _input
 from zonda.operators.maps.grid import tangent_wcs
@@ -46,6 +46,22 @@ def test_the_stated_noise_is_that_of_the_map(product):
     flat = _flat(product, "half_difference").smoothed(9 * ARCSEC)
     there = product.smoothed(9 * ARCSEC).rms(30 * ARCSEC, of="half_difference")
     assert flat.central_rms("half_difference", 30 * ARCSEC) == pytest.approx(there, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("key", "behind"), [("map", ""), ("map_f150", " (f150)"), ("map_f150_Q", " (f150 Q)"), ("healpix_f090", " (healpix f090)")]
+)
+def test_titles_say_of_which_band_and_stokes_parameter_a_picture_is(product, key, behind):
+    flat, style = _flat(product, "signal"), Style(0.0, 60 * ARCSEC, 0.0)
+    half = _flat(product, "half_difference")
+    titles = [
+        draw_map(key, "", key, flat, style)[0].ax.get_title(),
+        draw_noise(f"noise_{key}", {"half_difference": half}, style)[0].ax.get_title(),
+        draw_coverage(f"coverage_{key}", flat, 1, 1)[0].ax.get_title(),
+    ]
+    noise = f"Noise: {half.difference}{behind}, not smoothed"
+    assert titles[:2] == [f"Map{behind}, not smoothed", noise]
+    assert titles[2].endswith(f"per beam{behind}") or titles[2] == f"Samples per pixel{behind}"
 
 
 def test_the_coverage_of_a_map_with_a_pole_in_it_is_drawn(product):
