@@ -20,7 +20,15 @@ from zonda.core.weather import GroundWeather
 from zonda.operators.io.load_tod import LoadTOD
 from zonda.operators.io.save_tod import save_tod
 from zonda.operators.io.time_ordered_data import TimeOrderedData
-from zonda.operators.io.toast_hdf5 import FLAGS_ARE, WEATHER, azimuth_elevation, detectors_table, name_uid, nominal_noise
+from zonda.operators.io.toast_hdf5 import (
+    FLAGS_ARE,
+    WEATHER,
+    azimuth_elevation,
+    detectors_table,
+    name_uid,
+    nominal_noise,
+    session_of,
+)
 from zonda.operators.io.toast_reading import columns_of, offsets_of
 
 from .packages import needed
@@ -62,10 +70,7 @@ def to_toast(source: Source, stream: str = "signal", *, scan: str | int | None =
 
 def unfilled(tod: TimeOrderedData, comm: Any) -> Any:
     """A `toast.Observation` of all but the streams of a scan."""
-    band = str(tod.metadata.get("band", ""))
-    session = toast.instrument.Session(
-        tod.name.removesuffix(f"-{band}"), start=_datetime(tod.times[0]), end=_datetime(tod.times[-1])
-    )
+    session = toast.instrument.Session(session_of(tod), start=_datetime(tod.times[0]), end=_datetime(tod.times[-1]))
     ob = toast.Observation(comm, _telescope(tod), n_samples=tod.n_samples, name=tod.name, session=session)
     _fill_shared(ob, tod)
     if (noise := _noise(tod, list(ob.local_detectors))) is not None:

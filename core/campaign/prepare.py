@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..configuration.files import paths_in
 from ..errors import InputError, within
+from ..scene import WithScene
 from ..storage.files import product_path
 from . import parts
 from .entries import Entry, entries
@@ -192,7 +193,22 @@ class _Draft:
 
 
 def _entries(source: CampaignFile) -> list[Entry]:
+    if source.campaign.realizations > 1:
+        _check_draws(source.file)
     return entries(source.campaign, source.file.scene().seed, lambda settings: source.load(settings).scene().time)
+
+
+def _check_draws(file: PipelineFile) -> None:
+    """Refuse realizations of recorded data alone (`InputError`): they have the same bits for every seed."""
+    pipeline = file.pipeline()
+    for step in pipeline.operators:
+        if isinstance(step, WithScene) and pipeline.signals.components and pipeline.signals.components <= step.provides:
+            raise InputError(
+                "recorded data are the same in every realization: nothing is simulated beside them",
+                place=f"campaign, realizations, {step.label}",
+                cure="leave realizations out, or simulate a twin (signal: none); where a step draws random numbers, list seeds: "
+                "observations: [{seed: 1}, {seed: 2}]",
+            )
 
 
 def outline(source: CampaignFile) -> tuple[str, PipelineFile]:

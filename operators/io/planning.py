@@ -64,4 +64,4 @@ class LoadTODPlanning(Planning[LoadTOD]):
 
     def memory(self, observation: Observation) -> int:
         """What the library that reads the file holds, and the parts in which it is read."""
-        return 100_000_000
+        return 40_000_000

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from zonda.core.flags import INVALID
 from zonda.core.storage.files import writing
 from zonda.core.storage.hdf5_files import Disk
 from zonda.core.stream_names import UNITS
@@ -82,7 +83,16 @@ class Writer:
         """A rectangle of a stream."""
         with writing(self.path):
             self._file["detdata"][stream][detectors, samples] = values
+            if not np.isfinite(np.sum(values)):  # what is no number in one stream is not to be used in any
+                self._flags()[detectors, samples] |= np.where(np.isfinite(values), np.uint8(0), np.uint8(INVALID))
             self._disk.check()
+
+    def _flags(self) -> Any:
+        """The flags of the detectors' samples; made where they are not there yet."""
+        group = self._file["detdata"]
+        if "flags" not in group:
+            group.create_dataset("flags", (self._tod.n_detectors, self._tod.n_samples), "u1").attrs["units"] = ""
+        return group["flags"]
 
     def finish(self) -> None:
         """Write everything else and close the file."""
@@ -93,10 +103,9 @@ class Writer:
                 _write_instrument(self._file.create_group("instrument"), self._tod)
                 _write_metadata(self._file, self._tod)
                 _write_shared(self._file, self._tod)
-                flags = self._file["detdata"].create_dataset("flags", (self._tod.n_detectors, self._tod.n_samples), "u1")
-                flags.attrs["units"] = ""
+                flags = self._flags()
                 for d in np.flatnonzero(self._tod.detector_flags):  # rows never written are zeros and take no room
-                    flags[int(d)] = self._tod.detector_flags[d]
+                    flags[int(d)] |= self._tod.detector_flags[d]
             finally:
                 self._file.close()
                 self._disk.close()
@@ -127,6 +136,11 @@ def _long_attribute(group: Any, name: str, text: str) -> None:
     group.attrs.create(name, text, dtype=h5py.string_dtype())
 
 
+def session_of(tod: TimeOrderedData) -> str:
+    """The name of the session, which bands of one scan have in common: that of the scan."""
+    return tod.name.removesuffix(f"-{tod.metadata.get('band', '')}")
+
+
 def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
     from astropy.io.misc.hdf5 import write_table_hdf5
 
@@ -144,8 +158,8 @@ def _write_instrument(group: Any, tod: TimeOrderedData) -> None:
         site_lon_deg=float(np.degrees(longitude)),
         site_alt_m=float(altitude),
         session_class="toast.instrument.Session",
-        session_name=tod.name,
-        session_uid=name_uid(tod.name),
+        session_name=session_of(tod),
+        session_uid=name_uid(session_of(tod)),
         session_start=float(tod.times[0]),
         session_end=float(tod.times[-1]),
     )

@@ -38,6 +38,9 @@ PARTS = {
 }
 """What must be there, and what to say where it is not."""
 
+NUMBERS = {"times", "seconds", "flags", "boresight_azel", "boresight_radec", "hwp_angle"}
+"""What is read of ``shared``."""
+
 
 class Reader:
     """An open file. `read` and `flags` may be called from several threads at once.
@@ -125,6 +128,10 @@ def _check_parts(file: Any, place: str) -> None:
     for part, what in PARTS.items():
         if part not in file:
             raise InputError(f"is incomplete or corrupt: there is {what} (/{part})", place=place, cure=CURE)
+    for name, item in file["shared"].items():
+        if name in NUMBERS and (not hasattr(item, "dtype") or item.dtype.kind not in "fiu"):
+            text = f"shared/{name} holds no numbers ({getattr(item, 'dtype', 'a group')})"
+            raise InputError(text, place=place, cure=AGAIN)
     if not {"boresight_azel", "boresight_radec"} & set(file["shared"]):
         message = "there is no pointing (shared/boresight_azel, shared/boresight_radec)"
         raise InputError(f"is incomplete or corrupt: {message}", place=place, cure=CURE)
