@@ -30,7 +30,8 @@ def on_plane(product: MapArrays, planes: Mapping[str, AnyFloats], size: int = 40
     there &= known
     found = {}
     for name, values in planes.items():
-        found[name] = np.where(there, values.ravel()[place], 0 if name == "hits" else np.nan)
+        flat = values.ravel() if values.size else np.zeros(1)
+        found[name] = np.where(there, flat[place], 0 if name == "hits" else np.nan)
     return found, wcs
 
 
@@ -40,8 +41,9 @@ def _pixels_at(product: MapArrays, lon: Floats, lat: Floats) -> tuple[NDArray[np
         import healpy as hp
 
         wanted = hp.ang2pix(product.nside, lon, lat, nest=product.nest, lonlat=True)
-        place = np.clip(np.searchsorted(product.pixels, wanted), 0, len(product.pixels) - 1)
-        return place, product.pixels[place] == wanted
+        pixels = product.pixels if len(product.pixels) else np.array([-1])  # of a map without hits
+        place = np.clip(np.searchsorted(pixels, wanted), 0, len(pixels) - 1)
+        return place, pixels[place] == wanted
     x, y = product.wcs.wcs_world2pix(lon, lat, 0)
     ny, nx = product.signal.shape
     around = 360.0 / abs(product.wcs.wcs.cdelt[0])

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -121,8 +120,11 @@ def middle_of(fields: Sequence[Sequence[float]], pixel: float) -> tuple[float, f
     """(longitude, latitude) [rad] of the only one of some fields (`map_layout.fields_of`), else the middle of all of them."""
     if len(fields) == 1:
         return fields[0][0], fields[0][1]
-    boxes = [_box(longitude, 0.0, latitude, latitude, pixel) for longitude, latitude, *_ in fields]
-    return centre_of(reduce(lambda one, other: _joined(one, other, pixel), boxes), pixel)
+    found = None
+    for longitude, latitude, *_ in fields:
+        found = _joined(found, _box(longitude, 0.0, latitude, latitude, pixel), pixel)
+    assert found is not None
+    return centre_of(found, pixel)
 
 
 def layout_about(found: Mapping[str, Any]) -> tuple[float, float]:

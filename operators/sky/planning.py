@@ -189,7 +189,7 @@ class CMBPlanning(Planning[Any]):
 
     def memory(self, observation: Observation) -> int:
         """Maps and their multipoles."""
-        return 12 * self.operator.nside**2 * 8 * 12
+        return int(12 * self.operator.nside**2 * 8 * 12)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost: maps from multipoles, and what `SkyMap` does with them."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import zonda.testing
+from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.detectors.gain_drift import GainDrift, grid
 
@@ -42,6 +43,22 @@ def test_the_spectrum_falls_as_it_should(bench, slope):
         found = float((g[:, 200] * g[:, 200 + lag]).mean()) / 1e-4
         # products of normals of correlation r have the variance 1 + r^2
         assert abs(found - expected) < 4 * np.sqrt((1 + expected**2) / n)
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
+def test_the_splines_are_the_series(bench, slope):
+    """Equation (1) summed wave by wave at every sample: within (2 pi / 16)^4 / 384 = 6.2e-5 of each wave's amplitude."""
+    observation, step = bench.observation(3, 3000), GainDrift(rms="1 %", slope=slope, fastest="0.5 Hz")
+    found = step.prepare(observation).evaluate(slice(0, 3), slice(0, 3000))
+    every, nodes, waves = grid(observation, 0.5)
+    k = np.arange(1, waves + 1)
+    amplitude = 0.01 * np.sqrt(k**-slope / (k**-slope).sum())
+    phase = 2 * np.pi * np.outer(k, np.arange(3000)) / (nodes * every)
+    for d, row in enumerate(found):
+        drawn = normals(observation.detector_key(step.label), 0, 2 * waves, stream=d).astype(np.float64)
+        a, b = amplitude * drawn[:waves], amplitude * drawn[waves:]
+        series = a @ np.cos(phase) + b @ np.sin(phase)
+        assert np.abs(row - series).max() < 6.2e-5 * (np.abs(a) + np.abs(b)).sum()
 
 
 def test_it_is_slow(bench):

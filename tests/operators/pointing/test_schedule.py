@@ -122,6 +122,10 @@ def test_intervals_of_either_direction(tmp_path):
         assert (right[inside[1:] & inside[:-1]] == going).all()
     throw = samples_in(one.intervals["throw"], one.seconds)
     assert throw.all()
+    for name, going in (("throw_leftright", True), ("throw_rightleft", False)):
+        inside = samples_in(one.intervals[name], one.seconds)
+        assert (right[inside[1:] & inside[:-1]] == going).all()
+        assert len(one.intervals[name]) > 1
 
 
 def test_the_focal_plane_is_turned_about_the_boresight(tmp_path):

@@ -532,6 +532,14 @@ def test_a_healpix_map_of_half_the_sky_is_drawn():
     assert wcs.wcs.ctype[0] == "RA---ZEA"
 
 
+def test_a_healpix_map_without_hits_is_empty_on_the_plane():
+    """As of a scan all of whose samples are flagged."""
+    empty = np.zeros(0, np.int64)
+    flat, _ = on_plane(healpix(32, empty, (1.0, 0.3), "icrs"), {"signal": empty * 1.0, "hits": empty}, 50)
+    assert np.isnan(flat["signal"]).all()
+    assert not flat["hits"].any()
+
+
 def test_no_output_folder(data):
     data.output = None
     with pytest.raises(OutputError, match="no output folder"):
