@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .band import PER_BAND
+from .band import PASSBAND, PER_BAND
 from .configuration.diagnostics import nearest
 from .configuration.parameters import named
 from .configuration.values import mistake
@@ -29,7 +29,8 @@ def is_variant(value: Any) -> bool:
 def variant(given: Mapping[str, Any], context: Any = None) -> Any:
     """The instrument ``given["like"]`` (a registered name or an Instrument) with the other keys of ``given`` changed.
 
-    A mapping for ``telescope`` changes the keys that it names; ``band`` is replaced as a whole. Where telescope or band change
+    A mapping for ``telescope`` changes the keys that it names, and so does a band of ``bands`` that has the name of one of the
+    instrument's; ``band`` is replaced as a whole. Where telescope or band change
     and ``fwhm`` is not given, the beam keeps its ratio to the diffraction limit. What bands may state for themselves, such as
     ``detectors`` or ``net``, holds for all of them where it is changed. Where ``name`` is not given it lists the changes
     and is the same however their units are written. A variant without changes is the instrument itself.
@@ -51,10 +52,13 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Any:
     elif changes.get("bands"):
         changes["band"] = None
     elif changes.get("band") is not None:
-        _check_band(base, changes["band"])
+        _check_band(base, changes["band"], "band")
         changes["bands"] = []
     for_all = {key: None for key in PER_BAND if changes.get(key) is not None}  # stands above what the bands state
     own = [band.model_copy(update=for_all) for band in base.bands]
+    if isinstance(changes.get("bands"), list):
+        named_own = {band.name: band for band in own}
+        changes["bands"] = [_as_in_base(base, named_own, k, band) for k, band in enumerate(changes["bands"])]
     as_it_is = base.model_dump(mode="json") | {"telescope": base.telescope, "band": base.band, "bands": own}
     if changes.get("layout", base.layout) != base.layout:
         as_it_is["wafers"] = 1
@@ -100,12 +104,23 @@ def one_of(instrument: Any, band: Any) -> bool:
     return isinstance(band, str) and any(own.name == band for own in getattr(instrument, "bands", ()))
 
 
-def _check_band(base: Any, band: Any) -> None:
+def _check_band(base: Any, band: Any, *at: str | int) -> None:
     """Raise what a validator does where ``band`` is a name that neither ``base``, which has several, nor anything else has."""
     if isinstance(band, str) and base.bands and band not in registered_bands:
         names = [own.name for own in base.bands]
-        cure = f"its bands: {', '.join(names)}; or name a registered band (`zonda plugins`), or write one out"
-        raise mistake(f"{base.name} has no band {band!r}", nearest(band, names), cure, at=("band",))
+        cure = f"its bands: {', '.join(names)}; or name a registered band (`zonda plugins`), or give a passband: low, high or file"
+        raise mistake(f"{base.name} has no band {band!r}", nearest(band, names), cure, at=at)
+
+
+def _as_in_base(base: Any, own: Mapping[str, Any], k: int, band: Any) -> Any:
+    """The ``k``-th of the bands given. Without a passband it is the one of ``base`` with its name but for what is given."""
+    given = {"name": band} if isinstance(band, str) else band
+    if not isinstance(given, Mapping) or PASSBAND & {key for key, value in given.items() if value}:
+        return band
+    if given.get("name") in own:
+        return own[given["name"]].model_dump(mode="json") | dict(given)
+    _check_band(base, given.get("name"), "bands", k, "name")
+    return band
 
 
 def _with_beams(base: Any, made: Any, kept: bool) -> Any:

@@ -151,6 +151,17 @@ def test_what_is_changed_for_a_camera_of_several_bands_holds_for_all_of_them() -
     assert len(made.focalplane()) == 20
 
 
+def test_bands_by_the_names_of_the_instruments() -> None:
+    base = instruments.create("so_lat_mf")
+    made = base.varied(bands=[{"name": "f090", "net": "1 mK s(1/2)"}, "f150"])
+    assert made.cameras["f090"].net == 1e-3
+    assert made.cameras["f090"].band == base.cameras["f090"].band
+    assert made.cameras["f150"].net == base.cameras["f150"].net
+    assert list(base.varied(bands=["f150"]).cameras) == ["f150"]
+    own = base.varied(bands=[{"name": "f090", "low": "80 GHz", "high": "90 GHz", "net": "1 mK s(1/2)", "detectors": 24}])
+    assert own.cameras["f090"].band.low == 80e9
+
+
 def test_a_layout_without_wafers_has_none() -> None:
     made = instruments.create("so_lat_mf").varied(layout="hexagon", detectors=170)
     assert (made.wafers, set(made.focalplane().wafer)) == (1, {0})
@@ -163,7 +174,7 @@ def test_a_layout_without_wafers_has_none() -> None:
         ("detectors: 2", "2", "12 wafers share their pixels equally; detectors of f090 is 2", "write 24,"),
         ("detectors: 171, layout: hexagon", "171", "needs an even number of detectors", "write 170 or 172"),
         ("band: f091", "f091", "so_lat_mf has no band 'f091'", "its bands: f090, f150"),
-        ("bands: [{name: act_15ghz, net: 1 mK s(1/2)}]", "act_15ghz", "unknown band 'act_15ghz'", "low and high, or file"),
+        ("bands: [f150, {name: f091, net: 1 mK s(1/2)}]", "f091", "so_lat_mf has no band 'f091'", "low, high or file"),
         ("layout: rings, wafers: 3", "3", "3 wafers go with layout: wafers, not rings", "write layout: wafers"),
     ],
 )
