@@ -108,7 +108,7 @@ def _check_band(base: Any, band: Any, *at: str | int) -> None:
     """Raise what a validator does where ``band`` is a name that neither ``base``, which has several, nor anything else has."""
     if isinstance(band, str) and base.bands and band not in registered_bands:
         names = [own.name for own in base.bands]
-        cure = f"its bands: {', '.join(names)}; or name a registered band (`zonda plugins`), or give a passband: low, high or file"
+        cure = f"its bands: {', '.join(names)}; or a registered band (`zonda plugins`), or give a passband: low, high or file"
         raise mistake(f"{base.name} has no band {band!r}", nearest(band, names), cure, at=at)
 
 
