@@ -44,6 +44,8 @@ class Data:
     band: str = ""
     """Name of the band that these are the data of, where the camera has several."""
 
+    pointed: list[Observation] = field(default_factory=list)
+    """The scans of several bands before each of these got its detectors; empty where there is one band."""
     partial: dict[str, Product] = field(default_factory=dict)
     """What steps have added up so far, by label."""
     layouts: dict[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -76,9 +78,12 @@ class Data:
 
     @property
     def scans(self) -> list[Observation]:
-        """The observations, of several bands those of the first: what was pointed."""
+        """What was pointed: the observations, of several bands each with the detectors of all of them.
+
+        Of a campaign of several bands those of the first, which is all that its folder tells.
+        """
         bands = len(self.scene.instrument.bands) if not self.band else 0
-        return self.observations[:: bands or 1]
+        return self.pointed or self.observations[:: bands or 1]
 
     def named(self, key: str) -> str:
         """The name of a product or file of these data, the band's behind it where the camera has several."""

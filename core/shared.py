@@ -6,7 +6,7 @@ Nothing that a band computes may depend on the others: what is shared has the bi
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -32,7 +32,7 @@ class SharedScan:
     def __init__(self, room: int) -> None:
         self._free = self.room = room
         self._announced: dict[str, dict[str, Any]] = {}
-        self._made: dict[str, Any] = {}
+        self._made: dict[Hashable, Any] = {}
         self._lock = threading.RLock()
 
     def announce(self, label: str, band: str, part: Any) -> None:
@@ -41,10 +41,14 @@ class SharedScan:
 
     def made(self, label: str, make: Callable[[Mapping[str, Any]], T]) -> T:
         """What the step ``label`` made for all bands; the first one that asks makes it, of what was announced by each."""
+        return self.once(label, lambda: make(self._announced.get(label, {})))
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What is the same for all bands that have this ``key``: made by the first that asks."""
         with self._lock:
-            if label not in self._made:
-                self._made[label] = make(self._announced.get(label, {}))
-            found: T = self._made[label]
+            if key not in self._made:
+                self._made[key] = make()
+            found: T = self._made[key]
             return found
 
     def claim(self, size: int) -> bool:
@@ -60,3 +64,8 @@ class SharedScan:
         with self._lock:
             self._made.clear()
             self._free = self.room
+
+
+def once(shared: SharedScan | None, key: Hashable, make: Callable[[], T]) -> T:
+    """`SharedScan.once`, and ``make`` where there is one band."""
+    return make() if shared is None else shared.once(key, make)

@@ -63,6 +63,7 @@ def distribute(data: Data, bands: Sequence[Data]) -> None:
     for number, own in enumerate(bands):
         own.observations = [_of_band(scan, number, own, part) for scan, part in zip(data.observations, shared, strict=True)]
         own.layouts = _of(data.layouts, own.band)
+    data.pointed = data.observations
     for scan in data.observations:
         data.tally.update(scan.tally)
 

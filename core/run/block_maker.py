@@ -332,7 +332,6 @@ def check_left(step: Operator, block: Block, before: Mapping[str, AnyFloats], du
     for name, stream in block.detdata.items():
         if stream is before.get(name):
             continue
-        wanted = f"an array {block.shape} of {np.dtype(block.dtype)} in C order"
         if not isinstance(stream, np.ndarray):
             found = f"a {type(stream).__name__}"
         elif stream.shape != block.shape or stream.dtype != block.dtype:
@@ -341,6 +340,7 @@ def check_left(step: Operator, block: Block, before: Mapping[str, AnyFloats], du
             found = "an array that is not in C order"
         else:
             continue
+        wanted = f"an array {block.shape} of {np.dtype(block.dtype)} in C order"
         raise PluginError(
             f"exec left the stream {name!r} as {found}; it must be {wanted}",
             place=whose(step),

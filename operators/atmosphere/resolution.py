@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.shared import once
 from zonda.core.types import Floats
 
-from .turbulence.geometry import ScanPlane, axes, axes_at, crossing, rays
+from .fluctuations import units_fit
+from .turbulence.geometry import ScanPlane, axes, axes_at, crossing, looking, rays
 from .turbulence.nodes import (
     GRIDS,
     Layer,
@@ -47,6 +49,13 @@ LOOKED_AT = 1024
 
 IN_A_CELL = 4
 """Samples between two steps at which the path's error is looked at: it is a polynomial there, whose square is right to 1 %."""
+
+INTERPOLATED, STREAMS = 330, 2
+"""Detectors that are interpolated from a node, in emission and transmission, at the cost of evaluating a point: 80 ns for ten
+layers, 0.12 ns for each product; and these two."""
+
+SHORT_STEP = 4
+"""Samples: steps are hardly shorter."""
 
 PAYS_FROM = 1 << 18
 """Points (nodes x times) from which coarser steps for single layers are worth their interpolation."""
@@ -81,7 +90,8 @@ def choose_resolution(
 ) -> Resolution:
     """The coarsest nodes and steps that keep each error below ``tolerance`` of what the focal-plane mean, subtracted, leaves.
 
-    Where the detectors are the nodes, the steps in time may err by both shares, sqrt(2) of it.
+    Where the detectors are the nodes, since these would cost more (`INTERPOLATED`), the steps in time may err by both shares,
+    sqrt(2) of it.
     ``variance`` is that of the sum of the layers after the beam. The mean emission may be wrong by `MEAN_SHARE` of that.
     """
     xi, eta = observation.focalplane.xi, observation.focalplane.eta
@@ -89,9 +99,10 @@ def choose_resolution(
     left = differential_rms(*spread_evenly(xi, eta), layers, plane.stretch)
     # Of the rms of the fluctuation. A single detector, or none apart, is judged as if a hundredth were left.
     tolerance = tolerance * (left / rms if left > SMALLEST_DIFFERENCE * rms else 0.01)
-    nodes, error = choose_nodes(xi, eta, layers, tolerance * rms, plane.stretch)
+    most = _most_nodes(len(xi), observation.n_samples)
+    nodes, error = choose_nodes(xi, eta, layers, tolerance * rms, plane.stretch, most)
 
-    path = _Path(observation, xi, eta)
+    path = once(observation.shared, ("path", *looking(observation)), lambda: _Path(observation, xi, eta))
     elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
     # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the PWV fluctuated where none does).
     allowed = max(MEAN_SHARE * tolerance * float(emission(elevations[1])) * max(pwv_rms, 1e-4), 1e-9)
@@ -107,6 +118,12 @@ def choose_resolution(
     if len(nodes.xi) * observation.n_samples / step > PAYS_FROM:
         late = timing.double(steps, late, late_allowed, candidates[0])
     return Resolution(nodes, step, tuple(steps), tolerance, error / rms, late / rms, left / rms, mean_nodes, mean_step)
+
+
+def _most_nodes(n_detectors: int, n_samples: int) -> float:
+    """Number of nodes from which evaluating every detector costs less, where the series of all fit in memory."""
+    fit = units_fit(n_detectors, n_samples, SHORT_STEP, STREAMS)
+    return n_detectors / (1 + n_detectors / INTERPOLATED) if fit else n_detectors
 
 
 def _slope(emission: Emission, elevation: Floats) -> Floats:
@@ -217,6 +234,7 @@ class _Path:
         picked = np.unique(np.linspace(0, max(len(index) - 2, 0), LOOKED_AT).astype(np.int64))
         self._picked = index[picked[~np.isin(picked, last)]] if n > 1 else index  # the next sample is in the same window
         self.elevation = np.arcsin(self._rays(self._picked)[2])
+        self._errors: dict[int, tuple[Floats, float]] = {}
 
     def _rays(self, index: NDArray[np.int64] | slice) -> Floats:
         return rays(axes(self._observation.boresight_azel[index]), self._xi, self._eta)
@@ -229,6 +247,12 @@ class _Path:
         return np.asarray((ends[:, 1] - ends[:, 0]) * self._observation.sample_rate, np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
+        """Of `_errors_of`, each worked out once: bands share a path."""
+        if step not in self._errors:
+            self._errors[step] = self._errors_of(step)
+        return self._errors[step]
+
+    def _errors_of(self, step: int) -> tuple[Floats, float]:
         """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the three points; from `IN_A_CELL`
         samples of each cell."""
         squares, total = np.zeros(9), 0

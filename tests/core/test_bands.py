@@ -93,7 +93,7 @@ def test_bands_see_one_atmosphere_and_have_noise_of_their_own(both: Any) -> None
 def test_products_scans_and_the_log_bear_the_bands_names(both: Any) -> None:
     assert {"map_f090", "map_f150", "noiseless/map_f090", "noiseless/map_f150", "input_f090"} <= set(both)
     assert [o.name for o in both.observations] == [f"scan-00{k}-{name}" for k in range(2) for name in BANDS]
-    assert [o.name for o in both.scans] == ["scan-000-f090", "scan-001-f090"]
+    assert [(o.name, o.n_detectors) for o in both.scans] == [("scan-000", 2 * PIXELS), ("scan-001", 2 * PIXELS)]
     assert both.tally.get("BinMap f090", "samples binned") == both["map_f090"].hits.sum()
     ratio = np.nanmax(both["input_f090"].values) / np.nanmax(both["input_f150"].values)
     kelvin = [to_kelvin_rj("K_CMB", camera(name).band) for name in BANDS]

@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,7 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
+from zonda.core.shared import once
 from zonda.core.types import Floats
 
 from ..weather.radiative_transfer import EARTH_RADIUS
@@ -270,6 +272,12 @@ def _mean_drift(cone: Cone, crossings: Floats) -> tuple[Floats, float]:
     return mean, float(np.linalg.norm((mean - each) @ np.linalg.inv(each), 2, axis=(1, 2)).max())
 
 
+def looking(observation: Observation) -> tuple[int, bytes, bytes]:
+    """What tells whether two bands look along the same lines of sight."""
+    plane = observation.focalplane
+    return id(observation.boresight_azel), plane.xi.tobytes(), plane.eta.tobytes()
+
+
 def rim(xi: Floats, eta: Floats, number: int = 12) -> tuple[Floats, Floats]:
     """The outermost points in ``number`` directions: xi, eta."""
     angle = 2 * np.pi * np.arange(number) / number
@@ -290,7 +298,7 @@ def scan_planes(observations: Sequence[Observation]) -> list[ScanPlane]:
     """One `ScanPlane` per observation, in order of time given; positions are counted from the first one's start."""
     out: list[ScanPlane] = []
     for k, observation in enumerate(observations):
-        here = scan_plane(observation)
+        here = once(observation.shared, ("plane", *looking(observation)), partial(scan_plane, observation))
         if not out:
             out.append(replace(here, alpha=here.matrix @ here.centre))
             continue

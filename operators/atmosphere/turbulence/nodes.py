@@ -199,10 +199,12 @@ def spread_evenly(xi: Floats, eta: Floats, number: int = _TRIED) -> tuple[Floats
     return xi[index], eta[index]
 
 
-def choose_nodes(xi: Floats, eta: Floats, layers: Sequence[Layer], tolerance: float, stretch: float = 1.0) -> tuple[Nodes, float]:
+def choose_nodes(
+    xi: Floats, eta: Floats, layers: Sequence[Layer], tolerance: float, stretch: float = 1.0, most: float = math.inf
+) -> tuple[Nodes, float]:
     """The coarsest grid whose `grid_error` is <= ``tolerance``, and that error.
 
-    Where a grid would need as many nodes as there are detectors, the detectors are the nodes.
+    Where a grid would need as many nodes as there are detectors, or more than ``most``, the detectors are the nodes.
     """
     few_xi, few_eta = spread_evenly(xi, eta)
 
@@ -211,7 +213,7 @@ def choose_nodes(xi: Floats, eta: Floats, layers: Sequence[Layer], tolerance: fl
         x, y = _sides(xi, eta, n)
         return grid_error(x, y, few_xi, few_eta, layers, stretch)
 
-    sizes = [n for n in GRIDS if n * n < len(xi)]
+    sizes = [n for n in GRIDS if n * n < len(xi) and n * n <= most]
     reach = 1
     while reach < len(sizes) and error(sizes[reach - 1]) > tolerance:  # small grids cost little, and serve most often
         reach *= 2

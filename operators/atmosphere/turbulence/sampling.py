@@ -69,15 +69,15 @@ class Drifting:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A layer as several bands see it that step through it alike: ``fields[k]`` is that of ``bands[k]``."""
+    """A layer as some bands see it that step through it alike; ``lattice``: the number of the lattice that it lies on."""
 
     layer: Drifting
     bands: tuple[int, ...]
-    fields: tuple[Turbulence, ...]
+    lattice: int
 
     def of(self, bands: Sequence[int]) -> tuple[int, ...]:
-        """Which of its fields are those of some bands."""
-        return tuple(k for k, band in enumerate(self.bands) if band in bands)
+        """Those of some bands that see it."""
+        return tuple(band for band in bands if band in self.bands)
 
 
 class DriftingLayers:
@@ -123,7 +123,8 @@ class DriftingLayers:
         others: Sequence[Sequence[Drifting]] = (),
     ) -> None:
         first, stop = span
-        self._sheets, self._step, self._tiles = _sheets([drifting, *others]), step, Tiles()
+        self._lattices, self._sheets = _sheets([drifting, *others])
+        self._step, self._tiles = step, Tiles()
         self.paths: dict[int, LinesOfSight] = {}
         for own in sorted({step, *(s.layer.step for s in self._sheets)}):
             low, high = (first, stop) if own == step else _coarse(first, stop, own // step)
@@ -136,11 +137,11 @@ class DriftingLayers:
         self._slabs = [_slab(box, cells) for box, cells in swept]
         self._sides = [STRIP if box[1] - box[0] < NARROW else SQUARE for box, _ in swept]
         self._pieces = [_widened(box) for box, _ in swept]
-        self.cells = sum(cells for sheet, (_, cells) in zip(self._sheets, swept, strict=True) if 0 in sheet.bands)
+        self.cells = sum(cells for fields, (_, cells) in zip(self._lattices, swept, strict=True) if 0 in fields)
         """Lattice points swept over, about, of one band."""
         if self.cells > CELLS_IN_ALL:
             worst = max(range(len(swept)), key=lambda n: swept[n][1])
-            field = self._sheets[worst].fields[0]
+            field = next(iter(self._lattices[worst].values()))
             raise InputError(
                 f"the lines of sight sweep over {self.cells:.1e} lattice points of the turbulence "
                 f"({field.spacing:g} m for a beam of {field.sigma:.3g} m), the limit is {CELLS_IN_ALL:.0e}",
@@ -186,18 +187,19 @@ class DriftingLayers:
 
         ``places``: positions (x, y) per metre of height, and their boxes.
         """
-        sheet, sides, (matrix, i, j), (x, y, boxes) = self._sheets[n], self._sides[n], self._places[n], places
-        i, j = i[start : start + x.shape[1]], j[start : start + x.shape[1]]
-        which = sheet.of(bands)
-        rows = np.array([bands.index(sheet.bands[k]) for k in which], np.int64)
+        sheet, (matrix, i, j), (x, y, boxes) = self._sheets[n], self._places[n], places
+        number, i, j = sheet.lattice, i[start : start + x.shape[1]], j[start : start + x.shape[1]]
+        # Of all bands that are asked for, also of those that step through the layer otherwise.
+        fields = {band: field for band, field in self._lattices[number].items() if band in bands}
+        planes = np.array([list(fields).index(band) for band in sheet.of(bands)], np.int64)
+        rows = np.array([bands.index(band) for band in sheet.of(bands)], np.int64)
         low_i, high_i, low_j, high_j = extent(matrix, boxes, i, j)
-        piece = self._pieces[n]
+        piece, slab, sides = self._pieces[number], self._slabs[number], self._sides[number]
         if piece and piece[0] <= low_i <= high_i < piece[1] and piece[2] <= low_j <= high_j < piece[3]:
-            tile, address = self._tiles.get(sheet.fields, n, which, piece)
+            tile, address = self._tiles.get(fields, number, piece)
             addresses, held = np.array([[address]], np.uint64), [tile]
             sides, origin = (_WHOLE, _WHOLE), (piece[0], piece[2])
         else:
-            slab = self._slabs[n]
             if slab and slab[0] <= low_i <= high_i < slab[1]:
                 sides = _WHOLE, slab[2]
             first_i, first_j = low_i >> sides[0], low_j >> sides[1]
@@ -211,15 +213,15 @@ class DriftingLayers:
             for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
                 k, m = begin + a * across, (first_j + b) << sides[1]
                 box = (k, k + across, m, m + (1 << sides[1]))
-                tile, addresses[a, b] = self._tiles.get(sheet.fields, n, which, box)
+                tile, addresses[a, b] = self._tiles.get(fields, number, box)
                 held.append(tile)  # or it might be dropped while it is read
             origin = begin, first_j << sides[1]
-        interpolate(matrix, x, y, i, j, *sides, *origin, held[0].shape, addresses, self._constants[n], rows, out)
+        interpolate(matrix, x, y, i, j, *sides, *origin, held[0].shape, addresses, self._constants[n], planes, rows, out)
 
     def _swept(self, xi: Floats, eta: Floats) -> list[tuple[tuple[int, int, int, int], float]]:
-        """For each layer the first and last cells, across and along the wind, that the lines of sight of the rim (xi, eta) of
+        """For each lattice the first and last cells, across and along the wind, that the lines of sight of the rim (xi, eta) of
         the points reach; and about how many lattice points they sweep over."""
-        whole = [(1 << 62, -(1 << 62), 1 << 62, -(1 << 62))] * len(self._sheets)
+        whole = [(1 << 62, -(1 << 62), 1 << 62, -(1 << 62))] * len(self._lattices)
         cells = [0.0] * len(self._sheets)
         for own, path in self.paths.items():
             for start in range(0, path.count, TIMES_AT_ONCE):
@@ -231,27 +233,36 @@ class DriftingLayers:
                         matrix, i, j = self._places[n]
                         a, b, c, d = extent(matrix, boxes, i[start : start + count], j[start : start + count])
                         cells[n] += (b - a + 2.0 * AROUND) * (d - c + 2.0 * AROUND)
-                        k, m, p, q = whole[n]
-                        whole[n] = min(k, a), max(m, b), min(p, c), max(q, d)
-        return [(box, min(number, _cells_of(box))) for box, number in zip(whole, cells, strict=True)]
+                        k, m, p, q = whole[sheet.lattice]
+                        whole[sheet.lattice] = min(k, a), max(m, b), min(p, c), max(q, d)
+        most = [
+            max(number for number, sheet in zip(cells, self._sheets, strict=True) if sheet.lattice == k)
+            for k in range(len(whole))
+        ]
+        return [(box, min(number, _cells_of(box))) for box, number in zip(whole, most, strict=True)]
 
 
-def _sheets(of_bands: Sequence[Sequence[Drifting]]) -> list[Sheet]:
-    """Layer by layer what bands see alike; where they step through it otherwise, or on another lattice, each by itself."""
-    found: list[Sheet] = []
+def _sheets(of_bands: Sequence[Sequence[Drifting]]) -> tuple[list[dict[int, Turbulence]], list[Sheet]]:
+    """The lattices, each with the fields of the bands that see the layer on it, by number; and layer by layer what bands that
+    step through it alike evaluate together."""
+    lattices: list[dict[int, Turbulence]] = []
+    sheets: list[Sheet] = []
     for together in zip(*of_bands, strict=True):
-        left = list(enumerate(together))
+        left = dict(enumerate(together))
         while left:
-            _, layer = left[0]
-            mine = [(band, d) for band, d in left if d is layer or _seen_alike(layer, d)]
-            found.append(Sheet(layer, tuple(band for band, _ in mine), tuple(d.field for _, d in mine)))
-            left = [(band, d) for band, d in left if band not in found[-1].bands]
-    return found
+            first = next(iter(left.values()))
+            here = {band: d for band, d in left.items() if d is first or _on_one_lattice(first, d)}
+            for step in dict.fromkeys(d.step for d in here.values()):
+                mine = {band: d for band, d in here.items() if d.step == step}
+                sheets.append(Sheet(next(iter(mine.values())), tuple(mine), len(lattices)))
+            lattices.append({band: d.field for band, d in here.items()})
+            left = {band: d for band, d in left.items() if band not in here}
+    return lattices, sheets
 
 
-def _seen_alike(one: Drifting, other: Drifting) -> bool:
+def _on_one_lattice(one: Drifting, other: Drifting) -> bool:
     places = one.height == other.height and one.amplitude == other.amplitude and np.array_equal(one.wind, other.wind)
-    return places and one.step == other.step and one.field.alike(other.field)
+    return places and one.field.alike(other.field)
 
 
 def _cells_of(box: tuple[int, int, int, int]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future
 
 from .lattice import Turbulence, coefficients
@@ -27,14 +27,12 @@ class Tiles:
         self._lock = threading.Lock()
         self._free = BYTES_KEPT
 
-    def get(
-        self, fields: Sequence[Turbulence], layer: int, which: tuple[int, ...], box: tuple[int, int, int, int]
-    ) -> tuple[Field, int]:
+    def get(self, fields: Mapping[int, Turbulence], layer: int, box: tuple[int, int, int, int]) -> tuple[Field, int]:
         """Coefficients of a layer and their address: of the cells low <= i < high, low <= j < high of a box, with the apron.
 
-        (len(which), rows, cells in a row): of those of the layer's ``fields`` that are wanted.
+        (len(fields), rows, cells in a row): of the ``fields`` of some bands, by number.
         """
-        key = (layer, which, box)
+        key = (layer, tuple(fields), box)
         kept = self._kept.get(key)
         if kept is not None:
             return kept
@@ -48,7 +46,7 @@ class Tiles:
             return making.result()
         try:
             a, b, c, d = box
-            tile = coefficients([fields[k] for k in which], a, b + APRON, c, d + APRON)
+            tile = coefficients([*fields.values()], a, b + APRON, c, d + APRON)
             made = tile, tile.ctypes.data
         except BaseException as error:
             making.set_exception(error)

@@ -747,7 +747,7 @@ def test_units_and_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_array_equal(series(), expected)
     monkeypatch.setattr(sampling, "WIDEST", 0)
     monkeypatch.setattr(sampling, "SQUARE", (6, 6))
-    monkeypatch.setattr(sampling, "BYTES_KEPT", 1 << 20)
+    monkeypatch.setattr(tiles, "BYTES_KEPT", 1 << 20)
     np.testing.assert_array_equal(series(), expected)
     monkeypatch.setattr(fluctuations, "UNIT_DETECTORS", 16)
     monkeypatch.setattr(fluctuations, "UNIT_SAMPLES", 256)
