@@ -94,8 +94,8 @@ def test_a_stream_that_nobody_makes_is_refused_at_once(monkeypatch):
 
 def test_kept_streams_count_in_the_budget(monkeypatch):
     """Two streams of two scans of 200 detectors, 30000 samples: 192 MB, refused where there is room for all but them."""
-    from zonda.core import pipeline as module
     from zonda.core.machine import resident_memory
+    from zonda.core.run import in_turn as module
 
     steps = [zonda.PointingDaisy(scan_duration="5 min", scans=2), *STEPS[2:]]
     where, room = scene(camera(200)), max(resident_memory(), 230_000_000) + 150_000_000
