@@ -217,7 +217,8 @@ def outline(source: CampaignFile) -> tuple[str, PipelineFile]:
     first = found[0]
     together = sum(e.combination == first.combination for e in found)
     sets = len({repr(e.combination) for e in found})
-    text = f"campaign of {len(found)} entries, combined into {plural(sets, 'set')} of products"
+    number = "1 entry" if len(found) == 1 else f"{len(found)} entries"
+    text = f"campaign of {number}, combined into {plural(sets, 'set')} of products"
     return text, _with_budget(source.load(first.settings), 1 / math.sqrt(together))
 
 

@@ -47,7 +47,12 @@ class CampaignSection(Section):
         if step is None:
             have = " or ".join(operators_that(_takes_schedule)) or "a step that does"
             return [Diagnostic("no step takes the schedule", at, "", f"put {have} in the place of the pointing step")]
-        return overrides.put(document, f"{step}.schedule", given, at, KEYS)
+        found = overrides.put(document, f"{step}.schedule", given, at, KEYS)
+        if value.get("nights") is not None:
+            text = "nights would repeat the same scans: the rows of a schedule have times of their own"
+            cure = "write every night into the schedule, or use realizations for other random numbers"
+            found.append(Diagnostic(text, document.mark(("campaign", "nights")).start, "", cure))
+        return found
 
     @staticmethod
     def too_large(value: Any) -> bool:

@@ -110,7 +110,9 @@ class Table:
             return float(units.Unit(written).to(units.Unit(unit)))
         except (ValueError, units.UnitConversionError):
             raise InputError(
-                f"{name} has the unit {written!r}", place=self.place, cure=f"give it in {unit or 'no unit'}"
+                f"{name} has the unit {written!r}",
+                place=self.place,
+                cure=f"give it in {unit}, or another unit of its kind" if unit else "leave the unit out",
             ) from None
 
 
@@ -127,7 +129,7 @@ def read_table(path: Path) -> Table:
     Raises InputError for another kind of file, rows of unequal length, columns of one name, or a table without rows.
     """
     place = str(path)
-    with reading(place, "a table", "give ECSV, or CSV whose first line names the columns: ra [deg], dec [deg]"):
+    with reading(place, "a table", "give ECSV, or CSV whose first line names the columns, with their units in brackets"):
         if path.stat().st_size > LARGEST:
             raise InputError(f"is larger than {LARGEST >> 20} MB", place=place, cure="give a small table")
         text = path.read_text(encoding="utf-8-sig")

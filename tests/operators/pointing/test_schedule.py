@@ -277,6 +277,14 @@ def test_the_schedule_of_a_campaign_is_that_of_its_pointing_step(tmp_path):
         parse(FILE.format(pointing="PointingSchedule").replace("a.ecsv", "none.ecsv"), folder=tmp_path)
 
 
+def test_a_schedule_has_its_own_nights(tmp_path):
+    version_5(tmp_path / "a.ecsv")
+    text = FILE.format(pointing="PointingSchedule").replace("a.ecsv,", "a.ecsv, nights: 3,")
+    with pytest.raises(ConfigurationError, match="nights would repeat the same scans"):
+        parse(text, folder=tmp_path)
+    assert parse(text.replace("nights", "realizations"), folder=tmp_path).header.campaign.realizations == 3
+
+
 def test_files_begin_when_the_first_scan_does(tmp_path):
     """DATE-OBS is not the scene's time, which the schedule need not share."""
     from astropy.io import fits
