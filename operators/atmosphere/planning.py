@@ -42,7 +42,7 @@ INSTANTS = 200
 SAFETY = 1.25
 """Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
 
-POINT, TRANSFER, LATTICE = 1.2e-8, 6e-8, 4e-8
+POINT, TRANSFER, LATTICE = 1.2e-8, 1.2e-7, 6e-8
 """Seconds per point (node x time) of one layer and of the radiative transfer and splines; per lattice point."""
 
 CHOICE = 0.02, 2e-5

@@ -26,10 +26,10 @@ class BinMapPlanning(Planning[BinMap]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        n = self.operator.grid.n_pixels
+        n, more = self.operator.grid.n_pixels, 2e-8 if self.operator.crosslinking else 0.0
         if self.operator.stokes == "IQU":
-            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, 4.2e-8 if self.operator.nside else 2.4e-8))
-        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, 3.2e-9))
+            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, more + (5.2e-8 if self.operator.nside else 3.2e-8)))
+        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, more + 3.2e-9))
 
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, two halves, the products of all signals; and the pointing, twice while it is laid out."""

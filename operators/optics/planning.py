@@ -32,7 +32,7 @@ class EfficiencyPlanning(Planning[Efficiency]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(0.005, 1e-8, 0.9e-9))
+        return Estimate((), Cost(0.005, 1e-8, 1.6e-9))
 
 
 class GroundPlanning(Planning[Any]):
