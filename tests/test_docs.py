@@ -53,7 +53,7 @@ def with_files_of_the_page(folder, text):
 
 def with_survey_data(folder, text):
     """The files of streams that the page of a survey maps again, of a short run of its pipeline."""
-    names = re.findall(r"tod_scan-00\d-f150\.h5", text)
+    names = re.findall(r"tod_scan-00\d-field-\d-\d-f150\.h5", text)
     if not names:
         return
     import zonda

@@ -176,7 +176,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         """Its cost, and the saving and error of larger residuals."""
         modes, tightest, svd = self.operator.modes, self.operator.residual, self.operator.method == "svd"
         count = steps(tightest, modes, context) if svd else 1.0
-        cost = Cost(fixed=0.01, per_sample=0.4e-9 + LANCZOS * count)
+        cost = Cost(fixed=0.01, per_sample=2e-9 + LANCZOS * count)
         slow = 1 / context.cut if context.cut > 0 else context.first.duration
         size = context.bound(context.passed, slow, common=True)
         without = size | context.sky_error(1.0)

@@ -19,6 +19,7 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
 from .base import Aim, Pointing
+from .sun import mark_sun
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -33,7 +34,7 @@ class PointingBackAndForth(Pointing):
 
         x'' = -acceleration sin^2(pi u),   x - throw/2 = speed T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)]      (1)
 
-    so position, speed, acceleration and jerk are continuous. The turnaround reaches 1.41 speed^2 / acceleration beyond.
+    so position to jerk are continuous. It reaches 1.41 speed^2 / acceleration beyond. Samples with the Sun up or near say so.
     """
 
     throw: Angle = quantity("30 arcmin", gt=0, le=2 * math.pi)
@@ -62,8 +63,7 @@ class PointingBackAndForth(Pointing):
 
     def in_turnaround(self, seconds: Floats) -> NDArray[np.bool_]:
         """(n,) True in turnarounds."""
-        leg = self.throw / self.speed
-        return np.asarray(np.mod(seconds, leg + self.turnaround) > leg)
+        return np.asarray(np.mod(seconds, self.throw / self.speed + self.turnaround) > self.throw / self.speed)
 
     def directions(self, aim: Aim, seconds: Floats) -> Floats:
         longitude, elevation = _middle(aim, seconds)
@@ -82,6 +82,7 @@ class PointingBackAndForth(Pointing):
         return _intervals(seconds, self.throw / self.speed, self.turnaround, self.in_turnaround(seconds))
 
     def describe(self, observation: Observation) -> None:
+        mark_sun(observation)
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
         observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()), observation.n_samples)
 

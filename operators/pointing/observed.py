@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,11 +50,21 @@ class Samples:
 
 
 def observed(
-    label: str, scene: Scene, index: int, transform: CelestialTransform, centre: tuple[float, float], samples: Samples
+    label: str,
+    scene: Scene,
+    index: int,
+    transform: CelestialTransform,
+    centre: tuple[float, float],
+    samples: Samples,
+    called: str = "",
 ) -> Observation:
-    """The scan of ``samples`` that begins where ``transform`` does, about ``centre``, ICRS (ra, dec) [rad]."""
+    """The scan of ``samples`` that begins where ``transform`` does, about ``centre``, ICRS (ra, dec) [rad].
+
+    ``called``: what its name says beside its number; what files cannot be called becomes an underscore.
+    """
+    more = re.sub(r"[^A-Za-z0-9.+-]+", "_", called).strip("_.")
     observation = Observation(
-        name=f"scan-{index:03d}",
+        name=f"scan-{index:03d}" + (f"-{more}" if more else ""),
         index=index,
         site=scene.site,
         instrument=scene.instrument,

@@ -7,15 +7,21 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from zonda.core.errors import PointingError
+from zonda.core.numerics.sphere import separation
+
 from .limits import LargestMotion
 from .observed import report
 from .samples_per_beam import SamplesPerBeam
-from .schedule_files import read_schedule
+from .schedule_files import read_schedule, read_site
 from .scheduled import ScheduleParameters, scan_of
 from .sun_and_moon import distances
 
 if TYPE_CHECKING:
     from zonda.core.data import Data
+
+EARTH, NEAR, FAR = 6.371e6, 5e3, 1e5
+"""m: the Earth's radius; how far from the scene a schedule's site is another one, and how far its azimuths make no sense."""
 
 CHECKED = 1 << 14
 """Samples of all scans together that `zonda check` looks at."""
@@ -28,7 +34,9 @@ class PointingSchedule(ScheduleParameters):
     """Constant-elevation scans of an observing schedule in TOAST's formats, one observation a row.
 
     Azimuth limits and `acceleration` are those of the mount, `speed` is on the sky (the mount turns 1 / cos(elevation) as fast):
-    as in TOAST's `SimGround`. A scan begins at the lesser azimuth, towards larger ones, and has as many whole samples as fit.
+    as in TOAST's `SimGround`, whose turnarounds, flags and intervals are the default. A scan begins at the lesser azimuth,
+    towards larger ones, and has as many whole samples as fit. Its name ends with the patch, scan and subscan of the row. A
+    schedule that states its site is compared with the scene's: 5 km apart are a warning, 100 km an error.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -52,9 +60,27 @@ class PointingSchedule(ScheduleParameters):
         topics = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
         return lines + [f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(topics)]
 
+    def _compare_sites(self, data: Data) -> None:
+        """Warn where the schedule was made for another site; PointingError where that is far away."""
+        stated, site = read_site(self.schedule), data.scene.site
+        if stated is None:
+            return
+        there = np.array([stated.longitude]), np.array([stated.latitude])
+        apart = EARTH * float(separation(*there, (site.longitude, site.latitude))[0])
+        if apart > NEAR:
+            place = f"{np.degrees(stated.latitude):.4f} deg, {np.degrees(stated.longitude):.4f} deg"
+            text = f"the schedule was made for {stated.name} ({place}), {apart / 1e3:.4g} km from the scene's site {site.name}"
+            cure = "set the scene's site, or give a schedule of this site (or remove the site from its header)"
+            if apart > FAR:
+                raise PointingError(
+                    f"{text}: its azimuths look elsewhere from here", place=f"{self.label}, {self.schedule}", cure=cure
+                )
+            warnings.warn(f"{self.label}: {text}: {cure}", stacklevel=4)
+
     def _observe(self, data: Data, rate: float) -> None:
         scene, before = data.scene, len(data.observations)
         rows = read_schedule(self.schedule)
+        self._compare_sites(data)
         if abs(scene.time.seconds_since(rows[0].start)) > ANOTHER_DAY:
             text = f"the schedule begins {rows[0].start}, the weather is that of {scene.time}: set the scene's time"
             warnings.warn(f"{self.label}: {text}", stacklevel=3)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +49,70 @@ class Row:
     def label(self) -> str:
         """TOAST's name of the observation."""
         return "-".join([self.name, *self.number])
+
+
+@dataclass(frozen=True)
+class SchedulesSite:
+    """Where a schedule was made for: its name, and position [rad]."""
+
+    name: str
+    latitude: float
+    longitude: float
+
+
+def read_site(path: Path) -> SchedulesSite | None:
+    """The site that the head of a schedule states; None where it states none, or one that is not known (TOAST's default).
+
+    Raises InputError for a latitude or longitude that is none.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines()
+    if lines and lines[0].startswith("# %ECSV"):
+        about = _head_of_ecsv(lines)
+        found = [about.get(key) for key in ("site_name", "site_lat", "site_lon")]
+    else:
+        first = next(line for line in lines if line.strip() and not line.startswith("#"))
+        fields = first.split("|") if "|" in first else first.split()
+        found = [fields[0].strip(), fields[2], fields[3]]
+    if found[1] is None or found[2] is None:
+        return None
+    try:
+        latitude, longitude = (_degrees(value) for value in found[1:])
+    except ValueError:
+        text = f"its site's latitude and longitude are {found[1]!r} and {found[2]!r}"
+        raise InputError(text, place=str(path), cure="write them in degrees") from None
+    if found[0] in (None, "Unknown") and latitude == longitude == 0:
+        return None
+    return SchedulesSite(str(found[0]), math.radians(latitude), math.radians(longitude))
+
+
+def _head_of_ecsv(lines: list[str]) -> dict[str, Any]:
+    """The table's provenance: a mapping, or a list of them."""
+    from astropy.io.misc import yaml
+
+    head = [line[2:] for line in lines if line.startswith("# ")]
+    begin = next((k for k, line in enumerate(head) if line.startswith("meta:")), len(head))
+    end = next((k for k, line in enumerate(head[begin + 1 :], begin + 1) if not line.startswith((" ", "-"))), len(head))
+    try:
+        about = (yaml.load("\n".join(head[begin:end])) or {}).get("meta")
+    except Exception:  # what other programs wrote there with tags of their own
+        return {}
+    if isinstance(about, list):
+        return dict(pair for one in about for pair in (one.items() if isinstance(one, Mapping) else [one]))
+    return dict(about) if isinstance(about, Mapping) else {}
+
+
+def _degrees(value: Any) -> float:
+    """Of a quantity, a number or a text such as ``-22.96 deg``. Raises ValueError."""
+    from astropy.units import Quantity, UnitsError, deg, dimensionless_unscaled
+
+    try:
+        found = Quantity(value)
+        degrees = found.value if found.unit == dimensionless_unscaled else found.to_value(deg)
+    except (TypeError, UnitsError) as err:
+        raise ValueError from err
+    if not abs(degrees) <= 360:
+        raise ValueError
+    return float(degrees)
 
 
 def read_schedule(path: Path) -> list[Row]:

@@ -26,6 +26,7 @@ from .limits import LargestMotion, excess
 from .motion import POINTS, motion
 from .observed import Samples, observed
 from .schedule_files import Row
+from .sun import sunlit
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
@@ -44,10 +45,13 @@ class ScheduleParameters(Operator):
     """Constant speed on the sky between the limits."""
     acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)
     """Acceleration of the mount's azimuth in turnarounds (the largest, where they are smooth)."""
-    turnaround: Literal["smooth", "constant_acceleration"] = "smooth"
-    """Continuous acceleration (4 speed / acceleration long), or a constant one as in TOAST (half as long)."""
+    turnaround: Literal["smooth", "constant_acceleration"] = "constant_acceleration"
+    """Constant acceleration as in TOAST, or a continuous one (twice as long)."""
     flag_turnarounds: bool = True
     """Flag the samples in turnarounds, so that no map uses them."""
+    sun_close: Angle = quantity("45 deg", gt=0, le=math.pi)
+    """Distance of the Sun below which samples are flagged *sun close*. They are used all the same, as are those while the Sun is
+    up: both are flags and intervals of files."""
     elevation_nods: list[Angle] = Field(default_factory=list, max_length=100)
     """Offsets in elevation to which the telescope goes in turn before each scan, the last of them 0, e.g. [1 deg, -1 deg, 0 deg];
     flagged irregular."""
@@ -101,9 +105,10 @@ def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: 
     turning = sweep.turning(seconds - delay) & scanning
     if step.flag_turnarounds:
         flags |= np.where(turning, TURNAROUND, 0).astype(np.uint8)
+    lit, suns = sunlit(scene.site, start, seconds, azel, step.sun_close)
     centre = _centre(data, row, transform, delay)
-    samples = Samples(seconds, rate, boresight, flags, intervals)
-    observation = observed(step.label, scene, len(data.observations), transform, centre, samples)
+    samples = Samples(seconds, rate, boresight, flags | lit, intervals | suns)
+    observation = observed(step.label, scene, len(data.observations), transform, centre, samples, row.label)
     _check_motion(step, observation.name, track, (0.0, delay), False, place, moved)
     _check_motion(step, observation.name, track, (delay, len(seconds) / rate), sweep.smooth, place, moved)
     observation.tally.state(step.label, f"{observation.name}: row of the schedule", row.label)

@@ -10,6 +10,8 @@ import numpy as np
 
 from zonda.core.numerics.bodies import Track, tracks
 
+from .sun import looking
+
 if TYPE_CHECKING:
     from zonda.core.data import Observation
 
@@ -23,10 +25,8 @@ def distances(observations: Sequence[Observation]) -> list[str]:
     times, directions = [], []
     for o in observations:
         at = np.unique(np.linspace(0, o.n_samples - 1, min(each, o.n_samples)).astype(int))
-        x, y, z, w = o.boresight_azel[at].T
         times.append(o.start.posix + o.seconds[at])
-        # north, west, up of TOAST's quaternions; tracks are north, east, up
-        directions.append(np.stack([2 * (x * z + w * y), -2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1))
+        directions.append(looking(o.boresight_azel[at]))
     when, track = np.concatenate(times), Track(np.concatenate(directions))
     lines = []
     for name, body in zip(("Sun", "Moon"), tracks(observations[0].site, when, "sun", "moon"), strict=True):

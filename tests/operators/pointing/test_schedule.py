@@ -20,7 +20,7 @@ from zonda.core.registry import instruments
 from zonda.core.scene import Scene
 from zonda.operators.pointing.constant_elevation import Nod, Sweep
 from zonda.operators.pointing.schedule import PointingSchedule
-from zonda.operators.pointing.schedule_files import read_schedule
+from zonda.operators.pointing.schedule_files import read_schedule, read_site
 
 ROWS = [
     ("2025-03-01T06:00:00+00:00", "2025-03-01T06:02:00+00:00", 0.0, "patch", 120.0, 150.0, 50.0, 0, 0),
@@ -144,6 +144,55 @@ def test_the_focal_plane_is_turned_about_the_boresight(tmp_path):
     upright = from_angles(-turned.azimuth, turned.elevation)
     same = np.abs((upright * plain.boresight_azel).sum(axis=1))
     np.testing.assert_allclose(same, 1, atol=1e-12)
+
+
+def test_scans_are_called_by_their_rows(tmp_path):
+    rows = [(*row[:3], "patch/a", *row[4:]) for row in ROWS]
+    assert [o.name for o in scans(version_5(tmp_path / "a.ecsv"))] == ["scan-000-patch-0-0", "scan-001-patch-0-1"]
+    assert scans(version_5(tmp_path / "b.ecsv", rows))[0].name == "scan-000-patch_a-0-0"
+
+
+@pytest.mark.parametrize("version", [4, 5])
+def test_the_site_of_the_schedule_is_compared(tmp_path, version, recwarn):
+    """The head has latitude -22.96 deg; version 4 has the longitude too."""
+    path = version_4(tmp_path / "a.txt") if version == 4 else version_5(tmp_path / "a.ecsv")
+    if version == 5:
+        text = path.read_text().replace(
+            "# schema", "# - site_lon: !astropy.units.Quantity {unit: *id001, value: -67.79}\n# schema"
+        )
+        path.write_text(text)
+    stated = read_site(path)
+    assert (stated.name, stated.latitude) == ("atacama", pytest.approx(np.radians(-22.96)))
+    assert stated.longitude == pytest.approx(np.radians(-67.79))
+    scans(path)
+    assert not [w for w in recwarn if "was made for" in str(w.message)]
+
+    def elsewhere(latitude):
+        scene = Scene(site=SITE | {"latitude": latitude}, instrument="act_150ghz", time="2025-03-01T06:00", seed=1)
+        PointingSchedule(schedule=path, **FAST).observe(Data(scene))
+
+    with pytest.warns(UserWarning, match=r"made for atacama .*, 11\.12 km from the scene's site"):
+        elsewhere("-22.86 deg")
+    with pytest.raises(PointingError, match="its azimuths look elsewhere") as caught:
+        elsewhere("-21 deg")
+    assert str(path) in str(caught.value)
+    assert "set the scene's site" in str(caught.value)
+
+
+def test_a_schedule_without_a_site_and_a_wrong_one(tmp_path):
+    path = version_5(tmp_path / "a.ecsv")
+    assert read_site(path) is None  # no longitude
+    text = path.read_text()
+    for wrong, found in (("!other.Tag {a: 1}", None), ("north", "latitude")):
+        path.write_text(text.replace("# schema", f"# - site_lon: {wrong}\n# schema"))
+        if found is None:
+            assert read_site(path) is None
+        else:
+            with pytest.raises(InputError, match=found):
+                read_site(path)
+    unknown = version_4(tmp_path / "a.txt").read_text().replace("atacama | LAT | -22.960 | -67.790", "Unknown | LAT | 0.0 | 0.0")
+    (tmp_path / "b.txt").write_text(unknown)
+    assert read_site(tmp_path / "b.txt") is None
 
 
 def test_nods_come_before_the_scan(tmp_path):
