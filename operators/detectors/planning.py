@@ -12,14 +12,11 @@ from zonda.core.plan.context import Context
 from zonda.core.plan.estimate import Cost, Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 
-from .crosstalk import Crosstalk
+from .crosstalk import Crosstalk, Shares, neighbours, read_shares
 from .gain_drift import GainDrift, grid
 from .glitches import REACH, Glitches
 from .time_constant import REACH as REMEMBERED
 from .time_constant import TimeConstant
-
-NEIGHBOURS = 6
-"""Of a detector in a hexagonal focal plane."""
 
 
 class GainPlanning(Planning[GainDrift]):
@@ -74,18 +71,21 @@ class CrosstalkPlanning(Planning[Crosstalk]):
 
     def memory(self, observation: Observation) -> int:
         """The pairs."""
-        return 24 * NEIGHBOURS * observation.n_detectors
+        return 24 * len(self._shares(observation).source)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: six neighbours' signals."""
-        level = abs(self.operator.level) if self.operator.file is None else 0.0
-        size = context.bound(
-            NEIGHBOURS * level * (context.fluctuation + context.mean_emission), context.first.duration, common=True
-        )
-        effect = Effect(
-            "crosstalk", (full("exact"),), size | context.sky_error(NEIGHBOURS * level), "6 level x rms of the stream"
-        )
-        return Estimate((effect,) if level else (), Cost(fixed=0.01, per_sample=1e-9 + 0.3e-9 * NEIGHBOURS))
+        """Its size: the signals of others, all alike. A table may give one detector more than the rest."""
+        shares, o = self._shares(context.first), context.first
+        rows = np.repeat(np.arange(o.n_detectors), np.diff(shares.first))
+        largest = float(np.bincount(rows, np.abs(shares.share), o.n_detectors).max(initial=0.0))
+        size = context.bound(largest * (context.fluctuation + context.mean_emission), o.duration, common=True)
+        text = "largest sum of a detector's shares x (rms of the stream + mean emission); of the sky, that sum"
+        effect = Effect("crosstalk", (full("exact"),), size | context.sky_error(largest), text)
+        return Estimate((effect,), Cost(fixed=0.01, per_sample=1e-9 + 0.3e-9 * len(rows) / max(o.n_detectors, 1)))
+
+    def _shares(self, observation: Observation) -> Shares:
+        step, plane = self.operator, observation.focalplane
+        return neighbours(plane, step.level) if step.file is None else read_shares(step.file, plane)
 
 
 class GlitchPlanning(Planning[Glitches]):

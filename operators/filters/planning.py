@@ -100,7 +100,8 @@ class PolynomialPlanning(Planning[Any]):
         """Its cost; leaving it out leaves the mean and the slow part in."""
         functions = self.operator.order + 1
         cost = Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=1.2e-8 + 3.6e-9 * functions)
-        return Estimate((), cost, _left_in(context))
+        left = _left_in(context)
+        return Estimate((Effect("polynomials", (full(f"exact, order {self.operator.order}"),), left, LEFT_IN),), cost, left)
 
 
 class GroundPlanning(Planning[Any]):
@@ -115,7 +116,11 @@ class GroundPlanning(Planning[Any]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the template in."""
         cost = Cost(fixed=0.01, per_time=1e-7, per_sample=1.2e-8 + 5e-9 * self.operator.trend)
-        return Estimate((), cost, _left_in(context))
+        left = _left_in(context)
+        return Estimate((Effect("template in azimuth", (full("exact"),), left, LEFT_IN),), cost, left)
+
+
+LEFT_IN = "rms of the stream + mean emission, which no filter before it takes; all of the sky"
 
 
 def _left_in(context: Context) -> dict[str, float]:

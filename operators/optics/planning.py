@@ -67,11 +67,17 @@ class HalfWavePlatePlanning(Planning[Any]):
     """Angles of one plate; what they do is done where the sky is sampled and mapped."""
 
     of = "zonda.operators.optics.half_wave_plate:HalfWavePlate"
-    cost = Cost(0.001, 3e-8, 0.0)
 
     def memory(self, observation: Observation) -> int:
         """The angles."""
         return 8 * observation.n_samples
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its size: without it polarized detectors see Q and U at other angles, up to 2 (Q^2 + U^2)^(1/2) apart."""
+        most = 2 * context.peak * float(context.first.focalplane.polarization_efficiency.max(initial=0.0))
+        size = {"tod": most, "map_rms": most, "peak": most, "transfer": 2.0} if most else {"tod": 0.0, "map_rms": 0.0}
+        text = "2 p x the sky's brightness, which its polarized one cannot exceed"
+        return Estimate((Effect("half-wave plate", (full("exact: ideal, of one angle"),), size, text),), Cost(0.001, 3e-8))
 
 
 class LeakagePlanning(Planning[Any]):
@@ -84,6 +90,10 @@ class LeakagePlanning(Planning[Any]):
         return 8 * observation.n_samples if observation.hwp_angle is not None else 0
 
     def estimate(self, context: Context) -> Estimate:
-        """A product of whole streams, or with a plate one of their own."""
-        plate = context.first.hwp_angle is not None
-        return Estimate((), Cost(0.001, 3e-8, 8e-9 if plate else 5e-9))
+        """Its size; its cost: a product of whole streams, or with a plate one of their own."""
+        plate, o = context.first.hwp_angle is not None, context.first
+        share = self.operator.share * float(o.focalplane.polarization_efficiency.max(initial=0.0))
+        size = context.bound(share * (context.fluctuation + context.mean_emission), o.duration, common=True)
+        text = "p l x (rms of the stream + mean emission); of the sky, p l"
+        effect = Effect("leakage", (full("exact"),), size | context.sky_error(share), text)
+        return Estimate((effect,), Cost(0.001, 3e-8, 8e-9 if plate else 5e-9))

@@ -157,7 +157,12 @@ class SourcesPlanning(Planning[Any]):
         cost = Cost(fixed=0.01, per_time=1e-7, per_sample=0.5e-9 + 2e-9 * in_view)
         effect = not_simulated("beam chromaticity", "one beam for the band", context.sky_error(chromaticity(o.instrument.band)),
                                "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak")  # fmt: skip
-        return Estimate((effect,), cost)
+        peak = self.traits(o).peak or 0.0
+        size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
+        sources = Effect(
+            "point sources", (full("exact: each through its beam"),), size, "the brightest source in the smallest beam"
+        )
+        return Estimate((sources, effect), cost)
 
     def _catalogue_size(self) -> int:
         from .point_sources import Catalogue
@@ -194,4 +199,8 @@ class CMBPlanning(Planning[Any]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost: maps from multipoles, and what `SkyMap` does with them."""
         once = 1.2e-10 * self.operator.nside**3 + 3e-7 * 12 * self.operator.nside**2
-        return Estimate((), Cost(fixed=0.05, per_time=5e-8, per_sample=5e-9, once=once))
+        peak = self.traits(context.first).peak or 0.0
+        size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
+        text = "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB"
+        effect = Effect("CMB", (full(f"drawn at nside {self.operator.nside}"),), size, text)
+        return Estimate((effect,), Cost(fixed=0.05, per_time=5e-8, per_sample=5e-9, once=once))
