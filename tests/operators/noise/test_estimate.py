@@ -74,3 +74,13 @@ def test_short_scans_are_refused():
     with pytest.raises(InputError, match="make no 8 segments"):
         segment_length(N, RATE, 300.0, "here")
     assert segment_length(N, RATE, 20.0, "here") == 2000
+
+
+def test_few_segments_bias_the_white_level_little():
+    """Of 11 segments to 2 %: without sigma^2 / 2 of the logarithm by -2.8 %; 250 scans know it to 0.3 %."""
+    rng, length = np.random.default_rng(3), 64
+    rows = rng.normal(size=(250, 6 * length)) * 10  # NET 1 K s(1/2) at 100 Hz
+    found = [fit(*spectrum(row, np.ones(row.size, bool), 100.0, length)) for row in rows]
+    nets = [noise.net for noise in found if noise is not None and noise.knee == 0]
+    assert len(nets) > 240
+    assert abs(np.mean(nets) - 1) < 0.02

@@ -68,6 +68,17 @@ def test_the_stream_is_the_beam_itself(tmp_path, bench):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
 
+def test_a_beam_of_degrees_is_a_gaussian_of_the_angle(tmp_path):
+    """Of 5 deg, a source 5 deg away: the chord in place of the angle would make it brighter by 1e-4 of the peak."""
+    streams = []
+    for dec in (25.0, 20.0):
+        observation = scenes.scan(1, 200, radius=0.0)
+        observation.focalplane.fwhm[:] = np.radians(5)
+        path = catalogue(tmp_path / "c.csv", [(75.0, dec, 1e9)])
+        streams.append(scenes.run([PointSources(catalogue=path)], observation, keep=("sky",)).observations[0].detdata["sky"])
+    np.testing.assert_allclose(streams[0] / streams[1], 1 / 16, rtol=2e-6)  # float32; the series of the angle ends at 2e-6
+
+
 def test_fluxes_at_another_frequency(tmp_path):
     path = catalogue(tmp_path / "c.csv", [(75.0, 20.0, 100.0, 2.0)], "ra [deg],dec [deg],flux [mJy],spectral_index")
     band = scenes.camera().band
