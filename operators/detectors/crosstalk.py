@@ -37,10 +37,10 @@ COLUMNS = ("detector", "source", "share")
 
 
 class Crosstalk(Operator):
-    """Add to the signal of each detector shares of the signals of others, equation (1).
+    """Add to the signal of each detector shares of the signals of others: y_d = x_d + sum_e C_de x_e.
 
-    A sample that is not finite adds nothing to others. Either `level` of each nearest neighbour in the focal plane of the same
-    band, or the shares in a `file`.
+    C is `level` for the nearest neighbours in the focal plane that are of the same band, or the table in `file`. A sample that
+    is not finite adds nothing to others.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})

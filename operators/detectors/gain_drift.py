@@ -40,10 +40,10 @@ AT_ONCE = 256
 
 
 class GainDrift(Operator):
-    """Multiply the signal of each detector by a gain that drifts slowly about 1, equation (1).
+    """Multiply the signal of each detector by a gain that drifts slowly about 1, a Gaussian process of spectrum f^-slope.
 
-    The drifts of detectors and of scans are independent; the calibration does not know them. The mean emission of the atmosphere
-    drifts with the gain, which is most of what is seen of it.
+    The drifts of detectors and of scans are independent; the calibration does not know them. The gain multiplies the mean
+    emission of the atmosphere too, and most of the effect comes from there.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})

@@ -34,10 +34,10 @@ REACH = 23
 
 
 class Glitches(Operator):
-    """Pulses at random times in each detector that decay exponentially, equation (1): the component ``glitches`` at the detector.
+    """Pulses A exp(-(t - t_i) / decay) at random times t_i in each detector: the component ``glitches`` at the detector.
 
-    With `flag_above`, samples in which they exceed that much are lost as a glitch finder would lose them: they are not a number,
-    filters bridge them in every signal, and no map uses them. All is counted in the log.
+    Samples in which pulses exceed `flag_above` are lost, as if a glitch finder had found them: they become NaN, filters bridge
+    them in every signal, and no map uses them. The log counts pulses and samples.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})

@@ -34,10 +34,10 @@ REACH = 23
 
 
 class TimeConstant(Operator):
-    """First-order low-pass of each detector, equation (1).
+    """First-order low-pass of each detector, tau y' = x - y, with x linear between samples.
 
-    It acts on all that is in the signal, the noise too: noise of the readout, which the detector does not filter, is low as well.
-    Samples that are not finite stay, and are passed over.
+    It acts on all of the signal. Noise of the readout, which a real detector does not filter, is filtered too. Samples that are
+    not finite stay as they are, and the filter skips them.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})

@@ -35,7 +35,7 @@ from .baseline import Basis, Fit, Mask, in_double, polynomials
 
 
 class GroundFilter(Operator):
-    """Remove a template of each detector in bins of the boresight's azimuth, and a trend in time, fitted together: equation (1).
+    """Remove a template of each detector in bins of the boresight's azimuth, fitted together with a trend in time.
 
     What the ground adds repeats with the azimuth at constant elevation. Flagged samples are not used for the fit;
     turnarounds are.

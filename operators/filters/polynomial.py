@@ -36,10 +36,10 @@ Part = Literal[
 
 
 class PolynomialFilter(Operator):
-    """Remove the polynomial that fits each interval of each detector's scan best, equation (1).
+    """Remove the polynomial that fits each interval of each detector's scan best (least squares).
 
-    Flagged samples are not used for the fit; turnarounds are, where the interval contains them. An interval whose used samples do
-    not determine all functions loses what they determine.
+    Flagged samples are not used for the fit; turnarounds are, where the interval contains them. Where an interval has
+    too few samples for all orders, the polynomials that they determine are removed.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})

@@ -29,16 +29,17 @@ from zonda.core.types import Floats
 
 
 class GroundPickup(Operator):
-    """Radiation of the ground that depends on the boresight's azimuth and elevation, equation (1): the component ``ground``.
+    """Radiation of the ground that depends on the boresight's azimuth and elevation: the component ``ground``.
 
-    It enters at the detector (K_RJ, before calibration). The ground is the same in all scans of one seed.
+    A Gaussian process of the azimuth, smoothed by sidelobes of `fwhm`, times (elevation / 45 deg)^power. It enters at the
+    detector (K_RJ, before calibration). The ground is the same in all scans of one seed.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({Component("ground", "at the detector")})
 
     rms: Kelvin = quantity("1 mK", ge=0)
-    """Rms over all azimuths at 45 deg of elevation, of all grounds."""
+    """Rms over azimuths and over realizations of the ground, at an elevation of 45 deg."""
     fwhm: Angle = quantity("10 deg", ge=0.002, le=3.2)
     """FWHM of the sidelobes that smooth the ground."""
     power: float = Field(-1.0, ge=-6, le=6)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Mispointing(Operator):
-    """The true boresight differs from the recorded one by an offset, an error per scan and a jitter, equation (1).
+    """The true boresight differs from the recorded one by an offset, an error per scan and a jitter.
 
     The sky is seen where the telescope looks in fact; maps, filters and files take the recorded pointing. Atmosphere and ground,
     whose statistics do not change, stay where the recorded pointing is. It stands behind the pointing step.

@@ -33,7 +33,7 @@ CURE = "give columns of text: ell, TT or ell, TT, EE, BB, TE, as ell (ell + 1) C
 
 
 class CMBSky(Operator):
-    """Cosmic microwave background of a given power spectrum, equation (1): part of the component ``sky``.
+    """Cosmic microwave background, a Gaussian field of given power spectra: part of the component ``sky``.
 
     No spectrum comes with zonda: give a file of a theory code. With TT alone it is not polarized.
     """

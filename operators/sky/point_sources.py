@@ -41,10 +41,10 @@ PIECE = 256
 
 
 class PointSources(Operator):
-    """Point sources of a catalogue above the atmosphere (K_RJ), equation (1): part of the component ``sky``.
+    """Point sources of a catalogue above the atmosphere (K_RJ), seen through Gaussian beams: part of the component ``sky``.
 
-    The catalogue is a table (ECSV or CSV) with the columns `ra` and `dec` (ICRS) and `flux`, with units, and where it has them
-    `spectral_index` (S ~ frequency^index; otherwise 0) and `frequency` (of the flux).
+    The catalogue is a table (ECSV or CSV) with the columns `ra` and `dec` (ICRS) and `flux`, with units. Columns
+    `spectral_index` (S ~ frequency^index; otherwise 0) and `frequency` (of the flux) are optional.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
