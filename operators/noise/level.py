@@ -90,10 +90,10 @@ class Amplitude:
     observation
         With the smooth means that ``level`` was resolved with.
     factor
-        By which the noise exceeds the level.
+        By which the noise exceeds the level; of all detectors, or (n_det,).
     """
 
-    def __init__(self, label: str, level: WhiteLevel, observation: Observation, factor: float = 1.0) -> None:
+    def __init__(self, label: str, level: WhiteLevel, observation: Observation, factor: float | Floats = 1.0) -> None:
         self.label, self.level, self.factor = label, level, factor
         self._means, self._lock = dict(observation.smooth), threading.Lock()
         self._field: SmoothField | None = None
@@ -110,8 +110,8 @@ class Amplitude:
                         cure="set observation.smooth in configure(), or put that step before the noise",
                     )
                 self._field = self.level.amplitude(observation)
-                if self.factor != 1:
-                    self._field = self._field.scaled(np.full(observation.n_detectors, self.factor))
+                if np.any(self.factor != 1):
+                    self._field = self._field.scaled(np.broadcast_to(self.factor, observation.n_detectors))
             return self._field
 
 

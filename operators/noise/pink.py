@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from zonda.core.operator import Operator
 from .level import Amplitude, NoiseLevel, announced, resolve
 from .models import FixedNet
 from .one_over_f import PowerLawFilter, power_law_filter
-from .streams import Streams
+from .streams import Streams, StreamsOfSlopes
 
 if TYPE_CHECKING:
     from zonda.core.block import Block
@@ -40,9 +40,9 @@ class PinkNoise(Operator):
     reference: Literal["sky", "detector"] = "sky"
     """Whether `net` is quoted on the sky, after division by zeta e^-tau, or at the detector."""
     knee: Hertz | None = Field(None, ge=0)
-    """Frequency at which pink noise equals white noise; None: the instrument's; 0: no pink noise."""
+    """Frequency at which pink noise equals white noise; None: each detector's own; 0: no pink noise."""
     slope: float | None = Field(None, gt=0, le=3)
-    """The power spectrum falls as f^-slope; None: the instrument's."""
+    """The power spectrum falls as f^-slope; None: each detector's own, where they differ rounded to a tenth."""
     minimum_frequency: Hertz | None = Field(None, gt=0)
     """The spectrum is flat below; None: the instrument's."""
     poles: int = Field(8, ge=2, le=16)
@@ -79,32 +79,37 @@ class PinkNoise(Operator):
     def collect(self, data: Data, observation: Observation, state: _State | None) -> None:
         """State the rms."""
         if state is not None:
-            middle = np.median(state.amplitude.of(observation).time_mean()) * np.sqrt(state.streams.law.variance)
+            middle = np.median(state.amplitude.of(observation).time_mean() * np.sqrt(state.streams.variance))
             observation.tally.state(self.label, "rms at the detector, median (mK)", f"{1e3 * middle:.4g}")
 
 
 class _State(NamedTuple):
     amplitude: Amplitude
-    streams: Streams
+    streams: Streams | StreamsOfSlopes
     common: NDArray[np.float32]
     """(n_samp,), or (0,) where nothing is shared."""
 
 
 def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
     """Raises InputError where the number of poles cannot fit the spectrum (see `power_law_filter`)."""
+    each = spectrum.of_detectors(pink, observation)
     try:
         law = spectrum.filter(pink.poles)
+        laws = {s: law if s == spectrum.slope else replace(spectrum, slope=s).filter(pink.poles) for s in each.slopes}
     except InputError as err:
         raise InputError(err.message, place=pink.label, cure=err.cure) from None
-    observation.tally.state(pink.label, "power over that of white noise", spectrum.describe(law))
+    observation.tally.state(pink.label, "power over that of white noise", each.describe() + spectrum.describe(law))
     resolve(observation)
     level = level_of(pink, observation)
     net = level.sky_net(observation)
-    spectrum.state(observation, net)
-    square = float(np.mean(net[observation.good_detectors] ** 2)) if observation.good_detectors.any() else 0.0
-    observation.closed_forms.setdefault("pink", []).append(lambda f: 2 * square * spectrum.over_white(f))
-    amplitude = Amplitude(pink.label, level, observation, spectrum.factor * np.sqrt(law.gain))
-    streams = Streams(law, observation.detector_key(pink.label), observation.detector_key(pink.label, "start"))
+    spectrum.state(observation, net, each)
+    squares = np.where(observation.good_detectors, net**2, 0.0) / max(int(observation.good_detectors.sum()), 1)
+    observation.closed_forms.setdefault("pink", []).append(lambda f: 2 * each.over_white(f, squares))
+    gain = np.sqrt([laws[slope].gain for slope in each.slope.tolist()])
+    amplitude = Amplitude(pink.label, level, observation, each.factor * gain)
+    key, start = observation.detector_key(pink.label), observation.detector_key(pink.label, "start")
+    made = {slope: Streams(laws[slope], key, start) for slope in each.slopes}
+    streams = made[each.slopes[0]] if len(made) == 1 else StreamsOfSlopes(each.slope, made)
     common = np.zeros((1, observation.n_samples if pink.shared else 0), np.float32)
     if pink.shared:
         keys = (observation.detector_key(pink.label, "shared", *more) for more in ((), ("start",)))
@@ -129,6 +134,8 @@ class PinkSpectrum:
         """As the step asks for it, else the instrument's; None: no pink noise."""
         instrument = observation.instrument
         knee = instrument.knee if pink.knee is None else pink.knee
+        if pink.knee is None and not knee:  # the median; single detectors may have some
+            knee = float(instrument.focalplane().knee.max())
         minimum = pink.minimum_frequency or instrument.pink_minimum_frequency
         return cls(knee, pink.slope or instrument.slope, minimum, observation.sample_rate) if knee else None
 
@@ -151,13 +158,62 @@ class PinkSpectrum:
         text += f"within {100 * law.error:.2g} %, "
         return text + f"levelling off below to {law.plateau:.2g} times its value at {self.minimum:g} Hz"
 
-    def state(self, observation: Observation, net: NDArray[np.float64]) -> None:
+    def of_detectors(self, pink: PinkNoise, observation: Observation) -> Detectors:
+        """The spectra of the single detectors: those that the instrument's focal plane has, where the step states none."""
+        n, instrument = observation.n_detectors, observation.instrument
+        knee, slope = np.full(n, self.knee), np.full(n, self.slope)
+        if pink.knee is None or pink.slope is None:
+            plane = instrument.focalplane()
+            if plane.names == observation.focalplane.names:
+                knee = plane.knee if pink.knee is None and np.ptp(plane.knee) else knee
+                slope = np.clip(plane.slope.round(1), 0.1, 3.0) if pink.slope is None and np.ptp(plane.slope) else slope
+        return Detectors(knee, slope, self.minimum)
+
+    def state(self, observation: Observation, net: NDArray[np.float64], each: Detectors) -> None:
         """Write it to the focal plane, where the knee refers to the white noise of that: here it refers to ``net`` (n_det,)."""
         plane = observation.focalplane
         white = np.where(plane.net > 0, plane.net, net)
         ratio = np.divide(net, white, out=np.ones(len(plane)), where=white > 0)
-        plane.knee = self.knee * ratio ** (2 / self.slope)
-        plane.slope, plane.minimum_frequency = np.full(len(plane), self.slope), np.full(len(plane), self.minimum)
+        plane.knee = each.knee * ratio ** (2 / each.slope)
+        plane.slope, plane.minimum_frequency = each.slope.copy(), np.full(len(plane), self.minimum)
+
+
+@dataclass(frozen=True)
+class Detectors:
+    """Spectra as `PinkSpectrum`, of each detector: ``knee`` and ``slope`` (n_det,)."""
+
+    knee: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    minimum: float
+
+    @property
+    def slopes(self) -> list[float]:
+        """The different slopes."""
+        return [float(slope) for slope in np.unique(self.slope)]
+
+    @property
+    def factor(self) -> NDArray[np.float64]:
+        """(n_det,) root of the spectrum at its ``minimum``; by single numbers, whose powers have the same bits anywhere."""
+        pairs = zip(self.knee.tolist(), self.slope.tolist(), strict=True)
+        return np.array([(knee / self.minimum) ** (slope / 2) for knee, slope in pairs])
+
+    def describe(self) -> str:
+        """How far detectors differ, in words; empty where they do not."""
+        spans = [
+            f"{what} {values.min():.4g} to {values.max():.4g}{unit}"
+            for what, values, unit in (("knee", self.knee, " Hz"), ("slope", self.slope, ""))
+            if np.ptp(values)
+        ]
+        return f"{', '.join(spans)}; at the median " if spans else ""
+
+    def over_white(self, frequency: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum over detectors of ``weights`` (n_det,) times the spectra over those of white noise, (n,)."""
+        f = np.maximum(frequency, self.minimum)
+        found = np.zeros(len(f))
+        for slope in self.slopes:
+            mine = self.slope == slope
+            found += np.sum(weights[mine] * self.knee[mine] ** slope) * f**-slope
+        return found
 
 
 def level_of(pink: PinkNoise, observation: Observation) -> WhiteLevel:

@@ -124,7 +124,8 @@ class PinkPlanning(Planning[PinkNoise]):
 
     def _amplitude(self, spectrum: PinkSpectrum, observation: Observation) -> float:
         """rms of the white noise that is filtered, in the calibrated stream; of the noisiest detector, K."""
-        return float(np.max(calibrated(level_of(self.operator, observation), observation))) * spectrum.factor
+        each = spectrum.of_detectors(self.operator, observation)
+        return float(np.max(calibrated(level_of(self.operator, observation), observation) * each.factor))
 
 
 def calibrated(level: WhiteLevel, observation: Observation) -> Floats:

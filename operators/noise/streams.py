@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -57,6 +58,11 @@ class Streams:
         self._tap = np.append(law.zeros - law.poles, np.zeros(padding)).astype(np.float32)
         self._tiles: dict[int, _Tile] = {}
         self._lock = threading.Lock()
+
+    @property
+    def variance(self) -> float:
+        """Of the filter's output."""
+        return float(self.law.variance)
 
     def add(
         self,
@@ -124,6 +130,39 @@ class Streams:
         state = np.zeros((self._rate.size, TILE_DETECTORS), np.float32)
         state[:n] = self.law.start @ deviates
         return state
+
+
+class StreamsOfSlopes:
+    """`Streams` of detectors with filters of their own, each in the tiles where it is wanted. Same interface.
+
+    Parameters
+    ----------
+    slopes
+        (n_det,) which of the filters a detector has.
+    made
+        By slope.
+    """
+
+    def __init__(self, slopes: NDArray[np.float64], made: Mapping[float, Streams]) -> None:
+        self._slopes, self._made = slopes, made
+        self.variance = np.array([made[slope].variance for slope in slopes.tolist()])
+
+    def add(
+        self, detector: int, sample: int, out: AnyFloats, level: Series, common: NDArray[np.float32], shared: float, over: bool
+    ) -> None:
+        """As `Streams.add`."""
+        n_det, n_samp = out.shape
+        edges = [detector, *range((detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS)]
+        for low, high in pairwise([*edges, detector + n_det]):
+            rows = slice(low - detector, high - detector)
+            part, tile = Series(level.lines[rows], level.first, level.inside), np.empty((high - low, n_samp), out.dtype)
+            for slope in np.unique(self._slopes[low:high]).tolist():
+                self._made[slope].add(low, sample, tile, part, common, shared, over=True)
+                for row in np.flatnonzero(self._slopes[low:high] == slope):
+                    if over:
+                        out[rows][row] = tile[row]
+                    else:
+                        out[rows][row] += tile[row]
 
 
 def _pieces(start: int, stop: int) -> list[tuple[int, int]]:

@@ -145,6 +145,25 @@ def test_a_twin_on_the_real_pointing(saved: Any) -> None:
     assert abs(ratio.var() - 1) < 5 * np.sqrt(2 / good.sum())
 
 
+def test_a_twin_has_the_noise_of_each_detector(saved: Any, tmp_path: Path) -> None:
+    """Knees and NETs of a table: the rms of pink noise of slope 1 goes as NET sqrt(knee), times numbers drawn alike."""
+    names = [f"d{k:02d}" for k in range(19)]
+    found = {}
+    for which, knee in {"one": np.full(19, 1.0), "own": np.arange(19) / 4}.items():
+        table = tmp_path / f"{which}.ecsv"
+        rows = [f"{name} {1e-3 * (1 + k)} {knee[k]} 1.0" for k, name in enumerate(names)]
+        columns = "net, unit: K s(1/2)", "knee, unit: Hz", "slope"
+        head = ["# %ECSV 1.0", "# ---", "# datatype:", "# - {name: name, datatype: string}"]
+        head += [f"# - {{name: {column}, datatype: float64}}" for column in columns]
+        table.write_text("\n".join([*head, "name net knee slope", *rows]) + "\n")
+        step = zonda.LoadTOD(file=saved["Raw"][0], signal="none", noise=table)
+        steps = [step, zonda.WhiteNoise(), zonda.PinkNoise(), zonda.Efficiency()]
+        found[which] = zonda.Pipeline(steps).run(step.scene(seed=8), threads=1, keep=["pink"]).tod("pink")
+    expected = found["one"] * np.sqrt(np.arange(19) / 4)[:, None]
+    np.testing.assert_allclose(found["own"], expected, rtol=0, atol=1e-6 * np.abs(expected).max())  # float32
+    assert found["one"].std(axis=1)[18] > 5 * found["one"].std(axis=1)[0]
+
+
 def test_the_real_data_and_the_twin_in_one_pass(saved: Any) -> None:
     step = zonda.LoadTOD(file=saved["Raw"])
     steps = [step, *AIR, MAP]

@@ -1,0 +1,68 @@
+"""Pink noise with the knee and the slope of each detector, as a table of `zonda noise` or a focal plane states them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import zonda
+from zonda.operators.noise.estimate import fit, spectrum
+
+pytestmark = pytest.mark.filterwarnings("ignore:Pointing")
+
+KNEES, SLOPES = np.tile([0.0, 0.5, 2.0, 5.0], 5), np.repeat([1.0, 1.7], 10)
+"""Of 20 detectors, more than a tile of 16; Hz."""
+NET = 1e-3
+MEDIAN = float(np.median(KNEES))
+
+
+def camera(folder: Path, knees: Any = KNEES, slopes: Any = SLOPES) -> dict[str, Any]:
+    lines = ["name, xi [arcmin], eta [arcmin], knee [Hz], slope"]
+    lines += [f"d{k:02d}, {k / 20}, 0, {knee}, {slope}" for k, (knee, slope) in enumerate(zip(knees, slopes, strict=True))]
+    path = folder / f"array{len(list(folder.iterdir()))}.csv"
+    path.write_text("\n".join(lines))
+    return {
+        "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"}, "focalplane": str(path), "net": f"{NET} K s(1/2)",
+        "band": {"name": "b", "low": "130 GHz", "high": "170 GHz"}, "main_beam_efficiency": 1, "illumination_efficiency": 1,
+        "sample_rate": "50 Hz", "fwhm": "1 arcmin",
+    }  # fmt: skip
+
+
+def pink(instrument: Any, threads: int = 1, memory: int | None = None, **settings: Any) -> Any:
+    scene = zonda.Scene(site="atacama", instrument=instrument, time="2024-06-25T07:00", target="az 180 deg el 50 deg", seed=1)
+    steps = [zonda.PointingStare(scan_duration="1600 s"), zonda.PinkNoise(**settings), zonda.Efficiency()]
+    return zonda.Pipeline(steps).run(scene, threads=threads, memory=memory, keep=["pink"])
+
+
+def test_each_detector_has_its_own_spectrum(tmp_path: Path) -> None:
+    """White noise of the NET is added, so that `zonda noise` finds the knee: pulls below 4.5 of 2 x 15 estimates."""
+    streams = pink(camera(tmp_path)).tod("pink")
+    draw = np.random.default_rng(2)
+    for row, knee, slope in zip(streams, KNEES, SLOPES, strict=True):
+        if knee == 0:
+            assert not row.any()
+            continue
+        row = row + draw.normal(0, NET * np.sqrt(50), len(row))
+        found = fit(*spectrum(row, np.ones(len(row), bool), 50.0, 5000))
+        assert found is not None
+        assert abs(found.knee - knee) < 4.5 * found.knee_error + 0.03 * knee  # the filter's own error, 1.8 %
+        assert abs(found.slope - slope) < 4.5 * found.slope_error + 0.05
+
+
+def test_a_detector_has_the_bits_that_it_has_among_others_alike(tmp_path: Path) -> None:
+    """Those with the median's slope and knee; for every number of threads and block size."""
+    one = pink(camera(tmp_path)).tod("pink")
+    alike = pink(camera(tmp_path, np.full(20, 2.0), np.full(20, 1.7))).tod("pink")
+    mine = (KNEES == 2.0) & (SLOPES == 1.7)
+    np.testing.assert_array_equal(one[mine], alike[mine])
+    for threads, memory in ((3, 1 << 30), (1, 4_000_000)):
+        np.testing.assert_array_equal(one, pink(camera(tmp_path), threads, memory).tod("pink"))
+
+
+def test_the_step_stands_above_the_focal_plane(tmp_path: Path) -> None:
+    one = pink(camera(tmp_path), knee="1 Hz", slope=1.2).tod("pink")
+    other = pink(camera(tmp_path, np.ones(20), np.full(20, 1.2))).tod("pink")
+    np.testing.assert_array_equal(one, other)
