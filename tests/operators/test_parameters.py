@@ -301,6 +301,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "signal": ({}, {"signal": "none"}),
         "band": ({}, {"band": "150 GHz"}),
         "noise": ({}, {"noise": "noise.ecsv"}),
+        "noise_model": ({}, {"noise_model": "el_noise"}),
         "celestial": ({}, {"celestial": "recomputed"}),
         "flag_mask": ({"file": "flagged.h5"}, {"flag_mask": 1}),
         "detector_mask": ({"file": "flagged.h5"}, {"detector_mask": 1}),
@@ -617,6 +618,7 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 REFUSALS = {
     ("LoadTOD", "signal"): "BinMap needs signal",
     ("LoadTOD", "band"): "no band, or more than one, at 150 GHz",
+    ("LoadTOD", "noise_model"): "has no noise model 'el_noise'",
     ("SkyMap", "missing"): "NaN",
     ("PolynomialFilter", "interval"): "no interval 'throw'",
     ("TransferFunction", "map"): "there is no map 'chart'",
