@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from zonda.core.data import Data
+from zonda.core.flags import SUN_CLOSE, SUN_UP
 from zonda.core.numerics.quaternions import conjugate, multiply
 from zonda.core.scene import Scene
 from zonda.operators.pointing.schedule import PointingSchedule
@@ -36,8 +37,8 @@ ROWS = [  # duration, azimuths, elevation, rotation
 ]  # fmt: skip
 
 
-def schedule():
-    start, rows = dt.datetime(2025, 3, 1, 6, tzinfo=dt.UTC), []
+def schedule(hour):
+    start, rows = dt.datetime(2025, 3, 1, hour, 10, tzinfo=dt.UTC), []
     for k, (duration, low, high, elevation, rotation) in enumerate(ROWS):
         stop = start + dt.timedelta(seconds=duration)
         angles = (angle * u.deg for angle in (rotation, low, high, elevation))
@@ -47,9 +48,10 @@ def schedule():
 
 
 @pytest.mark.parametrize("name", ["night.ecsv", "night.txt"])
-@pytest.mark.parametrize("nods", [(), (1.0, -1.0, 0.0)])
-def test_scans_are_toasts(tmp_path, name, nods):
-    made = schedule()
+@pytest.mark.parametrize(("nods", "hour"), [((), 6), ((1.0, -1.0, 0.0), 10)])
+def test_scans_are_toasts(tmp_path, name, nods, hour):
+    """At 10:10 UTC the Sun is about to rise in the east."""
+    made = schedule(hour)
     made.write(str(tmp_path / name))
     site = toast.instrument.GroundSite("atacama", made.site_lat, made.site_lon, made.site_alt)
     plane = toast.instrument_sim.fake_hexagon_focalplane(n_pix=1, sample_rate=40 * u.Hz, psd_net=1 * u.K * u.s**0.5)
@@ -66,6 +68,8 @@ def test_scans_are_toasts(tmp_path, name, nods):
         sample_rate="40 Hz", elevation_nods=[f"{n} deg" for n in nods], check_limits="warn",
     ).observe(ours)  # fmt: skip
     assert len(theirs.obs) == len(ours.observations) == 8
+    suns = [np.unique(o.flags & (SUN_UP | SUN_CLOSE)) for o in ours.observations]
+    assert (set(np.concatenate(suns)) > {0}) == (hour == 10)
     for a, b in zip(theirs.obs, ours.observations, strict=True):
         n = min(b.n_samples, a.n_local_samples)
         assert abs(b.n_samples - a.n_local_samples) <= 1
@@ -74,6 +78,8 @@ def test_scans_are_toasts(tmp_path, name, nods):
         azimuth = np.angle(np.exp(1j * (b.azimuth[:n] - a.shared["azimuth"].data[:n])))
         assert np.abs(azimuth).max() < ARCSEC
         assert np.abs(b.elevation[:n] - a.shared["elevation"].data[:n]).max() < ARCSEC
+        differ = (b.flags[:n] ^ a.shared["flags"].data[:n]) & (SUN_UP | SUN_CLOSE) != 0
+        assert np.count_nonzero(differ) < 0.005 * n  # pyephem's Sun: some arcsec, or half a second of its way
         apart = multiply(conjugate(b.boresight_azel[:n]), a.shared["boresight_azel"].data[:n])
         assert 2 * np.linalg.norm(apart[:, :3], axis=1).max() < ARCSEC
         for interval in ("throw_leftright", "scan_rightleft", "turn_leftright", "turn_rightleft"):
