@@ -236,6 +236,8 @@ def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
     if "pol_leakage" in table.colnames:
         epsilon = np.asarray(table["pol_leakage"][rows], np.float64)
         columns.setdefault("polarization_efficiency", (1 - epsilon) / (1 + epsilon))
+    elif "polarization_angle" in columns:  # as TOAST's StokesWeights, whose epsilon is 0 then
+        columns.setdefault("polarization_efficiency", np.ones(len(rows)))
     return columns
 
 
