@@ -61,12 +61,13 @@ class ModeSpectrumPlanning(Planning[Any]):
     reads_streams = True
 
     def _rows(self, observation: Observation) -> int:
-        return min(observation.n_detectors, self.operator.detectors) * (self.operator.delays + 1)
+        detectors: int = min(observation.n_detectors, self.operator.detectors)
+        return detectors * int(self.operator.delays + 1)
 
     def memory(self, observation: Observation) -> int:
         """Covariance, eigenvectors and their work; a tile; the modes in time."""
-        rows = self._rows(observation)
-        return 8 * (6 * rows**2 + 4 * rows * TILE_SAMPLES + (2 * self.operator.modes + 2) * observation.n_samples)
+        rows, modes = self._rows(observation), int(self.operator.modes)
+        return int(8 * (6 * rows**2 + 4 * rows * TILE_SAMPLES + (2 * modes + 2) * observation.n_samples))
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
@@ -119,10 +120,10 @@ class CompareStreamsPlanning(Planning[Any]):
 
     def memory(self, observation: Observation) -> int:
         """Segments of a detector and their transforms, and the spectra of all."""
-        count = min(observation.n_detectors, self.operator.detectors)
+        count: int = min(observation.n_detectors, self.operator.detectors)
         from .compare_streams import LEAST_SEGMENTS
 
-        length = min(observation.n_samples / LEAST_SEGMENTS, self.operator.segment * observation.sample_rate)
+        length: float = min(observation.n_samples / LEAST_SEGMENTS, self.operator.segment * observation.sample_rate)
         return round(16 * observation.n_samples + (64 * CHUNK + 16 * count) * length)
 
     def estimate(self, context: Context) -> Estimate:

@@ -121,7 +121,7 @@ class Template:
     def remove(self, rows: Floats) -> int:
         """Equation (1) on ``rows`` (n_det, n) in place. Returns how many samples were not finite; they stay as they were."""
         finite = np.isfinite(rows)
-        whole: NDArray[np.bool_] = np.asarray(finite.all(axis=1))
+        whole: NDArray[np.bool_] = np.logical_and.reduce(finite, axis=1)
         if self.trend is not None and whole.all():
             self.trend.remove(rows)
         for row, fine, complete in zip(rows, finite, whole, strict=True):

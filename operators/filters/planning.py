@@ -79,7 +79,8 @@ class DetrendPlanning(Planning[Any]):
 
     def memory(self, observation: Observation) -> int:
         """The polynomials; the pointing of a mask; parts in float64."""
-        return 8 * (self.operator.order + 4 + ROWS) * observation.n_samples
+        order: int = self.operator.order
+        return 8 * (order + 4 + ROWS) * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
@@ -94,7 +95,8 @@ class PolynomialPlanning(Planning[Any]):
 
     def memory(self, observation: Observation) -> int:
         """The polynomials; the pointing of a mask; parts in float64."""
-        return 8 * (self.operator.order + 5 + ROWS) * observation.n_samples
+        order: int = self.operator.order
+        return 8 * (order + 5 + ROWS) * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the slow part in."""
@@ -111,7 +113,8 @@ class GroundPlanning(Planning[Any]):
 
     def memory(self, observation: Observation) -> int:
         """The trend, twice; bins; parts in float64."""
-        return 8 * (2 * self.operator.trend + 4 + ROWS) * observation.n_samples
+        trend: int = self.operator.trend
+        return 8 * (2 * trend + 4 + ROWS) * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the template in."""

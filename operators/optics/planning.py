@@ -60,7 +60,7 @@ class GroundPlanning(Planning[Any]):
         step = self.operator
         elevation = observation.elevation
         ends = np.array([elevation.min(), elevation.max()]) / (np.pi / 4)
-        return step.rms * (1 + 3 * step.scatter) * float(np.max(ends**step.power)) * calibration(observation)
+        return float(step.rms * (1 + 3 * step.scatter) * np.max(ends**step.power) * calibration(observation))
 
 
 class HalfWavePlatePlanning(Planning[Any]):
