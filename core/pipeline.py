@@ -21,7 +21,8 @@ from .operator import Operator
 from .output import Output, Progress
 from .run import arguments
 from .run.bands import data_of_bands, distribute, gather, hand_over, of_one_band, points, use_recorded
-from .run.budget import least_memory, longest_of, products_of
+from .run.budget import held_of, least_memory, longest_of
+from .run.in_step import joins
 from .run.in_turn import Band, Budget, execute
 from .run.order import check_order
 from .run.schedule import Chain
@@ -252,9 +253,9 @@ class Pipeline:
         """Bytes with which a process runs the pipeline over these observations on one thread, libraries included."""
         if len(self._pointed) > 1:
             shares = [(p, [o for o in observations if o.instrument == own.scene.instrument]) for p, own in self._pointed]
-            products = [products_of(p.chain, longest_of(scans)) for p, scans in shares]
-            each = zip(shares, products, strict=True)
-            return max(p._least_memory(scans, sum(products) - mine) for (p, scans), mine in each)
+            in_step = any(map(joins, shares[0][0].chain.steps))
+            held = [held_of(p.chain, longest_of(scans), in_step) for p, scans in shares]
+            return max(p._least_memory(scans, sum(held) - mine) for (p, scans), mine in zip(shares, held, strict=True))
         return self._least_memory(observations)
 
     def _least_memory(self, observations: Sequence[Observation], others: int = 0) -> int:

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile
+from ..run.budget import BASE
 from . import planner, result
 from .result import Plan
 from .summary import PlanSummary, Prediction
@@ -78,7 +79,7 @@ def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
 
 
 def _added(predictions: list[Prediction]) -> Prediction:
-    """Bands follow each other scan by scan: times add up, and of their memory that of maps, which grow beside each other."""
+    """Bands follow each other scan by scan: times add up, and of their memory what each holds while another acts."""
     products = sum(p.products for p in predictions)
     seconds: dict[str, float] = {}
     for p in predictions:
@@ -87,7 +88,7 @@ def _added(predictions: list[Prediction]) -> Prediction:
     return dataclasses.replace(
         predictions[0],
         seconds=seconds,
-        bytes=max(p.bytes - p.products for p in predictions) + products + max(p.shared for p in predictions),
+        bytes=max(max(p.bytes - p.products, BASE) for p in predictions) + products + max(p.shared for p in predictions),
         products=products,
         unknown=tuple(dict.fromkeys(label for p in predictions for label in p.unknown)),
         startup=max(p.startup for p in predictions),

@@ -17,6 +17,7 @@ import numpy as np
 from ..mapmaker import makes_products
 from ..output import Output
 from ..run.budget import BASE
+from ..run.in_step import joins
 from ..run.schedule import Chain, schedule
 from ..run.settings import Settings
 from ..shared import room_for
@@ -124,6 +125,8 @@ def predict(
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     startup = factors[STARTUP.kernel] * STARTUP.once
     products = sum(planning_of(o).memory(longest) for o in during if makes_products(o))
+    if any(map(joins, work.steps)):
+        products = held + found.bytes + item * longest.n_samples * longest.n_detectors  # its part of the stream of all bands
     shared = room_for(longest.n_detectors, longest.n_samples)
     size = BASE + max(held + found.bytes, after)
     return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared)

@@ -24,7 +24,7 @@ class Prediction:
     """How often each operator does its work, by label (`context.Work`)."""
     factors: Mapping[str, float] = field(default_factory=dict)
     products: float = 0.0
-    """Bytes that steps add up over all scans, part of ``bytes``."""
+    """Bytes that are held while another band of the camera acts: what steps add up over all scans."""
     shared: float = 0.0
     """Bytes that may be kept for another band of the camera, not part of ``bytes``."""
 

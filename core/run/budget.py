@@ -70,6 +70,11 @@ def products_of(chain: Chain, observation: Observation) -> int:
     return sum(planning_of(o).memory(observation) for o in chain.steps if makes_products(o))
 
 
+def held_of(chain: Chain, observation: Observation, in_step: bool = False) -> int:
+    """Bytes that a band holds while another acts: `products_of`; ``in_step`` with that one, whatever its steps hold."""
+    return sum(planning_of(o).memory(observation) for o in chain.steps) if in_step else products_of(chain, observation)
+
+
 def shared_bytes(observation: Observation) -> int:
     """Bytes that may be kept for the bands that observe a scan after another (`core.shared`)."""
     return observation.shared.room if observation.shared is not None else 0

@@ -40,6 +40,7 @@ from ..types import AnyFloats
 from .ahead import Ahead
 from .block_maker import BlockMaker, Measured
 from .blocks import least_block
+from .in_step import Turns, Waiting, joins
 from .schedule import Chain, Planned, Schedule
 from .settings import Settings, Timer
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
@@ -73,12 +74,19 @@ class Execution:
         self.ledger = Ledger()
         self._ahead = Ahead(False)
         self._stop = threading.Event()
+        self._in_step = False
 
     def run(self, data: Data, ahead: Ahead | None = None, following: Execution | None = None) -> None:
         """Configure, prepare, execute and collect; on any failure operators discard what they began.
 
         ``following``: what ``ahead`` may prepare meanwhile.
         """
+        for _ in self.turns(data, ahead, following):
+            raise AssertionError("an execution that is alone waits for no other")
+
+    def turns(self, data: Data, ahead: Ahead | None = None, following: Execution | None = None, in_step: bool = False) -> Turns:
+        """As `run`; ``in_step`` with other bands it yields where it waits for these (`core.run.in_step`)."""
+        self._in_step = in_step
         self._ahead = ahead or self._ahead
         self._store = Store(self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger)
         try:
@@ -88,7 +96,7 @@ class Execution:
                 self.prepare()
             self._plan()
             self._ahead.start(following)
-            self._execute()
+            yield from self._execute()
             for operator in self.chain.steps:
                 start = time.thread_time()
                 operator.collect(data, self.observation, self.states[operator.label])
@@ -170,12 +178,12 @@ class Execution:
 
     # ---- segments
 
-    def _execute(self) -> None:
+    def _execute(self) -> Turns:
         source, begun = Source(), list[Operator]()
         for planned in self.schedule.planned:
             head = planned.segment.operators[0]
             if head.couples == "all":
-                self._measure(head, source)
+                yield from self._measure(head, source)
             for operator in planned.segment.operators:
                 self._before(operator=operator, observation=self.observation, stage="exec")
             begun += planned.segment.operators
@@ -271,7 +279,7 @@ class Execution:
 
     # ---- steps that measure whole streams
 
-    def _measure(self, operator: Operator, source: Source) -> None:
+    def _measure(self, operator: Operator, source: Source) -> Turns:
         """Let a filter measure each signal, the complete one first; let another step measure the one stream that it requires."""
         names = sorted(operator.requires & source.names)
         if len(names) != 1:
@@ -279,17 +287,21 @@ class Execution:
                 f"{operator.label} measures a whole stream, but {len(names)} reach it", cure="it must require exactly one"
             )
         self._before(operator=operator, observation=self.observation, stage="measure")
-        start, others = time.process_time(), self._seconds("exec") + self._ahead.seconds()
+        used = 0.0
         one = self.chain.signals[0] if names == [MAIN] else Formed(names[0], frozenset())
         signals = [s for s in self.chain.signals if s.filtered and s.stream in source.names] if filters(operator) else [one]
         for signal in signals:
             lent: list[AnyFloats] = []
-            model = self.measured.get((operator.label, MAIN)) if signal.takes_model(operator.label) else None
-            stream = self._stream(operator, source, signal, lent)
-            self.measured[operator.label, signal.stream] = operator.measure(stream, model)
+            stream, takes = self._stream(operator, source, signal, lent), signal.takes_model(operator.label)
+            if self._in_step and joins(operator):
+                found = yield Waiting(operator, stream, takes, partial(self._lend, stream.name, lent))
+            else:
+                start = self._without_blocks()
+                found = operator.measure(stream, self.measured.get((operator.label, MAIN)) if takes else None)
+                used += self._without_blocks() - start
+            self.measured[operator.label, signal.stream] = found
             self._store.drop(lent)
-        others = self._seconds("exec") + self._ahead.seconds() - others  # what makes the stream again is theirs
-        self._tell(operator, "measure", time.process_time() - start - others)
+        self._tell(operator, "measure", used)
 
     def _stream(self, operator: Operator, source: Source, signal: Formed, lent: list[AnyFloats]) -> Stream:
         """A stream for a step that measures: under the name that it knows, with its own mean alone."""
@@ -312,13 +324,14 @@ class Execution:
         stream.signal, stream.components, stream.state = held, signal.components, self.states[operator.label]
         return stream
 
-    def _lend(self, name: str, lent: list[AnyFloats], shape: tuple[int, int]) -> AnyFloats:
-        """A float64 array, noted in ``lent``, for as long as a step measures."""
-        lent.append(self._store.allocate(name, shape, dtype=np.float64))
+    def _lend(self, name: str, lent: list[AnyFloats], shape: tuple[int, int], dtype: Any = np.float64) -> AnyFloats:
+        """An array, noted in ``lent``, for as long as a step measures."""
+        lent.append(self._store.allocate(name, shape, dtype=dtype))
         return lent[-1]
 
-    def _seconds(self, stage: str) -> float:
-        return sum(self.timer.seconds.get((o.label, stage), 0.0) for o in self.chain.steps)
+    def _without_blocks(self) -> float:
+        """CPU seconds of this process, without those of blocks (a stream made again is made of them) and of the scan ahead."""
+        return time.process_time() - self.timer.of_stage("exec") - self._ahead.seconds()
 
     def _sweep(
         self, stage: Stage, signal: Formed, what: str, work: Callable[[slice, slice, AnyFloats], Any]

@@ -70,6 +70,11 @@ class Timer:
         with self._lock:
             self.seconds[label, stage] = self.seconds.get((label, stage), 0.0) + seconds
 
+    def of_stage(self, stage: str) -> float:
+        """Seconds of one stage of all steps."""
+        with self._lock:
+            return sum(seconds for (_, which), seconds in self.seconds.items() if which == stage)
+
     def rows(self) -> list[tuple[str, str, float]]:
         """(label, stage, seconds) in the order in which they first took time."""
         with self._lock:

@@ -200,9 +200,7 @@ class Store:
         """Whether ``size`` more bytes stay within the streams' share of the budget."""
         return self._in_use + size <= self._room
 
-    def allocate(
-        self, name: str, shape: tuple[int, int], in_memory: bool = True, dtype: type[np.floating[Any]] | None = None
-    ) -> AnyFloats:
+    def allocate(self, name: str, shape: tuple[int, int], in_memory: bool = True, dtype: Any = None) -> AnyFloats:
         """An array of anything; a memory map of a file where it does not fit or is not wanted in memory.
 
         ``dtype``: where it is not that of the streams.

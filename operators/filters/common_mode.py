@@ -62,6 +62,16 @@ class CommonModeFilter(CommonModeParameters):
     linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
 
+    @property
+    def joins_bands(self) -> bool:
+        """Whether the modes are those of all bands' detectors (`core.run.in_step`)."""
+        return self.group == "all"
+
+    def of_rows(self, measured: Modes, rows: slice) -> Modes:
+        """The modes, for some of the detectors."""
+        scale = None if measured.scale is None else measured.scale[rows]
+        return Modes(measured.detectors[:, rows], measured.times, scale)
+
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
         """Find the modes; given those of the complete signal (``model``), their times in this one."""
         return _wafer_by_wafer(self, stream, model) if self.group == "wafer" else _modes(self, stream, model)

@@ -43,8 +43,8 @@ class CommonModeParameters(Operator):
 
     modes: int = Field(1, ge=1, le=100)
     """How many modes to remove."""
-    group: Literal["band", "wafer"] = "band"
-    """Whose modes are found together: those of all detectors of a band, or of each wafer of it. (Bands do not share modes.)"""
+    group: Literal["band", "wafer", "all"] = "band"
+    """Whose modes are found together: those of all detectors of a band, of each wafer of it, or of all bands of the camera."""
     method: Literal["svd", "mean"] = "svd"
     """Singular modes, or the mean of all detectors at each instant (one mode), which needs little memory."""
     residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
