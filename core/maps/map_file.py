@@ -137,7 +137,7 @@ class MapFile:
         """Cards of the first header: the name, where it comes from, and its own cards."""
         own = Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(about.cards)
         if (band := self.product.band) is not None:
-            own["RESTFRQ"] = band.centre, "[Hz] centre of the band"
+            own["RESTFRQ"] = float(f"{band.centre:.12g}"), "[Hz] centre of the band"
             own["BAND"] = ascii_text(band.name), "name of the band"
         return own
 

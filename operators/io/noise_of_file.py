@@ -16,6 +16,7 @@ from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.types import Floats
 
+from .recorded_scan import rows_of_bands
 from .recorded_stream import AT_ONCE, RecordedStream
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
@@ -42,8 +43,8 @@ def noise_of(path: Path, signal: str, estimate: Estimate, *, subtract_mean: bool
     Parameters
     ----------
     subtract_mean
-        Subtract at each sample the mean over the detectors, in which the atmosphere is; the noise of n detectors then loses 1/n
-        of its variance, which is given back.
+        Subtract at each sample the mean over the detectors of a band, in which the atmosphere is; the noise of n detectors then
+        loses 1/n of its variance, which is given back.
 
     Raises
     ------
@@ -56,18 +57,20 @@ def noise_of(path: Path, signal: str, estimate: Estimate, *, subtract_mean: bool
         if signal not in file.streams:
             have = ", ".join(sorted(file.streams)) or "none"
             raise InputError(f"has no stream {signal!r}", place=place, cure=f"choose --signal from: {have}")
-        use = np.flatnonzero((tod.detector_flags & np.uint8(flags.DETECTOR_MASK)) == 0)
-        if not len(use):
+        usable = (tod.detector_flags & np.uint8(flags.DETECTOR_MASK)) == 0
+        if not usable.any():
             raise InputError("all detectors are flagged", place=place, cure="unflag those that can be used")
-        stream = RecordedStream(file, signal, use, np.uint8(flags.DETECTOR_MASK))
         good = (tod.flags & np.uint8(flags.SAMPLE_MASK)) == 0
-        mean = _mean(stream, len(use), tod.n_samples) if subtract_mean and len(use) > 1 else None
-        back = 1.0 if mean is None else np.sqrt(len(use) / (len(use) - 1))
         found = {}
-        for rows in chunks(len(use), TILE_DETECTORS):
-            values, _ = stream.read(rows, slice(0, tod.n_samples))
-            for number, row in enumerate(values, rows.start):
-                found[tod.names[use[number]]] = estimate(row if mean is None else (row - mean) * back, good, tod.sample_rate)
+        for band in rows_of_bands(tod, None, place):
+            use = band[usable[band]]
+            stream = RecordedStream(file, signal, use, np.uint8(flags.DETECTOR_MASK))
+            mean = _mean(stream, len(use), tod.n_samples) if subtract_mean and len(use) > 1 else None
+            back = 1.0 if mean is None else np.sqrt(len(use) / (len(use) - 1))
+            for rows in chunks(len(use), TILE_DETECTORS):
+                values, _ = stream.read(rows, slice(0, tod.n_samples))
+                for number, row in enumerate(values, rows.start):
+                    found[tod.names[use[number]]] = estimate(row if mean is None else (row - mean) * back, good, tod.sample_rate)
     finally:
         file.close()
     return tod, found

@@ -47,7 +47,8 @@ class MapParameters(MapMaker):
     """`IQU`: solve for I, Q and U in each pixel (polarized detectors are needed). Q and U are COSMO's, from the meridians of
     `frame`."""
     condition_limit: float = Field(1000.0, ge=2.0, le=1e7)
-    """Of I, Q and U: pixels in which the condition number of the samples' angles (2 at best) is larger are NaN, and counted."""
+    """Of I, Q and U: pixels in which the condition number of the samples' angles is larger are NaN, and counted. It is 2 at
+    best, where polarizers are perfect."""
     contents: Literal["all", "hits"] = "all"
     """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
     half_difference: bool | Split = True

@@ -57,9 +57,9 @@ class SamplesPerBeam:
             return []
         folded = math.exp(-((math.pi * self.least) ** 2) / (16 * math.log(2)))
         what = f"only {self.least:.3g} samples per FWHM of {self._beam} in {self._where}"
-        cost = f"{self._lost}, and up to {100 * folded:.2g} % of the beam's transfer is folded to other scales"
+        cost = f"{self._lost}, and up to {100 * folded:.3g} % of the beam's transfer is folded to other scales"
         cure = f"scan at {rate_text(self._fwhm * self._rate / FEW, 1)} or less"
-        return [f"{what}: {cost}; {cure}, or read out at {FEW * self._fastest / self._fwhm:.3g} Hz or more"]
+        return [f"{what}: {cost}; {cure}, or read out at {math.ceil(FEW * self._fastest / self._fwhm)} Hz or more"]
 
     @property
     def _beam(self) -> str:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 @click.argument("file", type=click.Path(path_type=Path), metavar="FILE")
 @click.option("--signal", default="signal", show_default=True, metavar="NAME", help="Name of the stream.")
 @click.option("--segment", metavar="TIME", help="Length of the segments of Welch's method.  [default: 1/24 of the scan or less]")
-@click.option("--subtract-mean", is_flag=True, help="Subtract the mean over the detectors first, in which the atmosphere is.")
+@click.option("--subtract-mean", is_flag=True, help="Subtract the mean over each band's detectors first: the atmosphere.")
 @click.option("--output", type=click.Path(path_type=Path), metavar="TABLE", help="The table.  [default: FILE with .noise.ecsv]")
 def noise(file: Path, signal: str, segment: str | None, subtract_mean: bool, output: Path | None) -> None:
     """Estimate the noise of each detector from a file of time-ordered data (HDF5 in TOAST's layout, FITS of SaveTOD).
