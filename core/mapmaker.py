@@ -110,6 +110,11 @@ def changes_components(operator: Operator) -> bool:
     )
 
 
+def made_by(operator: Operator) -> frozenset[str]:
+    """What it provides, without streams that it only changes."""
+    return frozenset() if changes_components(operator) else operator.provides
+
+
 def makes_products(operator: Operator) -> bool:
     """Whether all that it makes are products in memory: map makers, spectra. (What a step writes while it runs, it does not
     provide.)"""

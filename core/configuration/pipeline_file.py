@@ -13,6 +13,7 @@ from zonda import __version__
 
 from .. import registry
 from ..errors import PipelineError, ZondaError
+from ..mapmaker import made_by
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
@@ -269,7 +270,7 @@ class _Check(Mistakes):
         if len(operators) != len(steps) or check_order(operators):
             return
         making = [operator for operator in operators if not isinstance(operator, Output)]
-        components = sorted(set().union(*(operator.provides for operator in operators)))
+        components = sorted(set().union(*map(made_by, operators)))
         for name, run in header.runs.items():
             if not can_be_named(name):
                 continue  # said below, at the name

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import PipelineError
+from ..mapmaker import made_by
 from ..signal import Signal
 from .bands import PlanOfBands, files_of_bands
 from .context import Context
@@ -220,7 +221,7 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
 
     It is what the map of white noise and atmosphere has more than that of the atmosphere alone, through which it is calibrated.
     """
-    provided = [s.operator.provides for s in part.steps]
+    provided = [made_by(s.operator) for s in part.steps]
     if not made.noise[1] or not any("white" in p for p in provided):
         return []
     air = ["atmosphere"] if any("atmosphere" in p for p in provided) else []

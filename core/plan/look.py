@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..data import Data, Observation
+from ..mapmaker import made_by
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
@@ -102,7 +103,7 @@ def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> froz
     found = set()
     if context.coverage is not None:
         found |= {"map_rms", "peak"}
-        made = {name for o in context.operators for name in o.provides if is_stream(name)}
+        made = {name for o in context.operators for name in made_by(o) if is_stream(name)}
         if made <= {"sky", "signal"} or any(pipeline.runs[r].only == ["sky"] for r in structure.runs):
             found.add("transfer")
     if context.readers or context.coverage is None:

@@ -12,6 +12,7 @@ from ..configuration.pipeline_file import PipelineFile
 from ..data import Data
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
+from ..mapmaker import made_by
 from ..output import Output
 from ..pipeline import Pipeline
 from .budget import limits
@@ -178,7 +179,7 @@ def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
         bound["psd"] = (rms / context.noise) ** 2  # both are white
     if pipeline.precision == "float32":
         return [Effect("precision", (full("float32"),), bound, formula)]
-    carries_mean = context.cut == 0 and any("atmosphere" in o.provides for o in context.operators)
+    carries_mean = context.cut == 0 and any("atmosphere" in made_by(o) for o in context.operators)
     if carries_mean or context.fluctuation > LARGEST_RATIO * context.noise:  # the filters refuse float32 there
         return [Effect("precision", (full("float64"),), bound, formula)]
     seconds = 4e-9 * context.samples

@@ -13,6 +13,7 @@ from pydantic import Field
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
 from ..focalplane import Focalplane
+from ..mapmaker import made_by
 from ..operator import Operator
 from ..output import Output
 from ..signal import Signal
@@ -69,9 +70,8 @@ def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, 
         if "boresight" not in o.provides and steps and "boresight" in steps[-1].operator.provides:
             steps.append(Step("Slice", Slice(seconds=seconds, observations=observations, every=every)))
         steps.append(step)
-    sky = any("sky" in s.operator.provides for s in steps) and any(
-        s.operator.provides & {"atmosphere", "white", "pink"} for s in steps
-    )
+    made = frozenset[str]().union(*(made_by(s.operator) for s in steps))
+    sky = "sky" in made and made & {"atmosphere", "white", "pink"}
     runs = {"sky_alone": Signal(only=["sky"])} if sky else {}
     return dataclasses.replace(file, steps=tuple(steps), header=file.header.model_copy(update={"runs": runs}))
 

@@ -47,6 +47,7 @@ from numpy.typing import NDArray
 from zonda.core.accuracy.metrics import Metric
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.mapmaker import made_by
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.operator import Operator
 from zonda.core.signal import Signal
@@ -130,7 +131,7 @@ class Transfer(Metric):
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("transfer", operators)
-        if not any("sky" in o.provides for o in operators):
+        if not any("sky" in made_by(o) for o in operators):
             raise PipelineError("the metric transfer needs a sky, and no step makes one", place="--metric", cure="add a SkyMap")
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:

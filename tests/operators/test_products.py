@@ -22,4 +22,6 @@ def test_processes_of_a_campaign_find_every_class_of_partial_products():
     own = {kind.__name__: kind for kind in kinds(Product) if kind is not Record and kind.__module__.startswith("zonda.operators")}
     assert {"MapSums", "Spectrum", "StreamComparison"} <= set(own)
     for name, kind in own.items():
+        if kind.__subclasses__():  # a base class
+            continue
         assert products.get(name) is kind

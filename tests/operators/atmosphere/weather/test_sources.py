@@ -111,8 +111,9 @@ def test_yaml_names_a_source_and_survives(weather, kind, tmp_path):
     ],
 )
 def test_mistakes_are_reported_at_their_place(weather, words):
+    scene_of = "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\n"
     with pytest.raises(ConfigurationError, match=words) as caught:
-        parse(f"site: green_bank\ninstrument: mustang2\ntime: 2024-11-25\nweather: {weather}\noperators: [PointingStare]\n")
+        parse(f"{scene_of}weather: {weather}\ntarget: 05h +20d\noperators: [PointingStare]\n")
     assert "<text>:4:" in str(caught.value)
     assert caught.value.message.startswith("1 mistake")
 
