@@ -19,10 +19,10 @@ from zonda.core.flags import (
     TURNAROUND,
 )
 from zonda.core.numerics.earth_orientation import orientation
+from zonda.core.packages import needed
 from zonda.core.types import Floats
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
-from .packages import needed
 from .scans import Scan, Source, scan_of
 
 EXTRA = "sotodlib"

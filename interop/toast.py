@@ -14,6 +14,7 @@ from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import INVALID
 from zonda.core.operator import Operator
+from zonda.core.packages import needed
 from zonda.core.pipeline import Pipeline
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
@@ -31,7 +32,6 @@ from zonda.operators.io.toast_hdf5 import (
 )
 from zonda.operators.io.toast_reading import columns_of, offsets_of
 
-from .packages import needed
 from .scans import Source, scan_of
 
 EXTRA = "toast"

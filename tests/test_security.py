@@ -56,7 +56,7 @@ ALLOWED = {
         "yaml.load",
     ): "astropy's, as its own reader of ECSV: yaml.SafeLoader, numbers and units",
     ("plugins/checks/dispatch.py", "subprocess.run"): "zonda itself, as a child; no shell; the folder's path is one argument",
-    ("interop/packages.py", "import_module"): "names that the bridges state",
+    ("core/packages.py", "import_module"): "names that bridges and steps state",
     ("zonda/__init__.py", "import_module"): "names from a table in the same file",
 }
 """Calls that could run what a file says, and why these do not."""

@@ -9,22 +9,21 @@ band as in any map of `SkyMap`, which does everything else.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr, field_validator
+from pydantic import Field, PrivateAttr
 
-from zonda.core.block import Block
 from zonda.core.configuration.files import InputPath
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.observation import Observation
-from zonda.core.operator import Operator
 from zonda.core.storage.files import reading
 from zonda.core.types import Floats
 
-from .skymap import SkyMap, show_input
+from .full_sky import FullSky, Nside
+from .skymap import SkyMap
 from .state import SkyState
 
 HIGHEST = 30_000
@@ -32,30 +31,20 @@ HIGHEST = 30_000
 CURE = "give columns of text: ell, TT or ell, TT, EE, BB, TE, as ell (ell + 1) C_l / (2 pi) in uK^2 (what CAMB and CLASS write)"
 
 
-class CMBSky(Operator):
+class CMBSky(FullSky):
     """Cosmic microwave background, a Gaussian field of given power spectra: part of the component ``sky``.
 
     No spectrum comes with zonda: give a file of a theory code. With TT alone it is not polarized.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
-
     spectrum: InputPath
     """Text: columns l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2; # begins a remark."""
-    nside: int = Field(2048, ge=16, le=8192)
+    nside: Nside = 2048
     """Of the HEALPix map that is drawn; a pixel should be smaller than half of the beam."""
     realization: int | None = Field(None, ge=0)
     """Number of the sky: the same for every seed. Where absent the seed draws it, and in a campaign every entry has another."""
 
     _skies: dict[int, tuple[SkyMap, float]] = PrivateAttr(default_factory=dict)
-
-    @field_validator("nside")
-    @classmethod
-    def _power_of_two(cls, value: int) -> int:
-        if value & (value - 1):
-            raise ValueError(f"nside is a power of two, not {value}")
-        return value
 
     def check(self, data: Data) -> list[str]:
         """Up to which multipole the spectrum reaches; raises InputError where it is wrong."""
@@ -67,27 +56,13 @@ class CMBSky(Operator):
         observation.tally.state(self.label, "rms of the sky before the beam", f"{1e6 * rms:.4g} uK_CMB, nside {self.nside}")
         return sky, sky.prepare(observation)
 
-    def exec(self, block: Block, state: tuple[SkyMap, SkyState]) -> None:
-        """See `SkyMap`."""
-        state[0].exec(block, state[1])
-
-    def collect(self, data: Data, observation: Observation, state: tuple[SkyMap, SkyState]) -> None:
-        """See `SkyMap`."""
-        state[0].collect(data, observation, state[1])
-
-    def finalize(self, data: Data) -> None:
-        """See `SkyMap`."""
-        show_input(self.label, data)
-
     def sky(self, seed: int) -> tuple[SkyMap, float]:
         """The step that samples the map of a seed, and the map's rms, K_CMB."""
         number = seed if self.realization is None else self.realization
         if number not in self._skies:
             maps = draw(read_spectrum(str(self.spectrum)), self.nside, stream_key(number, "CMBSky", self.label))
-            found = SkyMap(map=_table(maps, self.nside))
-            found._label = self.label
             self._skies.clear()
-            self._skies[number] = found, float(np.std(maps[0]))
+            self._skies[number] = self.sampler(maps, "K_CMB", "C"), float(np.std(maps[0]))
         return self._skies[number]
 
 
@@ -144,13 +119,3 @@ def draw(spectra: Floats, nside: int, key: Any) -> Floats:
     own = np.sqrt(np.maximum(ee - shared**2, 0.0))
     polarized = [shared[ell] * first + own[ell] * deviates(1), np.sqrt(bb)[ell] * deviates(2)]
     return np.asarray(healpy.alm2map([intensity, *polarized], nside, lmax=lmax, pol=True), np.float64)
-
-
-def _table(maps: Floats, nside: int) -> Any:
-    """The maps as a HEALPix table."""
-    from astropy.io import fits
-
-    columns = [fits.Column(name, "D", unit="K_CMB", array=values) for name, values in zip("IQU", maps, strict=False)]
-    table = fits.BinTableHDU.from_columns(columns)
-    table.header.update(PIXTYPE="HEALPIX", ORDERING="RING", NSIDE=nside, COORDSYS="C", INDXSCHM="IMPLICIT", POLCCONV="COSMO")
-    return table
