@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,9 @@ LINEAR = 1.1 * 2 * 8 * math.log(2) / 12
 
 FASTER = 1.6e-9
 """Seconds per sample that linear sampling saves."""
+
+PYSM = 1.5e-8
+"""Seconds of processor time that PySM takes per pixel, frequency and component."""
 
 CONVOLUTION = 1.2e-6
 """Seconds per point of the grid that the convolution takes."""
@@ -204,3 +208,39 @@ class CMBPlanning(Planning[Any]):
         text = "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB"
         effect = Effect("CMB", (full(f"drawn at nside {self.operator.nside}"),), size, text)
         return Estimate((effect,), Cost(fixed=0.05, per_time=5e-8, per_sample=5e-9, once=once))
+
+
+class PySMPlanning(Planning[Any]):
+    """It has no coarser form. The map of the band is made for it, and serves the run."""
+
+    of = "zonda.operators.sky.pysm:PySMSky"
+
+    def traits(self, observation: Observation) -> Traits:
+        """Largest brightness where the scan looks."""
+        return self._sampled(observation).traits(observation)
+
+    def memory(self, observation: Observation) -> int:
+        """Templates and maps, and what `SkyMap` keeps of them."""
+        own = int(12 * self.operator.nside**2 * 8 * (6 + 6 * self._number))
+        return own + self._sampled(observation).memory(observation)
+
+    def estimate(self, context: Context) -> Estimate:
+        """Its cost: PySM's, and that of `SkyMap`."""
+        from .pysm_emission import band_weights
+
+        peak = self.traits(context.first).peak or 0.0
+        size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
+        effect = Effect(
+            "sky of PySM", (full(f"at nside {self.operator.nside}"),), size, "largest brightness where the scan looks"
+        )
+        frequencies = len(band_weights(context.first.instrument.band)[0])
+        once = PYSM * frequencies * self._number * 12 * self.operator.nside**2
+        cost = self._sampled(context.first).estimate(context).cost or Cost()
+        return Estimate((effect,), replace(cost, once=cost.once + once))
+
+    @property
+    def _number(self) -> int:
+        return len(self.operator.models) + len(self.operator.components)
+
+    def _sampled(self, observation: Observation) -> SkyPlanning:
+        return SkyPlanning(self.operator.sky(observation))

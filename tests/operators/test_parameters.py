@@ -522,8 +522,8 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
     "Report": {"central_diameter": ({}, {"central_diameter": "30 arcsec"})},
 }  # fmt: skip
 
-NEED_OTHERS = {"ToastOperator"}
-"""Steps that need packages which are not installed with the tests; tests/interop has them."""
+NEED_OTHERS = {"ToastOperator", "PySMSky"}
+"""Steps that need packages which are not installed with the tests; tests/interop and sky/test_pysm.py have them."""
 
 CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],

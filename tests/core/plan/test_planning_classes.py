@@ -26,10 +26,9 @@ def test_the_planning_of_a_run_imports_no_operator_that_it_lacks():
     )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     others = (
-        "sky.cmb sky.point_sources atmosphere.screens optics.leakage optics.half_wave_plate optics.ground_pickup filters.ground"
-    )
-    others += (
-        " filters.polynomial filters.despline diagnostics.compare_maps diagnostics.compare_streams diagnostics.mode_spectrum"
+        "sky.cmb sky.pysm sky.point_sources atmosphere.screens optics.leakage optics.half_wave_plate optics.ground_pickup"
+        " filters.ground filters.polynomial filters.despline diagnostics.compare_maps diagnostics.compare_streams"
+        " diagnostics.mode_spectrum"
     )
     assert "zonda.operators.sky.skymap" in loaded
     assert not {f"zonda.operators.{name}" for name in others.split()} & set(loaded)
