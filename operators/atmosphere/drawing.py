@@ -63,7 +63,10 @@ def height_of_vapour(model: AtmosphereModel) -> float:
 
 
 def _layers_of(model: AtmosphereModel, label: str) -> Layers:
-    """The layers at the nodes; where bands of one camera see them alike, evaluated once for all of these."""
+    """The layers at the nodes; where bands of one camera see them alike, evaluated once for all of these.
+
+    A band takes what was made for it, so that tiles of the turbulence are released with the last that needs them.
+    """
     shared = model.observation.shared
     if shared is None:
         return drifting_layers(model)
@@ -71,7 +74,7 @@ def _layers_of(model: AtmosphereModel, label: str) -> Layers:
     def make(announced: Mapping[str, ExpectedLoad]) -> dict[str, Layers]:
         return _of_bands([load.model() for load in announced.values()], label, shared.claim)
 
-    return shared.made(label, make)[model.observation.name]
+    return shared.made(label, make).pop(model.observation.name)
 
 
 def _of_bands(models: Sequence[AtmosphereModel], label: str, claim: Callable[[int], bool]) -> dict[str, Layers]:

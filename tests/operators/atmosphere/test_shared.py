@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import zonda
 from zonda.core.shared import SharedScan
 from zonda.operators.atmosphere.turbulence import lattice
 from zonda.operators.atmosphere.turbulence.sampling import DriftingLayers
+from zonda.operators.atmosphere.turbulence.tiles import Tiles
 
 BANDS = {"f090": ("77 GHz", "106 GHz"), "f150": ("130 GHz", "170 GHz"), "f220": ("190 GHz", "250 GHz")}
 CASES = {"of each detector": ("6 deg", "6 m"), "at nodes": ("4 arcmin", "50 m")}
@@ -118,3 +121,27 @@ def test_bands_whose_detectors_stand_elsewhere_evaluate_their_own(drawn: dict[st
     assert [text for _, what, text in data.tally if what == "turbulence beside other bands"] == [
         "evaluated by itself: other nodes or steps"
     ] * 2
+
+
+@pytest.mark.parametrize("pixels", ["shared", "separate"])
+@pytest.mark.parametrize(("field", "dish"), CASES.values(), ids=CASES)
+def test_tiles_are_released_with_the_last_band_that_needs_them(
+    field: str, dish: str, pixels: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not only when the scan is done: tiles take up to 512 MB for each set of nodes, which no forecast counts."""
+    alive: WeakSet[Tiles] = WeakSet()
+    begin, forget, left = Tiles.__init__, SharedScan.forget, []
+
+    def born(self: Tiles) -> None:
+        begin(self)
+        alive.add(self)
+
+    def watched(self: SharedScan) -> None:
+        gc.collect()
+        left.append(len(alive))
+        forget(self)
+
+    monkeypatch.setattr(Tiles, "__init__", born)
+    monkeypatch.setattr(SharedScan, "forget", watched)
+    run(scene(field, "f090", "f150", dish=dish, pixels=pixels), threads=1)
+    assert left == [0, 0]
