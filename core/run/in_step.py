@@ -23,6 +23,9 @@ from ..tally import Tally
 from ..types import AnyFloats
 from .settings import Timer
 
+ELSEWHERE = "samples flagged as those of another band are: nothing is measured there"
+"""A count of the log."""
+
 
 @runtime_checkable
 class JoinsBands(Protocol):
@@ -104,6 +107,10 @@ def _measure(waiting: Sequence[Waiting], models: dict[str, Any]) -> list[Any]:
     rows = _rows(streams)
     for own, at in zip(streams, rows, strict=True):
         own.observation.detector_flags |= stream.observation.detector_flags[at]
+        if stream.signal == MAIN:
+            elsewhere = own.observation.good_samples & ~stream.observation.good_samples
+            own.observation.tally.count(step.label, ELSEWHERE, int(elsewhere.sum()), elsewhere.size)
+        own.observation.flags |= stream.observation.flags
     return [step.of_rows(found, at) for at in rows]
 
 
@@ -135,7 +142,7 @@ def _joined(streams: Sequence[Stream], lend: Callable[[tuple[int, int], np.dtype
 
 
 def _all_detectors(scans: Sequence[Observation]) -> Observation:
-    """A scan with the detectors of all bands. A sample that one band flags is flagged."""
+    """A scan with the detectors of all bands. A sample that one band flags is flagged: the bands have no common mode there."""
     first = scans[0]
     return replace(
         first, name=f"{first.name.removesuffix('-' + first.instrument.band.name)}, all bands",

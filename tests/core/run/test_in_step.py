@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.flags import DEAD
+from zonda.core.flags import DEAD, OPAQUE
 
 BANDS = (
     {"name": "f090", "low": "77 GHz", "high": "106 GHz", "net": "300 uK s(1/2)"},
@@ -38,6 +38,20 @@ class Poison(zonda.Operator):
             row = 3 - block.detectors.start
             if 0 <= row < block.shape[0]:
                 block.detdata["signal"][row] = np.nan
+
+
+class Opaque(zonda.Operator):
+    """Flags samples of the second band alone, as `Efficiency` does where the atmosphere is opaque in it."""
+
+    requires = frozenset({"signal"})
+    provides = frozenset({"signal"})
+
+    def prepare(self, observation: zonda.Observation) -> None:
+        if observation.instrument.band.name == "f150":
+            observation.flags[500:600] |= OPAQUE
+
+    def exec(self, block: zonda.Block, state: Any) -> None:
+        pass
 
 
 def pipeline(*filters: zonda.Operator, scans: int = 1, precision: Any = "float32") -> zonda.Pipeline:
@@ -110,6 +124,19 @@ def test_a_dead_detector_of_one_band_is_flagged_there() -> None:
     assert not (one.detector_flags & DEAD).any()
     np.testing.assert_array_equal(np.flatnonzero(other.detector_flags & DEAD), [3])
     assert np.isfinite(data["map_f150"].signal[data["map_f150"].hits > 0]).all()
+
+
+def test_samples_that_one_band_flags_are_no_data_of_the_other_which_would_keep_its_common_mode() -> None:
+    unfiltered = pipeline(Opaque()).run(scene(), keep=["signal"]).observations[0].detdata["signal"]
+    data = pipeline(Opaque(), zonda.CommonModeFilter(group="all")).run(scene(), keep=["signal"])
+    one, other = data.observations
+    np.testing.assert_array_equal(one.good_samples, other.good_samples)
+    assert not one.good_samples[500:600].any()
+    changed = (one.detdata["signal"] != unfiltered).any(axis=0)
+    assert changed[one.good_samples].all()
+    assert not changed[500:600].any()  # the mode is still there
+    told = {who: number for who, what, number in data.tally.counts() if "another band" in what}
+    assert told == {"CommonModeFilter f090": 100, "CommonModeFilter f150": 0}
 
 
 def test_a_camera_of_one_band_is_that_band() -> None:
