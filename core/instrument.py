@@ -132,8 +132,10 @@ class Instrument(Parameters):
         if (chosen := value.get("band")) is not None:
             whole = cls.model_validate({k: v for k, v in value.items() if k != "band"}, context=info.context)
             if not isinstance(chosen, str) or chosen not in whole.cameras:
-                text = "band beside bands chooses one of them, by its name"
-                raise mistake(text, "", f"write one of {', '.join(whole.cameras)}, or leave band or bands out")
+                unknown = f"{whole.name} has no band '{chosen}'"
+                text = unknown if isinstance(chosen, str) else "band beside bands is the name of one of them"
+                cure = f"write one of {', '.join(whole.cameras)}, or leave band or bands out"
+                raise mistake(text, nearest(chosen, whole.cameras), cure, at=("band",))
             camera = whole.cameras[chosen]
             return camera.model_dump(mode="json") | {"telescope": camera.telescope, "band": camera.band}
         own = [band.model_dump(mode="json") if isinstance(band, CameraBand) else band for band in value["bands"]]

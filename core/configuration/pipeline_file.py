@@ -110,7 +110,10 @@ class _Check(Mistakes):
         number = next((i for i, s in enumerate(steps) if s is not None and isinstance(s.operator, WithScene)), None)
         recorded = None if number is None else steps[number]
         self.recorded_at = "operators", number or 0
+        before = len(self.found)
         scene = self.scene(None if recorded is None else recorded.operator)
+        if self.recorded_lost(steps):
+            self.found[before:] = [m for m in self.found[before:] if not m.message.startswith("the pipeline needs '")]
         if header is not None:
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
@@ -131,6 +134,12 @@ class _Check(Mistakes):
         parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree and k not in own}
         made = tuple(s for s in steps if s is not None)
         return PipelineFile(header, parameters, made, self.name, scene, self.document)
+
+    def recorded_lost(self, steps: list[Step | None]) -> bool:
+        """Whether a step that brings its own site, instrument and time could not be made."""
+        written = [item for item, step in zip(self.tree["operators"], steps, strict=True) if step is None] if steps else []
+        names = {next(iter(item), None) if isinstance(item, dict) else item for item in written if isinstance(item, dict | str)}
+        return bool(names) and not names.isdisjoint(registry.operators_that(lambda step: issubclass(step, WithScene)))
 
     def look(self, steps: list[Step | None], scene: Scene) -> None:
         """Add what the steps that could be made would refuse: targets that are not up, files that are wrong."""

@@ -164,7 +164,7 @@ def test_a_variant_with_another_dish_keeps_the_ratio_to_the_diffraction_limit() 
             {"bands": [{"name": "so_93gz", "net": "1 mK s(1/2)"}]},
             "bands.0.name: unknown band 'so_93gz'(.|\n)*did you mean 'so_93ghz'",
         ),
-        ({"band": "f220"}, "write one of f090, f150"),
+        ({"band": "f15"}, "band: camera has no band 'f15'(.|\n)*did you mean 'f150'(.|\n)*write one of f090, f150"),
         ({"polarization": "pairs"}, "even number of detectors, two in each pixel; detectors of f090 is 19"),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 from astropy.io import fits
 
 import zonda
+from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import InputError
 from zonda.core.flags import INVALID
@@ -162,6 +163,14 @@ def test_a_pipeline_file_is_checked_planned_and_run(night: Any, tmp_path: Path) 
         one, other = (fits.getdata(tmp_path / folder / f"map_{band}.fits") for folder in ("out", "workers"))
         np.testing.assert_array_equal(one, other)
         assert np.isfinite(one).any()
+
+
+def test_a_mistake_in_the_step_does_not_ask_for_what_the_file_brings() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse("operators:\n  - LoadTOD: {file: night.h5, band: f150}\n  - BinMap: {pixel: 5 arcmin}\n")
+    assert [mistake.message.partition(":")[0] for mistake in caught.value.diagnostics] == ["LoadTOD, file", "LoadTOD, band"]
+    with pytest.raises(ConfigurationError, match="needs 'site', 'instrument', 'time'"):
+        parse("operators:\n  - BinMap: {pixel: 5 kg}\n")
 
 
 def test_what_does_not_fit_together(night: Any, tmp_path: Path) -> None:
