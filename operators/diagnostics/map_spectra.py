@@ -111,7 +111,8 @@ def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapS
     whole = {name: product for name, product in maps_of(products, split=False).items() if product.contents == "all"}
     flat = {name: product for name, product in whole.items() if product.projection == "TAN"}
     flat |= {name: product for name, product in maps_of(flat).items() if name not in whole}
-    names = wanted.maps or [name for name in whole if "/" not in name][:1]
+    usable = [name for name in whole if "/" not in name and whole[name].projection in ("TAN", "HEALPix")]
+    names = wanted.maps or usable[:1]
     if len(names) == 1 and names[0] in whole and whole[names[0]].projection == "HEALPix":
         product = whole[names[0]]
         found = sphere_spectra(names[0], product, wanted.bins, wanted.least, place)
@@ -120,7 +121,8 @@ def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapS
         cure = f"name some of these: {', '.join(flat)}" if flat else "leave projection and contents of the map out"
         raise PipelineError(f"there is no TAN map {missing[0]!r}", place=place, cure=cure)
     if not names:
-        raise PipelineError("there is no map of the signal", place=place, cure="leave projection and contents of the map out")
+        cure = "leave projection and contents of the map out"
+        raise PipelineError("there is no TAN or HEALPix map of the signal", place=place, cure=cure)
     return _of_planes(flat, names, wanted, place)
 
 

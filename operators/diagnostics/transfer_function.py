@@ -103,7 +103,7 @@ class TransferFunction(Output):
             a, b = (m if m.polarization is None else m.stokes(plane) for m in (before, after))
             rings = compare(a.signal, b.signal, window, before.pixel, edges)
             empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
-            data.tally.count(self.label, plane_key("rings without modes or power: NaN", plane), empty)
+            data.tally.count(self.label, f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN", empty)
             key, of = (plane_key(name, plane) for name in (key_of(self, "transfer_function"), self.map))
             found = data.products[key] = Transfer(rings, edges, self.modes, before.fwhm, self.label, of)
             if data.output is not None:

@@ -182,7 +182,8 @@ def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
     if (np.diff(tod.seconds) <= 0).any():
         row = int(np.flatnonzero(np.diff(tod.seconds) <= 0)[0]) + 1
         raise InputError(f"the times do not increase at sample {row}", place=place, cure="leave out the samples that repeat")
-    tolerance = step.interpolation_error * float(tod.columns.get("fwhm", plane.fwhm).min())
+    fwhm = tod.columns.get("fwhm", plane.fwhm)  # of all bands of the file, whichever are used; these alone have been checked
+    tolerance = step.interpolation_error * float(fwhm[fwhm > 0].min())
     found = boresights(tod, start, scene.site, step.celestial, tolerance, place)
     good = flags.good(sample_flags := flags.from_file(tod.flags, step.flag_mask), flags.EXCLUDE_SAMPLE)
     flagged = np.concatenate([b.part.tod.detector_flags[b.rows] for b in bands])

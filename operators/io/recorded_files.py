@@ -159,7 +159,7 @@ class RecordedFiles(Operator):
         open_ones: dict[Any, list[tuple[set[int], list[Path]]]] = {}
         told = [(path, *_told(path, _stamp(path))) for path in self.files]
         if (wanted := self.band) is not None:  # where no file has it, the first is refused
-            told = [one for one in told if any(is_near(mhz * 1e6, wanted) for mhz in one[2])] or told[:1]
+            told = [one for one in told if not one[2] or any(is_near(mhz * 1e6, wanted) for mhz in one[2])] or told[:1]
         for path, times, bands in told:
             same = open_ones.setdefault(times, [])
             beside = next(((known, paths) for known, paths in same if bands and not known & bands), None)
@@ -176,14 +176,18 @@ class RecordedFiles(Operator):
         place = f"{self.label}, {path}"
         tod, streams = _head(path, _stamp(path))
         stated = "net" in tod.columns
+        table = read_noise(self.noise) if self.noise is not None else None
         if self.noise_model is not None or not stated:
-            tod = replace(tod, columns={**tod.columns, **_fitted(path, _stamp(path), self.noise_model)})
+            try:
+                tod = replace(tod, columns={**tod.columns, **_fitted(path, _stamp(path), self.noise_model)})
+            except InputError:
+                if table is None or self.noise_model is not None:
+                    raise
         if self.signal is not None and self.signal not in streams:
             have = ", ".join(sorted(streams)) or "none"
             cure = f"set signal to one of: {have}; or signal: none for the pointing alone"
             raise InputError(f"has no stream {self.signal!r}", place=place, cure=cure)
         rows = rows_of_bands(tod, self.band, place)
-        table = read_noise(self.noise) if self.noise is not None else None
         tod, noise = _with_noise(tod, table, np.concatenate(rows), place)
         if table is None and "net" in tod.columns and (self.noise_model is not None or not stated):
             noise = f"fitted to the file's {self.noise_model or 'noise_model'}"

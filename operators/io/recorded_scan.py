@@ -119,7 +119,8 @@ def joined(cameras: Sequence[RecordedInstrument], place: str) -> RecordedInstrum
         bands.append(CameraBand.model_validate(own | {"name": _plain(camera.band.name)}))
     names = [band.name for band in bands]
     if len(set(names)) < len(names):
-        raise InputError(f"several bands are called {names[0]}", place=place, cure="set band, the centre of the one to be used")
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"several bands are called {twice}", place=place, cure="set band, the centre of the one to be used")
     planes = dict(zip(names, (camera.focalplane() for camera in cameras), strict=True))
     made = first.model_copy(update={
         "band": None, "bands": bands, "pixels": "overlaid", "fwhm": None,

@@ -69,6 +69,7 @@ class PixelSums(Product):
         self.rates |= other.rates
         self.unknown_variance |= other.unknown_variance
         self.coverage += other.coverage
+        self.coverage.check("the sum of the maps of all tasks")
 
     def _about(self) -> dict[str, Any]:
         """What `_with_about` takes."""

@@ -73,7 +73,7 @@ class PinkNoise(Operator):
         add = "pink" in block.detdata
         out = block.new("pink", zero=False)
         level = state.amplitude.of(block.observation).series(block.detectors, block.samples, out.dtype)
-        shared = state.common[block.samples]
+        shared = state.common[..., block.samples]
         state.streams.add(block.detectors.start, block.samples.start, out, level, shared, self.shared, over=not add)
 
     def collect(self, data: Data, observation: Observation, state: _State | None) -> None:
@@ -87,7 +87,7 @@ class _State(NamedTuple):
     amplitude: Amplitude
     streams: Streams | StreamsOfSlopes
     common: NDArray[np.float32]
-    """(n_samp,), or (0,) where nothing is shared."""
+    """(n_samp,), or one for each slope (n_slopes, n_samp); without samples where nothing is shared."""
 
 
 def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
@@ -110,11 +110,12 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
     key, start = observation.detector_key(pink.label), observation.detector_key(pink.label, "start")
     made = {slope: Streams(laws[slope], key, start) for slope in each.slopes}
     streams = made[each.slopes[0]] if len(made) == 1 else StreamsOfSlopes(each.slope, made)
-    common = np.zeros((1, observation.n_samples if pink.shared else 0), np.float32)
-    if pink.shared:
-        keys = (observation.detector_key(pink.label, "shared", *more) for more in ((), ("start",)))
-        Streams(law, *keys).add(0, 0, common)
-    return _State(amplitude, streams, common[0])
+    common = np.zeros((len(made), observation.n_samples if pink.shared else 0), np.float32)
+    if pink.shared:  # the same deviates through the filter of each slope
+        keys = [observation.detector_key(pink.label, "shared", *more) for more in ((), ("start",))]
+        for row, slope in enumerate(made):
+            Streams(laws[slope], *keys).add(0, 0, common[row : row + 1])
+    return _State(amplitude, streams, common[0] if len(made) == 1 else common)
 
 
 @dataclass(frozen=True)

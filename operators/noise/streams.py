@@ -133,7 +133,7 @@ class Streams:
 
 
 class StreamsOfSlopes:
-    """`Streams` of detectors with filters of their own, each in the tiles where it is wanted. Same interface.
+    """`Streams` of detectors with filters of their own, each in the tiles where it is wanted.
 
     Parameters
     ----------
@@ -150,14 +150,15 @@ class StreamsOfSlopes:
     def add(
         self, detector: int, sample: int, out: AnyFloats, level: Series, common: NDArray[np.float32], shared: float, over: bool
     ) -> None:
-        """As `Streams.add`."""
+        """As `Streams.add`; ``common`` (number of slopes, n_samp): one for each filter, in the order of ``made``."""
         n_det, n_samp = out.shape
         edges = [detector, *range((detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS)]
         for low, high in pairwise([*edges, detector + n_det]):
             rows = slice(low - detector, high - detector)
             part, tile = Series(level.lines[rows], level.first, level.inside), np.empty((high - low, n_samp), out.dtype)
             for slope in np.unique(self._slopes[low:high]).tolist():
-                self._made[slope].add(low, sample, tile, part, common, shared, over=True)
+                mine = common[list(self._made).index(slope)]
+                self._made[slope].add(low, sample, tile, part, mine, shared, over=True)
                 for row in np.flatnonzero(self._slopes[low:high] == slope):
                     if over:
                         out[rows][row] = tile[row]

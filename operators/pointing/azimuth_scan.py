@@ -34,7 +34,7 @@ class PointingBackAndForth(Pointing):
 
         x'' = -acceleration sin^2(pi u),   x - throw/2 = speed T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)]      (1)
 
-    so position to jerk are continuous. It reaches 1.41 speed^2 / acceleration beyond. Samples with the Sun up or near say so.
+    so position to jerk are continuous; it ends 1.41 speed^2 / acceleration beyond. Flags tell while the Sun is up or near.
     """
 
     throw: Angle = quantity("30 arcmin", gt=0, le=2 * math.pi)

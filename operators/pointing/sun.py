@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 CLOSE = math.radians(45.0)
 """Distance within which the Sun is close, where nothing else is said (TOAST's default)."""
 SPACING = 60.0
-"""s between the instants at which the Sun's place is computed; between them its elevation is linear to 3e-5 rad."""
+"""s between the instants at which the Sun's place is computed; between them its elevation is linear to 3e-6 rad."""
 
 
 def sunlit(

@@ -99,6 +99,8 @@ def test_transfer_function_of_each_plane(made):
         assert known.max() < 1.2
         assert (folder / f"transfer_function{which}.ecsv").exists()
         assert data[f"transfer_function{which}"].map == f"map{which}"
+        of = f"{which[1:]}: " if which else ""
+        assert f"{of}rings without modes or power: NaN" in [what for _, what, _ in data.tally]
     assert not np.allclose(rings[""], rings["_Q"], equal_nan=True)
 
 

@@ -1,5 +1,7 @@
 """Spectra of I, E and B of TAN and HEALPix maps against a sky that healpy made of known spectra."""
 
+import dataclasses
+
 import healpy
 import numpy as np
 import pytest
@@ -94,11 +96,25 @@ def test_white_levels_of_e_and_b():
             assert np.all(np.abs(power[use] / found.white[key][use] - 1) < 4.5 / np.sqrt(found.modes[use])), key
 
 
+def test_a_map_without_a_spectrum_is_passed_over(sky):
+    """A CAR map before a TAN map; alone it is refused."""
+    flat = tan_map(sky, 0.0, pixels=64)
+    header = {**flat.header, "CTYPE1": "RA---CAR", "CTYPE2": "DEC--CAR"}
+    strip = dataclasses.replace(flat, header=header)
+    found = map_spectra({"a": strip, "map": flat}, Wanted([], 8, 0.1, None), "MapSpectrum")
+    assert set(found.spectra.power) == {"map", "map_E", "map_B"}
+    with pytest.raises(PipelineError, match="no TAN or HEALPix map"):
+        map_spectra({"a": strip}, Wanted([], 8, 0.1, None), "MapSpectrum")
+
+
 def test_what_has_no_spectrum_is_refused():
     pixels = np.arange(100)
     how = {"header": None, "centre": (0.0, 0.0), "pixel": 1e-4, "frame": "icrs"}
     product = polarized(*np.zeros((3, 100)), nside=8192, pixels=pixels, **how)
     with pytest.raises(PipelineError, match="nside 8192 would take gigabytes"):
+        map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum")
+    product = polarized(*np.zeros((3, 0)), nside=64, pixels=pixels[:0], **how)
+    with pytest.raises(PipelineError, match="no pixel has enough samples"):
         map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum")
     with pytest.raises(PipelineError, match="there is no TAN map 'other'"):
         map_spectra({"map": product}, Wanted(["other"], 8, 0.1, None), "MapSpectrum")

@@ -116,6 +116,36 @@ def test_a_band_has_the_bits_that_it_has_alone(night: Any, tmp_path: Path) -> No
         same(alone["map"], load(files[number::2], *steps)["map"])
 
 
+def test_a_beam_of_a_band_that_is_not_used_may_be_unknown(night: Any, tmp_path: Path) -> None:
+    _, files = night
+    whole = load_tod(one_file(files[:2], tmp_path / "whole.h5"))
+    whole.columns["fwhm"][whole.columns["band_centre"] < 100e9] = np.nan
+    same(load(save_tod(tmp_path / "unknown.h5", whole), band="150 GHz")["map"], load(files[1])["map"])
+
+
+def test_scans_that_state_no_band_are_all_used(night: Any, tmp_path: Path) -> None:
+    """Whatever band is chosen: it is the scene's."""
+    _, files = night
+    bare = []
+    for k, file in enumerate(files[1::2]):
+        tod = load_tod(file)
+        for name in ("band_centre", "band_width"):
+            del tod.columns[name]
+        bare.append(save_tod(tmp_path / f"bare{k}.h5", tod))
+    scene = zonda.Scene(**{**SCENE, "instrument": zonda.Scene(**SCENE).instrument.cameras["f150"]})
+    assert len(load(bare, scene=scene, band="150 GHz").observations) == 2
+
+
+def test_two_bands_of_one_name(night: Any, tmp_path: Path) -> None:
+    _, files = night
+    whole = load_tod(one_file(files[:2], tmp_path / "whole.h5"))
+    centre = whole.columns["band_centre"]
+    centre[:] = np.where(centre < 100e9, np.where(np.arange(len(centre)) < 3, 20e9, 26.6e9), 27.4e9)
+    whole.columns["band_width"][:] = 0.1e9
+    with pytest.raises(InputError, match="several bands are called f027"):
+        load(save_tod(tmp_path / "alike.h5", whole))
+
+
 def test_another_instrument_in_the_scene_is_not_used(night: Any) -> None:
     _, files = night
     scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-06-25T07:00")

@@ -12,6 +12,7 @@ import pytest
 import zonda
 from zonda.core.errors import InputError
 from zonda.core.made_up import Given, Points, made_up_scene
+from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.operators.io.toast_noise import fit
 
 TRUTH = [(3e-4, 0.1, 1e-3, 1.0), (3e-4, 5.0, 1e-4, 2.5), (1e-3, 0.01, 1e-5, 1.3)]
@@ -81,6 +82,25 @@ def test_a_model_of_the_file_is_chosen_by_name(saved: Path) -> None:
     np.testing.assert_allclose(observation.focalplane.net, expected, rtol=1e-5)
     np.testing.assert_allclose(observation.focalplane.knee, 0.2 * own / expected**2, rtol=1e-4)  # slope 1
     assert ("noise of the detectors", "fitted to the file's measured") in [(what, text) for _, what, text in observation.tally]
+
+
+def test_a_table_stands_in_for_a_model_that_cannot_be_used(saved: Path) -> None:
+    """As the message about the model advises."""
+    tod = load_tod(saved)
+    del tod.columns["net"]
+    path, table = save_tod(saved.with_name("bare.h5"), tod), saved.with_suffix(".ecsv")
+    with h5py.File(path, "a") as file:
+        write_model(file, tod.names, lambda f, k: 0 * f + 1e-6, units="V2 s", model="noise_model")
+    head = "".join(f"# - {{name: {name}, datatype: float64}}\n" for name in ("net", "knee", "slope"))
+    rows = "".join(f"{name} 0.002 0.5 1.5\n" for name in tod.names)
+    head = f"# %ECSV 1.0\n# ---\n# datatype:\n# - {{name: name, datatype: string}}\n{head}"
+    table.write_text(f"{head}name net knee slope\n{rows}")
+    with pytest.raises(InputError, match="spectra in 'V2 s'"):
+        zonda.LoadTOD(file=path).scene()
+    step = zonda.LoadTOD(file=path, noise=table)
+    data = zonda.Data(step.scene())
+    step.observe(data)
+    np.testing.assert_array_equal(data.observations[0].focalplane.knee, 0.5)
 
 
 def test_models_that_cannot_be_used(saved: Path) -> None:

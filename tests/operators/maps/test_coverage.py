@@ -247,7 +247,12 @@ def test_hits_of_scans_are_those_of_each_alone(bench, grid):
 
 
 def test_too_many_hits_of_scans_are_refused(bench, monkeypatch):
+    one, other = (coverage.Coverage(None, [np.arange(600, dtype=np.int32)], [np.ones(600, np.int32)]) for _ in range(2))
+    sums, more = MapSums(1000, ["signal"]), MapSums(1000, ["signal"])
+    sums.coverage, more.coverage = one, other
     monkeypatch.setattr(coverage, "MOST_ENTRIES", 1000)
+    with pytest.raises(PipelineError, match="more than 1 GB"):
+        sums += more  # of two tasks of a campaign
     with pytest.raises(PipelineError, match="more than 1 GB") as caught:
         made(bench, [bench.observation(7, 3000, index=i) for i in range(3)], pixel="2 arcsec")
     assert "scan_hits" in str(caught.value)

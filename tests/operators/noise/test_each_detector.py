@@ -37,9 +37,13 @@ def pink(instrument: Any, threads: int = 1, memory: int | None = None, **setting
     return zonda.Pipeline(steps).run(scene, threads=threads, memory=memory, keep=["pink"])
 
 
-def test_each_detector_has_its_own_spectrum(tmp_path: Path) -> None:
-    """White noise of the NET is added, so that `zonda noise` finds the knee: pulls below 4.5 of 2 x 15 estimates."""
-    streams = pink(camera(tmp_path)).tod("pink")
+@pytest.mark.parametrize("shared", [0.0, 1.0])
+def test_each_detector_has_its_own_spectrum(tmp_path: Path, shared: float) -> None:
+    """White noise of the NET is added, so that `zonda noise` finds the knee: pulls below 4.5 of 2 x 15 estimates.
+
+    So has what all have in common: the same deviates, through each detector's filter.
+    """
+    streams = pink(camera(tmp_path), shared=shared).tod("pink")
     draw = np.random.default_rng(2)
     for row, knee, slope in zip(streams, KNEES, SLOPES, strict=True):
         if knee == 0:
@@ -58,8 +62,10 @@ def test_a_detector_has_the_bits_that_it_has_among_others_alike(tmp_path: Path) 
     alike = pink(camera(tmp_path, np.full(20, 2.0), np.full(20, 1.7))).tod("pink")
     mine = (KNEES == 2.0) & (SLOPES == 1.7)
     np.testing.assert_array_equal(one[mine], alike[mine])
+    half = pink(camera(tmp_path), shared=0.5).tod("pink")
     for threads, memory in ((3, 1 << 30), (1, 4_000_000)):
         np.testing.assert_array_equal(one, pink(camera(tmp_path), threads, memory).tod("pink"))
+        np.testing.assert_array_equal(half, pink(camera(tmp_path), threads, memory, shared=0.5).tod("pink"))
 
 
 def test_the_step_stands_above_the_focal_plane(tmp_path: Path) -> None:
