@@ -81,8 +81,13 @@ class Execution:
 
         ``following``: what ``ahead`` may prepare meanwhile.
         """
-        for _ in self.turns(data, ahead, following):
-            raise AssertionError("an execution that is alone waits for no other")
+        try:
+            for _ in self.turns(data, ahead, following):
+                raise AssertionError("an execution that is alone waits for no other")
+        except RuntimeError as error:
+            if isinstance(error.__cause__, StopIteration):  # a step's, in a generator
+                raise error.__cause__ from None
+            raise
 
     def turns(self, data: Data, ahead: Ahead | None = None, following: Execution | None = None, in_step: bool = False) -> Turns:
         """As `run`; ``in_step`` with other bands it yields where it waits for these (`core.run.in_step`)."""

@@ -83,6 +83,10 @@ def run_in_step(bands: Sequence[Turns], timer: Timer) -> None:
             parts = _measure(here, models)
             timer.add(here[0].operator.label, "measure", time.process_time() - timer.of_stage("exec") - start)
             waiting = [_resume(band, part) for band, part in zip(bands, parts, strict=True)]
+    except RuntimeError as error:
+        if isinstance(error.__cause__, StopIteration):  # a step's, in a generator
+            raise error.__cause__ from None
+        raise
     finally:
         for band in bands:
             band.close()
