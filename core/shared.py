@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-ROOM = 256 << 20
+ROOM = 64 << 20
 """Bytes that may be kept for bands to come; less than one stream of a band takes."""
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, field_validator
+from pydantic import Field, PrivateAttr, field_serializer, field_validator
 
 from zonda.core import flags
 from zonda.core.configuration.files import InputPath
@@ -93,6 +93,11 @@ class RecordedFiles(Operator):
 
     _scans: dict[int, list[File]] = PrivateAttr(default_factory=dict)
     """By the observations' numbers."""
+
+    @field_serializer("file", when_used="json")
+    def _as_text(self, file: Path | list[Path]) -> str | list[str]:
+        """pydantic 2.9 would write a list as one text."""
+        return [str(one) for one in file] if isinstance(file, list) else str(file)
 
     @field_validator("file")
     @classmethod
