@@ -6,7 +6,8 @@ Nothing that a band computes may depend on the others: what is shared has the bi
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -34,6 +35,7 @@ class SharedScan:
         self._announced: dict[str, dict[str, Any]] = {}
         self._made: dict[Hashable, Any] = {}
         self._lock = threading.RLock()
+        self._of_thread = threading.local()
 
     def announce(self, label: str, band: str, part: Any) -> None:
         """Say what a band adds to what the step ``label`` makes for all; in `Operator.observe`, in the order of the bands."""
@@ -50,6 +52,33 @@ class SharedScan:
                 self._made[key] = make()
             found: T = self._made[key]
             return found
+
+    @contextmanager
+    def block(self) -> Iterator[None]:
+        """While one thread works on a block with one band after the other: `of_block` keeps what it makes until the end."""
+        kept: dict[Hashable, tuple[Any, int]] = {}
+        self._of_thread.kept = kept
+        try:
+            yield
+        finally:
+            self._of_thread.kept = None
+            self.claim(-sum(size for _, size in kept.values()))
+
+    def of_block(self, key: Hashable, size: int, make: Callable[[], T]) -> T:
+        """What is the same in a block for all bands that have this ``key``, of ``size`` bytes: made by the first that asks.
+
+        Made for this band alone outside of `block`, and where there is no room to keep it.
+        """
+        kept = getattr(self._of_thread, "kept", None)
+        if kept is None:
+            return make()
+        if key not in kept:
+            found = make()
+            if not self.claim(size):
+                return found
+            kept[key] = found, size
+        same: T = kept[key][0]
+        return same
 
     def claim(self, size: int) -> bool:
         """Whether ``size`` bytes more may be kept; a negative size gives back."""
@@ -69,3 +98,8 @@ class SharedScan:
 def once(shared: SharedScan | None, key: Hashable, make: Callable[[], T]) -> T:
     """`SharedScan.once`, and ``make`` where there is one band."""
     return make() if shared is None else shared.once(key, make)
+
+
+def of_block(shared: SharedScan | None, key: Hashable, size: int, make: Callable[[], T]) -> T:
+    """`SharedScan.of_block`, and ``make`` where there is one band."""
+    return make() if shared is None else shared.of_block(key, size, make)
