@@ -27,7 +27,7 @@ from .context import Context
 from .coverage import DEEP
 from .decide import Decided
 from .estimate import Choice, add
-from .planner import plan
+from .planner import Wishes, plan_band
 from .result import Plan
 from .slices import SECONDS, sliced
 from .structure import Structure
@@ -184,7 +184,7 @@ def audit(
     part = sliced(file, seconds, observations, size.every)
     whole = Structure(tuple(o.label for o in part.pipeline().operators), tuple(part.runs), ())
     dropped = [d.operator for d in chosen if d.effect.name == NAME and d.operator in whole.operators]
-    whole_plan = plan(part, prune_all=False, drop=dropped)
+    whole_plan = plan_band(part, Wishes(prune_all=False, drop=dropped))
     words = f"the first {seconds:.3g} s of {observations} scan{'s' if observations > 1 else ''}"
     if size.every > 1:
         words += f", every {size.every}th detector"

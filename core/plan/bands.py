@@ -6,14 +6,15 @@ What a band's map needs is simulated for all of them; what is coarser is so wher
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile
 from ..run.budget import BASE
-from . import planner, result
+from . import result
+from .planner import Wishes, plan_band
 from .result import Plan
 from .summary import PlanSummary, Prediction
 
@@ -37,12 +38,46 @@ class PlanOfBands:
         return "\n\n".join(f"band {name}: {made}" for name, made in self.plans.items()) + f"\n\nall bands: {self.summary}"
 
 
-def plan(file: PipelineFile, **options: Any) -> Plan | PlanOfBands:
-    """Plan a pipeline file, each band of its camera; arguments and errors as of `planner.plan`."""
+def plan(
+    file: PipelineFile,
+    *,
+    keep: Sequence[str] = (),
+    drop: Sequence[str] = (),
+    prune_all: bool = True,
+    threads: int | None = None,
+    memory: int | None = None,
+    measure: bool = False,
+) -> Plan | PlanOfBands:
+    """Plan a pipeline file: decide as on a reference machine (one thread, memory for all), predict for this one.
+
+    Parameters
+    ----------
+    keep
+        Effects or operators that stay as the pipeline asks for them (``poles``, ``PinkNoise.poles``, ``PinkNoise``).
+    drop
+        Effects or operators to leave out, whatever that costs; their bounds are stated.
+    prune_all
+        False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
+    threads, memory
+        Of the run that is predicted [memory in bytes]; decisions do not depend on them. None: those of this machine.
+    measure
+        Run a slice of a few seconds to find the cost of operators that do not state it; decisions do not depend on it.
+
+    Returns
+    -------
+    Plan | PlanOfBands
+        The plan, or those of all bands of a camera with several.
+
+    Raises
+    ------
+    ZondaError
+        For a name that is not in the plan, or a budget that is not a number from 0 to 1.
+    """
+    wishes = Wishes(keep, drop, prune_all, threads, memory, measure)
     names = files_of_bands(file) if isinstance(file, PipelineFile) else {}
     if not names:
-        return planner.plan(file, **options)
-    return PlanOfBands({name: planner.plan(file, band=name, **options) for name in names})
+        return plan_band(file, wishes)
+    return PlanOfBands({name: plan_band(file, wishes, name) for name in names})
 
 
 def as_dict(made: Plan | PlanOfBands) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile
@@ -36,37 +37,22 @@ AMPLE = 1 << 60
 threads, memory and disk: the same file and seed give the same bits, and all parts of a campaign's map are made alike."""
 
 
-def plan(
-    file: PipelineFile,
-    *,
-    keep: Sequence[str] = (),
-    drop: Sequence[str] = (),
-    prune_all: bool = True,
-    threads: int | None = None,
-    memory: int | None = None,
-    measure: bool = False,
-    band: str = "",
-) -> Plan:
-    """Plan a pipeline file: decide as on a reference machine (one thread, memory for all), predict for this one.
+@dataclass(frozen=True)
+class Wishes:
+    """What a plan is asked for, beside the pipeline file: the parameters of `zonda.plan`."""
 
-    Parameters
-    ----------
-    keep
-        Effects or operators that stay as the pipeline asks for them (``poles``, ``PinkNoise.poles``, ``PinkNoise``).
-    drop
-        Effects or operators to leave out, whatever that costs; their bounds are stated.
-    prune_all
-        False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
-    measure
-        Run a slice of a few seconds to find the cost of operators that do not state it; decisions do not depend on it.
-    band
-        The one that is planned, of a camera with several.
+    keep: Sequence[str] = ()
+    drop: Sequence[str] = ()
+    prune_all: bool = True
+    threads: int | None = None
+    memory: int | None = None
+    measure: bool = False
 
-    Raises
-    ------
-    ZondaError
-        For a name that is not in the plan, or a budget that is not a number from 0 to 1.
-    """
+
+def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") -> Plan:
+    """Plan a pipeline file for a camera's only band, or for one ``band`` of several. Errors are those of `zonda.plan`."""
+    wishes = wishes or Wishes()
+    keep, drop, prune_all = wishes.keep, wishes.drop, wishes.prune_all
     _check_arguments(file, keep, drop)
     begin = time.process_time()
     pipeline, scene = file.pipeline(), file.scene()
@@ -91,9 +77,9 @@ def plan(
         forced={d.name for d in effects if d.operator in whole or {d.name, d.effect.name, d.operator} & {*drop}},
         prune_all=prune_all,
     )
-    if measure and (unknown := [label for label, cost in costs.items() if cost is None]):
+    if wishes.measure and (unknown := [label for label, cost in costs.items() if cost is None]):
         costs |= measured(file, unknown)
-    machine = threads or available_threads(), memory or available_memory() // 2
+    machine = wishes.threads or available_threads(), wishes.memory or available_memory() // 2
     now = predict(context, costs, item, *machine)
     prediction = _with_savings(now, decided)
     single = any(d.operator == "pipeline" and d.chosen for d in decided)

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 import zonda
 from zonda.core.configuration import locate
-from zonda.core.plan import planner, remembered
-from zonda.core.plan.planner import plan
+from zonda.core.plan import bands, remembered
+from zonda.core.plan.planner import plan_band
 from zonda.core.plan.remembered import summary
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
@@ -33,13 +33,13 @@ def no_planning(monkeypatch):
         raise RuntimeError("planned again")
 
     def switch():
-        monkeypatch.setattr(planner, "plan", refuse)
+        monkeypatch.setattr(bands, "plan_band", refuse)
 
     return switch
 
 
 def test_the_same_as_planned(file, no_planning):
-    made = plan(file)
+    made = plan_band(file)
     first = summary(file)
     no_planning()
     again = summary(file)

@@ -10,7 +10,7 @@ from zonda.core.operator import Operator
 from zonda.core.output import Output
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan import structure as shares
-from zonda.core.plan.planner import plan
+from zonda.core.plan.planner import plan_band
 from zonda.core.plan.structure import Structure, prune, work
 from zonda.core.signal import Component, Signal
 
@@ -209,7 +209,7 @@ def test_what_runs_of_a_file(end, without, tmp_path):
 
     sky = Path(__file__).parents[3] / "pipelines" / "data" / "merging_cluster.fits"
     file = parse(FILE.replace("FILE", str(sky)) + end)
-    planned = plan(file).apply(file)
+    planned = plan_band(file).apply(file)
     assert {s.key for s in file.steps} - {s.key for s in planned.steps} == without
     data = planned.pipeline().run(planned.scene(), output=tmp_path, threads=1)
     assert {label for label, _, _ in data.provenance["timings"]} == {s.key for s in file.steps} - without

@@ -201,7 +201,7 @@ def test_a_signal_that_there_is_not(reference, runs, said):
 
 def test_the_plan_keeps_a_signal_that_is_compared(tmp_path):
     from zonda.core.configuration.pipeline_file import parse
-    from zonda.core.plan.planner import plan
+    from zonda.core.plan.planner import plan_band
 
     text = """
 site: green_bank
@@ -218,7 +218,7 @@ operators:
   - Report
 """
     file = parse(text)
-    applied = plan(file).apply(file)
+    applied = plan_band(file).apply(file)
     assert list(applied.pipeline().runs) == ["quiet"]  # nothing reads the other
     data = applied.pipeline().run(applied.scene(), output=tmp_path, threads=1)
     assert data.products["stream_comparison"].reference == "signal/quiet"
