@@ -8,8 +8,26 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from zonda.core.data import Block
+from zonda.core.flags import DEAD, OPAQUE, SUN_UP
+from zonda.core.operator import Operator
+
+
+def skip_without(package):
+    """Skip the tests of a file where an optional package is not installed; ``ZONDA_<PACKAGE>=required`` lets them fail."""
+    if os.environ.get(f"ZONDA_{package.upper()}") != "required":
+        pytest.importorskip(package, reason=f"{package} is not installed: .ci/{package} makes an environment with it")
+
+
+class Marks(Operator):
+    """Flags a dead and an opaque detector and opaque samples, as CommonModeFilter and Efficiency do; the Sun, which is used."""
+
+    def prepare(self, observation):
+        observation.detector_flags[[1, 5]] |= np.array([DEAD, OPAQUE], np.uint8)
+        observation.flags[400:437] |= OPAQUE
+        observation.flags[420:600] |= SUN_UP
 
 
 def camera(detectors: int) -> str:

@@ -181,18 +181,22 @@ def test_a_registered_band_by_its_name() -> None:
     assert made.cameras["so_145ghz"].knee == 1
 
 
+def two_bands(folder: Path, maps: str) -> Path:
+    """A pipeline file of a camera with two registered bands and these last steps."""
+    file = folder / "two.yaml"
+    lines = [
+        "site: llano_de_chajnantor", "time: 2022-08-01T23:00", "target: 260d -10d",
+        "instrument: {name: x, telescope: {name: d, diameter: 6 m}, detectors: 7, field_of_view: 20 arcmin,",
+        "  main_beam_efficiency: 0.8, illumination_efficiency: 0.9, net: 1 mK s(1/2), sample_rate: 50 Hz,",
+        "  bands: [so_93ghz, so_145ghz]}",
+        f"operators: [PointingDaisy: {{scan_duration: 20 s}}, WhiteNoise, Efficiency, {maps}]",
+    ]  # fmt: skip
+    file.write_text("\n".join(lines))
+    return file
+
+
 def test_the_plan_of_a_file_with_several_bands(tmp_path: Path) -> None:
-    file = tmp_path / "two.yaml"
-    lines = "\n".join(
-        [
-            "site: llano_de_chajnantor", "time: 2022-08-01T23:00", "target: 260d -10d",
-            "instrument: {name: x, telescope: {name: d, diameter: 6 m}, detectors: 7, field_of_view: 20 arcmin,",
-            "  main_beam_efficiency: 0.8, illumination_efficiency: 0.9, net: 1 mK s(1/2), sample_rate: 50 Hz,",
-            "  bands: [so_93ghz, so_145ghz]}",
-            "operators: [PointingDaisy: {scan_duration: 20 s}, WhiteNoise, Efficiency, BinMap: {pixel: 1 arcmin}]",
-        ]
-    )  # fmt: skip
-    file.write_text(lines)
+    file = two_bands(tmp_path, "BinMap: {pixel: 1 arcmin}")
     assert zonda.load(file, ["instrument.band=so_145ghz"]).scene().instrument.band.name == "so_145ghz"
     made = zonda.plan(zonda.load(file))
     assert set(made.plans) == {"so_93ghz", "so_145ghz"}
@@ -249,17 +253,7 @@ def test_a_campaign_adds_up_each_band(tmp_path: Path) -> None:
 
 def test_the_forecast_knows_that_maps_of_all_bands_grow_beside_each_other(tmp_path: Path) -> None:
     """`zonda plan`: the largest band without its maps, the maps of all, and what is kept for bands to come."""
-    file = tmp_path / "two.yaml"
-    lines = "\n".join(
-        [
-            "site: llano_de_chajnantor", "time: 2022-08-01T23:00", "target: 260d -10d",
-            "instrument: {name: x, telescope: {name: d, diameter: 6 m}, detectors: 7, field_of_view: 20 arcmin,",
-            "  main_beam_efficiency: 0.8, illumination_efficiency: 0.9, net: 1 mK s(1/2), sample_rate: 50 Hz,",
-            "  bands: [so_93ghz, so_145ghz]}",
-            "operators: [PointingDaisy: {scan_duration: 20 s}, WhiteNoise, Efficiency, BinMap: {pixel: 2 arcsec}, SaveMap]",
-        ]
-    )  # fmt: skip
-    file.write_text(lines)
+    file = two_bands(tmp_path, "BinMap: {pixel: 2 arcsec}, SaveMap")
     made = zonda.plan(zonda.load(file))
     each = [p.summary.prediction for p in made.plans.values()]
     whole = made.summary.prediction

@@ -3,13 +3,12 @@
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
 import zonda
-from zonda.core.flags import DEAD, OPAQUE, SUN_UP
-from zonda.core.operator import Operator
+
+from ..scenes import Marks
 
 INSTRUMENT = {
     "name": "camera",
@@ -27,15 +26,6 @@ INSTRUMENT = {
 }
 SCENE = {"site": "atacama", "instrument": INSTRUMENT, "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
 SCAN = {"throw": "4 deg", "speed": "0.8 deg/s", "acceleration": "1 deg/s2", "scan_duration": "41.3 s", "check_limits": "warn"}
-
-
-class Marks(Operator):
-    """Flags a dead and an opaque detector and opaque samples, as CommonModeFilter and Efficiency do; the Sun, which is used."""
-
-    def prepare(self, observation):
-        observation.detector_flags[[1, 5]] |= np.array([DEAD, OPAQUE], np.uint8)
-        observation.flags[400:437] |= OPAQUE
-        observation.flags[420:600] |= SUN_UP
 
 
 @pytest.fixture(scope="session")

@@ -4,8 +4,6 @@
 (ZONDA_SOTODLIB=required).
 """
 
-import os
-
 import numpy as np
 import pytest
 
@@ -14,12 +12,11 @@ from zonda.core.numerics.quaternions import detector_quaternions, multiply
 from zonda.interop.sotodlib import sight_line, to_axismanager
 from zonda.operators.io.save_tod import load_tod
 
+from ..scenes import skip_without
+
 pytestmark = [pytest.mark.sotodlib, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
 
-if os.environ.get("ZONDA_SOTODLIB") == "required":
-    import sotodlib.core
-else:
-    sotodlib = pytest.importorskip("sotodlib.core", reason="sotodlib is not installed: .ci/sotodlib makes an environment with it")
+skip_without("sotodlib")
 
 import so3g.proj
 import sotodlib.coords

@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-import os
 
 import astropy.units as u
 import healpy
@@ -15,13 +14,13 @@ import zonda
 from zonda.core.errors import InputError, PipelineError
 from zonda.operators.io.save_tod import load_tod
 
+from ..scenes import skip_without
+
 pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore:LoadTOD", "ignore::DeprecationWarning")]
 
-if os.environ.get("ZONDA_TOAST") == "required":
-    import toast
-else:
-    toast = pytest.importorskip("toast", reason="TOAST is not installed: .ci/toast makes an environment with it")
+skip_without("toast")
 
+import toast
 import toast.io
 import toast.ops
 

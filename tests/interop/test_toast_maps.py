@@ -4,23 +4,20 @@ The scans are recorded ones with gaps, turnarounds, a dead and an opaque detecto
 these in an environment with TOAST (the extra ``toast``), where none may be skipped (ZONDA_TOAST=required).
 """
 
-import os
-
 import numpy as np
 import pytest
 
 import zonda
 
-from .conftest import INSTRUMENT, SCAN, SCENE, Marks
+from ..scenes import Marks, skip_without
+from .conftest import INSTRUMENT, SCAN, SCENE
 
 pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning", "ignore:SkyMap")]
 
-if os.environ.get("ZONDA_TOAST") == "required":
-    import toast
-else:
-    toast = pytest.importorskip("toast", reason="TOAST is not installed: .ci/toast makes an environment with it")
+skip_without("toast")
 
 import astropy.units as u
+import toast
 import toast.ops
 import toast.templates
 

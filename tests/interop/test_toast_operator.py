@@ -3,7 +3,6 @@
 `.ci/toast` runs these in an environment with TOAST (the extra ``toast``), where none may be skipped (ZONDA_TOAST=required).
 """
 
-import os
 import re
 
 import numpy as np
@@ -17,14 +16,13 @@ from zonda.core.errors import ZondaError
 from zonda.core.operator import Operator
 from zonda.testing import check_operator
 
-from .conftest import SCAN, SCENE, Marks
+from ..scenes import Marks, skip_without
+from .conftest import SCAN, SCENE
 
 pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
 
-if os.environ.get("ZONDA_TOAST") == "required":
-    import toast.ops
-else:
-    toast = pytest.importorskip("toast.ops", reason="TOAST is not installed: .ci/toast makes an environment with it")
+skip_without("toast")
+
 
 TURNAROUNDS_TOO = 9
 """TOAST's mask of samples that a fit leaves out, but for turnarounds (4) and trimmed ends (2), which our filters use."""

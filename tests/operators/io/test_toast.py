@@ -3,29 +3,26 @@
 `.ci/toast` runs these in an environment with TOAST (the extra ``toast``), where none may be skipped (ZONDA_TOAST=required).
 """
 
-import os
-
 import numpy as np
 import pytest
 
 import zonda
-from zonda.core.flags import DEAD, OPAQUE, SUN_UP
 from zonda.core.intervals import samples_in
 from zonda.core.operator import Operator
 from zonda.core.polarization import PolarizationAngles
 from zonda.operators.io.load_tod import LoadTOD
 from zonda.operators.io.save_tod import SaveTOD, load_tod
 
+from ...scenes import Marks, skip_without
+
 pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
 
-if os.environ.get("ZONDA_TOAST") == "required":
-    import toast
-else:
-    toast = pytest.importorskip("toast", reason="TOAST is not installed: .ci/toast makes an environment with it")
+skip_without("toast")
 
 from datetime import UTC, datetime, timedelta
 
 import astropy.units as u
+import toast
 import toast.instrument
 import toast.instrument_sim
 import toast.io
@@ -47,15 +44,6 @@ INSTRUMENT = {
 }
 SCENE = {"site": "atacama", "instrument": INSTRUMENT, "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
 SCAN = {"throw": "4 deg", "speed": "1 deg/s", "acceleration": "1 deg/s2", "scan_duration": "61.3 s", "check_limits": "warn"}
-
-
-class Marks(Operator):
-    """Flags a dead and an opaque detector and opaque samples, as CommonModeFilter and Efficiency do; the Sun, which is used."""
-
-    def prepare(self, observation):
-        observation.detector_flags[[1, 5]] |= np.array([DEAD, OPAQUE], np.uint8)
-        observation.flags[400:437] |= OPAQUE
-        observation.flags[420:600] |= SUN_UP
 
 
 def toast_data(path):

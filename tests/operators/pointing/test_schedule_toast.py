@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
 
 import numpy as np
 import pytest
@@ -17,14 +16,14 @@ from zonda.core.numerics.quaternions import conjugate, multiply
 from zonda.core.scene import Scene
 from zonda.operators.pointing.schedule import PointingSchedule
 
+from ...scenes import skip_without
+
 pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore")]
 
-if os.environ.get("ZONDA_TOAST") == "required":
-    import toast
-else:
-    toast = pytest.importorskip("toast", reason="TOAST is not installed: .ci/toast makes an environment with it")
+skip_without("toast")
 
 import astropy.units as u
+import toast
 import toast.instrument
 import toast.instrument_sim
 import toast.ops
