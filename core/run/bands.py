@@ -40,9 +40,10 @@ def points(operator: Operator) -> bool:
 def of_one_band(operator: Operator) -> bool:
     """Whether a step acts on each band's data: all but those that only point, which is done once for all bands.
 
-    A step that points and reads streams too observes the scans of all bands first, and then each band's data (`Data.band`).
+    A step that points and reads streams too observes the scans of all bands first, and then each band's data (`Data.band`); so
+    does one that reads recorded pointing, whose flags differ from band to band.
     """
-    return operator.provides != {"boresight"}
+    return operator.provides != {"boresight"} or isinstance(operator, WithScene)
 
 
 def use_recorded(data: Data, operators: Sequence[Operator]) -> None:

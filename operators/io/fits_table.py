@@ -260,7 +260,7 @@ class Reader:
     def flags(self, detectors: NDArray[np.intp], samples: slice) -> None:
         """The file has no flags of single samples of detectors."""
 
-    def noise(self, model: str | None) -> dict[str, Floats]:
+    def noise(self, model: str | None, mask: int) -> dict[str, Floats]:
         """The file has no noise models. Raises InputError where one is asked for."""
         if model is not None:
             raise InputError("is FITS, which has no noise models", place=self.place, cure="leave noise_model out")

@@ -88,6 +88,7 @@ class LoadTOD(RecordedFiles):
         for observation in data.observations:
             if file := self.file_of(observation):
                 observation.flags = file.flags.copy()
+                _tell(self.label, observation, file)
 
     def prepare(self, observation: Observation) -> RecordedStream | None:
         """Open the file, and find each detector's level. None: nothing of this scan is read."""
@@ -136,22 +137,40 @@ def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
             cure="leave time out of the pipeline, and nights out of a campaign",
         )
     data.scene = given.model_copy(update={"site": own["site"], "instrument": own["instrument"]})
+    most = 0
     for scan in step.scans(given.instrument):
-        observation = _observation(step, data, _of_bands(step, scan, own["instrument"]))
+        number = sum(len(part.cameras) for part in scan)
+        most = most or number
+        observation = _observation(step, data, _of_bands(step, scan, own["instrument"], most))
         found[observation.index] = [
             File(
                 part.path,
                 {part.tod.names[row]: row for rows in part.rows for row in rows.tolist()},
                 flags.from_file(part.tod.flags, step.flag_mask),
+                part.noise,
             )
             for part in scan
         ]
+        if not own["instrument"].bands:
+            file = next(file for file in found[observation.index] if observation.focalplane.names[0] in file.rows)
+            _tell(step.label, observation, file)
         data.observations.append(observation)
     return found
 
 
-def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument) -> list[_Band]:
-    """What a scan has of each of the camera's bands. Raises InputError where it is of another camera, or lacks a band."""
+def _tell(label: str, observation: Observation, file: File) -> None:
+    """State what an observation of one band has of its file, and what is left out of it."""
+    good, dead = flags.good(file.flags, flags.EXCLUDE_SAMPLE), observation.detector_flags != 0
+    observation.tally.state(label, "noise of the detectors", file.noise)
+    observation.tally.count(label, "samples that the file's flags exclude", int((~good).sum()), good.size)
+    observation.tally.count(label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead))
+
+
+def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument, most: int) -> list[_Band]:
+    """What a scan has of each of the camera's bands; ``most``: bands of the first scan.
+
+    Raises InputError where it is of another camera, lacks a band, or has one more.
+    """
     place = f"{step.label}, {scan[0].path.name}"
     every = [_Band(part, *each) for part in scan for each in zip(part.cameras, part.rows, strict=True)]
     bands = {band.camera.band.name: band for band in every}
@@ -162,7 +181,7 @@ def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument) -> list[_Band]:
             first = f"{camera.name} at {camera.band.centre / 1e9:.4g} GHz"
             cure = "load the files of one instrument, all bands of each scan; or choose a band"
             raise InputError(f"was recorded with {what}, the first scan with {first}", place=place, cure=cure)
-    if instrument.bands and len(bands) > len(instrument.bands):
+    if len(every) > most:
         text = f"has the bands {', '.join(bands)}, the first scan {', '.join(instrument.cameras)}"
         raise InputError(text, place=place, cure="begin with a scan of all bands; or choose a band")
     for part in scan[1:]:
@@ -207,10 +226,6 @@ def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
         weather=tod.weather,
         hwp_angle=tod.hwp_angle,
     )
-    tally = observation.tally
-    tally.state(step.label, "noise of the detectors", part.noise)
-    tally.count(step.label, "samples that the file's flags exclude", int((~good).sum()), good.size)
-    tally.count(step.label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead))
     state_celestial(step.label, observation, found, tod.sample_rate)
     return observation
 

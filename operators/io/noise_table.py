@@ -29,7 +29,8 @@ class NoiseTable:
         """The columns for these detectors. Raises InputError where one is not in the table."""
         if lacking := [name for name in detectors if name not in self.names]:
             text = f"{len(lacking)} of {len(detectors)} detectors are not in {self.path}, e.g. {lacking[0]}"
-            raise InputError(text, place=place, cure="make the table of this file: zonda noise FILE")
+            cure = "make the table of this file: zonda noise FILE; flag detectors that it finds no noise of"
+            raise InputError(text, place=place, cure=cure)
         rows = np.array([self.names[name] for name in detectors])
         return {name: values[rows] for name, values in self.columns.items()}
 

@@ -53,11 +53,12 @@ class RecordedScan:
 
 @dataclass(frozen=True)
 class File:
-    """A file of a scan that is read: the rows of its detectors, and its flags of samples (n_samp,)."""
+    """A file of a scan that is read: the rows of its detectors, its flags of samples (n_samp,), whose noise it has in words."""
 
     path: Path
     rows: dict[str, int]
     flags: flags.Flags
+    noise: str
 
 
 Scan = list[RecordedScan]
@@ -184,7 +185,7 @@ class RecordedFiles(Operator):
         table = read_noise(self.noise) if self.noise is not None else None
         if self.noise_model is not None or not stated:
             try:
-                tod = replace(tod, columns={**tod.columns, **_fitted(path, _stamp(path), self.noise_model)})
+                tod = replace(tod, columns={**tod.columns, **_fitted(path, _stamp(path), self.noise_model, self.detector_mask)})
             except InputError:
                 if table is None or self.noise_model is not None:
                     raise
@@ -193,10 +194,11 @@ class RecordedFiles(Operator):
             cure = f"set signal to one of: {have}; or signal: none for the pointing alone"
             raise InputError(f"has no stream {self.signal!r}", place=place, cure=cure)
         rows = rows_of_bands(tod, self.band, place)
-        tod, noise = _with_noise(tod, table, np.concatenate(rows), place)
+        used = (tod.detector_flags & np.uint8(self.detector_mask)) == 0
+        tod, noise = _with_noise(tod, table, np.concatenate([r[used[r]] for r in rows]), place)
         if table is None and "net" in tod.columns and (self.noise_model is not None or not stated):
             noise = f"fitted to the file's {self.noise_model or 'noise_model'}"
-        return RecordedScan(path, tod, tuple(instrument_of(tod, r, given, place) for r in rows), tuple(rows), noise)
+        return RecordedScan(path, tod, tuple(instrument_of(tod, r, used[r], given, place) for r in rows), tuple(rows), noise)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -225,11 +227,11 @@ def _head(path: Path, stamp: tuple[int, int]) -> tuple[TimeOrderedData, Mapping[
 
 
 @lru_cache(maxsize=NEW_SCANS)
-def _fitted(path: Path, stamp: tuple[int, int], model: str | None) -> Mapping[str, Floats]:
-    """The noise of a model of a file."""
+def _fitted(path: Path, stamp: tuple[int, int], model: str | None, mask: int) -> Mapping[str, Floats]:
+    """The noise of a model of a file, of detectors without a bit of ``mask``."""
     opened = reader(path)
     try:
-        return opened.noise(model)
+        return opened.noise(model, mask)
     finally:
         opened.close()
 
@@ -237,11 +239,13 @@ def _fitted(path: Path, stamp: tuple[int, int], model: str | None) -> Mapping[st
 def _with_noise(
     tod: TimeOrderedData, table: NoiseTable | None, rows: NDArray[np.intp], place: str
 ) -> tuple[TimeOrderedData, str]:
-    """The file's data with the noise of a table, and where its noise comes from."""
+    """The file's data with the noise of a table for the detectors ``rows``, and where its noise comes from."""
     if table is None:
         what = "the file's" if "net" in tod.columns else "the scene's instrument's, or none: the file states none"
         return tod, what
     columns = dict(tod.columns)
+    if not rows.size:
+        return tod, str(table.path)
     for name, values in table.of([tod.names[row] for row in rows], place).items():
         columns[name] = np.array(columns.get(name, np.full(tod.n_detectors, values[0])), np.float64)
         columns[name][rows] = values

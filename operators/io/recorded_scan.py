@@ -26,7 +26,8 @@ SAME_BAND = 1e-2
 NEAR_BAND = 0.05
 """Relative difference of centres up to which a band is the one that was named."""
 
-NO_NOISE = "the file states none: NET 0, and all detectors weigh the same"
+POSITIVE = ("fwhm", "slope")
+"""What is above zero, of the columns."""
 
 
 class RecordedInstrument(Instrument):
@@ -146,12 +147,15 @@ def band_of(instrument: Instrument | None, centre: float) -> Instrument | None:
     return min(instrument.cameras.values(), key=lambda camera: abs(camera.band.centre - centre))
 
 
-def instrument_of(tod: TimeOrderedData, rows: NDArray[np.intp], given: Instrument | None, place: str) -> RecordedInstrument:
+def instrument_of(
+    tod: TimeOrderedData, rows: NDArray[np.intp], used: NDArray[np.bool_], given: Instrument | None, place: str
+) -> RecordedInstrument:
     """The camera of one band that the file describes; what it does not state is taken from ``given``, the scene's.
 
-    Raises InputError where neither states the beam, or a column is not finite.
+    ``used`` (len(rows),): what is not known of other detectors is that of a used one. Raises InputError where neither states the
+    beam, or a column of a used detector is not finite.
     """
-    columns = {name: values[rows] for name, values in tod.columns.items()}
+    columns = {name: _known(name, values[rows], used) for name, values in tod.columns.items()}
     given = band_of(given, float(np.median(columns.get("band_centre", np.zeros(1)))))
     plane = _focalplane(tod, columns, rows, given, place)
     fwhm = float(np.median(plane.fwhm))
@@ -183,6 +187,13 @@ def instrument_of(tod: TimeOrderedData, rows: NDArray[np.intp], given: Instrumen
     )
     made._planes = {band.name: plane}
     return made
+
+
+def _known(name: str, values: Floats, used: NDArray[np.bool_]) -> Floats:
+    """The values (n_det,), and the median of the used detectors' where one that is not ``used`` has none that can be."""
+    known = np.isfinite(values) & ((values > 0) | (name not in POSITIVE))
+    found = np.sort(values[used & known])
+    return np.where(used | known, values, found[len(found) // 2]) if found.size else values
 
 
 def _band(tod: TimeOrderedData, columns: Mapping[str, Floats], given: Instrument | None, place: str) -> Band:
@@ -235,7 +246,7 @@ def _focalplane(
         found["wafer"] = columns["wafer"]
     names = [tod.names[row] for row in rows]
     for name, values in {**found, "xi": tod.xi[rows], "eta": tod.eta[rows]}.items():
-        bad = np.flatnonzero(~np.isfinite(values) | ((values <= 0) if name in ("fwhm", "slope") else values < -np.inf))
+        bad = np.flatnonzero(~np.isfinite(values) | ((values <= 0) & (name in POSITIVE)))
         if bad.size:
             cure = "give it a number in the focal plane of the file; flag the detector if it is not to be used"
             raise InputError(f"{name} of detector {names[bad[0]]} is {values[bad[0]]:g}", place=place, cure=cure)

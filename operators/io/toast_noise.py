@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.storage.hdf5_files import check_size
@@ -27,10 +28,11 @@ def models(file: Any) -> list[str]:
     return [name for name, item in found if "mixing_matrix" in item and "psd_units" in item.attrs]
 
 
-def columns_of_model(group: Any, detectors: list[str], place: str) -> dict[str, Floats]:
+def columns_of_model(group: Any, detectors: list[str], unused: NDArray[np.bool_], place: str) -> dict[str, Floats]:
     """NET [K sqrt(s)], knee, minimum_frequency [Hz] and slope (n_det,) of the spectra of an open noise model.
 
-    The spectrum of a detector is the sum of those that TOAST mixes for it, times their weights squared.
+    The spectrum of a detector is the sum of those that TOAST mixes for it, times their weights squared. Of an ``unused`` detector
+    (n_det,) they are NaN.
 
     Raises
     ------
@@ -41,8 +43,9 @@ def columns_of_model(group: Any, detectors: list[str], place: str) -> dict[str, 
     mixed: dict[str, list[tuple[str, float]]] = {}
     for detector, key, weight in group["mixing_matrix"][:]:
         mixed.setdefault(detector.decode(), []).append((key.decode(), float(weight)))
-    found, known = np.zeros((4, len(detectors))), dict[bytes, Floats]()
-    for number, detector in enumerate(detectors):
+    found, known = np.full((4, len(detectors)), np.nan), dict[bytes, Floats]()
+    for number in np.flatnonzero(~unused).tolist():
+        detector = detectors[number]
         parts = [(key, weight) for key, weight in mixed.get(detector, ()) if weight != 0]
         if not parts or any(key not in spectra for key, _ in parts):
             raise InputError(f"{group.name} has no spectrum of detector {detector}", place=place, cure=CURE)

@@ -86,10 +86,11 @@ class Reader:
         with reading(self.place, KIND, CURE):
             return np.asarray(_rectangle(found, detectors, samples), np.uint8)
 
-    def noise(self, model: str | None) -> dict[str, Floats]:
+    def noise(self, model: str | None, mask: int) -> dict[str, Floats]:
         """`TimeOrderedData.columns` of the noise of a model of the file; None: of `DEFAULT_MODEL`, nothing where there is none.
 
-        Raises InputError where there is no model of this name, or it cannot be used.
+        ``mask``: detectors with one of these bits are not used. Raises InputError where there is no model of this name, or it
+        cannot be used.
         """
         have = toast_noise.models(self._file)
         if model is None and DEFAULT_MODEL not in have:
@@ -98,7 +99,8 @@ class Reader:
             cure = f"choose from: {', '.join(have)}" if have else "leave noise_model out"
             raise InputError(f"has no noise model {model!r} (/metadata)", place=self.place, cure=cure)
         with reading(self.place, KIND, CURE):
-            return toast_noise.columns_of_model(self._file["metadata"][model or DEFAULT_MODEL], self.tod.names, self.place)
+            group, unused = self._file["metadata"][model or DEFAULT_MODEL], (self.tod.detector_flags & np.uint8(mask)) != 0
+            return toast_noise.columns_of_model(group, self.tod.names, unused, self.place)
 
     def close(self) -> None:
         """Close the file."""

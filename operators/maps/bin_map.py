@@ -175,7 +175,9 @@ def weights_of(step: BinMap, observation: Observation, reference: float) -> tupl
     Raises PipelineError where they differ by too much, or are not known.
     """
     usable, net = observation.good_detectors, observation.focalplane.net.copy()
-    net[~usable] = net[usable][0] if usable.any() else 1.0  # they weigh nothing, whatever their noise
+    if not usable.any():
+        return np.ones(len(net)), np.ones(len(net))
+    net[~usable] = net[usable][0]  # they weigh nothing, whatever their noise
     variance = net**2 * observation.sample_rate / reference
     weight = np.ones(len(net))
     if step.weights == "inverse_variance" and step.contents == "all":
@@ -267,7 +269,8 @@ def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared
         sums.coverage.add_directions(state.directions)
     if before is not None:
         sums.coverage.add_hits(sums.hits.sum(axis=0) - before, f"{step.label}, {observation.name}")
-    sums.unknown_variance |= step.weights == "inverse_variance" and not (observation.focalplane.net > 0).all()
+    used = observation.focalplane.net[observation.good_detectors]
+    sums.unknown_variance |= step.weights == "inverse_variance" and not (used > 0).all()
     every, tally = observation.n_detectors * observation.n_samples, observation.tally
     tally.count(step.label, "samples binned", binned, every)
     for what, number in (("outside the map", OUTSIDE), ("flagged", FLAGGED), ("not finite", NOT_FINITE)):

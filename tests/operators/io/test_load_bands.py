@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -162,6 +163,23 @@ def test_every_band_has_the_flags_of_its_file(night: Any, tmp_path: Path) -> Non
     found, whole = load([files[0], flagged]), load(files[:2])
     same(found["map_f090"], whole["map_f090"])
     assert whole["map_f150"].hits.sum() - found["map_f150"].hits.sum() == 100 * 12
+    what = "samples that the file's flags exclude"
+    assert [found.tally.get(f"LoadTOD {band}", what) for band in ("f090", "f150")] == [0, 100]
+    twin = load([files[0], flagged], zonda.WhiteNoise(), zonda.Efficiency(), MAP, signal="none")
+    for band in ("f090", "f150"):
+        same(twin[f"map_{band}"], found[f"map_{band}"], ("hits",))
+
+
+def test_every_band_says_where_its_noise_comes_from(night: Any, tmp_path: Path) -> None:
+    _, files = night
+    tod = load_tod(files[1])
+    del tod.columns["net"]
+    with_model = save_tod(tmp_path / "model.h5", tod)
+    with h5py.File(with_model, "a") as file, h5py.File(files[1]) as source:
+        source.copy("metadata/noise_model", file["metadata"])
+    found = load([files[0], with_model])
+    stated = {who: text for who, what, text in found.tally if what == "noise of the detectors"}
+    assert stated == {"LoadTOD f090": "the file's", "LoadTOD f150": "fitted to the file's noise_model"}
 
 
 def test_a_twin_of_both_bands(night: Any) -> None:
@@ -208,6 +226,9 @@ def test_what_does_not_fit_together(night: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="first scan with camera at 150 GHz") as caught:
         load(files[:3])  # the second scan lacks a band
     assert "all bands of each scan" in caught.value.cure
+    with pytest.raises(InputError, match="has the bands f090, f150, the first scan f090") as caught:
+        load([files[0], *files[2:]])
+    assert "begin with a scan of all bands" in caught.value.cure
     tod = load_tod(files[1])
     tod.boresight_radec = tod.boresight_radec[:, [1, 0, 3, 2]]
     elsewhere = save_tod(tmp_path / "elsewhere.h5", tod)

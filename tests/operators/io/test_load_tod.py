@@ -16,7 +16,7 @@ import zonda
 import zonda.testing
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import InputError, ZondaError
-from zonda.core.flags import SUN_UP, TURNAROUND
+from zonda.core.flags import INVALID, SUN_UP, TURNAROUND
 from zonda.core.made_up import Given, Points, made_up_scene
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.plugins.checks.scenes import sky_file
@@ -377,6 +377,28 @@ def test_bad_files_are_named_with_a_cure(saved: Any, tmp_path: Path, what: str) 
         load(path, MAP)
     assert "bad.h5" in caught.value.place
     assert caught.value.cure
+
+
+@pytest.mark.parametrize("column", ["net", "fwhm", "knee", "slope", "polarization_angle"])
+def test_what_is_not_known_of_a_flagged_detector_does_not_matter(saved: Any, tmp_path: Path, column: str) -> None:
+    """As the message about one that is not flagged advises."""
+    tod = load_tod(saved["Filtered"][0])
+    tod.detector_flags[2] |= INVALID
+    whole = load(save_tod(tmp_path / "flagged.h5", tod), MAP)
+    tod.columns[column][2] = np.nan
+    found = load(save_tod(tmp_path / "unknown.h5", tod), MAP)
+    np.testing.assert_array_equal(found["map"].signal, whole["map"].signal)
+    np.testing.assert_array_equal(found["map"].noise, whole["map"].noise)
+
+
+def test_a_scan_of_which_nothing_is_used(saved: Any, tmp_path: Path) -> None:
+    """It adds nothing to the map of the others."""
+    tod = load_tod(saved["Filtered"][0])
+    tod.detector_flags |= INVALID
+    none = save_tod(tmp_path / "none.h5", tod)
+    assert load(none, MAP)["map"].hits.sum() == 0
+    found, whole = load([saved["Filtered"][0], none], MAP), load(saved["Filtered"][0], MAP)
+    np.testing.assert_array_equal(found["map"].signal, whole["map"].signal)
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".fits"])

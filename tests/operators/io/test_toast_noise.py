@@ -11,6 +11,7 @@ import pytest
 
 import zonda
 from zonda.core.errors import InputError
+from zonda.core.flags import INVALID
 from zonda.core.made_up import Given, Points, made_up_scene
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.operators.io.toast_noise import fit
@@ -120,3 +121,27 @@ def test_models_that_cannot_be_used(saved: Path) -> None:
             zonda.LoadTOD(file=saved, noise_model=model).scene()
         assert saved.name in caught.value.place
         assert caught.value.cure
+
+
+@pytest.mark.parametrize("kind", ["zero", "NaN", "none"])
+def test_a_flagged_detector_needs_no_spectrum(saved: Path, kind: str) -> None:
+    """It weighs nothing; the noise of another detector stands for it."""
+    tod = load_tod(saved)
+    tod.detector_flags[3] |= INVALID
+    path = save_tod(saved.with_name("flagged.h5"), tod)
+    bad = {"zero": 0.0, "NaN": np.nan, "none": 1e-6}[kind]
+    with h5py.File(path, "a") as file:
+        write_model(file, tod.names, lambda f, k: 0 * f + (bad if k == 3 else 1e-6), model="measured")
+        if kind == "none":
+            group = file["metadata/measured"]
+            rows = [row for row in group["mixing_matrix"][:] if row[0] != tod.names[3].encode()]
+            del group["mixing_matrix"]
+            group.create_dataset("mixing_matrix", data=np.array(rows, "S16, S16, f4"))
+    step = zonda.LoadTOD(file=path, noise_model="measured")
+    data = zonda.Data(step.scene())
+    step.observe(data)
+    (observation,) = data.observations
+    assert not observation.good_detectors[3]
+    assert np.isfinite(observation.focalplane.net).all()
+    with pytest.raises(InputError, match=tod.names[3]):
+        zonda.LoadTOD(file=path, noise_model="measured", detector_mask=0).scene()

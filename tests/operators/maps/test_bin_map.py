@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 import zonda
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.flags import INVALID
 from zonda.core.numerics.angles import ARCMIN
 from zonda.core.numerics.projection import directions, frame_rotation
 from zonda.core.numerics.smooth import SmoothField
@@ -346,6 +347,10 @@ def test_zero_net_needs_uniform_weights(bench):
     with pytest.raises(PipelineError, match="NET 0"):
         bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
     assert bench.run([BinMap(weights="uniform")], observation, {"signal": np.ones((7, 300))}).map.hits.sum() == 2100
+    observation.detector_flags[3] = INVALID  # then it does not matter
+    found = bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
+    assert found.map.hits.sum() == 1800
+    assert "uniform: every NET is 0" not in str(found.tally)
 
 
 def test_two_maps_need_two_names(bench):

@@ -43,6 +43,23 @@ def test_the_table_and_the_scan_that_it_belongs_to(night, tmp_path):
     np.testing.assert_allclose(data.observations[0].focalplane.net, found["net"], rtol=1e-8)  # nine digits in the table
 
 
+def test_a_flagged_detector_is_in_no_table(night, tmp_path):
+    """And none is wanted: it weighs nothing."""
+    tod = load_tod(night[0])
+    tod.detector_flags[4] = 1
+    path, table = save_tod(tmp_path / "flagged.h5", tod), tmp_path / "table.ecsv"
+    done = CliRunner().invoke(noise, [str(path), "--output", str(table)])
+    assert done.exit_code == 0, done.output
+    step = zonda.LoadTOD(file=path, noise=table)
+    data = zonda.Pipeline([step, zonda.BinMap(pixel="5 arcsec")]).run(step.scene(), threads=1)
+    found = Table.read(table, format="ascii.ecsv")["net"]
+    net = data.observations[0].focalplane.net
+    np.testing.assert_array_equal(np.delete(net, 4), found)
+    assert net[4] == pytest.approx(night[1].net[4])  # the file's
+    with pytest.raises(InputError, match="1 of 12 detectors are not in"):
+        zonda.LoadTOD(file=path, noise=table, detector_mask=0).scene()
+
+
 def test_the_mean_over_the_detectors(night, tmp_path):
     path, plane = night
     done = CliRunner().invoke(noise, [str(path), "--subtract-mean", "--output", str(tmp_path / "t.ecsv")])
