@@ -27,7 +27,7 @@ from .coverage import Coverage, Directions
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
-from .map_layout import grid_of, layout_of, outside
+from .map_layout import check_size, grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .stokes_map import check_polarized, stokes_binnings
@@ -74,9 +74,12 @@ class BinMap(MapParameters):
 
     def check(self, data: Data) -> list[str]:
         """The share of the samples outside a map of a given width."""
-        for observation in data.observations[:1]:
-            check_polarized(self, observation)
-        return [] if self.width is None or not data.observations else [outside(self, data.observations)]
+        if not data.observations:
+            return []
+        check_polarized(self, data.observations[0])
+        if self.nside is None:
+            check_size(self, data.observations)
+        return [] if self.width is None else [outside(self, data.observations)]
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""

@@ -121,6 +121,18 @@ def checked(step: MapParameters, grid: Image) -> Image:
     return grid
 
 
+def check_size(step: MapParameters, observations: Sequence[Observation]) -> None:
+    """Refuse an image that is too large for what is known of the scans: some instants of them (InputError)."""
+    fields = fields_of(step, observations, [])
+    if step.projection == "CAR":
+        wide = step.width is not None
+        box = box_about(step, middle_of(fields, step.pixel)) if wide else box_of(step, observations, None)
+        checked(step, grid_of_box(box, step.pixel, step.frame))
+    else:
+        *middle, half_width, half_height = whole_of(fields, step.label)
+        image_grid(step, (middle[0], middle[1]), (half_width, half_height))
+
+
 def outside(step: MapParameters, observations: Sequence[Observation]) -> str:
     """The share of the samples outside an image of a given width."""
     fields = fields_of(step, observations, [])

@@ -379,6 +379,16 @@ def test_a_map_of_too_many_pixels_is_refused(bench):
         bench.run([BinMap(pixel="0.001 arcsec")], bench.observation(7, 300), {"signal": np.ones((7, 300))})
 
 
+@pytest.mark.parametrize("projection", ["TAN", "CAR"])
+@pytest.mark.parametrize("size", [{"pixel": "0.001 arcsec"}, {"pixel": "0.1 arcsec", "width": "2 deg"}])
+def test_the_check_refuses_a_map_of_too_many_pixels(bench, projection, size):
+    data = zonda.Data(None, [bench.observation(7, 300)])
+    with pytest.raises(InputError, match="too large"):
+        BinMap(projection=projection, **size).check(data)
+    for fits in (BinMap(projection=projection, pixel="2 arcsec"), BinMap(nside=2**20)):
+        assert fits.check(data) == []
+
+
 def test_scan_too_wide_for_a_tangent_plane_is_refused(bench):
     observation = bench.observation(1, 3000, radius=np.radians(80), centre=(1.0, 0.0))
     with pytest.raises(InputError, match="75 deg"):
