@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 ROOM = 64 << 20
-"""Bytes that may be kept for bands to come; less than one stream of a band takes."""
+"""Most bytes that are kept of one scan until the last band has used them; for short scans one stream of a band is the limit."""
 
 
 def room_for(n_detectors: int, n_samples: int) -> int:
@@ -27,7 +27,7 @@ class SharedScan:
     Parameters
     ----------
     room
-        Bytes that may be kept for bands to come (`claim`).
+        Most bytes that are kept until the last band has used them (`claim`).
     """
 
     def __init__(self, room: int) -> None:

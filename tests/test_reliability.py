@@ -254,7 +254,7 @@ def test_the_input_is_removed_before_it_is_read(here: Path) -> None:
     os.unlink("map.fits")
     with pytest.raises(InputError, match="no such file") as caught:
         file.pipeline().run(file.scene(), output=here / "out")
-    assert "removed during the run" in caught.value.cure
+    assert "moved or removed" in caught.value.cure
     assert products(here) == {}
 
 

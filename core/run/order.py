@@ -51,13 +51,13 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                 problems.append(OrderProblem(index, message, f"add a step that provides {what} above", cure))
         adds_up = forms(operator) and (operator.requires | operator.optional) - {"boresight"}
         components = {what for what in later if isinstance(what, Component)} if adds_up else set()
+        late: dict[str, list[str]] = {}
         for what in sorted(((operator.optional | components) - operator.requires) & set(later)):
-            if not isinstance(operator, Output):
-                problems.append(
-                    OrderProblem(
-                        index, f"{later[what]} provides {what} only after {name} has used it", f"move {name} below {later[what]}"
-                    )
-                )
+            late.setdefault(later[what], []).append(what)
+        for step, whats in late.items() if not isinstance(operator, Output) else ():
+            used = "it" if len(whats) == 1 else "them"
+            message = f"{step} provides {' and '.join(whats)} only after {name} has used {used}"
+            problems.append(OrderProblem(index, message, f"move {name} below {step}"))
         if operator.couples == "all" and len(operator.requires - {"boresight"}) != 1:
             problems.append(
                 OrderProblem(

@@ -76,7 +76,7 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
     except ZondaError:
         raise
     except FileNotFoundError as error:
-        raise InputError("no such file", place=place, cure="check the path; it may have been removed during the run") from error
+        raise InputError("there is no such file", place=place, cure=_whereabouts(error.filename)) from error
     except IsADirectoryError as error:
         raise InputError("is a folder, not a file", place=place, cure="give the file's path") from error
     except PermissionError as error:
@@ -87,6 +87,21 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
         raise InputError("needs more memory than there is", place=place, cure=cure) from error
     except Exception as error:
         raise InputError(f"cannot be read as {kind}: {first_line(error)}", place=place, cure=cure) from error
+
+
+def _whereabouts(path: str | bytes | int | None) -> str:
+    """What to do about a path where nothing is: a name in its folder that is near, or the folder that is missing."""
+    otherwise = "check the path; if it was there before, it has been moved or removed"
+    if not isinstance(path, (str, bytes)):
+        return otherwise
+    file = Path(os.fsdecode(path)).absolute()
+    if not file.parent.is_dir():
+        return f"check the path: there is no folder {file.parent}"
+    from ..configuration.diagnostics import nearest  # most runs miss no file
+
+    with contextlib.suppress(OSError):
+        return nearest(file.name, os.listdir(file.parent), otherwise)
+    return otherwise
 
 
 @contextlib.contextmanager

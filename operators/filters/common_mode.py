@@ -46,7 +46,8 @@ ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
 
 KEPT = "modes kept because the data do not determine them (rank)"
-"""A count of the log."""
+UNDETERMINED = "degenerate modes (the next singular value is nearly as large)"
+"""Counts of the log. Degenerate: the next singular value is more than `gap` times the mode's own."""
 
 
 class CommonModeFilter(CommonModeParameters):
@@ -157,13 +158,13 @@ def _choose(step: CommonModeFilter, found: Ritz, gram: Gram, observation: Observ
     size = np.append(np.sqrt(np.maximum(found.values, 0.0)), 0.0)
     determined = max((i + 1 for i in range(wanted) if size[i + 1] <= step.gap * size[i]), default=0)
     observation.tally.count(step.label, KEPT, step.modes - wanted)
-    observation.tally.count(step.label, "modes not determined (gap closed)", wanted - determined)
+    observation.tally.count(step.label, UNDETERMINED, wanted - determined)
     if determined == wanted or step.on_undetermined == "remove":
         return wanted
     if step.on_undetermined == "mean" and determined == 0:
         u = gram.use / np.sqrt(gram.n_good)
         found.detectors, found.times, found.residuals = u[None], gram.apply(u)[1][None], np.zeros(1)
-        found.what = "detector mean, because the gap is closed"
+        found.what = "detector mean, because the first mode is degenerate"
         return 1
     return determined
 

@@ -8,7 +8,7 @@ from zonda.core.checks import Family, Measured
 from zonda.core.errors import PipelineError, ZondaError
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
-from zonda.operators.filters.common_mode import CommonModeFilter
+from zonda.operators.filters.common_mode import UNDETERMINED, CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.optics.efficiency import Efficiency
@@ -118,7 +118,7 @@ def undetermined_mode() -> Measured:
     """relative error where white noise leaves no leading mode and the detectors' mean is removed instead"""
     a = np.random.default_rng(4).standard_normal((N_DET, N))
     data = run([CommonModeFilter()], scan(N_DET, N), a, keep=("signal",))
-    counted = data.tally.get("CommonModeFilter", "modes not determined (gap closed)")
+    counted = data.tally.get("CommonModeFilter", UNDETERMINED)
     error = float(np.linalg.norm(data.observations[0].detdata["signal"] - (a - a.mean(0))) / np.linalg.norm(a))
     return error if counted == 1 else np.inf, f"{counted} mode counted as not determined"
 

@@ -252,7 +252,7 @@ def test_a_campaign_adds_up_each_band(tmp_path: Path) -> None:
 
 
 def test_the_forecast_knows_that_maps_of_all_bands_grow_beside_each_other(tmp_path: Path) -> None:
-    """`zonda plan`: the largest band without its maps, the maps of all, and what is kept for bands to come."""
+    """`zonda plan`: the largest band without its maps, the maps of all, and what is kept for the bands that follow."""
     file = two_bands(tmp_path, "BinMap: {pixel: 2 arcsec}, SaveMap")
     made = zonda.plan(zonda.load(file))
     each = [p.summary.prediction for p in made.plans.values()]

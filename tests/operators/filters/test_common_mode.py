@@ -12,7 +12,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.operators.filters.common_mode import CommonModeFilter
+from zonda.operators.filters.common_mode import UNDETERMINED, CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.plugins.checks import scenes
@@ -90,14 +90,14 @@ def test_closed_gap(bench, policy, expected):
     result = run(bench, a, on_undetermined=policy, residual=1e-8)
     wanted = {"mean": a - a.mean(axis=0), "same": a, "svd": numpy_removed(a, 1)}[expected]
     assert np.linalg.norm(result.signal - wanted) < 1e-5 * np.linalg.norm(a)
-    assert result.tally["CommonModeFilter", "modes not determined (gap closed)"] == "1"
+    assert result.tally["CommonModeFilter", UNDETERMINED] == "1"
 
 
 def test_second_mode_undetermined_is_skipped_and_the_first_removed(bench):
     a = atmosphere_like(0.3, 0.0, 0.017)
     result = run(bench, a, modes=2, residual=1e-8)
     assert np.linalg.norm(result.signal - numpy_removed(a, 1)) < 1e-5 * np.linalg.norm(result.signal)
-    assert result.tally["CommonModeFilter", "modes not determined (gap closed)"] == "1"
+    assert result.tally["CommonModeFilter", UNDETERMINED] == "1"
 
 
 def test_dead_constant_and_nan_detectors_are_flagged_and_take_no_part(bench):

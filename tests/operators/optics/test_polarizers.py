@@ -123,8 +123,11 @@ def test_what_comes_through_the_optics_leaks_and_noise_does_not(plate, calibrati
 def test_leakage_behind_what_forms_the_signal_is_refused():
     steps = [zonda.PointingStare(scan_duration="5 s"), zonda.WhiteNoise(), zonda.Efficiency(), Leakage()]
     scene = zonda.Scene(site="green_bank", instrument=CAMERA, time="2024-11-25T07:00", target="75 deg 20 deg", seed=3)
-    with pytest.raises(zonda.ZondaError, match=r"Leakage provides atmosphere only after Efficiency has used it"):
+    with pytest.raises(
+        zonda.ZondaError, match=r"Leakage provides atmosphere and sky only after Efficiency has used them"
+    ) as caught:
         zonda.Pipeline(steps).run(scene, keep=["signal"])
+    assert str(caught.value).count("Leakage provides") == 1
 
 
 def test_without_polarized_detectors_neither_has_an_effect_and_the_log_says_so():

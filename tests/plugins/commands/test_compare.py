@@ -156,6 +156,18 @@ def test_refusals(tmp_path, values, capsys, make, words):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_missing_file(tmp_path, values, capsys):
+    a = write(tmp_path / "map_f090.fits", values)
+    wanted = {
+        tmp_path / "map_f09.fits": "did you mean 'map_f090.fits'?",
+        tmp_path / "none" / "map.fits": f"check the path: there is no folder {tmp_path / 'none'}",
+        tmp_path / "other.fits": "check the path; if it was there before, it has been moved or removed",
+    }
+    for path, cure in wanted.items():
+        assert compare(path, a) == 2
+        assert f"{path}: there is no such file\n  = {cure}\n" in capsys.readouterr().err
+
+
 def test_folders_without_common_maps(tmp_path, capsys):
     for run in ("one", "two"):
         (tmp_path / run).mkdir()
