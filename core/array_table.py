@@ -7,7 +7,7 @@ is in `QUANTITIES` and `TEXTS`. What it does not have holds as the instrument or
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .configuration.diagnostics import nearest
 from .errors import InputError
 from .focalplane import Focalplane
+from .storage.table_mistakes import Mistakes
 from .types import Floats
 
 if TYPE_CHECKING:
@@ -55,12 +56,15 @@ class ArrayTable:
         Of each detector; ``bands`` is empty where there is no such column.
     columns
         By name, (n,) SI: `QUANTITIES`, and ``wafer`` and ``dead`` as whole numbers.
+    lines
+        Line of the file of each; of the heading last.
     """
 
     place: str
     names: list[str]
     bands: list[str]
     columns: Mapping[str, NDArray[Any]]
+    lines: Sequence[int]
 
     @property
     def reach(self) -> float:
@@ -91,11 +95,12 @@ class ArrayTable:
             raise InputError("has no column 'band', and the instrument has several", place=self.place, cure=cure)
         unknown = [k for k, band in enumerate(self.bands) if band not in counts]
         if unknown and (several or len(unknown) == len(self.names)):
-            k = unknown[0]
-            text = f"detector {self.names[k]} in row {k + 1} is of the unknown band {self.bands[k]!r}"
-            hint = nearest(self.bands[k], list(counts))
-            cure = f"{hint + ' ' if hint else ''}the instrument has: {', '.join(counts)}"
-            raise InputError(text, place=self.place, cure=cure)
+            mistakes = Mistakes(self.place)
+            for k in unknown:
+                hint = nearest(self.bands[k], list(counts))
+                cure = f"{hint + ' ' if hint else ''}the instrument has: {', '.join(counts)}"
+                mistakes.add(self.lines[k], f"detector {self.names[k]} is of the unknown band {self.bands[k]!r}", cure)
+            mistakes.tell()
         for band, stated in counts.items():
             found = len(self.rows(band))
             if not found:
@@ -112,8 +117,8 @@ class ArrayTable:
 def read_array(path: Path) -> ArrayTable:
     """Read a table of detectors.
 
-    Raises InputError for missing columns, names that are there twice, values that are not finite or out of their limits,
-    unknown units, and columns that are misspelt.
+    Raises InputError, of all mistakes at once, for missing columns, names that are there twice, values that are not finite or out
+    of their limits, unknown units, and columns that are misspelt.
     """
     try:
         state = path.stat()
@@ -127,51 +132,65 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
     from .storage.ecsv import read_table  # most runs read no table
 
     table = read_table(path)
-    missing = [name for name in ("name", "xi", "eta") if name not in table.columns]
-    if missing:
-        cure = f"a table of detectors has name, xi and eta; it has: {', '.join(table.columns)}"
-        raise InputError(f"has no column {missing[0]!r}", place=table.place, cure=cure)
-    known = (*TEXTS, *QUANTITIES)
-    for column in table.columns:
-        if column not in known and (hint := nearest(column, known)):
-            raise InputError(f"has an unknown column {column!r}", place=table.place, cure=hint)
-    names = table.texts("name")
+    mistakes = Mistakes(table.place)
+    _check_columns(table, mistakes)
+    names = table.texts("name") if "name" in table.columns else [""] * len(table)
     seen: dict[str, int] = {}
-    for row, name in enumerate(names):
+    for name, line in zip(names if "name" in table.columns else (), table.lines, strict=False):
         if not name or name in seen:
-            text = f"name {name!r} of row {row + 1} is that of row {seen[name] + 1} too" if name else f"row {row + 1} has no name"
-            raise InputError(text, place=table.place, cure="give each detector a name of its own")
-        seen[name] = row
-    columns: dict[str, NDArray[Any]] = {
-        key: _within_limits(table, key, table.numbers(key, unit)) for key, unit in QUANTITIES.items() if key in table.columns
-    }
-    away = np.hypot(columns["xi"], columns["eta"])
-    if away.max() > FARTHEST:
-        row = int(away.argmax())
-        degrees, most = (math.degrees(math.atan(tangent)) for tangent in (away[row], FARTHEST))
-        text = f"detector {names[row]} in row {row + 1} looks {degrees:.4g} deg away from the boresight"
-        cure = f"give xi and eta within {most:.4g} deg; see that their units are right"
-        raise InputError(text, place=table.place, cure=cure)
+            text = f"name {name!r} is that of line {seen[name]} too" if name else "has no name"
+            mistakes.add(line, text, "give each detector a name of its own")
+        seen.setdefault(name, line)
+    columns: dict[str, NDArray[Any]] = {}
+    for key, unit in QUANTITIES.items():
+        if key in table.columns:
+            with mistakes.noted():
+                columns[key] = table.numbers(key, unit)
+            _check_limits(table, key, mistakes)
+    if {"xi", "eta"} <= columns.keys():
+        _check_distances(table, names, np.hypot(columns["xi"], columns["eta"]), mistakes)
     if "polarization_angle" in columns:
         columns.setdefault("polarization_efficiency", np.ones(len(names)))
     if "wafer" in table.columns:
         columns["wafer"] = _numbered(table.texts("wafer"))
     if "dead" in table.columns:
-        columns["dead"] = _dead(table)
+        columns["dead"] = _dead(table, mistakes)
+    mistakes.tell()
     bands = table.texts("band") if "band" in table.columns else []
-    return ArrayTable(table.place, names, bands, columns)
+    return ArrayTable(table.place, names, bands, columns, table.lines)
 
 
-def _within_limits(table: Table, key: str, values: Floats) -> Floats:
+def _check_columns(table: Table, mistakes: Mistakes) -> None:
+    """Those that a table must have are there, and none is misspelt."""
+    known = (*TEXTS, *QUANTITIES)
+    misspelt = {
+        c: hint for c in table.columns if c not in known and (hint := nearest(c, [k for k in known if k not in table.columns]))
+    }
+    for column, hint in misspelt.items():
+        mistakes.add(table.lines[-1], f"has an unknown column {column!r}", hint)
+    for name in ("name", "xi", "eta"):
+        if name not in table.columns and not any(repr(name) in hint for hint in misspelt.values()):
+            cure = f"a table of detectors has name, xi and eta; it has: {', '.join(table.columns)}"
+            mistakes.add(table.lines[-1], f"has no column {name!r}", cure)
+
+
+def _check_limits(table: Table, key: str, mistakes: Mistakes) -> None:
+    """Those of a pure number, and zero, hold in every unit."""
+    values = table.values(key)
     low = -np.inf if key in SIGNED else 0.0
-    bad = np.flatnonzero((values < low) | (values > LARGEST.get(key, np.inf)) | ((values == 0) & (key in POSITIVE)))
-    if bad.size:
-        row = int(bad[0])
-        limits = "more than 0" if key in POSITIVE else "0 or more"
-        limits += f", at most {LARGEST[key]:g}" if key in LARGEST else ""
-        text = f"{key} of row {row + 1} is {table.texts(key)[row]}"
-        raise InputError(text, place=table.place, cure=f"give {limits}")
-    return values
+    limits = "more than 0" if key in POSITIVE else "0 or more"
+    limits += f", at most {LARGEST[key]:g}" if key in LARGEST else ""
+    for row in np.flatnonzero(
+        (values < low) | (values > LARGEST.get(key, np.inf)) | ((values == 0) & (key in POSITIVE))
+    ).tolist():
+        mistakes.add(table.lines[row], f"{key} is {table.texts(key)[row]}", f"give {limits}")
+
+
+def _check_distances(table: Table, names: list[str], away: Floats, mistakes: Mistakes) -> None:
+    for row in np.flatnonzero(away > FARTHEST).tolist():
+        degrees, most = (math.degrees(math.atan(tangent)) for tangent in (away[row], FARTHEST))
+        text = f"detector {names[row]} looks {degrees:.4g} deg away from the boresight"
+        mistakes.add(table.lines[row], text, f"give xi and eta within {most:.4g} deg; see that their units are right")
 
 
 def _numbered(texts: list[str]) -> NDArray[np.int64]:
@@ -182,13 +201,12 @@ def _numbered(texts: list[str]) -> NDArray[np.int64]:
         return np.unique(texts, return_inverse=True)[1].astype(np.int64).ravel()
 
 
-def _dead(table: Table) -> NDArray[np.int64]:
+def _dead(table: Table, mistakes: Mistakes) -> NDArray[np.int64]:
     texts = [text.lower() for text in table.texts("dead")]
-    for row, text in enumerate(texts):
+    for text, line in zip(texts, table.lines, strict=False):
         if text not in DEAD:
-            place = table.place
-            raise InputError(f"dead of row {row + 1} is {text!r}", place=place, cure="write true or false")
-    return np.array([DEAD[text] for text in texts], np.int64)
+            mistakes.add(line, f"dead is {text!r}", "write true or false")
+    return np.array([DEAD.get(text, 0) for text in texts], np.int64)
 
 
 def stated_by(table: ArrayTable, band: str, stated: Mapping[str, Any]) -> dict[str, Any]:

@@ -163,7 +163,7 @@ def test_mistakes_in_the_files_of_several_steps_stand_at_their_parameters(here, 
         assert "my.yaml:7:34" in message
         assert "is no schedule" in message
         assert "my.yaml:8:31" in message
-        assert "dec of row 2 is 95 deg" in message
+        assert "line 3: dec is 95 deg" in message
         assert "2 mistakes in my.yaml" in message
 
 

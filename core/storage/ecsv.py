@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..configuration.units import KINDS
 from ..errors import InputError
 from .files import reading, write_text
+from .table_mistakes import Mistakes, TableError
 
 LARGEST = 1 << 28
 """Bytes of a file that is read as a small table."""
@@ -63,64 +65,67 @@ class Table:
         The file, as messages call it.
     columns
         By name: texts and the unit as it is written (empty: none).
+    lines
+        Line of the file of each row, from 1; of the heading last.
     """
 
     place: str
     columns: Mapping[str, tuple[list[str], str]]
+    lines: Sequence[int]
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()))[0]) if self.columns else 0
 
     def texts(self, name: str) -> list[str]:
-        """A column as it is written. Raises InputError where there is none of this name."""
+        """A column as it is written. Raises `TableError` where there is none of this name."""
         if name not in self.columns:
-            raise InputError(f"has no column {name!r}", place=self.place, cure=f"it has: {', '.join(self.columns)}")
+            cure = f"it has: {', '.join(self.columns)}"
+            raise TableError(self.place, [(self.lines[-1], f"has no column {name!r}", cure)])
         return self.columns[name][0]
 
     def numbers(self, name: str, unit: str = "") -> NDArray[np.float64]:
         """A column of finite numbers, in ``unit``; where that is empty, the column has none.
 
-        Raises InputError for a column without a unit, of another kind, or with a row that is not a finite number.
+        Raises `TableError` for a column without a unit, of another kind, and for every row that is not a finite number.
         """
-        texts, written = self.texts(name), self.columns[name][1]
-        try:
-            values = np.array([float(text) for text in texts])
-        except ValueError:
-            values = np.array([np.nan])
-            bad = next(row for row, text in enumerate(texts) if not _is_number(text))
-        else:
-            bad = int(np.argmin(np.isfinite(values))) if len(values) else 0
-        if not np.isfinite(values).all():
-            raise InputError(
-                f"{name} of row {bad + 1} is {texts[bad]!r}, not a finite number",
-                place=self.place,
-                cure="mend or remove that row",
-            )
-        return values * self._factor(name, written, unit)
+        texts, mistakes = self.texts(name), Mistakes(self.place)
+        factor = 1.0
+        with mistakes.noted():
+            factor = self._factor(name, self.columns[name][1], unit)
+        values = self.values(name)
+        for row in np.flatnonzero(~np.isfinite(values)).tolist():
+            text = f"{name} is {texts[row]!r}, not a finite number"
+            mistakes.add(self.lines[row], text, "mend or remove that row")
+        mistakes.tell()
+        return values * factor
+
+    def values(self, name: str) -> NDArray[np.float64]:
+        """A column as numbers, in the unit in which it is written; NaN where it has another text."""
+        return np.array([_number(text) for text in self.texts(name)])
 
     def _factor(self, name: str, written: str, unit: str) -> float:
         if not unit and not written:
             return 1.0
+        named = KINDS[unit].display if unit in KINDS else (unit,)
+        accepted = f"{', '.join(named[:-1])} or {named[-1]}" if len(named) > 1 else unit
         if not written:
-            cure = f"give it one: in ECSV 'unit: {unit}', in CSV a heading such as {name} [{unit}]"
-            raise InputError(f"{name} has no unit", place=self.place, cure=cure)
+            cure = f"give it in {accepted}: in ECSV 'unit: {named[0]}', in CSV a heading such as {name} [{named[0]}]"
+            raise TableError(self.place, [(self.lines[-1], f"{name} has no unit", cure)])
         from astropy import units
 
         try:
             return float(units.Unit(written).to(units.Unit(unit)))
         except (ValueError, units.UnitConversionError):
-            raise InputError(
-                f"{name} has the unit {written!r}",
-                place=self.place,
-                cure=f"give it in {unit}, or another unit of its kind" if unit else "leave the unit out",
-            ) from None
+            cure = f"give it in {accepted}, or another unit of its kind" if unit else "leave the unit out"
+            raise TableError(self.place, [(self.lines[-1], f"{name} has the unit {written!r}", cure)]) from None
 
 
-def _is_number(text: str) -> bool:
+def _number(text: str) -> float:
+    """NaN where it is none."""
     try:
-        return math.isfinite(float(text))
+        return float(text)
     except ValueError:
-        return False
+        return math.nan
 
 
 def read_table(path: Path) -> Table:
@@ -133,32 +138,51 @@ def read_table(path: Path) -> Table:
         if path.stat().st_size > LARGEST:
             raise InputError(f"is larger than {LARGEST >> 20} MB", place=place, cure="give a small table")
         text = path.read_text(encoding="utf-8-sig")
-    names, units, rows = _ecsv(text, place) if text.startswith("# %ECSV") else _csv(text)
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise InputError(f"has two columns {twice[0]!r}", place=place, cure="rename one of them")
-    for number, row in enumerate(rows):
+    names, units, rows, lines = _ecsv(text, place) if text.startswith("# %ECSV") else _csv(text)
+    mistakes = Mistakes(place)
+    for name in sorted({n for n in names if names.count(n) > 1}):
+        mistakes.add(lines[-1], f"has two columns {name!r}", "rename one of them")
+    for row, line in zip(rows, lines, strict=False):
         if len(row) != len(names):
             cure = f"write {len(names)} values: {', '.join(names)}"
-            raise InputError(f"row {number + 1} has {len(row)} values, not {len(names)}", place=place, cure=cure)
+            mistakes.add(line, f"has {len(row)} values, not {len(names)}", cure)
     if not rows:
-        raise InputError("has no rows", place=place, cure="give a table with a row or more")
+        mistakes.add(0, "has no rows", "give a table with a row or more")
+    mistakes.tell()
     columns = [list(column) for column in zip(*rows, strict=True)]
-    return Table(place, {n: (c, u) for n, u, c in zip(names, units, columns, strict=True)})
+    return Table(place, {n: (c, u) for n, u, c in zip(names, units, columns, strict=True)}, lines)
 
 
-def _csv(text: str) -> tuple[list[str], list[str], list[list[str]]]:
-    """Names, units and rows."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    first = lines[0].lstrip("# ") if lines else ""
-    named = [word.partition("[") for word in next(csv.reader([first]), [])]
+Cells = list[list[str]]
+Written = tuple[list[str], list[str], Cells, list[int]]
+"""Names, units and rows of a table, and `Table.lines`."""
+
+
+def _csv(text: str) -> Written:
+    """CSV. The heading is the first line that is no comment; where that has numbers, a comment above with as many fields."""
+    written = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    numbers, rows = _cells([(number, line) for number, line in written if not line.startswith("#")], ",")
+    if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
+        above = [(number, line.lstrip("# ")) for number, line in written if line.startswith("#") and number < numbers[0]]
+        fitting = [(number, row) for number, row in zip(*_cells(above, ","), strict=True) if len(row) == len(rows[0])]
+        with_units = [(number, row) for number, row in fitting if any("[" in cell for cell in row)]
+        if fitting:
+            number, heading = (with_units or fitting)[-1]
+            numbers, rows = [number, *numbers], [heading, *rows]
+    named = [word.partition("[") for word in (rows[0] if rows else [])]
     names, units = [name.strip() for name, _, _ in named], [unit.strip("] ") for _, _, unit in named]
-    rows = csv.reader((line for line in lines[1:] if not line.startswith("#")), skipinitialspace=True)
-    return names, units, [[cell.strip() for cell in row] for row in rows]
+    return names, units, [[cell.strip() for cell in row] for row in rows[1:]], [*numbers[1:], *(numbers[:1] or [1])]
 
 
-def _ecsv(text: str, place: str) -> tuple[list[str], list[str], list[list[str]]]:
-    """Names, units and rows."""
+def _cells(lines: Sequence[tuple[int, str]], comma: str) -> tuple[list[int], Cells]:
+    """Cells of numbered lines, and the number of the line of each row."""
+    reader = csv.reader((line for _, line in lines), delimiter=comma, skipinitialspace=True)
+    found = [(lines[reader.line_num - 1][0], row) for row in reader]
+    return [number for number, _ in found], [row for _, row in found]
+
+
+def _ecsv(text: str, place: str) -> Written:
+    """ECSV."""
     import yaml
 
     with reading(place, "ECSV", "write it with astropy: table.write(path, format='ascii.ecsv')"):
@@ -166,12 +190,11 @@ def _ecsv(text: str, place: str) -> tuple[list[str], list[str], list[list[str]]]
         head = [line[2:] for line in lines if line.startswith("# ")]
         document = yaml.safe_load(_without_meta(head[1:]))
         described = {str(column["name"]): str(column.get("unit", "")) for column in document["datatype"]}
-        comma = str(document.get("delimiter", " "))
-        body = [line for line in lines if line.strip() and not line.startswith("#")]
-        rows = list(csv.reader(body, delimiter=comma, skipinitialspace=True))
+        body = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+        numbers, rows = _cells(body, str(document.get("delimiter", " ")))
         names = rows[0]
         units = [described[name] for name in names]
-    return names, units, rows[1:]
+    return names, units, rows[1:], [*numbers[1:], numbers[0]]
 
 
 def _without_meta(head: list[str]) -> str:

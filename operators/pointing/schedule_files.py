@@ -15,6 +15,8 @@ from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.storage.ecsv import Table, read_table
 from zonda.core.storage.files import reading
+from zonda.core.storage.table_mistakes import Mistakes
+from zonda.core.types import Floats
 
 COLUMNS = ("start_time", "stop_time", "boresight_angle", "name", "azmin", "azmax", "el", "scan_index", "subscan_index")
 """In the order of version 4."""
@@ -126,22 +128,40 @@ def read_schedule(path: Path) -> list[Row]:
 def _version_4(path: Path, place: str) -> Table:
     """The table of a text schedule: a line about the site, then nine fields a line, between bars."""
     with reading(place, "a schedule", CURE):
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip() and not line.startswith("#")]
-    rows = [[field.strip() for field in line.split("|")] if "|" in line else line.split() for line in lines]
+        text = path.read_text(encoding="utf-8").splitlines()
+    written = [(number, line) for number, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
+    rows = [[field.strip() for field in line.split("|")] if "|" in line else line.split() for _, line in written]
     if len(rows) < 2 or len(rows[0]) != 5:
         raise InputError("is no schedule: there is no line about the site, or none behind it", place=place, cure=CURE)
-    for number, row in enumerate(rows[1:]):
+    mistakes, lines = Mistakes(place), [number for number, _ in written]
+    for line, row in zip(lines[1:], rows[1:], strict=True):
         if len(row) != len(COLUMNS):
-            raise InputError(f"row {number + 1} has {len(row)} fields, not {len(COLUMNS)}", place=place, cure=CURE)
+            mistakes.add(line, f"has {len(row)} fields, not {len(COLUMNS)}", CURE)
+    mistakes.tell()
     columns = [list(column) for column in zip(*rows[1:], strict=True)]
     units = dict.fromkeys(("boresight_angle", "azmin", "azmax", "el"), "deg")
-    return Table(place, {name: (column, units.get(name, "")) for name, column in zip(COLUMNS, columns, strict=True)})
+    named = {name: (column, units.get(name, "")) for name, column in zip(COLUMNS, columns, strict=True)}
+    return Table(place, named, [*lines[1:], lines[0]])
 
 
 def _rows(table: Table) -> list[Row]:
-    angles = {name: table.numbers(name, "rad") for name in ("boresight_angle", "azmin", "azmax", "el")}
-    texts = {name: table.texts(name) for name in ("name", "scan_index", "subscan_index")}
-    begin, end = (_times(table, name) for name in ("start_time", "stop_time"))
+    mistakes, angles, texts, times = (
+        Mistakes(table.place),
+        dict[str, Floats](),
+        dict[str, list[str]](),
+        dict[str, list[Instant]](),
+    )
+    for name in ("boresight_angle", "azmin", "azmax", "el"):
+        with mistakes.noted():
+            angles[name] = table.numbers(name, "rad")
+    for name in ("name", "scan_index", "subscan_index"):
+        with mistakes.noted():
+            texts[name] = table.texts(name)
+    for name in ("start_time", "stop_time"):
+        with mistakes.noted():
+            times[name] = _times(table, name)
+    mistakes.tell()
+    begin, end = times["start_time"], times["stop_time"]
     found = []
     for k in range(len(table)):
         low, high = float(angles["azmin"][k]), float(angles["azmax"][k])
@@ -158,8 +178,9 @@ def _rows(table: Table) -> list[Row]:
         )
         wrong = _what_is_wrong(row)
         if wrong:
-            raise InputError(f"row {k + 1} ({row.label}): {wrong}", place=table.place, cure="mend or remove that row")
+            mistakes.add(table.lines[k], f"{row.label}: {wrong}", "mend or remove that row")
         found.append(row)
+    mistakes.tell()
     return found
 
 
@@ -174,11 +195,11 @@ def _what_is_wrong(row: Row) -> str:
 
 
 def _times(table: Table, name: str) -> list[Instant]:
-    found = []
-    for number, text in enumerate(table.texts(name)):
+    found, mistakes = [], Mistakes(table.place)
+    for text, line in zip(table.texts(name), table.lines, strict=False):
         try:
             found.append(Instant.parse(re.sub(r"\s*\+00:00$", "Z", text)))
         except ValueError as err:
-            cure = "write it as 2025-03-01T06:00:00+00:00"
-            raise InputError(f"{name} of row {number + 1}: {err}", place=table.place, cure=cure) from None
+            mistakes.add(line, f"{name}: {err}", "write it as 2025-03-01T06:00:00+00:00")
+    mistakes.tell()
     return found

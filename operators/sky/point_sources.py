@@ -31,6 +31,7 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.storage.ecsv import read_table
+from zonda.core.storage.table_mistakes import Mistakes
 from zonda.core.types import Floats
 
 REACH = 6.0
@@ -89,17 +90,22 @@ class Catalogue:
     def read(cls, step: PointSources) -> Catalogue:
         """Raises InputError for a table without the columns, or with a declination that there is not."""
         table = read_table(step.catalogue)
-        ra, dec, flux = table.numbers("ra", "rad"), table.numbers("dec", "rad"), table.numbers("flux", "Jy")
-        if (np.abs(dec) > np.pi / 2 + 1e-12).any():
-            row = int(np.argmax(np.abs(dec) > np.pi / 2)) + 1
-            raise InputError(f"dec of row {row} is {np.degrees(dec[row - 1]):g} deg", place=table.place, cure="mend that row")
-        index = table.numbers("spectral_index") if "spectral_index" in table.columns else np.zeros(len(flux))
+        units = {"ra": "rad", "dec": "rad", "flux": "Jy", "spectral_index": "", "frequency": "Hz"}
+        mistakes, found = Mistakes(table.place), dict[str, Floats]()
+        for name in ["ra", "dec", "flux", *({"spectral_index", "frequency"} & table.columns.keys())]:
+            with mistakes.noted():
+                found[name] = table.numbers(name, units[name])
+        for row in np.flatnonzero(np.abs(found.get("dec", np.zeros(0))) > np.pi / 2 + 1e-12).tolist():
+            mistakes.add(table.lines[row], f"dec is {np.degrees(found['dec'][row]):g} deg", "mend that row")
+        mistakes.tell()
+        ra, dec, flux = found["ra"], found["dec"], found["flux"]
+        index = found.get("spectral_index", np.zeros(len(flux)))
         if "frequency" in table.columns:
             if step.frequency is not None:
                 raise InputError(
                     "has a column frequency", place=table.place, cure=f"remove {step.label}.frequency, or the column"
                 )
-            frequency = table.numbers("frequency", "Hz")
+            frequency = found["frequency"]
         else:
             frequency = np.full(len(flux), math.nan if step.frequency is None else step.frequency)
         return cls(unit_vectors(ra, dec), flux, index, frequency)

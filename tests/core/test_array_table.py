@@ -123,7 +123,7 @@ def test_of_a_table_that_cannot_be_read_nothing_else_is_said(tmp_path: Path) -> 
     table = written(tmp_path / "a.csv", f"{HEAD}, net [uK s(1/2)]", ["a, 0, 0, 300", "a, 0.1, 0, 400"])
     with pytest.raises(ZondaError) as caught:  # not that net is missing, which the table would have given
         zonda.Instrument(**{k: v for k, v in CAMERA.items() if k != "net"}, focalplane=str(table))
-    assert "is that of row 1 too" in str(caught.value)
+    assert "is that of line 2 too" in str(caught.value)
     assert "net" not in str(caught.value).splitlines()[0]
 
 
@@ -166,20 +166,20 @@ def test_a_variant_with_a_table(tmp_path: Path) -> None:
 
 FAULTS = [
     ("name, xi [deg]", ["a, 0"], "has no column 'eta'", "a table of detectors has name, xi and eta"),
-    (HEAD, ["a, 0, 0", "a, 1, 0"], "name 'a' of row 2 is that of row 1 too", "name of its own"),
-    (HEAD, ["a, 0, 0", ", 1, 0"], "row 2 has no name", "name of its own"),
-    (HEAD, ["a, 0, 0", "b, nan, 0"], "xi of row 2 is 'nan'", "mend or remove that row"),
-    (HEAD, ["a, 0, 0", "b, east, 0"], "xi of row 2 is 'east'", "mend or remove that row"),
-    (HEAD, ["a, 0"], "row 1 has 2 values, not 3", "write 3 values"),
-    ("name, xi, eta [deg]", ["a, 0, 0"], "xi has no unit", "xi [rad]"),
-    ("name, xi [parsnips], eta [deg]", ["a, 0, 0"], "xi has the unit 'parsnips'", "give it in rad"),
-    (f"{HEAD}, net [K]", ["a, 0, 0, 1"], "net has the unit 'K'", "give it in K s(1/2)"),
-    (f"{HEAD}, fwhm [deg]", ["a, 0, 0, 0"], "fwhm of row 1 is 0", "more than 0"),
-    (f"{HEAD}, polarization_efficiency", ["a, 0, 0, 1.5"], "polarization_efficiency of row 1 is 1.5", "at most 1"),
-    (f"{HEAD}, dead", ["a, 0, 0, maybe"], "dead of row 1 is 'maybe'", "true or false"),
+    (HEAD, ["a, 0, 0", "a, 1, 0"], "line 3: name 'a' is that of line 2 too", "name of its own"),
+    (HEAD, ["a, 0, 0", ", 1, 0"], "line 3: has no name", "name of its own"),
+    (HEAD, ["a, 0, 0", "b, nan, 0"], "line 3: xi is 'nan'", "mend or remove that row"),
+    (HEAD, ["a, 0, 0", "b, east, 0"], "line 3: xi is 'east'", "mend or remove that row"),
+    (HEAD, ["a, 0"], "line 2: has 2 values, not 3", "write 3 values"),
+    ("name, xi, eta [deg]", ["a, 0, 0"], "xi has no unit", "deg, arcmin, arcsec or rad: in ECSV"),
+    ("name, xi [parsnips], eta [deg]", ["a, 0, 0"], "xi has the unit 'parsnips'", "give it in deg, arcmin, arcsec or rad"),
+    (f"{HEAD}, net [K]", ["a, 0, 0, 1"], "net has the unit 'K'", "give it in mK s(1/2), uK s(1/2) or K s(1/2)"),
+    (f"{HEAD}, fwhm [deg]", ["a, 0, 0, 0"], "line 2: fwhm is 0", "more than 0"),
+    (f"{HEAD}, polarization_efficiency", ["a, 0, 0, 1.5"], "line 2: polarization_efficiency is 1.5", "at most 1"),
+    (f"{HEAD}, dead", ["a, 0, 0, maybe"], "line 2: dead is 'maybe'", "true or false"),
     (f"{HEAD}, polarisation_angle [deg]", ["a, 0, 0, 0"], "unknown column 'polarisation_angle'", "'polarization_angle'"),
     (HEAD, [], "has no rows", "a row or more"),
-    (HEAD, ["a, 0, 0", "b, 30, 20"], "detector b in row 2 looks 32.18 deg away", "see that their units are right"),
+    (HEAD, ["a, 0, 0", "b, 30, 20"], "line 3: detector b looks 32.18 deg away", "see that their units are right"),
 ]
 
 
@@ -196,7 +196,7 @@ def test_faults_of_a_table(tmp_path: Path, head: str, rows: list[str], cause: st
     ("camera", "head", "rows", "cause"),
     [
         (TWO, HEAD, ["a, 0, 0"], "has no column 'band', and the instrument has several"),
-        (TWO, f"{HEAD}, band", ["a, 0, 0, f090", "b, 0, 0, f151"], "detector b in row 2 is of the unknown band 'f151'"),
+        (TWO, f"{HEAD}, band", ["a, 0, 0, f090", "b, 0, 0, f151"], "line 3: detector b is of the unknown band 'f151'"),
         (TWO, f"{HEAD}, band", ["a, 0, 0, f090"], "has no detector of the band f150; its bands: f090"),
         (TWO, f"{HEAD}, band", ["a, 0, 0, f090", "b, 0, 0, f151"], "did you mean 'f150'? the instrument has: f090, f150"),
         (CAMERA, f"{HEAD}, band", ["a, 0, 0, f090"], "unknown band 'f090'"),
@@ -215,6 +215,23 @@ def test_tables_that_do_not_suit_the_instrument(
     assert cause in str(caught.value)
 
 
+def test_all_mistakes_of_a_table_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
+    rows = ["# an outer ring", "a, 0, 0, 1, 0.5, no", "b, 40, x, 1, 4, maybe", "", "b, 0.1, 0, -1, nan, yes"]
+    with pytest.raises(ZondaError) as caught:
+        of(tmp_path, "name, xi [deg], eta [deg], net, slope, dead", *rows)
+    told = [line.removeprefix("  = ") for line in str(caught.value).splitlines() if line.startswith("  = line ")]
+    assert [line.partition(";")[0] for line in told] == [
+        "line 1: net has no unit",
+        "line 4: eta is 'x', not a finite number",
+        "line 4: slope is 4",
+        "line 4: dead is 'maybe'",
+        "line 6: name 'b' is that of line 4 too",
+        "line 6: net is -1",
+        "line 6: slope is 'nan', not a finite number",
+    ]
+    assert "array.csv: 7 mistakes" in str(caught.value)
+
+
 def test_a_pipeline_file_names_the_table_beside_it(tmp_path: Path) -> None:
     written(tmp_path / "array.csv", HEAD, ["a, 0, 0", "b, nan, 0"])
     path = tmp_path / "my.yaml"
@@ -222,7 +239,7 @@ def test_a_pipeline_file_names_the_table_beside_it(tmp_path: Path) -> None:
         "site: green_bank\ninstrument:\n  like: mustang2\n  focalplane: array.csv\ntime: 2024-11-25T07:00\ntarget: 05h +20d\n"
         "operators:\n  - PointingDaisy\n  - WhiteNoise\n  - Efficiency\n  - BinMap\n"
     )
-    with pytest.raises(ZondaError, match=r"xi of row 2 is 'nan'") as caught:
+    with pytest.raises(ZondaError, match=r"line 3: xi is 'nan'") as caught:
         load(path)
     assert "my.yaml:4" in str(caught.value)
     assert "1 mistake" in str(caught.value)

@@ -63,12 +63,12 @@ def test_shares_from_a_file(bench, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "heading", "match"),
     [
-        (["A,B,0.1"], "detector,source", "row 1 has 3 values, not 2"),
-        (["nobody,{1},0.1"], "detector,source,share", "detector 'nobody' in row 1 is no detector of the focal plane"),
+        (["A,B,0.1"], "detector,source", "line 2: has 3 values, not 2"),
+        (["nobody,{1},0.1"], "detector,source,share", "line 2: detector 'nobody' is no detector of the focal plane"),
         (["{0},{0},0.1"], "detector,source,share", "a detector's share of itself"),
         (["{0},{1},0.1", "{0},{1},0.2"], "detector,source,share", "there twice"),
-        (["{0},{1},nan"], "detector,source,share", "share of row 1 is 'nan', not a finite number"),
-        (["{0},{1},much"], "detector,source,share", "share of row 1 is 'much'"),
+        (["{0},{1},nan"], "detector,source,share", "line 2: share is 'nan', not a finite number"),
+        (["{0},{1},much"], "detector,source,share", "line 2: share is 'much'"),
         (["{0},{1}"], "detector,source", "has no column 'share'"),
         ([], "detector,source,share", "has no rows"),
     ],

@@ -272,11 +272,12 @@ def change(number, **values):
 @pytest.mark.parametrize(
     ("rows", "match"),
     [
-        (change(1, stop_time=ROWS[1][0]), r"row 2 \(patch-0-1\): stop_time is not later than start_time"),
+        (change(1, stop_time=ROWS[1][0]), "line 21: patch-0-1: stop_time is not later than start_time"),
         (change(0, el=91.0), "el is 91 deg, not between 0 and 90 deg"),
         (change(0, azmax=600.0), "more than a turn apart"),
-        (change(0, azmin="nan"), "azmin of row 1 is 'nan', not a finite number"),
-        (change(0, start_time="yesterday"), "start_time of row 1: cannot read 'yesterday' as a time"),
+        (change(0, azmin="nan"), "line 20: azmin is 'nan', not a finite number"),
+        (change(0, start_time="yesterday"), "line 20: start_time: cannot read 'yesterday' as a time"),
+        (change(0, azmin="nan", start_time="now"), r"2 mistakes\n  = line 20: azmin is 'nan'.*\n  = line 20: start_time: cannot"),
         ([], "has no rows"),
     ],
 )

@@ -92,7 +92,7 @@ def test_fluxes_at_another_frequency(tmp_path):
         ("ra [deg],dec [deg]", (75, 20), "has no column 'flux'"),
         ("ra [deg],dec [deg],flux", (75, 20, 1), "flux has no unit"),
         ("ra [deg],dec [deg],flux [K]", (75, 20, 1), "flux has the unit 'K'"),
-        ("ra [deg],dec [deg],flux [Jy]", (75, 95, 1), "dec of row 1 is 95 deg"),
+        ("ra [deg],dec [deg],flux [Jy]", (75, 95, 1), "line 2: dec is 95 deg"),
         ("ra [deg],dec [deg],flux [Jy]", (75, 20, "nan"), "not a finite number"),
     ],
 )
