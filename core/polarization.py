@@ -79,7 +79,7 @@ class PolarizationAngles:
 
         At the pole itself, where psi is not defined, 1 and 0. The bits depend on detector and sample alone.
         """
-        _fill(self.poles, self.axes, self.plate, self.gamma, detectors, start, cosine, sine)
+        fill_angles(self.poles, self.axes, self.plate, self.gamma, detectors, start, cosine, sine)
 
     def add(
         self,
@@ -104,7 +104,8 @@ def seen_from(quaternions: Floats, direction: Floats) -> Floats:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _fill(poles, axes, plate, gamma, detectors, start, cosine, sine):  # type: ignore[no-untyped-def]
+def fill_angles(poles, axes, plate, gamma, detectors, start, cosine, sine):  # type: ignore[no-untyped-def]
+    """The loop of `PolarizationAngles.fill`."""
     n, has_plate = cosine.shape[1], plate.shape[1] > 0
     x, y, z = poles[0, start : start + n], poles[1, start : start + n], poles[2, start : start + n]
     for k in range(detectors.size):
@@ -128,15 +129,16 @@ def _fill(poles, axes, plate, gamma, detectors, start, cosine, sine):  # type: i
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _add(poles, axes, plate, gamma, detectors, start, efficiency, q, u, rows, out):  # type: ignore[no-untyped-def]
     n, cast = out.shape[1], out.dtype.type
-    cosine, sine = np.empty((1, AT_ONCE)), np.empty((1, AT_ONCE))
+    cosine, sine = np.empty(AT_ONCE), np.empty(AT_ONCE)
     for k in range(detectors.size):
         for first in range(0, n, AT_ONCE):
             stop = min(first + AT_ONCE, n)
-            c, s = cosine[:, : stop - first], sine[:, : stop - first]
-            _fill(poles, axes, plate, gamma, detectors[k : k + 1], start + first, c, s)
+            c, s = cosine[: stop - first], sine[: stop - first]
+            turn = c.reshape(1, c.size), s.reshape(1, s.size)  # C arrays: slices of rows would not be worked on in vectors
+            fill_angles(poles, axes, plate, gamma, detectors[k : k + 1], start + first, turn[0], turn[1])
             row, one, two, p = out[rows[k], first:stop], q[k, first:stop], u[k, first:stop], efficiency[k]
             for t in range(stop - first):
-                row[t] += cast(p * (np.float64(one[t]) * c[0, t] + np.float64(two[t]) * s[0, t]))
+                row[t] += cast(p * (np.float64(one[t]) * c[t] + np.float64(two[t]) * s[t]))
 
 
 def between_meridians(directions: Floats, of: Floats, to: Floats) -> NDArray[np.complex128]:

@@ -125,3 +125,74 @@ def prefetch(typing_context: Any, array: Any, place: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.uint64), generate
+
+
+def _vector(builder: Any, pointer: Any, kind: Any) -> Any:
+    """The eight numbers from ``pointer`` on."""
+    return builder.bitcast(pointer, ir.VectorType(kind, 8).as_pointer())
+
+
+def _eight_times(builder: Any, value: Any) -> Any:
+    """A vector of eight times one number."""
+    nothing, lane = ir.Constant(ir.VectorType(value.type, 8), ir.Undefined), ir.IntType(32)
+    first = builder.insert_element(nothing, value, lane(0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(lane, 8), [0] * 8))
+
+
+@intrinsic
+def running_terms(typing_context: Any, c: Any, s: Any, x: Any, y: Any, magic: Any, run: Any, size: Any, out: Any) -> Any:
+    """Sums over the samples 0 .. t of the bits of (x c, x s, x c c, x c s, x s s, y, y c, y s) + ``magic``, each in float64.
+
+    They go to out[8 run[t]] and on, so that those of the last sample of each run stay. With 1.5 2^52 for ``magic``, the sum over
+    a run of integers of up to 51 bits is the difference of two of these, less the bits of ``magic`` once a sample: exact, as all
+    of it is taken modulo 2^64. C arrays: ``c``, ``s``, ``x``, ``y`` float64, ``run`` int32, ``out`` int64; ``size`` (int64)
+    samples; nothing is checked.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        from numba.core import cgutils
+
+        kinds, (size, magic) = signature.args, (arguments[6], arguments[4])
+        c, s, x, y, run, out = (make_array(kinds[k])(context, builder, arguments[k]).data for k in (0, 1, 2, 3, 5, 7))
+        double, integer, lane = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
+        ones = ir.Constant(ir.VectorType(double, 8), [1.0] * 8)
+        magic = _eight_times(builder, magic)
+
+        def choose(a: Any, b: Any, lanes: str) -> Any:
+            """Lanes of ``a``, where there is a 1 those of ``b``."""
+            places = [k + 8 * int(which) for k, which in enumerate(lanes)]
+            return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(lane, 8), places))
+
+        total = cgutils.alloca_once_value(builder, ir.Constant(ir.VectorType(integer, 8), [0] * 8))
+        with cgutils.for_range(builder, size) as loop:
+            at = [_eight_times(builder, builder.load(builder.gep(data, [loop.index]))) for data in (c, s, x, y)]
+            first = choose(at[2], at[3], "00000111")
+            second = choose(choose(ones, at[0], "00110000"), at[1], "00001000")
+            third = choose(choose(at[0], at[1], "01011001"), ones, "00000100")
+            term = builder.fadd(builder.fmul(builder.fmul(first, second), third), magic)
+            added = builder.add(builder.load(total), builder.bitcast(term, ir.VectorType(integer, 8)))
+            builder.store(added, total)
+            place = builder.mul(builder.zext(builder.load(builder.gep(run, [loop.index])), integer), integer(8))
+            builder.store(added, _vector(builder, builder.gep(out, [place]), integer), align=8)
+        return context.get_dummy_value()
+
+    return types.void(c, s, x, y, magic, run, size, out), generate
+
+
+@intrinsic
+def add_change(typing_context: Any, f: Any, at: Any, sums: Any, run: Any, less: Any) -> Any:
+    """f[at + k] += sums[8 run + k] - sums[8 run - 8 + k] - less, k = 0 .. 7, of int64 C arrays; ``at``, ``run`` are uint64."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kinds, (_, at, _, run, less) = signature.args, arguments
+        f, sums = (make_array(kinds[k])(context, builder, arguments[k]).data for k in (0, 2))
+        integer = ir.IntType(64)
+        last = builder.gep(sums, [builder.mul(run, integer(8))])
+        pointers = (last, builder.gep(last, [integer(-8)]), builder.gep(f, [at]))
+        now, before, to = (_vector(builder, pointer, integer) for pointer in pointers)
+        change = builder.sub(builder.load(now, align=8), builder.load(before, align=8))
+        change = builder.sub(change, _eight_times(builder, less))
+        builder.store(builder.add(builder.load(to, align=8), change), to, align=8)
+        return context.get_dummy_value()
+
+    return types.void(f, types.uint64, sums, types.uint64, types.int64), generate

@@ -33,6 +33,7 @@ from .parameters import MapParameters
 from .stokes_map import check_polarized, stokes_binnings
 from .stokes_product import StokesSums
 from .stokes_sums import StokesBinning
+from .stokes_sums import add_block as add_polarized
 from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, WEIGHT, Binning, Sums, add_image, add_list
 
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
@@ -218,8 +219,7 @@ def add_signals(step: BinMap, block: Block, state: Prepared, reference: float) -
     if state.directions is not None:
         state.directions.add(signals, block)
     if step.stokes == "IQU":
-        for polarized in state.binnings:
-            polarized.add(tuple(signals), block)  # type: ignore[union-attr]
+        add_polarized(state.binnings, tuple(signals), block)  # type: ignore[arg-type]
         return
     for half in halves(step, list(state.binnings)):
         left = signals

@@ -34,7 +34,7 @@ from zonda.core.types import Floats
 
 from .grid import Grid
 from .image_grid import rays
-from .stokes_sums import tiles
+from .looking import tiles
 from .sums import WEIGHT, Sums
 
 SLOWEST = 1e-10

@@ -28,7 +28,7 @@ class BinMapPlanning(Planning[BinMap]):
         """Its cost."""
         n, more = self.operator.grid.n_pixels, 2e-8 if self.operator.crosslinking else 0.0
         if self.operator.stokes == "IQU":
-            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, more + (5.2e-8 if self.operator.nside else 3.2e-8)))
+            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, more + (1.6e-8 if self.operator.nside else 1.0e-8)))
         return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, more + 3.2e-9))
 
     def memory(self, observation: Observation) -> int:

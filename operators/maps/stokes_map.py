@@ -19,9 +19,11 @@ from zonda.core.types import Floats
 
 from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES, halves_of
+from .looking import Looking
 from .parameters import MapParameters
+from .stokes_kernel import HIT
 from .stokes_product import StokesSums
-from .stokes_sums import HIT, PLACES, StokesBinning
+from .stokes_sums import PLACES, StokesBinning
 from .sums import VALUE, WEIGHT, Sums
 
 AT_ONCE = 1 << 14
@@ -52,18 +54,15 @@ def stokes_binnings(
     ``levels``: weights and noise of the detectors (`bin_map.weights_of`), and the window (n_samp,) or (0,); ``good`` (n_samp,):
     which samples count. Raises PipelineError where no detector is polarized.
     """
-    plane, (weight, noise, window) = observation.focalplane, levels
+    weight, noise, window = levels
     check_polarized(step, observation)
     own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
     angles = PolarizationAngles.of(observation, observation.boresight_radec, frame_rotation(step.frame)[2])
-    pointing, signals = grid.pointing(observation), len(observation.signals)
+    looking, signals = Looking.of(observation, grid, angles), len(observation.signals)
     return [
-        StokesBinning(
-            grid, pointing, angles, use, (good & samples).astype(np.uint8), window, weight, noise,
-            plane.polarization_efficiency, signals, own, spare,
-        )
+        StokesBinning(looking, use, (good & samples).astype(np.uint8), window, weight, noise, signals, own, spare)
         for use, samples in halves_of(step.split, observation)
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)

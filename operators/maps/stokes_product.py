@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from zonda.core.data import Observation
 
 from .pixel_sums import PixelSums, zeros
-from .stokes_sums import DATA, HIT, MATRIX, StokesBinning
+from .stokes_kernel import DATA, HIT
+from .stokes_sums import MATRIX, StokesBinning
 from .sums import Sums
 
 

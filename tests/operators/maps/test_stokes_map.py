@@ -338,16 +338,3 @@ def test_a_campaign_of_two_workers_gives_the_bits_of_one_run(tmp_path):
     assert np.isfinite(found[0]["Q"]).sum() > 20
     for name, values in found[0].items():
         np.testing.assert_array_equal(values, found[1][name], err_msg=name)
-
-
-def test_a_window_enters_the_noise_squared() -> None:
-    """Equation (2) of `stokes_sums`: two samples of window 1/2 add 2 x 1/4 of their w^2 sigma^2 to N, 2 x 1/2 of w to A."""
-    from zonda.operators.maps.stokes_sums import DATA, add_stokes
-    from zonda.operators.maps.sums import WEIGHT
-
-    sums, one, two = np.zeros((1, DATA + 3 + 6), np.int64), np.ones(1), np.ones((1, 2))
-    how = np.ones(2, np.uint8), np.full(2, 0.5), one, 0.8 * one, one
-    add_stokes((two,), 0, np.zeros(1, np.int64), np.zeros((1, 2), np.int32), two, 0 * two, *how, True, sums,
-               np.zeros(4, np.int64), np.zeros(2))  # fmt: skip
-    assert sums[0, 1] == WEIGHT
-    np.testing.assert_allclose(sums[0, DATA + 3 :] / WEIGHT, np.array([1, 1, 0, 1, 0, 0]) * 0.4, atol=2 / WEIGHT)
