@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from .model import AtmosphereModel, ExpectedLoad
 from .response import Response, delay_per_vapour
 from .turbulence.beams import rayleigh_distance, widened
 from .turbulence.lines_of_sight import LinesOfSight
-from .turbulence.sampling import Drifting, DriftingLayers
-from .turbulence.together import Layers, Together
+from .turbulence.sampling import Drifting, DriftingLayers, share_tiles
 
 PLANES = {
     "transverse": "transverse to the mean line of sight",
@@ -62,70 +61,43 @@ def height_of_vapour(model: AtmosphereModel) -> float:
     return float(shares @ np.array([layer.height for layer in model.layers]) / shares.sum())
 
 
-def _layers_of(model: AtmosphereModel, label: str) -> Layers:
-    """The layers at the nodes; where bands of one camera see them alike, evaluated once for all of these.
+def _layers_of(model: AtmosphereModel, label: str) -> DriftingLayers:
+    """The layers; bands of one camera make the tiles of lattices that they look through together once for all.
 
-    A band takes what was made for it, so that tiles of the turbulence are released with the last that needs them.
+    A band takes what was made for it, so that tiles are released with the last that needs them.
     """
     shared = model.observation.shared
     if shared is None:
         return drifting_layers(model)
 
-    def make(announced: Mapping[str, ExpectedLoad]) -> dict[str, Layers]:
-        return _of_bands([load.model() for load in announced.values()], label, shared.claim)
+    def make(announced: Mapping[str, ExpectedLoad]) -> dict[str, DriftingLayers]:
+        return _of_bands([load.model() for load in announced.values()], label)
 
     return shared.made(label, make).pop(model.observation.name)
 
 
-def _of_bands(models: Sequence[AtmosphereModel], label: str, claim: Callable[[int], bool]) -> dict[str, Layers]:
-    """By name of the band's scan its layers, those of bands that look at the same points and times together."""
-    found: dict[str, Layers] = {}
-    for first in models:
-        if first.observation.name in found:
-            continue
-        group = [model for model in models if model is first or _looks_alike(first, model)]
-        layers = drifting_layers(first, others=group[1:])
-        together = Together(layers, len(group), claim)
-        for number, model in enumerate(group):
-            found[model.observation.name] = together.of(number) if len(group) > 1 else layers
-            others = [other.observation.instrument.band.name for other in group if other is not model]
-            text = f"evaluated once with that of {', '.join(others)}" if others else "evaluated by itself: other nodes or steps"
-            model.observation.tally.state(label, "turbulence beside other bands", text)
-    return found
+def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, DriftingLayers]:
+    """By name of the band's scan its layers."""
+    layers = [drifting_layers(model) for model in models]
+    for model, others in zip(models, share_tiles(layers), strict=True):
+        whole = len(model.turbulence) - len(set(model.parameters.omit))
+        named = ((models[k].observation.instrument.band.name, n) for k, n in sorted(others.items()))
+        parts = ", ".join(f"{name} ({n} of {whole} layers)" for name, n in named)
+        text = f"lattices made once with those of {parts}" if parts else "lattices of its own: other beams or directions"
+        model.observation.tally.state(label, "turbulence beside other bands", text)
+    return {model.observation.name: one for model, one in zip(models, layers, strict=True)}
 
 
-def _looks_alike(one: AtmosphereModel, other: AtmosphereModel) -> bool:
-    """Whether two bands look at the layers from the same points at the same times."""
-    a, b, p, q = one.resolution(), other.resolution(), one.observation, other.observation
-    pairs = (a.nodes, b.nodes), (p.focalplane, q.focalplane)
-    same = a.step == b.step and a.nodes.shape == b.nodes.shape and repr(one.parameters) == repr(other.parameters)
-    if not same or p.boresight_azel is not q.boresight_azel:
-        return False
-    return all(np.array_equal(x.xi, y.xi) and np.array_equal(x.eta, y.eta) for x, y in pairs)
-
-
-def drifting_layers(
-    model: AtmosphereModel, points: tuple[Floats, Floats] | None = None, others: Sequence[AtmosphereModel] = ()
-) -> DriftingLayers:
-    """The layers that are simulated, over the whole scan, to be looked at from focal-plane ``points``, by default the nodes.
-
-    ``others``: models of bands that look alike, for which they are evaluated at once (`DriftingLayers.of_bands`).
-    """
+def drifting_layers(model: AtmosphereModel, points: tuple[Floats, Floats] | None = None) -> DriftingLayers:
+    """The layers that are simulated, over the whole scan, to be looked at from focal-plane ``points``, by default the nodes."""
     chosen = model.resolution()
-    drifting, *more = (_drifting(one) for one in (model, *others))
+    parts = zip(model.turbulence, model.layers, chosen.steps, strict=True)
+    every = [Drifting(field, layer.height, layer.amplitude, layer.wind, step) for field, layer, step in parts]
+    drifting = [one for number, one in enumerate(every) if number not in model.parameters.omit]
     first, count = times(slice(0, model.observation.n_samples), chosen.step)
     kind = np.float64 if chosen.nodes.shape else np.float32
-    span = first, first + count
-    return DriftingLayers(
-        model.observation, model.plane, points or (chosen.nodes.xi, chosen.nodes.eta), drifting, chosen.step, span, kind, more
-    )
-
-
-def _drifting(model: AtmosphereModel) -> list[Drifting]:
-    """The layers that are simulated, as one band sees them."""
-    parts = zip(model.turbulence, model.layers, model.resolution().steps, strict=True)
-    drifting = [Drifting(field, layer.height, layer.amplitude, layer.wind, step) for field, layer, step in parts]
-    return [one for number, one in enumerate(drifting) if number not in model.parameters.omit]
+    points, span = points or (chosen.nodes.xi, chosen.nodes.eta), (first, first + count)
+    return DriftingLayers(model.observation, model.plane, points, drifting, chosen.step, span, kind)
 
 
 def state_drawn(model: AtmosphereModel, label: str, state: AtNodes | OfDetectors) -> None:

@@ -22,8 +22,7 @@ from zonda.core.types import AnyFloats
 
 from .response import Response
 from .turbulence.nodes import Nodes
-from .turbulence.sampling import TIMES_AT_ONCE
-from .turbulence.together import Layers
+from .turbulence.sampling import TIMES_AT_ONCE, DriftingLayers
 
 ToPwv = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
 """(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""
@@ -55,7 +54,7 @@ class AtNodes:
     sums: tuple[int, float, float]
 
     @classmethod
-    def make(cls, nodes: Nodes, layers: Layers, to_pwv: ToPwv, response: Response, step: int, n_samples: int) -> AtNodes:
+    def make(cls, nodes: Nodes, layers: DriftingLayers, to_pwv: ToPwv, response: Response, step: int, n_samples: int) -> AtNodes:
         """Evaluate the layers at the nodes over the whole scan, a part of it at a time."""
         n_node, weights = len(nodes.xi), np.ascontiguousarray(nodes.weights)
         width = -(-n_samples // step) + 3
@@ -87,7 +86,9 @@ class AtNodes:
 class OfDetectors:
     """Each detector's own series, in float32, made on demand. Safe for threads."""
 
-    def __init__(self, nodes: Nodes, layers: Layers, to_pwv: ToPwv, response: Response, step: int, n_samples: int) -> None:
+    def __init__(
+        self, nodes: Nodes, layers: DriftingLayers, to_pwv: ToPwv, response: Response, step: int, n_samples: int
+    ) -> None:
         self._xi, self._eta, self._layers, self._to_pwv, self._response = nodes.xi, nodes.eta, layers, to_pwv, response
         self.step, self._n_samples = step, n_samples
         self._units: OrderedDict[tuple[int, int], Future[dict[str, AnyFloats]]] = OrderedDict()

@@ -63,24 +63,23 @@ def mark(matrix, boxes, i, j, side_i, side_j, first_i, first_j, wanted):  # type
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, shape, addresses, constants, planes, rows, out):  # type: ignore[no-untyped-def]
-    """out[rows[b]] += amplitude * the cubic B-spline of field planes[b], coefficients at ``addresses`` (uint64, one per tile).
+def interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, width, addresses, constants, out):  # type: ignore[no-untyped-def]
+    """out += amplitude * the cubic B-spline of the coefficients at ``addresses`` (uint64, one per tile).
 
-    (low_i, low_j): the first cell of the first tile; ``shape``: of a tile, (fields, rows, cells in a row). ``constants``: 1/6,
-    2/3, 1/2, 1 and the amplitude, of the type that the spline is summed in. Cells and weights are found once for all fields.
+    (low_i, low_j): the first cell of the first tile; ``width``: cells in a row of a tile. ``constants``: 1/6, 2/3, 1/2, 1 and
+    the amplitude, of the type that the spline is summed in.
     """
     m0, m1, m2, m3 = matrix[0], matrix[1], matrix[2], matrix[3]
     inside_i, inside_j = nb.int32((1 << side_i) - 1), nb.int32((1 << side_j) - 1)
-    width, columns_of_tiles = nb.int32(shape[2]), nb.int32(addresses.shape[1])
-    field = nb.uint64(4) * nb.uint64(shape[1]) * nb.uint64(shape[2])
+    stride, width, columns_of_tiles = nb.uint64(width), nb.int32(width), nb.int32(addresses.shape[1])
     shift_i, shift_j = nb.int32(side_i), nb.int32(side_j)
     # Cells are counted from the first tile's, in 32 bits: what the box of one call holds fits.
     origin_i, origin_j = float(low_i), float(low_j)
-    stride, flat = nb.uint64(width), addresses.reshape(-1)
+    flat = addresses.reshape(-1)
     sixth, two_thirds, half, one, amplitude = constants[0], constants[1], constants[2], constants[3], constants[4]
     tile, inside = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
     kind = constants.dtype
-    u, v, sums = np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty((planes.size, 4 * CHUNK), kind)
+    u, v, sums = np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty(4 * CHUNK, kind)
     w0, w1, w2, w3 = np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty(CHUNK, kind)
     for n in range(x.shape[0]):
         for start in range(0, x.shape[1], CHUNK):
@@ -98,17 +97,14 @@ def interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, shape, address
                 q = one - p
                 w0[t], w1[t] = amplitude * (q * q * q * sixth), amplitude * (two_thirds - p * p * (one - p * half))
                 w2[t], w3[t] = amplitude * (two_thirds - q * q * (one - q * half)), amplitude * (p * p * p * sixth)
-            for b in range(planes.size):
-                own = sums[b]
-                for t in range(count):
-                    where = flat[nb.uint64(tile[t])] + nb.uint64(planes[b]) * field + nb.uint64(4) * nb.uint64(inside[t])
-                    four_columns_at(where, stride, w0[t], w1[t], w2[t], w3[t], own, nb.uint64(4) * t)
+            for t in range(count):
+                where = flat[nb.uint64(tile[t])] + nb.uint64(4) * nb.uint64(inside[t])
+                four_columns_at(where, stride, w0[t], w1[t], w2[t], w3[t], sums, nb.uint64(4) * t)
             for t in range(count):
                 p = v[t]
                 q = one - p
                 w0[t], w1[t] = q * q * q * sixth, two_thirds - p * p * (one - p * half)
                 w2[t], w3[t] = two_thirds - q * q * (one - q * half), p * p * p * sixth
-            for b in range(planes.size):
-                own, row = sums[b], out[rows[b], n][start:]
-                for t in range(count):
-                    row[t] += w0[t] * own[4 * t] + w1[t] * own[4 * t + 1] + w2[t] * own[4 * t + 2] + w3[t] * own[4 * t + 3]
+            row = out[n][start:]
+            for t in range(count):
+                row[t] += w0[t] * sums[4 * t] + w1[t] * sums[4 * t + 1] + w2[t] * sums[4 * t + 2] + w3[t] * sums[4 * t + 3]

@@ -114,14 +114,13 @@ class Turbulence:
 
     def coefficients(self, i0: int, i1: int, j0: int, j1: int) -> Field:
         """Cubic B-spline coefficients at lattice points, so that the spline passes through the field. As `region`."""
-        found: Field = coefficients([self], i0, i1, j0, j1)[0]
-        return found
+        return coefficients([self], i0, i1, j0, j1)[0]
 
 
-def coefficients(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -> Field:
-    """`Turbulence.coefficients` of fields that are `alike`, (n_field, i1 - i0, j1 - j0): each has the bits that it has alone."""
+def coefficients(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -> list[Field]:
+    """`Turbulence.coefficients` of fields that are `alike`: each has the bits that it has alone."""
     h = PREFILTER
-    out = np.empty((len(fields), i1 - i0, j1 - j0), np.float32)
+    out = [np.empty((i1 - i0, j1 - j0), np.float32) for _ in fields]
     for field, made in zip(_regions(fields, i0 - h, i1 + h, j0 - h, j1 + h), out, strict=True):
         _prefilter(field, prefilter_taps(), made)
     return out

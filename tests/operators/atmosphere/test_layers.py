@@ -259,33 +259,33 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(tiles, "coefficients", watched)
     expected = series()
     assert len(made) == 2  # a piece for each layer
-    monkeypatch.setattr(sampling, "SPARE", -1)  # of the path's end nothing is in the piece: the others' tiles serve
+    monkeypatch.setattr(tiles, "SPARE", -1)  # of the path's end nothing is in the piece: the others' tiles serve
     np.testing.assert_array_equal(series(), expected)
     assert len(made) > 4
-    monkeypatch.setattr(sampling, "ONE_PIECE", 0)
-    monkeypatch.setattr(sampling, "SPARE", 2)
+    monkeypatch.setattr(tiles, "ONE_PIECE", 0)
+    monkeypatch.setattr(tiles, "SPARE", 2)
     made.clear()
     np.testing.assert_array_equal(series(), expected)
     once = len(made)
     for longest, kept, times in ((16, 512 << 20, 1024), (32, 0, 7), (256, 1 << 20, 100)):
         monkeypatch.setattr(fluctuations, "TIMES_AT_ONCE", times)
         monkeypatch.setattr(fluctuations, "POINTS_AT_ONCE", times)
-        monkeypatch.setattr(sampling, "LONGEST", longest)
+        monkeypatch.setattr(tiles, "LONGEST", longest)
         monkeypatch.setattr(tiles, "BYTES_KEPT", kept)
         monkeypatch.setattr(sampling, "TIMES_AT_ONCE", times)
         made.clear()
         np.testing.assert_array_equal(series(), expected)
         assert {along for _, along in made} == {longest + 3}
         assert len({across for across, _ in made}) <= 2  # as wide as each layer's path
-    monkeypatch.setattr(sampling, "LONGEST", 8)
+    monkeypatch.setattr(tiles, "LONGEST", 8)
     made.clear()
     series()
     assert len(made) > 4 * once
-    monkeypatch.setattr(sampling, "WIDEST", 0)
+    monkeypatch.setattr(tiles, "WIDEST", 0)
     for name, narrow in (("STRIP", 1 << 20), ("SQUARE", 0)):
-        monkeypatch.setattr(sampling, "NARROW", narrow)
+        monkeypatch.setattr(tiles, "NARROW", narrow)
         for sides in ((3, 4), (5, 5)):
-            monkeypatch.setattr(sampling, name, sides)
+            monkeypatch.setattr(tiles, name, sides)
             made.clear()
             np.testing.assert_array_equal(series(), expected)
             assert set(made) == {((1 << sides[0]) + 3, (1 << sides[1]) + 3)}
@@ -743,10 +743,10 @@ def test_units_and_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> 
         return out
 
     expected = series()
-    monkeypatch.setattr(sampling, "ONE_PIECE", 0)
+    monkeypatch.setattr(tiles, "ONE_PIECE", 0)
     np.testing.assert_array_equal(series(), expected)
-    monkeypatch.setattr(sampling, "WIDEST", 0)
-    monkeypatch.setattr(sampling, "SQUARE", (6, 6))
+    monkeypatch.setattr(tiles, "WIDEST", 0)
+    monkeypatch.setattr(tiles, "SQUARE", (6, 6))
     monkeypatch.setattr(tiles, "BYTES_KEPT", 1 << 20)
     np.testing.assert_array_equal(series(), expected)
     monkeypatch.setattr(fluctuations, "UNIT_DETECTORS", 16)

@@ -1,4 +1,4 @@
-"""Turbulence that bands of one camera see at the same points: evaluated once, with the bits that each band has alone."""
+"""Turbulence that bands of one camera look through: its tiles are made once, with the bits that each band has alone."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import pytest
 
 import zonda
 from zonda.core.shared import SharedScan
-from zonda.operators.atmosphere.turbulence import lattice
-from zonda.operators.atmosphere.turbulence.sampling import DriftingLayers
+from zonda.operators.atmosphere.turbulence import lattice, tiles
 from zonda.operators.atmosphere.turbulence.tiles import Tiles
 
 BANDS = {"f090": ("77 GHz", "106 GHz"), "f150": ("130 GHz", "170 GHz"), "f220": ("190 GHz", "250 GHz")}
@@ -30,11 +29,11 @@ def scene(field: str, *names: str, dish: str = "6 m", detectors: int = 19, **cha
     return zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
 
 
-def run(where: zonda.Scene, **settings: Any) -> zonda.Data:
+def run(where: zonda.Scene, tolerance: str = "1 %", **settings: Any) -> zonda.Data:
     """Two scans of 40 s."""
     steps = [
         zonda.PointingDaisy(radius="1 deg", speed="20 arcmin/s", scan_duration="40 s", scans=2),
-        zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %", layers=4, tolerance="1 %"),
+        zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %", layers=4, tolerance=tolerance),
         zonda.Efficiency(),
         zonda.HighpassFilter(frequency="0.1 Hz"),
         zonda.CommonModeFilter(),
@@ -44,29 +43,27 @@ def run(where: zonda.Scene, **settings: Any) -> zonda.Data:
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What is evaluated, by the bands it is for, and how many lattice points are drawn."""
-    found: dict[str, Any] = {"bands": [], "points": 0}
-    of_bands, normals = DriftingLayers.of_bands, lattice.lattice_normals
-
-    def watched(self: DriftingLayers, bands: tuple[int, ...], *rest: Any) -> Any:
-        found["bands"].append(bands)
-        return of_bands(self, bands, *rest)
+def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """How many lattice points are drawn."""
+    found, normals = {"points": 0}, lattice.lattice_normals
 
     def counted(*of: Any) -> Any:
         values = normals(*of)
         found["points"] += values.size
         return values
 
-    monkeypatch.setattr(DriftingLayers, "of_bands", watched)
     monkeypatch.setattr(lattice, "lattice_normals", counted)
     return found
 
 
+def told_of(data: zonda.Data, what: str) -> dict[str, str]:
+    """By band."""
+    return {label.split()[-1]: text for label, name, text in data.tally if name == what}
+
+
 @pytest.mark.parametrize(("field", "dish"), CASES.values(), ids=CASES)
-def test_it_is_evaluated_once_and_has_the_bits_of_a_band_alone(field: str, dish: str, drawn: dict[str, Any]) -> None:
+def test_tiles_are_made_once_and_have_the_bits_of_a_band_alone(field: str, dish: str, drawn: dict[str, int]) -> None:
     together = run(scene(field, *BANDS, dish=dish), keep=["atmosphere"], threads=1)
-    assert set(drawn["bands"]) == {(0, 1, 2)}
     points, drawn["points"] = drawn["points"], 0
     for name in BANDS:
         alone = run(scene(field, name, dish=dish), keep=["atmosphere"], threads=2)
@@ -74,36 +71,47 @@ def test_it_is_evaluated_once_and_has_the_bits_of_a_band_alone(field: str, dish:
             other = together.tod("atmosphere", f"scan-{scan:03d}-{name}")
             np.testing.assert_array_equal(alone.tod("atmosphere", scan), other)
         np.testing.assert_array_equal(alone["map"].signal, together[f"map_{name}"].signal)
-        others = ", ".join(n for n in BANDS if n != name)
-        told = [text for label, what, text in together.tally if what == "turbulence beside other bands" and label.endswith(name)]
-        assert told == [f"evaluated once with that of {others}"]
+        others = ", ".join(f"{n} (4 of 4 layers)" for n in BANDS if n != name)
+        assert told_of(together, "turbulence beside other bands")[name] == f"lattices made once with those of {others}"
     assert points == drawn["points"] / len(BANDS)  # the random numbers of one band
 
 
-@pytest.mark.parametrize("room", [0, 4000, 1 << 30])
-@pytest.mark.parametrize("threads", [1, 3])
-def test_room_and_threads_change_no_bit(room: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there is no room for a band to come, it evaluates its own; what is kept is within the room and given back."""
+OTHERS = {
+    "steps": ("6 deg", 19, "0.46 %", "step in time"),
+    "steps at nodes": ("20 arcmin", 127, "1.2 %", "step in time"),
+    "nodes": ("20 arcmin", 127, "1.8 %", "nodes"),
+    "nodes beside none": ("20 arcmin", 127, "0.62 %", "nodes"),
+}
+"""Field, detectors, tolerance, and what then differs between f090 and f150."""
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("field", "detectors", "tolerance", "what"), OTHERS.values(), ids=OTHERS)
+def test_bands_of_other_nodes_and_steps_share_tiles(
+    field: str, detectors: int, tolerance: str, what: str, threads: int, drawn: dict[str, int]
+) -> None:
+    names = "f090", "f150"
+    both = run(scene(field, *names, detectors=detectors), tolerance, keep=["atmosphere"], threads=threads)
+    points, drawn["points"] = drawn["points"], 0
+    assert len(set(told_of(both, what).values())) == 2
+    for name, other in (names, names[::-1]):
+        told = told_of(both, "turbulence beside other bands")[name]
+        assert told == f"lattices made once with those of {other} (4 of 4 layers)"
+        alone = run(scene(field, name, detectors=detectors), tolerance, keep=["atmosphere"], threads=1)
+        for scan in range(2):
+            np.testing.assert_array_equal(alone.tod("atmosphere", scan), both.tod("atmosphere", f"scan-{scan:03d}-{name}"))
+    assert points < 0.6 * drawn["points"]
+
+
+def test_tiles_that_are_dropped_are_made_again_for_a_band_alone(drawn: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is no room to keep them for a band to come."""
     alone = run(scene("6 deg", "f150"), keep=["signal"], threads=1)
-    kept: list[int] = []
-    made, claim = SharedScan.__init__, SharedScan.claim
-
-    def begin(self: SharedScan, _: int) -> None:
-        made(self, room)
-
-    def watched(self: SharedScan, size: int) -> bool:
-        granted = claim(self, size)
-        kept.append(self.room - self._free)
-        return granted
-
-    monkeypatch.setattr(SharedScan, "__init__", begin)
-    monkeypatch.setattr(SharedScan, "claim", watched)
-    both = run(scene("6 deg", "f090", "f150"), keep=["signal"], threads=threads)
+    points, drawn["points"] = drawn["points"], 0
+    monkeypatch.setattr(tiles, "BYTES_KEPT", 0)
+    both = run(scene("6 deg", "f090", "f150"), keep=["signal"], threads=1)
     for scan in range(2):
         np.testing.assert_array_equal(alone.tod(scan=scan), both.tod(scan=f"scan-{scan:03d}-f150"))
-    assert 0 <= min(kept) <= max(kept) <= room
-    assert (max(kept) > 0) is (room > 4000)
-    assert kept[-1] == 0
+    assert drawn["points"] >= 2 * points
 
 
 def test_streams_that_are_made_again_have_the_same_bits() -> None:
@@ -115,12 +123,10 @@ def test_streams_that_are_made_again_have_the_same_bits() -> None:
         np.testing.assert_array_equal(ample[f"map_{name}"].signal, little[f"map_{name}"].signal)
 
 
-def test_bands_whose_detectors_stand_elsewhere_evaluate_their_own(drawn: dict[str, Any]) -> None:
+def test_bands_whose_detectors_stand_elsewhere_make_their_own() -> None:
     data = run(scene("6 deg", "f090", "f150", pixels="separate"), threads=1)
-    assert set(drawn["bands"]) == {(0,)}
-    assert [text for _, what, text in data.tally if what == "turbulence beside other bands"] == [
-        "evaluated by itself: other nodes or steps"
-    ] * 2
+    own = "lattices of its own: other beams or directions"
+    assert told_of(data, "turbulence beside other bands") == {"f090": own, "f150": own}
 
 
 @pytest.mark.parametrize("pixels", ["shared", "separate"])
