@@ -37,7 +37,7 @@ class Ahead:
         self.on = on
         self._pool: ThreadPoolExecutor | None = None
         self._clock: int | None = None
-        self._begun: Preparable | None = None
+        self._begun: list[Preparable] = []
 
     def start(self, execution: Preparable | None) -> None:
         """Begin with the preparation of an observation, whose execution will wait for it."""
@@ -45,19 +45,21 @@ class Ahead:
             return
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, "ahead", initializer=self._note_clock)
-        self._begun, execution.beforehand = execution, self._pool.submit(execution.prepare)
+        self._begun.append(execution)
+        execution.beforehand = self._pool.submit(execution.prepare)
 
     def seconds(self) -> float:
         """CPU time that the thread has taken, 0 where the system does not tell."""
         return 0.0 if self._clock is None else time.clock_gettime(self._clock)
 
     def close(self) -> None:
-        """End the thread; where its last observation was never run, discard what was prepared for it."""
-        if self._begun is not None:
-            self._begun.abandon()
+        """End the thread; discard what was prepared for observations that were never run."""
+        for execution in self._begun:
+            execution.abandon()
+        self._begun.clear()
         if self._pool is not None:
             self._pool.shutdown()
-        self._pool = self._clock = self._begun = None
+        self._pool = self._clock = None
 
     def _note_clock(self) -> None:
         if hasattr(time, "pthread_getcpuclockid"):

@@ -89,6 +89,17 @@ def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) 
     return replace(settings, memory=settings.memory - size, ceiling=ceiling)
 
 
+def share_in_step(chain: Chain, observation: Observation, settings: Settings, bands: int, beside: int) -> Settings | None:
+    """The settings of one of several ``bands`` that work on a scan at the same time (`in_step`).
+
+    None where less would then be kept in memory than where it works alone. ``beside``: bytes that the steps of the others hold.
+    """
+    memory = (settings.memory - beside) // bands
+    if not spares(chain, observation, settings, settings.memory - memory):
+        return None
+    return replace(settings, memory=memory, bands=bands, spare=[])
+
+
 def check_kept_memory(size: int, free: int, place: str) -> None:
     """Refuse to keep streams of ``size`` bytes where less memory is ``free``. Raises PipelineError."""
     if size > free:

@@ -13,8 +13,8 @@ from __future__ import annotations
 import copy
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -40,7 +40,7 @@ from ..types import AnyFloats
 from .ahead import Ahead
 from .block_maker import BlockMaker, Measured
 from .blocks import least_block
-from .in_step import Turns, Waiting, joins
+from .in_step import Sweep, Turns, Waiting, joins, sweep
 from .schedule import Chain, Planned, Schedule
 from .settings import Settings, Timer
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
@@ -90,7 +90,7 @@ class Execution:
             raise
 
     def turns(self, data: Data, ahead: Ahead | None = None, following: Execution | None = None, in_step: bool = False) -> Turns:
-        """As `run`; ``in_step`` with other bands it yields where it waits for these (`core.run.in_step`)."""
+        """As `run`; ``in_step`` with other bands it yields its blocks, and where it waits for these (`core.run.in_step`)."""
         self._in_step = in_step
         self._ahead = ahead or self._ahead
         self._store = Store(self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger)
@@ -161,7 +161,8 @@ class Execution:
         settings = self.settings
         if settings.ceiling is None:
             return settings
-        room, threads = max(settings.ceiling - (resident_memory() - sum(a.nbytes for a in settings.spare)), 1), settings.threads
+        room = max((settings.ceiling - (resident_memory() - sum(a.nbytes for a in settings.spare))) // settings.bands, 1)
+        threads = settings.threads
         if room >= settings.memory:
             return settings
         if room < settings.least:  # the operators took a little more than they said: work on fewer blocks at once
@@ -192,7 +193,7 @@ class Execution:
             for operator in planned.segment.operators:
                 self._before(operator=operator, observation=self.observation, stage="exec")
             begun += planned.segment.operators
-            source = self._carry_out(planned, Stage(planned.segment, source, planned.wanted))
+            source = yield from self._carry_out(planned, Stage(planned.segment, source, planned.wanted))
             if source.stage is None:  # else they are not through yet
                 for operator in begun:
                     used = self.timer.seconds.get((operator.label, "exec"), 0.0)
@@ -216,10 +217,10 @@ class Execution:
             forget_pages(stream.array)
         return whole
 
-    def _carry_out(self, planned: Planned, stage: Stage) -> Source:
+    def _carry_out(self, planned: Planned, stage: Stage) -> Generator[Sweep | Waiting, Any, Source]:
         """Let a segment work, or put that off until its streams are read."""
         if planned.how != "again":
-            return self._pass(planned, stage)
+            return (yield from self._pass(planned, stage))
         self._store.clear_spare()
         found = self._probe(stage)
         names = frozenset(stage.wanted & found.detdata.keys())
@@ -227,7 +228,7 @@ class Execution:
             self.observation.tally.state("Execution", f"stream {name} made again when it is read", planned.why)
         return Source({}, stage, names, dict(found.means))
 
-    def _pass(self, planned: Planned, stage: Stage) -> Source:
+    def _pass(self, planned: Planned, stage: Stage) -> Generator[Sweep | Waiting, Any, Source]:
         """Run a segment's operators over all blocks, and hold what it passes on."""
         observation, settings, source = self.observation, self.settings, stage.source
         made: dict[str, Stream] = {}
@@ -254,33 +255,17 @@ class Execution:
                 forget_pages(stream.array)
 
         what = ", ".join(o.label for o in stage.segment.operators)
-        self._map(work, self.schedule.blocks(planned), what)
+        todo = Sweep(work, self.schedule.blocks(planned), f"{observation.name}: {what}", self._stop.set)
+        if self._in_step:
+            yield todo
+        else:
+            sweep(todo, settings)
         stage.has_been_swept()
         self._blocks.release()
         kept = {name: Stream(name, observation, s.array, means, settings.threads) for name, s in made.items() if name in seen}
         held = {id(s.array) for s in kept.values()}
         self._store.release([s.array for s in [*source.streams.values(), *made.values()] if id(s.array) not in held])
         return Source.of(kept, means)
-
-    def _map(self, work: Callable[[slice, slice], None], blocks: list[tuple[slice, slice]], what: str) -> None:
-        """Call ``work`` on every block, on ``threads`` threads; the first error stops all."""
-        progress, total = self.settings.progress, len(blocks)
-        if self.settings.threads == 1 or total == 1:
-            for done, block in enumerate(blocks, 1):
-                work(*block)
-                progress(done, total, f"{self.observation.name}: {what}")
-            return
-        with ThreadPoolExecutor(self.settings.threads) as pool:
-            futures = [pool.submit(work, *block) for block in blocks]
-            try:
-                for done, future in enumerate(as_completed(futures), 1):
-                    future.result()
-                    progress(done, total, f"{self.observation.name}: {what}")
-            except BaseException:
-                self._stop.set()
-                for future in futures:
-                    future.cancel()
-                raise
 
     # ---- steps that measure whole streams
 
@@ -299,7 +284,8 @@ class Execution:
             lent: list[AnyFloats] = []
             stream, takes = self._stream(operator, source, signal, lent), signal.takes_model(operator.label)
             if self._in_step and joins(operator):
-                found = yield Waiting(operator, stream, takes, partial(self._lend, stream.name, lent))
+                found, seconds = yield Waiting(operator, stream, takes)
+                used += seconds
             else:
                 start = self._without_blocks()
                 found = operator.measure(stream, self.measured.get((operator.label, MAIN)) if takes else None)

@@ -1,6 +1,7 @@
-"""Bands in step: where a step measures the detectors of all bands together, the bands of a scan wait for each other there.
+"""Bands in step: each block of a scan is worked on with one band after the other, so that what they share is found once.
 
-Such a band does not have the bits that it has alone. All other cameras and pipelines observe with one band after the other
+Where a step measures the detectors of all bands together, bands wait for each other. Such a band does not have the bits that it
+has alone; any other has. Bands that share nothing, or for whose streams the memory has no room, follow each other scan by scan
 (`in_turn`).
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Protocol, runtime_checkable
@@ -17,11 +19,13 @@ import numpy as np
 from ..focalplane import Focalplane
 from ..observation import Observation
 from ..operator import Operator
+from ..shared import SharedScan
 from ..signal import MAIN
 from ..stream import Stream, forget_pages
 from ..tally import Tally
 from ..types import AnyFloats
-from .settings import Timer
+from .settings import Settings, Timer
+from .streams import Ledger, Store
 
 ELSEWHERE = "samples flagged as those of another band are: nothing is measured there"
 """A count of the log."""
@@ -46,7 +50,7 @@ class JoinsBands(Protocol):
 
 @dataclass(frozen=True)
 class Waiting:
-    """A band that waits until a step has measured the streams of all.
+    """A band that waits until a step has measured the streams of all; it takes what was found, and the CPU seconds of its part.
 
     Attributes
     ----------
@@ -54,18 +58,35 @@ class Waiting:
         The step, and the band's stream.
     takes_model
         Whether the signal takes what was measured in the complete one.
-    lend
-        Gives an array (n_det, n_samp) of a type for as long as the step measures.
     """
 
     operator: Operator
     stream: Stream
     takes_model: bool
-    lend: Callable[[tuple[int, int], np.dtype[Any]], AnyFloats]
 
 
-Turns = Generator[Waiting, Any, None]
-"""An execution that yields where it waits, and takes what was measured."""
+@dataclass(frozen=True)
+class Sweep:
+    """Work on all blocks of a scan.
+
+    Attributes
+    ----------
+    work
+        Called with the detectors and the samples of each of ``blocks``, on several threads.
+    what
+        The scan and the steps, for the progress.
+    stop
+        Called where a block fails: the others are of no use any more.
+    """
+
+    work: Callable[[slice, slice], None]
+    blocks: Sequence[tuple[slice, slice]]
+    what: str
+    stop: Callable[[], None]
+
+
+Turns = Generator[Waiting | Sweep, Any, None]
+"""An execution that yields where it works on blocks and where it waits for other bands."""
 
 
 def joins(operator: Operator) -> bool:
@@ -73,16 +94,55 @@ def joins(operator: Operator) -> bool:
     return isinstance(operator, JoinsBands) and operator.joins_bands
 
 
-def run_in_step(bands: Sequence[Turns], timer: Timer) -> None:
-    """Execute one scan with all bands, which wait for each other at each stream that a step measures for all."""
+def sweep(one: Sweep, settings: Settings) -> None:
+    """Work on every block, on ``settings.threads`` threads; the first error stops all."""
+    blocks, progress, total = one.blocks, settings.progress, len(one.blocks)
+    if settings.threads == 1 or total == 1:
+        for done, block in enumerate(blocks, 1):
+            one.work(*block)
+            progress(done, total, one.what)
+        return
+    with ThreadPoolExecutor(settings.threads) as pool:
+        futures = [pool.submit(one.work, *block) for block in blocks]
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                future.result()
+                progress(done, total, one.what)
+        except BaseException:
+            one.stop()
+            for future in futures:
+                future.cancel()
+            raise
+
+
+def run_in_step(bands: Sequence[Turns], settings: Settings, timer: Timer, shared: SharedScan | None) -> None:
+    """Execute one scan with all bands.
+
+    Parameters
+    ----------
+    settings
+        ``memory``: bytes for streams of all bands together, where a step measures these.
+    shared
+        What blocks are worked on with one band after the other; None: each band works on all of its blocks at a time.
+    """
+    store = Store(settings.memory, settings.dtype, [], Ledger())
     models: dict[str, Any] = {}
     try:
-        waiting = [next(band, None) for band in bands]
-        while here := [w for w in waiting if w is not None]:
-            start = time.process_time() - timer.of_stage("exec")
-            parts = _measure(here, models)
-            timer.add(here[0].operator.label, "measure", time.process_time() - timer.of_stage("exec") - start)
-            waiting = [_resume(band, part) for band, part in zip(bands, parts, strict=True)]
+        asked = [next(band, None) for band in bands]
+        while any(asked):
+            answers: list[Any] = [None] * len(bands)
+            sweeps = {k: one for k, one in enumerate(asked) if isinstance(one, Sweep)}
+            if sweeps:
+                _sweep(list(sweeps.values()), settings, shared)
+                ready = list(sweeps)
+            else:
+                ready = [k for k, one in enumerate(asked) if one is not None]
+                start = time.process_time() - timer.of_stage("exec")  # a stream made again is made of blocks
+                parts = _measure([one for one in asked if isinstance(one, Waiting)], models, store)
+                used = (time.process_time() - timer.of_stage("exec") - start) / len(parts)
+                answers = [(part, used) for part in parts]
+            for k in ready:
+                asked[k] = _resume(bands[k], answers[k])
     except RuntimeError as error:
         if isinstance(error.__cause__, StopIteration):  # a step's, in a generator
             raise error.__cause__ from None
@@ -90,21 +150,43 @@ def run_in_step(bands: Sequence[Turns], timer: Timer) -> None:
     finally:
         for band in bands:
             band.close()
+        store.close()
 
 
-def _resume(band: Turns, part: Any) -> Waiting | None:
+def _resume(band: Turns, answer: Any) -> Waiting | Sweep | None:
     try:
-        return band.send(part)
+        return band.send(answer)
     except StopIteration:
         return None
 
 
-def _measure(waiting: Sequence[Waiting], models: dict[str, Any]) -> list[Any]:
+def _sweep(sweeps: Sequence[Sweep], settings: Settings, shared: SharedScan | None) -> None:
+    """Work on the blocks of several bands: on each with all of them where their blocks are the same."""
+    first = sweeps[0]
+    if shared is None or any(one.blocks != first.blocks for one in sweeps):
+        for one in sweeps:
+            sweep(one, settings)
+        return
+
+    def work(detectors: slice, samples: slice) -> None:
+        with shared.block():
+            for one in sweeps:
+                one.work(detectors, samples)
+
+    def stop() -> None:
+        for one in sweeps:
+            one.stop()
+
+    sweep(replace(first, work=work, stop=stop), settings)
+
+
+def _measure(waiting: Sequence[Waiting], models: dict[str, Any], store: Store) -> list[Any]:
     """What each band needs of what the step measured for all; ``models``: by label, what it measured in the complete signal."""
     step, streams = waiting[0].operator, [w.stream for w in waiting]
     assert isinstance(step, JoinsBands)
-    stream = _joined(streams, waiting[0].lend)
+    stream = _joined(streams, store)
     found = step.measure(stream, models.get(step.label) if waiting[0].takes_model else None)
+    store.release([stream.array])
     if stream.signal == MAIN:
         models[step.label] = found
     streams[0].observation.tally.update(stream.observation.tally)
@@ -124,10 +206,10 @@ def _rows(streams: Sequence[Stream]) -> list[slice]:
     return [slice(first, end) for first, end in pairwise(ends)]
 
 
-def _joined(streams: Sequence[Stream], lend: Callable[[tuple[int, int], np.dtype[Any]], AnyFloats]) -> Stream:
+def _joined(streams: Sequence[Stream], store: Store) -> Stream:
     """A copy of all streams, one band after the other. In float64 it has the mean emission, which float32 cannot carry."""
     first, rows = streams[0], _rows(streams)
-    array = lend((rows[-1].stop, first.shape[1]), first.dtype)
+    array = store.allocate(first.name, (rows[-1].stop, first.shape[1]), dtype=first.dtype)
     carries = first.dtype == np.float64
     for stream, at in zip(streams, rows, strict=True):
         mean = stream.means.get(stream.name) if carries else None

@@ -1,6 +1,6 @@
 """Executes all scans of a run, each with all bands of the camera; what these share of a scan is released after the last.
 
-Bands follow each other, or are in step where a filter measures all of them together (`in_step`).
+Bands that share pixels, or that a filter measures together, are in step (`in_step`); others follow each other.
 """
 
 from __future__ import annotations
@@ -9,12 +9,14 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ..data import Data
 from ..hooks import manager
 from ..machine import available_memory
 from ..output import Progress
 from .ahead import Ahead
-from .budget import check_kept_memory, divided, held_of, longest_of, with_scan_ahead
+from .budget import check_kept_memory, divided, held_of, longest_of, share_in_step, with_scan_ahead
 from .execution import Execution
 from .in_step import joins, run_in_step
 from .schedule import Chain
@@ -56,37 +58,80 @@ class Budget:
 def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Budget) -> None:
     """Run all observations in order, each with all bands; the next one is prepared while one is executed."""
     hooks = manager().hook.zonda_before_operator, manager().hook.zonda_after_operator
-    # who listens hears of one observation after the other
+    heard = any(hook.get_hookimpls() for hook in hooks)  # who listens hears of one observation after the other
     several = sum(len(band.data.observations) for band in bands) > 1
-    in_step = len(bands) > 1 and any(map(joins, bands[0].chain.steps))
-    ahead = Ahead(settings.threads > 1 and several and not in_step and not any(hook.get_hookimpls() for hook in hooks))
+    joined = len(bands) > 1 and any(map(joins, bands[0].chain.steps))
+    ahead = Ahead(settings.threads > 1 and several and not joined and not heard)
     every = [o for band in bands for o in band.data.observations]
     settings = replace(settings, kept=8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every))
-    held = [band.held(in_step) for band in bands]
-    executions = []
-    for band, mine in zip(bands, held, strict=True):
-        own = _divided(band, replace(settings, others=sum(held) - mine), ahead, budget)
-        if in_step:  # their streams are held side by side, and once more together
-            own = replace(own, memory=max(own.memory // (2 * len(bands)), min(own.least, own.memory)))
-        executions.append([Execution(band.chain, o, own, timer, *hooks) for o in band.data.observations])
-    turns = [turn for scan in zip(*executions, strict=True) for turn in zip(scan, bands, strict=True)]
+    held = [band.held(joined) for band in bands]
+    alone = [
+        _divided(band, replace(settings, others=sum(held) - mine), ahead, budget) for band, mine in zip(bands, held, strict=True)
+    ]
+    shares = _joined(alone) if joined else None if heard else _shares(bands, alone, ahead.on)
+    executions = [
+        [Execution(band.chain, o, own, timer, *hooks) for o in band.data.observations]
+        for band, own in zip(bands, shares or alone, strict=True)
+    ]
+    scans = list(zip(*executions, strict=True))
     try:
-        if in_step:
-            _run_in_step(executions, bands, timer)
-            return
-        for (execution, band), (following, _) in zip(turns, [*turns[1:], (None, None)], strict=True):
-            execution.run(band.data, ahead, following)
-            _done(execution, band, band is bands[-1])
+        if shares is None:
+            _run_in_turn(scans, bands, ahead)
+        else:
+            memory, threads = alone[0].memory, min(own.threads for own in shares)
+            blocks = _alike(bands) and sum(own.memory for own in shares) <= memory
+            _run_in_step(scans, bands, ahead, replace(alone[0], memory=memory // 2, threads=threads), timer, blocks)
     finally:
         ahead.close()
 
 
-def _run_in_step(executions: Sequence[Sequence[Execution]], bands: Sequence[Band], timer: Timer) -> None:
-    """Run all observations in order, each with all bands in step (`core.run.in_step`)."""
-    for scan in zip(*executions, strict=True):
-        run_in_step([one.turns(band.data, in_step=True) for one, band in zip(scan, bands, strict=True)], timer)
+def _run_in_turn(scans: Sequence[Sequence[Execution]], bands: Sequence[Band], ahead: Ahead) -> None:
+    """Run all observations in order, with one band after the other."""
+    turns = [turn for scan in scans for turn in zip(scan, bands, strict=True)]
+    for (execution, band), (following, _) in zip(turns, [*turns[1:], (None, None)], strict=True):
+        execution.run(band.data, ahead, following)
+        _done(execution, band, band is bands[-1])
+
+
+def _run_in_step(
+    scans: Sequence[Sequence[Execution]], bands: Sequence[Band], ahead: Ahead, settings: Settings, timer: Timer, blocks: bool
+) -> None:
+    """Run all observations in order, each with all bands in step; ``blocks``: block by block."""
+    datas = [band.data for band in bands]
+    for scan, following in zip(scans, [*scans[1:], [None] * len(bands)], strict=True):
+        turns = [one.turns(data, ahead, then, in_step=True) for one, data, then in zip(scan, datas, following, strict=True)]
+        run_in_step(turns, settings, timer, scan[0].observation.shared if blocks else None)
         for execution, band in zip(scan, bands, strict=True):
             _done(execution, band, band is bands[-1])
+
+
+def _joined(alone: Sequence[Settings]) -> list[Settings]:
+    """The settings of bands whose streams are held side by side, and once more together."""
+    n = len(alone)
+    return [replace(own, memory=max(own.memory // (2 * n), min(own.least, own.memory)), bands=n, spare=[]) for own in alone]
+
+
+def _shares(bands: Sequence[Band], alone: Sequence[Settings], ahead: bool) -> list[Settings] | None:
+    """The settings of bands in step; None where bands follow each other: they look through other pixels, or would keep less."""
+    if len(bands) == 1 or not _alike(bands):
+        return None
+    beside = [(2 if ahead else 1) * (band.held(in_step=True) - band.held(in_step=False)) for band in bands]
+    found = [
+        share_in_step(band.chain, longest_of(band.data.observations), own, len(bands), sum(beside) - mine)
+        for band, own, mine in zip(bands, alone, beside, strict=True)
+    ]
+    shares = [one for one in found if one is not None]
+    return shares if len(shares) == len(bands) else None
+
+
+def _alike(bands: Sequence[Band]) -> bool:
+    """Whether the detectors of all bands look through the same pixels."""
+    first, *others = ([o.focalplane for o in band.data.observations] for band in bands)
+    return all(
+        np.array_equal(a.xi, b.xi) and np.array_equal(a.eta, b.eta)
+        for planes in others
+        for a, b in zip(first, planes, strict=True)
+    )
 
 
 def _done(execution: Execution, band: Band, last: bool) -> None:

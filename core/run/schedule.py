@@ -354,4 +354,5 @@ def spares(chain: Chain, observation: Observation, settings: Settings, size: int
         with_all, with_less = (schedule(chain, observation, s) for s in (settings, less))
     except PipelineError:  # a stream would go to a disk that has no room for it
         return False
-    return with_less.elsewhere == with_all.elsewhere and with_less.least <= less.memory
+    same = with_less.elsewhere == with_all.elsewhere and with_less.made_again == with_all.made_again
+    return same and with_less.least <= less.memory

@@ -43,6 +43,8 @@ class Settings:
         Bytes of the streams of all scans that the user wants to have at the end.
     others
         Bytes of the products of the other bands of a camera, which grow scan by scan beside those of this one.
+    bands
+        Bands that hold streams and blocks at a time (`core.run.in_step`): ``memory`` is the part of one of them.
     """
 
     threads: int = 1
@@ -56,6 +58,7 @@ class Settings:
     least: int = 0
     kept: int = 0
     others: int = 0
+    bands: int = 1
 
 
 @dataclass
