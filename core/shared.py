@@ -28,10 +28,13 @@ class SharedScan:
     ----------
     room
         Most bytes that are kept until the last band has used them (`claim`).
+    bands
+        Number of bands that look through the same pixels; 1: each looks through others.
     """
 
-    def __init__(self, room: int) -> None:
+    def __init__(self, room: int, bands: int = 1) -> None:
         self._free = self.room = room
+        self.bands = bands
         self._announced: dict[str, dict[str, Any]] = {}
         self._made: dict[Hashable, Any] = {}
         self._lock = threading.RLock()

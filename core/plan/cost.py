@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from ..mapmaker import makes_products
 from ..output import Output
-from ..run.budget import BASE
+from ..run.budget import BASE, share_in_step
 from ..run.in_step import joins
 from ..run.schedule import Chain, schedule
 from ..run.settings import Settings
@@ -115,7 +116,14 @@ def predict(
     after = sum(planning_of(o).memory(longest) for o in context.operators if isinstance(o, Output))
     settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
     work = context.work
-    found = schedule(Chain(work.steps, work.signals, work.components), longest, settings)
+    chain = Chain(work.steps, work.signals, work.components)
+    products = sum(planning_of(o).memory(longest) for o in during if makes_products(o))
+    bands = 1 if longest.shared is None else longest.shared.bands
+    in_step = None
+    if bands > 1:
+        alone = replace(settings, memory=max(settings.memory - (bands - 1) * products, 1))
+        in_step = share_in_step(chain, longest, alone, bands, (bands - 1) * (held - products))
+    found = schedule(chain, longest, in_step or settings)
     seconds = {}
     for label, cost in costs.items():
         if cost is not None:
@@ -124,9 +132,11 @@ def predict(
             seconds[label] = factors[cost.kernel] * (work.times.get(label, 1.0) * (each + again) + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     startup = factors[STARTUP.kernel] * STARTUP.once
-    products = sum(planning_of(o).memory(longest) for o in during if makes_products(o))
+    if in_step is not None:
+        products = held + found.bytes
     if any(map(joins, work.steps)):
         products = held + found.bytes + item * longest.n_samples * longest.n_detectors  # its part of the stream of all bands
     shared = room_for(longest.n_detectors, longest.n_samples)
     size = BASE + max(held + found.bytes, after)
-    return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared)
+    once = {label: cost.shared for label, cost in costs.items() if cost is not None and in_step is not None}
+    return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared, once)

@@ -24,9 +24,12 @@ class Prediction:
     """How often each operator does its work, by label (`context.Work`)."""
     factors: Mapping[str, float] = field(default_factory=dict)
     products: float = 0.0
-    """Bytes that are held while another band of the camera acts: what steps add up over all scans."""
+    """Bytes that are held while another band of the camera acts: what steps add up over all scans, and all where bands are in
+    step."""
     shared: float = 0.0
     """Bytes that may be kept for another band of the camera, not part of ``bytes``."""
+    once: Mapping[str, float] = field(default_factory=dict)
+    """Share of the seconds by operator that bands in step need once."""
 
     @property
     def total(self) -> float:

@@ -10,8 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from ..data import Data
 from ..errors import InputError, PipelineError
+from ..focalplane import Focalplane
 from ..observation import Observation
 from ..operator import Operator
 from ..scene import WithScene
@@ -60,13 +63,23 @@ def use_recorded(data: Data, operators: Sequence[Operator]) -> None:
 
 def distribute(data: Data, bands: Sequence[Data]) -> None:
     """Give each band its detectors of all scans, and what is laid out for it; what pointing tells is told once."""
-    shared = [SharedScan(room_for(scan.n_detectors // len(bands), scan.n_samples)) for scan in data.observations]
+    shared = [
+        SharedScan(room_for(scan.n_detectors // len(bands), scan.n_samples), _alike(scan.focalplane, len(bands)))
+        for scan in data.observations
+    ]
     for number, own in enumerate(bands):
         own.observations = [_of_band(scan, number, own, part) for scan, part in zip(data.observations, shared, strict=True)]
         own.layouts = _of(data.layouts, own.band)
     data.pointed = data.observations
     for scan in data.observations:
         data.tally.update(scan.tally)
+
+
+def _alike(plane: Focalplane, bands: int) -> int:
+    """Number of bands whose detectors look through the same pixels; 1 where not all do."""
+    first, *others = (plane.band == number for number in range(bands))
+    same = all(np.array_equal(of[first], of[other]) for other in others for of in (plane.xi, plane.eta))
+    return bands if same else 1
 
 
 def hand_over(data: Data, bands: Sequence[Data]) -> None:

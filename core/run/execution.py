@@ -315,9 +315,9 @@ class Execution:
         stream.signal, stream.components, stream.state = held, signal.components, self.states[operator.label]
         return stream
 
-    def _lend(self, name: str, lent: list[AnyFloats], shape: tuple[int, int], dtype: Any = np.float64) -> AnyFloats:
-        """An array, noted in ``lent``, for as long as a step measures."""
-        lent.append(self._store.allocate(name, shape, dtype=dtype))
+    def _lend(self, name: str, lent: list[AnyFloats], shape: tuple[int, int]) -> AnyFloats:
+        """A float64 array, noted in ``lent``, for as long as a step measures."""
+        lent.append(self._store.allocate(name, shape, dtype=np.float64))
         return lent[-1]
 
     def _without_blocks(self) -> float:

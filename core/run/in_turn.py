@@ -9,8 +9,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from ..data import Data
 from ..hooks import manager
 from ..machine import available_memory
@@ -126,12 +124,7 @@ def _shares(bands: Sequence[Band], alone: Sequence[Settings], ahead: bool) -> li
 
 def _alike(bands: Sequence[Band]) -> bool:
     """Whether the detectors of all bands look through the same pixels."""
-    first, *others = ([o.focalplane for o in band.data.observations] for band in bands)
-    return all(
-        np.array_equal(a.xi, b.xi) and np.array_equal(a.eta, b.eta)
-        for planes in others
-        for a, b in zip(first, planes, strict=True)
-    )
+    return all(o.shared is not None and o.shared.bands == len(bands) for o in bands[0].data.observations)
 
 
 def _done(execution: Execution, band: Band, last: bool) -> None:

@@ -1,6 +1,6 @@
 """Bands in step: `CommonModeFilter` with `group: all` finds the modes of the detectors of all bands together."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -142,3 +142,73 @@ def test_samples_that_one_band_flags_are_no_data_of_the_other_which_would_keep_i
 def test_a_camera_of_one_band_is_that_band() -> None:
     found = [pipeline(zonda.CommonModeFilter(group=group)).run(scene(1))["map"].signal for group in ("all", "band")]
     np.testing.assert_array_equal(*found)
+
+
+class Watched(zonda.Operator):
+    """Notes what it is given: (band, first detector, first sample)."""
+
+    provides = frozenset({"watched"})
+    seen: ClassVar[list[tuple[str, int, int]]] = []
+    discarded: ClassVar[list[str]] = []
+    fail: str = ""
+
+    def exec(self, block: zonda.Block, state: Any) -> None:
+        name = block.observation.instrument.band.name
+        self.seen.append((name, block.detectors.start, block.samples.start))
+        if name == self.fail and (block.samples.start or block.detectors.start):
+            raise ValueError("on purpose")
+        block.new("watched")
+
+    def discard(self, observation: zonda.Observation, state: Any) -> None:
+        self.discarded.append(observation.instrument.band.name)
+
+
+def watched(scene: zonda.Scene, fail: str = "", filters: Any = (), **options: Any) -> list[str]:
+    """Names of the bands in the order in which they worked on blocks."""
+    Watched.seen.clear()
+    Watched.discarded.clear()
+    pointing = zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="100 s")
+    steps = [pointing, zonda.WhiteNoise(), Watched(fail=fail), zonda.Efficiency(), *filters, zonda.BinMap(pixel="1 arcmin")]
+    zonda.Pipeline(steps).run(scene, threads=1, keep=["watched"], **options)
+    return [name for name, *_ in Watched.seen]
+
+
+def test_bands_that_share_pixels_take_turns_block_by_block() -> None:
+    names = watched(scene(), memory=16_000_000)
+    assert len(names) > 2
+    assert names[:4] == ["f090", "f150", "f090", "f150"]
+    assert [part[1:] for part in Watched.seen[::2]] == [part[1:] for part in Watched.seen[1::2]]
+
+
+def test_bands_with_pixels_of_their_own_follow_each_other() -> None:
+    names = watched(scene(pixels="separate"), memory=16_000_000)
+    assert names == sorted(names)
+
+
+def test_bands_follow_each_other_where_their_streams_would_not_be_kept_side_by_side() -> None:
+    """Both streams of a band, each 19 x 40000 x 4 bytes = 3 MB, are kept where half of the memory is 10 MB; beside 15 MB of
+    blocks there is no room for them in a band's share of 10 MB."""
+    fast = scene(sample_rate="400 Hz")
+    filters = [zonda.HighpassFilter(frequency="0.2 Hz"), zonda.CommonModeFilter()]
+    names = watched(fast, filters=filters, memory=21_000_000)
+    assert names == sorted(names)
+    names = watched(fast, filters=filters, memory=60_000_000)
+    assert names != sorted(names)
+
+
+def test_where_a_band_fails_all_discard_what_they_began() -> None:
+    with pytest.raises(Exception, match="on purpose"):
+        watched(scene(), fail="f150", memory=16_000_000)
+    assert sorted(Watched.discarded) == ["f090", "f150"]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_bands_in_step_have_the_bits_that_they_have_alone(threads: int) -> None:
+    """Two scans: the second is prepared while the first is executed, with two threads."""
+    both = pipeline(scans=2).run(scene(), threads=threads)
+    for number, band in enumerate(BANDS):
+        alone = pipeline(scans=2).run(
+            scene(1, band={k: band[k] for k in ("name", "low", "high")}, net=band["net"]), threads=threads
+        )
+        for plane in PLANES:
+            np.testing.assert_array_equal(getattr(both[f"map_{band['name']}"], plane), getattr(alone["map"], plane), str(number))
