@@ -52,6 +52,10 @@ def configuration(models: Sequence[str], components: Mapping[str, Any], place: s
 def check_templates(config: Mapping[str, Any], nside: int, place: str) -> None:
     """Raises InputError where files that components name are not on this machine."""
     lacking = [name for name in _templates(config, nside) if not _is_here(name)]
+    for item in _classes(config):
+        if not any(map(is_file, item.values())):
+            asked = [_of_nside(name, item, nside) for name in _asked_for(item, nside)]
+            lacking += asked[:1] if not any(map(_is_here, asked)) else []
     if lacking:
         more = f" and {len(lacking) - 3} more" if len(lacking) > 3 else ""
         raise _lacks(", ".join(lacking[:3]) + more, place)
@@ -132,15 +136,51 @@ def is_file(item: Any) -> bool:
 
 
 def _templates(config: Mapping[str, Any], nside: int) -> Iterator[str]:
-    """Files that components name; those whose names their classes put together show up in `emission`."""
+    """Files that components name."""
+    for item in _classes(config):
+        names = (_of_nside(value, item, nside) for value in item.values() if is_file(value))
+        yield from (name for name in names if "{" not in name)
+
+
+def _classes(config: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The configuration of each class: components may be made up of several."""
+    if "class" in config:
+        yield config
     for item in config.values():
         if isinstance(item, Mapping):
-            yield from _templates(item, nside)
-        elif is_file(item):
-            nearest_nside = min(config.get("available_nside") or [nside], key=lambda n: abs(n - nside))
-            name = item.replace("{nside}", str(nearest_nside))
-            if "{" not in name:
-                yield name
+            yield from _classes(item)
+
+
+def _of_nside(name: str, item: Mapping[str, Any], nside: int) -> str:
+    """A template's name for the resolution that PySM takes of those there are."""
+    nearest_nside = min(item.get("available_nside") or [nside], key=lambda n: abs(n - nside))
+    return name.replace("{nside}", str(nearest_nside))
+
+
+class _Asked(Exception):
+    """A component asked for a file."""
+
+
+def _asked_for(item: Mapping[str, Any], nside: int) -> list[str]:
+    """Files whose names a class puts together: the first that it asks for when it is made, or its maps of all frequencies.
+
+    Nothing is read. Empty where the class cannot be made, which `emission` tells.
+    """
+    from unittest.mock import patch
+
+    pysm3 = needed("pysm3", EXTRA)
+
+    def get(_: Any, name: str) -> str:
+        raise _Asked(name)
+
+    with ALONE, _same_numbers(), patch.object(pysm3.utils.RemoteData, "get", get):
+        try:
+            (made,) = pysm3.sky.create_components_from_config({"one": dict(item)}, nside=nside)
+        except _Asked as asked:
+            return [str(asked)]
+        except Exception:  # of any kind, also mistakes of PySM's own
+            return []
+    return [str(name) for name in getattr(made, "maps", {}).values()]
 
 
 def _is_here(name: str) -> bool:

@@ -241,7 +241,7 @@ def test_each_band_has_its_own_map_and_paths_start_beside_the_file(tmp_path, mon
 @real
 @pytest.mark.parametrize("of", ["s0", "co1", "rg3"])
 def test_nothing_is_downloaded_unless_it_is_asked_for(tmp_path, capsys, monkeypatch, of):
-    """rg3 puts the names of its files together: no list has them, and the run itself refuses. co1's stand in its class."""
+    """rg3 puts the names of its files together from what PySM lists; co1's stand in its class."""
     monkeypatch.delenv("PYSM_LOCAL_DATA", raising=False)
     monkeypatch.setattr("socket.socket.connect", None)
     path = file(tmp_path, models=[of], nside=64)
@@ -253,9 +253,31 @@ def test_nothing_is_downloaded_unless_it_is_asked_for(tmp_path, capsys, monkeypa
         assert "PySMSky" in said
         assert "set download: true" in said
         assert "PYSM_LOCAL_DATA" in said
-        assert main(["check", str(path)]) == (2 if of == "s0" else 0)
-        if of == "s0":
-            assert "pysm_2/synch_t_new.fits" in capsys.readouterr().err
+        assert main(["check", str(path)]) == 2
+        assert {"s0": "pysm_2/synch_t_new.fits", "co1": "co/HFI", "rg3": "001.0.fits"}[of] in capsys.readouterr().err
+
+
+@real
+@pytest.mark.parametrize(
+    ("model", "nside", "template"),
+    [
+        ("co1", 512, "co/HFI_CompMap_CO-Type1_512_R2.00_ring.fits"),
+        ("co2", 2048, "co/HFI_CompMap_CO-Type1_2048_R2.00_ring.fits"),
+        ("rg1", 16, "websky/0.4/radio/radio_0017.0.fits"),
+        ("rg3", 16, "websky/0.4/radio_catalog/background/2048/001.0.fits"),
+        ("cib1", 16, "websky/0.4/cib/cib_0017.0.fits"),
+    ],
+)
+def test_templates_whose_names_classes_put_together_are_looked_for(tmp_path, monkeypatch, model, nside, template):
+    """Without reading them: what is there here is no FITS file."""
+    monkeypatch.setenv("PYSM_LOCAL_DATA", str(tmp_path))
+    with set_temp_cache(tmp_path):
+        step = PySMSky(models=[model], nside=nside)
+        with pytest.raises(InputError, match=template):
+            step.check(None)
+        (tmp_path / template).parent.mkdir(parents=True)
+        (tmp_path / template).write_text("one template")
+        assert model in step.check(None)[0]
 
 
 @real
