@@ -96,7 +96,7 @@ class _Solved:
             condition[hit] = np.where(low[:, 0] > SINGULAR * low[:, 2], low[:, 2] / low[:, 0], np.inf)
         fine = condition[hit] <= limit
         pixels, axes, low = hit[fine], axes[fine], low[fine]
-        inverse = np.einsum("nij,nj,nkj->nik", axes, 1 / low, axes)
+        inverse = (axes / low[:, None, :]) @ axes.transpose(0, 2, 1)
         values[pixels] = np.einsum("nij,nj->ni", inverse, data[pixels] / VALUE)
         values[pixels] += np.einsum("nij,nj->ni", inverse, _rest(a[fine], values[pixels], data[pixels] / VALUE))
         spread[pixels] = np.einsum("nii->ni", inverse)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from zonda.operators.maps.grid import HealpixGrid
+from zonda.operators.maps.grid import HealpixGrid, _union
 from zonda.operators.maps.healpix import Lookup, healpix_pixels, lookup
 
 MARGIN = 1e-12
@@ -100,3 +100,11 @@ def test_no_pixel_is_covered_and_pieces_of_a_scan() -> None:
     piece = np.empty((1, 300), np.int32)
     grid.pixels(h, 210, 510, np.zeros(1), np.zeros(1), piece)
     np.testing.assert_array_equal(piece[0], out[0, 210:510])
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.lists(st.integers(0, 3000), max_size=30), max_size=4), st.integers(1, 10**9))
+def test_a_footprint_is_all_pixels_of_its_discs(pieces, spread):
+    """Whether they are marked in a range or sorted."""
+    discs = [np.array([5 * spread], np.int64), *(spread * np.array(piece, np.int64) for piece in pieces)]
+    np.testing.assert_array_equal(_union(discs), np.unique(np.concatenate(discs)))
