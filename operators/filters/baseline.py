@@ -18,68 +18,81 @@ is larger than that of a sample.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.block import Block
 from zonda.core.compilation.jit import nb
-from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.smooth import spline_basis
 from zonda.core.types import Floats
 
-from .source_mask import MASKED, Inside
-
-SPOILT = "samples not finite"
-"""Count of samples that are left as they are."""
-
-ROWS = 32
-"""Detectors that are worked on in float64 at a time."""
-
-AT_ONCE = 1024
-"""Samples whose functions stay in the first cache for all rows: those of a scan of half an hour exceed the second."""
+from .rows import AT_ONCE, Mask, Rows, read, write
 
 DETERMINED = 1e-14
 """Eigenvalues of B_g B_g^T below this share of the largest count as zero."""
 
-Mask = NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class Basis:
-    """Functions of time of which few reach a sample.
+    """Functions of time of which the same few reach all samples of a run.
 
     Attributes
     ----------
-    first
-        (N,) number of the first function that reaches each sample.
-    weights
-        (N, taps): the values of the functions first .. first + taps - 1.
+    functions
+        (taps, N): the values of the functions that reach each sample.
+    stops
+        (n_run,) end of each run of samples, at most `AT_ONCE` of them.
+    firsts
+        (n_run,) number of the first function that reaches the run; those that follow it are the next taps - 1.
     size
         K, the number of functions.
     """
 
-    first: NDArray[np.int64]
-    weights: Floats
+    functions: Floats
+    stops: NDArray[np.int64]
+    firsts: NDArray[np.int64]
     size: int
+
+    @classmethod
+    def of(cls, functions: Floats, first: NDArray[np.int64], size: int) -> Basis:
+        """From the number (N,) of the first function that reaches each sample."""
+        stops = runs(first)
+        return cls(np.ascontiguousarray(functions), stops, first[stops - 1], size)
 
     def inverse(self, use: Mask) -> Floats:
         """(K, K): the pseudoinverse of B_g B_g^T for the samples ``use`` (N,)."""
-        return np.asarray(np.linalg.pinv(self.normal(use), rcond=DETERMINED, hermitian=True))
+        found = np.linalg.pinv(self.normal(use), rcond=DETERMINED, hermitian=True)
+        return np.asarray((found + found.T) / 2, np.float64)
 
     def normal(self, use: Mask) -> Floats:
         """(K, K): B_g B_g^T for the samples ``use`` (N,)."""
         normal = np.zeros((self.size, self.size))
-        _normal(use, self.first, self.weights, normal)
+        _normal(use, self.functions, self.stops, self.firsts, normal)
         return normal
+
+    def sums(self, rows: Rows, use: Mask) -> Floats:
+        """(n_det, K): B_g x_g; not finite where a sample of the row is not, used or not."""
+        sums = np.zeros((len(rows.values), self.size))
+        _sums(*rows, use, self.functions, self.stops, self.firsts, sums)
+        return sums
+
+    def subtract(self, rows: Rows, coefficients: Floats) -> None:
+        """Subtract B^T ``coefficients`` (n_det, K)."""
+        _subtract(*rows, self.functions, self.stops, self.firsts, coefficients)
+
+
+def runs(value: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Ends of runs of `AT_ONCE` samples or less, each within one chunk, whose ``value`` (N,) is the same."""
+    starts = np.append(True, value[1:] != value[:-1])
+    starts[::AT_ONCE] = True
+    return np.append(np.flatnonzero(starts)[1:], len(value))
 
 
 def polynomials(n: int, order: int) -> Basis:
     """Legendre polynomials up to ``order`` over a scan of ``n`` samples."""
     time = (2 * np.arange(n) + 1) / n - 1
-    return Basis(np.zeros(n, np.int64), np.asarray(np.polynomial.legendre.legvander(time, order), np.float64), order + 1)
+    return Basis.of(np.asarray(np.polynomial.legendre.legvander(time, order).T, np.float64), np.zeros(n, np.int64), order + 1)
 
 
 def splines(n: int, spacing: float) -> Basis:
@@ -87,7 +100,7 @@ def splines(n: int, spacing: float) -> Basis:
     inner = max(1, math.ceil((n - 1) / spacing))  # knots inside the scan, half of an interval or less from either end
     position = (np.arange(n) - (n - 1) / 2) / spacing + (inner - 1) / 2 + 1
     first = np.clip(np.floor(position).astype(np.int64), 0, inner)
-    return Basis(first, np.ascontiguousarray(spline_basis(position - first).T), inner + 4)
+    return Basis.of(spline_basis(position - first), first, inner + 4)
 
 
 @dataclass(frozen=True)
@@ -103,18 +116,27 @@ class Fit:
         """A fit of these functions to the samples ``use`` (N,)."""
         return cls(basis, use, basis.inverse(use))
 
-    def remove(self, rows: Floats, masked: Mask | None = None) -> int:
-        """Equation (1) on ``rows`` (n_det, N) in place. ``masked`` (n_det, N): samples that are not used, of each detector, where
-        equation (2) allows it.
+    def remove(self, rows: Rows, masked: Mask | None = None) -> int:
+        """Equation (1) on rows in place. ``masked`` (n_det, N): samples that are not used, of each detector, where equation (2)
+        allows it.
 
         Returns how many samples were not finite; they stay as they were.
         """
-        plain, spoilt = np.ones(len(rows), bool), 0
-        for d, row in enumerate(rows):
-            finite = np.isfinite(row)
-            plain[d] = finite.all() and not (masked is not None and masked[d].any())
-            if plain[d]:
-                continue
+        found, spoilt = self.coefficients(rows, masked)
+        self.basis.subtract(rows, found)
+        return spoilt
+
+    def coefficients(self, rows: Rows, masked: Mask | None = None) -> tuple[Floats, int]:
+        """What `remove` subtracts, (n_det, K), and how many samples are not finite."""
+        sums, spoilt = self.basis.sums(rows, self.use), 0
+        found = solved(self.inverse, sums)
+        other = ~np.isfinite(sums).all(axis=1)
+        if masked is not None:
+            other |= masked.any(axis=1)
+        for d in np.flatnonzero(other):
+            row = rows.double(slice(d, d + 1), len(self.use))
+            finite = np.isfinite(row[0])
+            row[0, ~finite] = 0.0
             use, inverse = self.use, self.inverse
             if not finite.all():
                 use = use & finite
@@ -122,17 +144,8 @@ class Fit:
                 spoilt += int(np.count_nonzero(~finite))
             if masked is not None and masked[d].any():
                 use, inverse = self._outside(use, inverse, masked[d])
-            self._remove(rows, np.array([d]), use, inverse)
-        self._remove(rows, np.flatnonzero(plain), self.use, self.inverse)
-        return spoilt
-
-    def _remove(self, rows: Floats, which: NDArray[np.intp], use: Mask, inverse: Floats) -> None:
-        """Equation (1) on the ``rows`` of these numbers, all of which use the same samples."""
-        basis, sums = self.basis, np.zeros((len(which), self.basis.size))
-        _sums(rows, which, use, basis.first, basis.weights, sums)
-        for own in sums:
-            own[:] = inverse @ own
-        _subtract(rows, which, basis.first, basis.weights, sums)
+            found[d] = solved(inverse, self.basis.sums(Rows.of(row), use))[0]
+        return found, spoilt
 
     def _outside(self, use: Mask, inverse: Floats, masked: Mask) -> tuple[Mask, Floats]:
         """Samples to use outside of a mask (N,), and their inverse; those that are given where equation (2) forbids it."""
@@ -144,77 +157,97 @@ class Fit:
         return left, found
 
 
-def in_double(label: str, block: Block, remove: Callable[[Floats, Mask | None], int], inside: Inside | None = None) -> None:
-    """Let ``remove`` change the signal of a block in float64, its mean included; no mean is left beside it.
+def solved(inverse: Floats, sums: Floats) -> Floats:
+    """(n_det, K): ``inverse`` (K, K), symmetric, times each row of ``sums`` (n_det, K).
 
-    ``remove(rows, masked)`` changes samples (n_det, n_samp) of up to `ROWS` detectors in place and returns how many were not
-    finite; ``masked``: which of them are ``inside`` a source mask. The step ``label`` counts both.
+    Not by BLAS, whose bits depend on how many rows there are.
     """
-    signal, mean, tally = block.detdata["signal"], block.means.pop("signal", None), block.observation.tally
-    masked = inside.at(block.detectors, block.samples) if inside is not None else None
-    if masked is not None:
-        tally.count(label, MASKED, int(masked.sum()), masked.size)
-    spoilt = 0
-    for part in chunks(len(signal), ROWS):
-        rows = signal[part].astype(np.float64)
-        if mean is not None:
-            first = block.detectors.start
-            rows += mean.evaluate(slice(first + part.start, first + part.stop), block.samples)
-        spoilt += remove(rows, None if masked is None else masked[part])
-        signal[part] = rows
-    tally.count(label, SPOILT, spoilt)
+    out = np.zeros(sums.shape)
+    _solve(inverse, sums, out)
+    return out
+
+
+# A sum may be formed in any order within a chunk of one row: the compiler chooses it once, whatever rows stand beside it.
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+def dot(a, b):  # type: ignore[no-untyped-def]
+    """sum_t a_t b_t of two chunks."""
+    total = 0.0
+    for t in range(nb.uint64(a.size)):
+        total += a[t] * b[t]
+    return total
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def lessen(x, c, f):  # type: ignore[no-untyped-def]
+    """x -= c f, of two chunks."""
+    for t in range(nb.uint64(x.size)):
+        x[t] -= c * f[t]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _normal(use, first, weights, normal):  # type: ignore[no-untyped-def]
+def _solve(inverse, sums, out):  # type: ignore[no-untyped-def]
+    """All rows for each row of the matrix, which may exceed the cache."""
+    for k in range(sums.shape[1]):
+        for d in range(sums.shape[0]):
+            lessen(out[d], -sums[d, k], inverse[k])
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def keep_used(x, use):  # type: ignore[no-untyped-def]
+    """x = 0 where it is not used, unless it is not finite."""
+    for t in range(nb.uint64(x.size)):
+        x[t] *= use[t]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _normal(use, functions, stops, firsts, normal):  # type: ignore[no-untyped-def]
     """normal += B_g B_g^T."""
-    taps = weights.shape[1]
-    for t in range(use.size):
-        if use[t]:
-            k = first[t]
-            for i in range(taps):
-                for j in range(taps):
-                    normal[k + i, k + j] += weights[t, i] * weights[t, j]
+    taps, low, x = functions.shape[0], 0, np.empty(AT_ONCE)
+    for r in range(stops.size):
+        high, k = stops[r], firsts[r]
+        used = x[: high - low]
+        for i in range(taps):
+            for t in range(nb.uint64(used.size)):
+                used[t] = functions[i, low + t] * use[low + t]
+            for j in range(i + 1):
+                normal[k + i, k + j] += dot(used, functions[j, low:high])
+        low = high
+    for i in range(normal.shape[0]):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _sums(rows, which, use, first, weights, sums):  # type: ignore[no-untyped-def]
-    """sums (n_row, K) += B_g x_g of the ``rows`` of the numbers ``which`` (n_row,)."""
-    taps, n = weights.shape[1], use.size
-    for low in range(0, n, AT_ONCE):
-        high = min(low + AT_ONCE, n)
-        k = 0
-        while k + 4 <= which.size:  # side by side: a sum waits for its last term
-            a, b, c, d = rows[which[k]], rows[which[k + 1]], rows[which[k + 2]], rows[which[k + 3]]
-            p, q, r, s = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
-            for t in range(low, high):
-                if use[t]:
-                    for i in range(taps):
-                        at, w = first[t] + i, weights[t, i]
-                        p[at] += w * a[t]
-                        q[at] += w * b[t]
-                        r[at] += w * c[t]
-                        s[at] += w * d[t]
-            k += 4
-        while k < which.size:
-            row, own = rows[which[k]], sums[k]
-            for t in range(low, high):
-                if use[t]:
-                    for i in range(taps):
-                        own[first[t] + i] += weights[t, i] * row[t]
-            k += 1
+def _sums(  # type: ignore[no-untyped-def]
+    values, lines, cell, inside, start, begin, use, functions, stops, firsts, sums
+):
+    """sums (n_row, K) += B_g x_g; the first arguments are those of `Rows`."""
+    low, chunk = 0, np.empty(AT_ONCE)
+    for r in range(stops.size):
+        high = stops[r]
+        x = chunk[: high - low]
+        for d in range(values.shape[0]):
+            read(values, lines, cell, inside, start, d, begin + low, x)
+            keep_used(x, use[low:high])
+            for i in range(functions.shape[0]):
+                sums[d, firsts[r] + i] += dot(x, functions[i, low:high])
+        low = high
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _subtract(rows, which, first, weights, coefficients):  # type: ignore[no-untyped-def]
-    """Subtract B^T ``coefficients`` (n_row, K) from the ``rows`` of the numbers ``which`` (n_row,)."""
-    taps, n = weights.shape[1], first.size
-    for low in range(0, n, AT_ONCE):
-        high = min(low + AT_ONCE, n)
-        for k in range(which.size):
-            row, own = rows[which[k]], coefficients[k]
-            for t in range(low, high):
-                value = row[t]
-                for i in range(taps):
-                    value -= weights[t, i] * own[first[t] + i]
-                row[t] = value
+def _subtract(  # type: ignore[no-untyped-def]
+    values, lines, cell, inside, start, begin, functions, stops, firsts, coefficients
+):
+    """Subtract B^T ``coefficients`` (n_row, K)."""
+    low, chunk = 0, np.empty(AT_ONCE)
+    for r in range(stops.size):
+        high = stops[r]
+        x = chunk[: high - low]
+        for d in range(values.shape[0]):
+            read(values, lines, cell, inside, start, d, begin + low, x)
+            for i in range(functions.shape[0]):
+                lessen(x, coefficients[d, firsts[r] + i], functions[i, low:high])
+            write(values, d, begin + low, x)
+        low = high

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from zonda.core.types import AnyFloats, Floats
 
 from .baseline import Fit
+from .rows import Rows
 from .source_mask import filter_outside
 
 ORDER = 4
@@ -52,5 +53,5 @@ class BesselPlan:
             row[...] = sosfilt(self.sos, row)
 
         if self.trend is not None:
-            self.trend.remove(rows, masked)
+            self.trend.remove(Rows.of(rows), masked)
         return sum(filter_outside(row, bad, None if masked is None else masked[d], act) for d, row in enumerate(rows))

@@ -11,7 +11,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
 from zonda.core.operator import Operator
 
-from .baseline import Fit, in_double, splines
+from .baseline import Fit, splines
+from .rows import by_rows
 
 MOST = 2000
 """Knots of a scan: the normal equations are solved whole."""
@@ -49,4 +50,4 @@ class Despline(Operator):
 
     def exec(self, block: Block, state: Fit) -> None:
         """Subtract the fit from each row."""
-        in_double(self.label, block, state.remove)
+        by_rows(self.label, block, state.remove)

@@ -10,7 +10,8 @@ from zonda.core.data import Block, Observation
 from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
 from zonda.core.operator import Operator
 
-from .baseline import Fit, in_double, polynomials
+from .baseline import Fit, polynomials
+from .rows import by_rows
 from .source_mask import Inside, SourceMask, check_mask
 
 
@@ -42,4 +43,4 @@ class Detrend(Operator):
     def exec(self, block: Block, state: tuple[Fit, Inside | None]) -> None:
         """Subtract the fit from each row."""
         fit, inside = state
-        in_double(self.label, block, fit.remove, inside)
+        by_rows(self.label, block, fit.remove, inside)

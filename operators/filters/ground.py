@@ -10,7 +10,11 @@ scan, and g the samples that are used, the least-squares fit of both together is
     c = (T'_g T'_g^T)^-1 T'_g x_g,   a = (G_g G_g^T)^-1 G_g (x_g - T_g^T c)                                  (2)
 
 (Frisch & Waugh 1933), where G_g G_g^T is diagonal: the number of samples in each bin. White noise loses n_bin + K degrees of
-freedom. A bin without used samples removes nothing.
+freedom. A bin without used samples removes nothing. T' has no mean over the used samples of a bin, so that
+
+    G^T a + T^T c = G^T (G_g G_g^T)^-1 G_g x_g + T'^T c:                                                     (3)
+
+the sums of x over bins and with T' are found in one reading.
 """
 
 from __future__ import annotations
@@ -31,7 +35,8 @@ from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .baseline import Basis, Fit, Mask, in_double, polynomials
+from .baseline import Basis, Fit, dot, keep_used, lessen, polynomials, runs, solved
+from .rows import AT_ONCE, Mask, Rows, by_rows, read, write
 
 
 class GroundFilter(Operator):
@@ -65,11 +70,11 @@ class GroundFilter(Operator):
             warnings.warn(f"{self.label}: {text}: the template is a mean; choose a smaller bin", stacklevel=2)
         observation.tally.state(self.label, f"{observation.name}: bins of the template", f"{size}")
         use = good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
-        return Template.of(number, polynomials(observation.n_samples, self.trend).weights[:, 1:], use)
+        return Template.of(number, polynomials(observation.n_samples, self.trend).functions[1:], use)
 
     def exec(self, block: Block, state: Template) -> None:
         """Subtract the template and the trend from each row."""
-        in_double(self.label, block, lambda rows, _: state.remove(rows))
+        by_rows(self.label, block, lambda rows, _: state.remove(rows))
 
 
 def _bins(observation: Observation, width: float, split: bool) -> NDArray[np.int64]:
@@ -83,63 +88,117 @@ def _bins(observation: Observation, width: float, split: bool) -> NDArray[np.int
 
 @dataclass(frozen=True)
 class Template:
-    """Equation (2) for one scan.
+    """Equation (3) for one scan.
 
     Attributes
     ----------
     bins
         (n,) bin of each sample.
     raw
-        (n, K): T of equation (1), transposed.
+        (K, n): T of equation (1).
     use
         (n,) samples that are used.
+    stops
+        (n_run,): `baseline.runs` of ``bins``.
     share
         (n_bin,) 1 / number of used samples, 0 where there are none.
     trend
-        The fit of T'; None: K = 0.
+        The fit of T'.
     """
 
     bins: NDArray[np.int64]
     raw: Floats
     use: Mask
+    stops: NDArray[np.int64]
     share: Floats
-    trend: Fit | None
+    trend: Fit
 
     @classmethod
     def of(cls, bins: NDArray[np.int64], raw: Floats, use: Mask) -> Template:
         """For the samples ``use`` (n,)."""
         count = np.bincount(bins[use], minlength=int(bins.max()) + 1)
         share = np.divide(1.0, count, where=count > 0, out=np.zeros(len(count)))
-        if not raw.shape[1]:
-            return cls(bins, raw, use, share, None)
-        within = np.ascontiguousarray(raw, np.float64).copy()
-        for column in within.T:
-            column -= (np.bincount(bins[use], column[use], len(count)) * share)[bins]
-        basis = Basis(np.zeros(len(bins), np.int64), within, raw.shape[1])
-        return cls(bins, raw, use, share, Fit.of(basis, use))
+        within = np.array(raw, np.float64)
+        for row in within:
+            row -= (np.bincount(bins[use], row[use], len(count)) * share)[bins]
+        trend = Fit.of(Basis.of(within, np.zeros(len(bins), np.int64), len(raw)), use)
+        return cls(bins, raw, use, runs(bins), share, trend)
 
-    def remove(self, rows: Floats) -> int:
-        """Equation (1) on ``rows`` (n_det, n) in place. Returns how many samples were not finite; they stay as they were."""
-        finite = np.isfinite(rows)
-        whole: NDArray[np.bool_] = np.logical_and.reduce(finite, axis=1)
-        if self.trend is not None and whole.all():
-            self.trend.remove(rows)
-        for row, fine, complete in zip(rows, finite, whole, strict=True):
-            one = self if complete else Template.of(self.bins, self.raw, self.use & fine)
-            if one.trend is not None and not whole.all():
-                one.trend.remove(row[None])
-            _remove_bins(row, one.use, one.bins, one.share)
-        return int(np.count_nonzero(~finite))
+    def remove(self, rows: Rows) -> int:
+        """Equation (3) on rows in place. Returns how many samples were not finite; they stay as they were."""
+        sums, means = np.zeros((len(rows.values), len(self.raw))), np.zeros((len(rows.values), len(self.share)))
+        functions, number = self.trend.basis.functions, self.bins[self.stops - 1]
+        _sums(*rows, self.use, functions, self.stops, number, sums, means)
+        means *= self.share
+        trend = solved(self.trend.inverse, sums)
+        fine = np.isfinite(means).all(axis=1)
+        _subtract(*rows, fine, functions, self.stops, number, trend, means)
+        return sum(self._alone(rows, int(d)) for d in np.flatnonzero(~fine))
+
+    def _alone(self, rows: Rows, d: int) -> int:
+        """`remove` on the row ``d``, some of whose samples are not finite."""
+        row = rows.double(slice(d, d + 1), len(self.use))
+        finite = np.isfinite(row[0])
+        spoilt = row[0, ~finite]
+        row[0, ~finite] = 0.0
+        Template.of(self.bins, self.raw, self.use & finite).remove(Rows.of(row))
+        row[0, ~finite] = spoilt
+        rows.values[d] = row[0]
+        return len(spoilt)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+def _total(x):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for t in range(nb.uint64(x.size)):
+        total += x[t]
+    return total
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _remove_bins(row, use, bins, share):  # type: ignore[no-untyped-def]
-    """Subtract the mean over the used samples of each bin."""
-    means = np.zeros(share.size)
-    for t in range(row.size):
-        if use[t]:
-            means[bins[t]] += row[t]
-    for b in range(share.size):
-        means[b] *= share[b]
-    for t in range(row.size):
-        row[t] -= means[bins[t]]
+def _sums(  # type: ignore[no-untyped-def]
+    values, lines, cell, inside, start, begin, use, functions, stops, number, sums, totals
+):
+    """sums (n_row, K) += T'_g x_g, and totals (n_row, n_bin) += G_g x_g; the first arguments are those of `Rows`."""
+    chunk, first = np.empty(AT_ONCE), 0
+    for low in range(0, use.size, AT_ONCE):
+        high, last = min(low + AT_ONCE, use.size), first
+        x = chunk[: high - low]
+        while last < stops.size and stops[last] <= high:
+            last += 1
+        for d in range(values.shape[0]):
+            read(values, lines, cell, inside, start, d, begin + low, x)
+            keep_used(x, use[low:high])
+            for i in range(functions.shape[0]):
+                sums[d, i] += dot(x, functions[i, low:high])
+            at = 0
+            for r in range(first, last):
+                totals[d, number[r]] += _total(x[at : stops[r] - low])
+                at = stops[r] - low
+        first = last
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _subtract(  # type: ignore[no-untyped-def]
+    values, lines, cell, inside, start, begin, which, functions, stops, number, trend, means
+):
+    """Subtract T'^T ``trend`` (n_row, K) and G^T ``means`` (n_row, n_bin) from the rows ``which`` (n_row,)."""
+    chunk, first, n = np.empty(AT_ONCE), 0, stops[-1]
+    for low in range(0, n, AT_ONCE):
+        high, last = min(low + AT_ONCE, n), first
+        x = chunk[: high - low]
+        while last < stops.size and stops[last] <= high:
+            last += 1
+        for d in range(values.shape[0]):
+            if which[d]:
+                read(values, lines, cell, inside, start, d, begin + low, x)
+                for i in range(functions.shape[0]):
+                    lessen(x, trend[d, i], functions[i, low:high])
+                at = 0
+                for r in range(first, last):
+                    mean = means[d, number[r]]
+                    for t in range(nb.uint64(at), nb.uint64(stops[r] - low)):
+                        x[t] -= mean
+                    at = stops[r] - low
+                write(values, d, begin + low, x)
+        first = last

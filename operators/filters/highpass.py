@@ -13,10 +13,11 @@ from zonda.core.errors import PipelineError
 from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
 from zonda.core.types import AnyFloats, Floats
 
-from .baseline import SPOILT, Fit, in_double, polynomials
+from .baseline import Fit, polynomials
 from .bessel import BesselPlan, sections
 from .brick_wall import HighpassPlan, plan_highpass
 from .parameters import HighpassParameters
+from .rows import SPOILT, in_double
 from .source_mask import Inside, check_mask, filter_outside
 
 ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"

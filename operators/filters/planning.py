@@ -14,14 +14,17 @@ from zonda.core.plan.context import LEAKS, Context
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 
-from .baseline import ROWS
 from .bessel import amplitude
 from .common_mode import CommonModeFilter
 from .gram import MOST_COPIED
 from .highpass import HighpassFilter
+from .rows import ROWS
 
 LANCZOS = 0.5e-9
 """Seconds per sample of one Lanczos step, which reads the stream once."""
+
+FUNCTION = 0.55e-9
+"""Seconds per sample of one function of time that is fitted and removed."""
 
 START = 1e-3
 """Residual of the first vector, the detectors' mean."""
@@ -78,14 +81,12 @@ class DetrendPlanning(Planning[Any]):
     of = "zonda.operators.filters.detrend:Detrend"
 
     def memory(self, observation: Observation) -> int:
-        """The polynomials; the pointing of a mask; parts in float64."""
-        order: int = self.operator.order
-        return 8 * (order + 4 + ROWS) * observation.n_samples
+        """As of `polynomial_memory`."""
+        return polynomial_memory(self.operator, observation)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        functions = self.operator.order + 1
-        return Estimate((), Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=4e-9 + 2e-9 * functions))
+        return Estimate((), polynomial_cost(self.operator.order))
 
 
 class PolynomialPlanning(Planning[Any]):
@@ -94,16 +95,26 @@ class PolynomialPlanning(Planning[Any]):
     of = "zonda.operators.filters.polynomial:PolynomialFilter"
 
     def memory(self, observation: Observation) -> int:
-        """The polynomials; the pointing of a mask; parts in float64."""
-        order: int = self.operator.order
-        return 8 * (order + 5 + ROWS) * observation.n_samples
+        """As of `polynomial_memory`."""
+        return polynomial_memory(self.operator, observation)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the slow part in."""
-        functions = self.operator.order + 1
-        cost = Cost(fixed=0.01, per_time=1e-8 * functions**2, per_sample=1.2e-8 + 3.6e-9 * functions)
-        left = _left_in(context)
+        cost, left = polynomial_cost(self.operator.order), _left_in(context)
         return Estimate((Effect("polynomials", (full(f"exact, order {self.operator.order}"),), left, LEFT_IN),), cost, left)
+
+
+def polynomial_cost(order: int) -> Cost:
+    """Of polynomials that are fitted to each detector and removed."""
+    functions = order + 1
+    return Cost(fixed=0.01, per_time=2e-8 + 8e-9 * functions, per_sample=3.5e-9 + FUNCTION * functions)
+
+
+def polynomial_memory(operator: Any, observation: Observation) -> int:
+    """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some rows are in it."""
+    masked = 3 + 2.5 * ROWS if operator.mask else 0.0
+    order: int = operator.order
+    return math.ceil(8 * (order + 5 + masked) * observation.n_samples)
 
 
 class GroundPlanning(Planning[Any]):
@@ -112,13 +123,14 @@ class GroundPlanning(Planning[Any]):
     of = "zonda.operators.filters.ground:GroundFilter"
 
     def memory(self, observation: Observation) -> int:
-        """The trend, twice; bins; parts in float64."""
+        """The trend, twice; bins, and what finds them; a row in float64."""
         trend: int = self.operator.trend
-        return 8 * (2 * trend + 4 + ROWS) * observation.n_samples
+        return 8 * (2 * trend + 8) * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the template in."""
-        cost = Cost(fixed=0.01, per_time=1e-7, per_sample=1.2e-8 + 5e-9 * self.operator.trend)
+        trend: int = self.operator.trend
+        cost = Cost(fixed=0.01, per_time=1e-7 + 2e-8 * trend, per_sample=3e-9 + FUNCTION * trend)
         left = _left_in(context)
         return Estimate((Effect("template in azimuth", (full("exact"),), left, LEFT_IN),), cost, left)
 
@@ -136,11 +148,11 @@ class DesplinePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
     of = "zonda.operators.filters.despline:Despline"
-    cost = Cost(fixed=0.01, per_time=1e-7, per_sample=1.4e-8)
+    cost = Cost(fixed=0.01, per_time=1e-7, per_sample=3.5e-9 + 4 * FUNCTION)
 
     def memory(self, observation: Observation) -> int:
-        """The splines at each sample; parts in float64."""
-        return 8 * (5 + ROWS) * observation.n_samples
+        """The splines at each sample, and what they are made from; a row in float64."""
+        return 8 * 12 * observation.n_samples
 
 
 class TaperPlanning(Planning[Any]):

@@ -23,10 +23,12 @@ from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
 from zonda.core.intervals import ranges
+from zonda.core.numerics.smooth import product
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .baseline import Basis, Fit, in_double, polynomials
+from .baseline import Basis, Fit, polynomials
+from .rows import Rows, by_rows
 from .source_mask import Inside, SourceMask, check_mask
 
 Part = Literal[
@@ -85,7 +87,7 @@ class PolynomialFilter(Operator):
     def exec(self, block: Block, state: tuple[Pieces, Inside | None]) -> None:
         """Subtract the fits from each row."""
         pieces, inside = state
-        in_double(self.label, block, pieces.remove, inside)
+        by_rows(self.label, block, pieces.remove, inside)
 
 
 @dataclass(frozen=True)
@@ -96,12 +98,15 @@ class Pieces:
     ----------
     parts, fits
         The samples of each interval, and the fit to them.
+    gaps
+        Samples between intervals, before the first and behind the last one: as many as there are intervals and one more.
     outside
         (n,) True for samples in no interval.
     """
 
     parts: list[slice]
     fits: list[Fit]
+    gaps: list[slice]
     outside: NDArray[np.bool_]
 
     @classmethod
@@ -111,32 +116,23 @@ class Pieces:
         for part in parts:
             outside[part] = False
         fits = [Fit(_basis(n, order), use[p], _inverse(n, order, use[p])) for p in parts for n in (p.stop - p.start,)]
-        return cls(parts, fits, outside)
+        starts, stops = [0, *(p.stop for p in parts)], [*(p.start for p in parts), len(use)]
+        return cls(parts, fits, [slice(a, b) for a, b in zip(starts, stops, strict=True)], outside)
 
-    def remove(self, rows: Floats, masked: NDArray[np.bool_] | None = None) -> int:
-        """Equation (1) on ``rows`` (n_det, n) in place; the rest as of `Fit.remove`."""
-        outside = self.outside.any()
-        ends = np.empty((len(rows), 2 * len(self.parts)))
-        spoilt = 0
-        for k, (part, fit) in enumerate(zip(self.parts, self.fits, strict=True)):
-            edges = [part.start, part.stop - 1]
-            if outside:
-                ends[:, 2 * k : 2 * k + 2] = rows[:, edges]
-            spoilt += fit.remove(rows[:, part], None if masked is None else masked[:, part])
-            if outside:
-                ends[:, 2 * k : 2 * k + 2] -= rows[:, edges]
-        if outside:
-            where = np.array([edge for part in self.parts for edge in (part.start, part.stop - 1)], np.float64)
-            self._remove_lines(rows, where, ends)
+    def remove(self, rows: Rows, masked: NDArray[np.bool_] | None = None) -> int:
+        """Equation (1) on rows in place; the rest as of `Fit.remove`."""
+        spoilt, removed = 0, list[Floats]()
+        for part, fit in zip(self.parts, self.fits, strict=True):
+            found, bad = fit.coefficients(rows.at(part.start), None if masked is None else masked[:, part])
+            fit.basis.subtract(rows.at(part.start), found)
+            removed.extend(product(found, fit.basis.functions[:, [0, -1]]).T)
+            spoilt += bad
+        removed = [removed[0], *removed, removed[-1]]
+        for gap, before, behind in zip(self.gaps, removed[::2], removed[1::2], strict=True):
+            if (n := gap.stop - gap.start) > 0:
+                line = (before + behind) / 2, (behind - before) / (2 + 2 / n)  # through the samples on either side of the gap
+                _basis(n, 1).subtract(rows.at(gap.start), np.stack(line, axis=1))
         return spoilt
-
-    def _remove_lines(self, rows: Floats, where: Floats, ends: Floats) -> None:
-        """Subtract straight lines between the intervals; ``ends`` (n_det, n_edge): what was removed at the samples ``where``."""
-        at = np.flatnonzero(self.outside)
-        for row, values in zip(rows, ends, strict=True):
-            known = np.isfinite(values)
-            if known.any():
-                row[at] -= np.interp(at, where[known], values[known])
 
 
 @lru_cache(maxsize=16)

@@ -18,7 +18,7 @@ from zonda.core.numerics.chunks import chunks
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .baseline import ROWS
+from .rows import ROWS
 
 MEAN = "samples with mean emission under the window: put a Detrend before it"
 """A count of the log."""

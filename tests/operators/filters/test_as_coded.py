@@ -18,6 +18,7 @@ from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.despline import Despline
 from zonda.operators.filters.detrend import Detrend
 from zonda.operators.filters.highpass import HighpassFilter
+from zonda.operators.filters.rows import Rows
 from zonda.operators.filters.taper import Taper
 
 RATE, CUT = 100.0, 0.08
@@ -190,7 +191,7 @@ def test_a_gap_longer_than_the_knots_is_no_trouble():
     use[2000:4500] = False
     t = np.linspace(-1, 1, n)
     rows = (1 + t - 2 * t**3)[None].copy()
-    Fit.of(splines(n, 300), use).remove(rows)
+    Fit.of(splines(n, 300), use).remove(Rows.of(rows))
     assert np.isfinite(rows).all()
     assert np.abs(rows[0, use]).max() < 1e-6
 

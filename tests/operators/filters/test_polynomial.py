@@ -14,6 +14,7 @@ from zonda.core.flags import INVALID, PROCESSING
 from zonda.core.intervals import ranges
 from zonda.operators.filters.detrend import Detrend
 from zonda.operators.filters.polynomial import Pieces, PolynomialFilter
+from zonda.operators.filters.rows import Rows
 from zonda.plugins.checks import scenes
 
 N = 6000
@@ -124,10 +125,10 @@ def test_rows_together_have_the_bits_of_rows_alone():
     use = rng.random(3000) < 0.9
     pieces = Pieces.of([slice(0, 1100), slice(1200, 3000)], 3, use)
     together = rows.copy()
-    assert pieces.remove(together, masked) == 1
+    assert pieces.remove(Rows.of(together), masked) == 1
     for d, row in enumerate(rows):
         alone = row[None].copy()
-        pieces.remove(alone, masked[d : d + 1])
+        pieces.remove(Rows.of(alone), masked[d : d + 1])
         np.testing.assert_array_equal(together[d], alone[0])
 
 
