@@ -34,13 +34,13 @@ APRON = 3
 BYTES_KEPT = 512 << 20
 """Memory of the tiles that are kept."""
 
-SQUARE, STRIP = (8, 8), (5, 10)
+SQUARE, STRIP = (8, 9), (5, 10)
 """Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the path is narrow."""
 
 NARROW = 96
 """Cells: a path that is narrower than this across the wind, and has no slabs, is tiled by strips."""
 
-SLAB, WIDEST, LONGEST = 1 << 16, 1024, 1 << 10
+SLAB, WIDEST, LONGEST = 1 << 18, 1024, 1 << 10
 """Cells of a slab, about; cells across the wind up to which there are slabs; most cells along it."""
 
 DENSE = 1.5
@@ -49,8 +49,9 @@ DENSE = 1.5
 ONE_PIECE = 1 << 16
 """Cells of a layer, with `AROUND` more on every side, up to which all that a scan sweeps over is made as one piece."""
 
-AROUND, SPARE = 20, 2
-"""Cells about the made ones that the pyramid works out too, about; and those beyond what the rim of the points sweeps over."""
+AROUND, SPARE, BEYOND = 20, 2, 32
+"""Cells about the made ones that the pyramid works out too, about; cells beyond what some points of the rim sweep over: so many,
+and one for so many across the wind."""
 
 MOST = 0.5
 """Bands make tiles for each other where they reach at least this share of the cells between the outermost of both."""
@@ -159,7 +160,8 @@ class Tiling:
     def __init__(self, tiles: Tiles, number: int, fields: Mapping[int, Turbulence], swept: Swept) -> None:
         self._tiles, self._number, self.fields = tiles, number, fields
         low, high, begin, end = swept.box
-        low, high, begin, end = low - SPARE, high + 1 + SPARE, begin - SPARE, end + 1 + SPARE
+        spare = SPARE + (high - low) // BEYOND
+        low, high, begin, end = low - spare, high + 1 + spare, begin - spare, end + 1 + spare
         held = points_of(swept.box)
         self._piece = (low, high, begin, end) if held <= ONE_PIECE else None
         self._slab: tuple[int, int, int] | None = None
