@@ -99,14 +99,14 @@ class Pieces:
     parts, fits
         The samples of each interval, and the fit to them.
     gaps
-        Samples between intervals, before the first and behind the last one: as many as there are intervals and one more.
+        Samples between intervals: how many intervals are before them, and what lines are made of.
     outside
         (n,) True for samples in no interval.
     """
 
     parts: list[slice]
     fits: list[Fit]
-    gaps: list[slice]
+    gaps: list[tuple[int, slice, Basis]]
     outside: NDArray[np.bool_]
 
     @classmethod
@@ -117,7 +117,8 @@ class Pieces:
             outside[part] = False
         fits = [Fit(_basis(n, order), use[p], _inverse(n, order, use[p])) for p in parts for n in (p.stop - p.start,)]
         starts, stops = [0, *(p.stop for p in parts)], [*(p.start for p in parts), len(use)]
-        return cls(parts, fits, [slice(a, b) for a, b in zip(starts, stops, strict=True)], outside)
+        gaps = [(k, slice(a, b), _basis(b - a, 1)) for k, (a, b) in enumerate(zip(starts, stops, strict=True)) if b > a]
+        return cls(parts, fits, gaps, outside)
 
     def remove(self, rows: Rows, masked: NDArray[np.bool_] | None = None) -> int:
         """Equation (1) on rows in place; the rest as of `Fit.remove`."""
@@ -128,10 +129,10 @@ class Pieces:
             removed.extend(product(found, fit.basis.functions[:, [0, -1]]).T)
             spoilt += bad
         removed = [removed[0], *removed, removed[-1]]
-        for gap, before, behind in zip(self.gaps, removed[::2], removed[1::2], strict=True):
-            if (n := gap.stop - gap.start) > 0:
-                line = (before + behind) / 2, (behind - before) / (2 + 2 / n)  # through the samples on either side of the gap
-                _basis(n, 1).subtract(rows.at(gap.start), np.stack(line, axis=1))
+        for k, gap, lines in self.gaps:
+            before, behind, n = removed[2 * k], removed[2 * k + 1], gap.stop - gap.start
+            line = (before + behind) / 2, (behind - before) / (2 + 2 / n)  # through the samples on either side of the gap
+            lines.subtract(rows.at(gap.start), np.stack(line, axis=1))
         return spoilt
 
 
