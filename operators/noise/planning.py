@@ -54,6 +54,9 @@ class PinkPlanning(Planning[PinkNoise]):
         """Filter states that are kept, and the common part."""
         kept = -(-observation.n_detectors // TILE_DETECTORS) * (observation.n_samples // CHECKPOINT + 3)
         common = 12 * observation.n_samples if self.operator.shared > 0 else 0
+        if spectrum := PinkSpectrum.of(self.operator, observation):
+            slopes = spectrum.of_detectors(self.operator, observation).slope
+            kept, common = math.ceil(kept * filters_in_a_tile(slopes)), common * len(np.unique(slopes))
         return kept * (4 * TILE_DETECTORS * (self.operator.poles + 3) + 300) + common + 80 * observation.n_detectors
 
     def traits(self, observation: Observation) -> Traits:
@@ -89,7 +92,7 @@ class PinkPlanning(Planning[PinkNoise]):
             size["tod"] = traits.rms
         size["psd"] = level * float(law.response(np.array([0.1 / (o.duration * o.sample_rate)]))[0])
         text = "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R: high-pass filter"
-        cost = pole_cost(pink.poles)
+        cost = pole_cost(pink.poles, filters_in_a_tile(spectrum.of_detectors(pink, o).slope))
         choices = [full(f"{pink.poles} poles"), *self._coarser(context, spectrum, level)]
         if pink.shared == 0 and not context.kept_streams & pink.provides:
             # a common part would be what a singular mode consists of: it is not dropped
@@ -106,7 +109,8 @@ class PinkPlanning(Planning[PinkNoise]):
         law, amplitude = spectrum.filter(pink.poles), self._amplitude(spectrum, o)
         correlated, common = _correlated(law, context), pink.shared > 0 and not context.removes_common
         text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
-        seconds = pole_cost(pink.poles).seconds(context.times, o.n_detectors)
+        passes = filters_in_a_tile(spectrum.of_detectors(pink, o).slope)
+        seconds = pole_cost(pink.poles, passes).seconds(context.times, o.n_detectors)
         for poles in self.coarser("poles"):
             try:
                 coarse = spectrum.filter(poles)
@@ -118,7 +122,7 @@ class PinkPlanning(Planning[PinkNoise]):
                 free = difference(law, coarse, replace(context, traits={}), o.sample_rate, o.duration)
                 bound["tod"] = amplitude * math.sqrt(free)
             bound["psd"] = psd_error(law, coarse, level)
-            saved = seconds - pole_cost(poles).seconds(context.times, o.n_detectors)
+            saved = seconds - pole_cost(poles, passes).seconds(context.times, o.n_detectors)
             choices.append(Choice("coarse", f"{poles} poles", {"poles": poles}, bound=bound, formula=text, seconds=saved))
         return choices
 
@@ -133,9 +137,15 @@ def calibrated(level: WhiteLevel, observation: Observation) -> Floats:
     return np.asarray(level.sky_net(observation) * math.sqrt(observation.sample_rate), np.float64)
 
 
-def pole_cost(poles: int) -> Cost:
-    """The kernel takes poles four at a time."""
-    return Cost(fixed=0.01, per_sample=1.7e-9 + 0.75e-9 * math.ceil(poles / 4), kernel="random")
+def pole_cost(poles: int, passes: float = 1.0) -> Cost:
+    """The kernel takes poles four at a time. ``passes``: filters in a tile of detectors (`filters_in_a_tile`)."""
+    return Cost(fixed=0.01 * passes, per_sample=(1.7e-9 + 0.75e-9 * math.ceil(poles / 4)) * passes, kernel="random")
+
+
+def filters_in_a_tile(slopes: Floats) -> float:
+    """Different slopes (n_det,) in a tile of detectors, on average: each is a filter that is run for the whole tile."""
+    tiles = [slopes[first : first + TILE_DETECTORS] for first in range(0, len(slopes), TILE_DETECTORS)]
+    return float(np.mean([len(np.unique(tile)) for tile in tiles])) if tiles else 1.0
 
 
 def difference(a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float) -> float:

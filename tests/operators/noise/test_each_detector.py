@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 import zonda
+from zonda.core.plan.look import look
+from zonda.core.plan.planning import planning_of
+from zonda.core.plan.structure import Structure
 from zonda.operators.noise.estimate import fit, spectrum
 
 pytestmark = pytest.mark.filterwarnings("ignore:Pointing")
@@ -72,3 +75,19 @@ def test_the_step_stands_above_the_focal_plane(tmp_path: Path) -> None:
     one = pink(camera(tmp_path), knee="1 Hz", slope=1.2).tod("pink")
     other = pink(camera(tmp_path, np.ones(20), np.full(20, 1.2))).tod("pink")
     np.testing.assert_array_equal(one, other)
+
+
+def test_the_plan_counts_a_pass_for_each_slope_in_a_tile(tmp_path: Path) -> None:
+    """Two slopes in the first tile of 16 detectors (10 and 6), one in the rest: 1.5 on average."""
+    costs, sizes = [], []
+    for slopes in ([1.2] * len(SLOPES), SLOPES):
+        instrument = camera(tmp_path, slopes=slopes)
+        scene = zonda.Scene(site="atacama", instrument=instrument, time="2024-06-25T07:00", target="az 180 deg el 50 deg", seed=1)
+        steps = [zonda.PointingStare(scan_duration="16 s"), zonda.PinkNoise(shared=0.5), zonda.Efficiency()]
+        pipeline = zonda.Pipeline([*steps, zonda.BinMap(pixel="1 arcmin")])
+        context = look(pipeline, scene, Structure.of_all(pipeline))
+        planning = planning_of(context.operators[1])
+        costs.append(planning.estimate(context).cost)
+        sizes.append(planning.memory(context.first))
+    assert costs[1].per_sample == pytest.approx(1.5 * costs[0].per_sample)
+    assert sizes[1] > sizes[0]
