@@ -29,6 +29,9 @@ SCRATCH_STREAMS = 2
 AMPLE = 3.0
 """Times the streams of all signals: with so much memory unfiltered ones are held across the filters, not made again."""
 
+AMPLE_BLOCK = 128 << 20
+"""Bytes of a block's arrays on one thread beyond which larger ones gain nothing."""
+
 COMPLETE = (Formed(MAIN, frozenset()),)
 """The complete signal alone."""
 
@@ -293,7 +296,7 @@ class Schedule:
         settings, (whole, part) = self.settings, self._streams_in_block(stage)
         rows, columns = least_block(stage.span, self.shape)
         each = settings.threads * np.dtype(settings.dtype).itemsize
-        share = block_share(settings.memory // 2 // each, whole, part)
+        share = block_share(min(settings.memory // 2, settings.threads * AMPLE_BLOCK) // each, whole, part)
         return share if share >= rows * columns else block_share((settings.memory - held) // each, whole, part)
 
     def _bytes(self, stage: Stage, block: int, piece: int) -> int:
