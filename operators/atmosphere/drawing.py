@@ -10,7 +10,7 @@ import numpy as np
 from zonda.core.instrument import SPEED_OF_LIGHT
 from zonda.core.types import Floats
 
-from .fluctuations import AtNodes, OfDetectors, times, units_fit
+from .fluctuations import BYTES_KEPT, AtNodes, OfDetectors, keeps_all, times, units_bytes
 from .model import AtmosphereModel, ExpectedLoad
 from .response import Response, delay_per_vapour
 from .turbulence.beams import rayleigh_distance, widened
@@ -51,8 +51,13 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
         observation.tally.state(label, what, text)
     if "path_delay" in parameters.outputs:
         observation.tally.state(label, "wet path delay", f"{per_vapour:.3f} times the PWV (non-dispersive)")
-    make = AtNodes.make if chosen.nodes.shape else OfDetectors
-    return make(chosen.nodes, turbulence, pwv, response, chosen.step, observation.n_samples)
+    arguments = chosen.nodes, turbulence, pwv, response, chosen.step, observation.n_samples
+    if chosen.nodes.shape:
+        return AtNodes.make(*arguments)
+    made, shared = OfDetectors(*arguments), observation.shared
+    if shared is not None and shared.bands > 1:
+        made.join(shared.once((label, "units"), list))
+    return made
 
 
 def height_of_vapour(model: AtmosphereModel) -> float:
@@ -120,7 +125,16 @@ def in_time_order(model: AtmosphereModel) -> bool:
     o, chosen = model.observation, model.resolution()
     if chosen.nodes.shape:
         return False
-    return not units_fit(o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs)))
+    return not keeps_all(o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs)))
+
+
+def bytes_of_units(model: AtmosphereModel) -> int:
+    """Bytes of the detectors' series that are kept; 0 where they are interpolated from nodes."""
+    o, chosen = model.observation, model.resolution()
+    if chosen.nodes.shape:
+        return 0
+    every = units_bytes(o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs)))
+    return min(every, BYTES_KEPT) if in_time_order(model) else every
 
 
 def _statements(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[str, str]]:

@@ -2,13 +2,15 @@
 
 At nodes everything is drawn once, before the blocks: few nodes stand for all detectors. Where each detector is its own node
 its series are made on demand, a unit of detectors and samples at a time, so that a scan of any length needs
-little memory; a unit has the same bits whenever it is made.
+little memory; a unit has the same bits whenever it is made. Where all units of a scan are kept they are made in order of time,
+those of bands in step next to each other: tiles of the turbulence serve all detectors of that moment.
 """
 
 from __future__ import annotations
 
 import math
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -38,6 +40,10 @@ AHEAD = 8
 
 BYTES_KEPT = 128 << 20
 """Memory of the units that are kept: until the other detectors and operators have taken their part."""
+
+ALL_KEPT, SHARE_KEPT = 384 << 20, 0.3
+"""Memory up to which all units of a scan are kept, as long as it is at most this share of a stream's: a step behind this one that
+needs whole scans would else need a whole stream, or the units in another order than that of time."""
 
 
 def times(samples: slice, step: int) -> tuple[int, int]:
@@ -94,7 +100,19 @@ class OfDetectors:
         self._units: OrderedDict[tuple[int, int], Future[dict[str, AnyFloats]]] = OrderedDict()
         self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
         self._lock = threading.Lock()
-        self._size = _unit_size(len(nodes.xi), step, len(response.names))
+        n_detectors, streams = len(nodes.xi), len(response.names)
+        self._groups, self._times = -(-n_detectors // UNIT_DETECTORS), -(-n_samples // UNIT_SAMPLES)
+        self._keeps_all, self._begun = keeps_all(n_detectors, n_samples, step, streams), 0
+        self._most = max(1, BYTES_KEPT // _unit_size(n_detectors, step, streams))
+        if self._keeps_all:
+            self._most = self._groups * self._times
+        self._beside: list[weakref.ref[OfDetectors]] = []
+
+    def join(self, bands: list[weakref.ref[OfDetectors]]) -> None:
+        """Let bands that are in step make units next to each other; ``bands``: a list that all of them are given."""
+        if self._keeps_all:
+            self._beside = bands
+            bands.append(weakref.ref(self))
 
     def drawn(self) -> tuple[int, float, float]:
         """As `AtNodes.drawn`, of the units made so far."""
@@ -122,40 +140,68 @@ class OfDetectors:
 
     def _unit(self, unit: int, number: int) -> dict[str, AnyFloats]:
         """The coefficients of a unit. A thread that would wait for another to make it makes one that comes later instead."""
-        most = max(1, BYTES_KEPT // self._size)
         while True:
             with self._lock:
                 wanted = self._units.get((unit, number))
-                key: tuple[int, int] | None = None
-                if wanted is None:
-                    key = unit, number
-                else:
+                if wanted is not None:
                     self._units.move_to_end((unit, number))
-                    if not wanted.done():
-                        key = next((k for k in self._next(unit, number, min(AHEAD, most)) if k not in self._units), None)
-                if key is not None:
-                    mine: Future[dict[str, AnyFloats]] = Future()
-                    self._units[key] = mine
-                    while len(self._units) > most:
-                        self._units.popitem(last=False)  # a thread that waits for it still holds it
-            if key is None:
+                key = None if wanted is not None and wanted.done() else self._to_make(unit, number)
+                mine = None if key is None else self._begin(key)
+            if key is None or mine is None:
                 assert wanted is not None
                 return wanted.result()
-            try:
-                mine.set_result(self._make(*key))
-            except BaseException as error:
-                mine.set_exception(error)
-                with self._lock:
-                    self._units.pop(key, None)
-                raise
+            self._fill(key, mine)
+            for other in [band() for band in self._beside]:
+                if other is not None and other is not self:
+                    other._also(key)
             if key == (unit, number):
                 return mine.result()
 
+    def _to_make(self, unit: int, number: int) -> tuple[int, int] | None:
+        """The unit to begin with where one is wanted that is not made; None: all that may be of use have been begun."""
+        if self._keeps_all:
+            while self._begun < self._groups * self._times:
+                number, unit = divmod(self._begun, self._groups)
+                if (unit, number) not in self._units:
+                    return unit, number
+                self._begun += 1
+            return None
+        if (unit, number) not in self._units:
+            return unit, number
+        return next((k for k in self._next(unit, number, min(AHEAD, self._most)) if k not in self._units), None)
+
+    def _begin(self, key: tuple[int, int]) -> Future[dict[str, AnyFloats]]:
+        """Note that a unit is being made; the lock is held."""
+        mine: Future[dict[str, AnyFloats]] = Future()
+        self._units[key] = mine
+        while len(self._units) > self._most:
+            self._units.popitem(last=False)  # a thread that waits for it still holds it
+        return mine
+
+    def _fill(self, key: tuple[int, int], mine: Future[dict[str, AnyFloats]]) -> None:
+        """Make a unit that has been begun."""
+        try:
+            mine.set_result(self._make(*key))
+        except BaseException as error:
+            mine.set_exception(error)
+            with self._lock:
+                self._units.pop(key, None)
+                self._begun = 0
+            raise
+
+    def _also(self, key: tuple[int, int]) -> None:
+        """Make a unit that another band has just made, unless it has been begun."""
+        with self._lock:
+            if key in self._units:
+                return
+            mine = self._begin(key)
+        self._fill(key, mine)
+
     def _next(self, unit: int, number: int, reach: int) -> Iterator[tuple[int, int]]:
         """Units that will be needed soon: later ones of the same detectors, the same time of the next detectors."""
-        for k in range(number + 1, min(number + reach, -(-self._n_samples // UNIT_SAMPLES))):
+        for k in range(number + 1, min(number + reach, self._times)):
             yield unit, k
-        for k in range(unit + 1, min(unit + reach, -(-len(self._xi) // UNIT_DETECTORS))):
+        for k in range(unit + 1, min(unit + reach, self._groups)):
             yield k, number
 
     def _make(self, unit: int, number: int) -> dict[str, AnyFloats]:
@@ -172,9 +218,20 @@ class OfDetectors:
 
 
 def units_fit(n_detectors: int, n_samples: int, step: int, streams: int) -> bool:
-    """Whether all units of `OfDetectors` can be kept, so that the order in which blocks are worked on does not matter."""
+    """Whether all units of `OfDetectors` take little memory."""
+    return units_bytes(n_detectors, n_samples, step, streams) <= BYTES_KEPT
+
+
+def keeps_all(n_detectors: int, n_samples: int, step: int, streams: int) -> bool:
+    """Whether all units of `OfDetectors` are kept, so that the order in which blocks are worked on does not matter."""
+    stream = 4 * n_detectors * n_samples
+    return units_bytes(n_detectors, n_samples, step, streams) <= max(BYTES_KEPT, min(ALL_KEPT, SHARE_KEPT * stream))
+
+
+def units_bytes(n_detectors: int, n_samples: int, step: int, streams: int) -> int:
+    """Bytes of all units of `OfDetectors`."""
     number = -(-n_detectors // UNIT_DETECTORS) * -(-n_samples // UNIT_SAMPLES)
-    return number * _unit_size(n_detectors, step, streams) <= BYTES_KEPT
+    return number * _unit_size(n_detectors, step, streams)
 
 
 def _unit_size(n_detectors: int, step: int, streams: int) -> int:

@@ -27,7 +27,7 @@ from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
 from .averaging import shares
-from .drawing import in_time_order
+from .drawing import bytes_of_units, in_time_order
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
 from .turbulence.geometry import ScanPlane, axes, crossing, rays
@@ -68,8 +68,9 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
     )
 
     def memory(self, observation: Observation) -> int:
-        """Tables, tiles of the turbulence, weights of the nodes, which are chosen later."""
-        return 100_000_000 + 700 * observation.n_detectors + 40 * observation.n_samples
+        """Tables, tiles of the turbulence, weights of the nodes; where there are none, the series of detectors."""
+        size = 100_000_000 + 700 * observation.n_detectors + 40 * observation.n_samples
+        return size + bytes_of_units(self.operator.model(observation))
 
     def in_time_order(self, observation: Observation) -> bool:
         """Where detectors are evaluated one by one and the scan is long, all of them share the turbulence of the moment."""

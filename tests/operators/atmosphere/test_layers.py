@@ -812,6 +812,7 @@ def test_a_pipeline_gives_the_same_bits_in_any_order_of_blocks(kept: int, bench:
     camera = instrument(detectors=37, field="10 deg", diameter="6 m")
     o = swept(50.0, 180 + 4 * np.sin(2 * np.pi * np.arange(12000) / 4000), camera)
     monkeypatch.setattr(fluctuations, "BYTES_KEPT", kept)
+    monkeypatch.setattr(fluctuations, "ALL_KEPT", kept)
     steps = [operator(layers=1, lowest="3 km")]
     state = steps[0].prepare(o)
     assert planning_of(steps[0]).in_time_order(o) is (kept == 0)
