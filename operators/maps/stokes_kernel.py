@@ -84,7 +84,7 @@ def add_stokes(signals, first, rows, at, cells, turn, good, window, weight, nois
             _unpacked(turn[0, place, begin : begin + number], turn[1, place, begin : begin + number], c, s)
             share[:number] = window[begin : begin + number]
             if n_fine < number or top >= limit_bits[0] or _least(pixels) < 0:
-                number = _without(signals, rows[k], low, pixels, fine, limits, (c, s, share), values, kept, dropped)
+                number = _without(signals, rows[k], low, pixels, fine, limits, size, c, s, share, values, kept, dropped)
                 pixels, top = kept[:number], limit_bits[1]
             limit_bits[1] = top
             largest[0], largest[1] = max(largest[0], max(w0, noise[k]) * WEIGHT), max(largest[1], limits[1] * w0 * VALUE + 1.0)
@@ -154,29 +154,28 @@ def _scale(level, share, power, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _without(signals, d, first, pixels, fine, limits, of_samples, values, kept, dropped):  # type: ignore[no-untyped-def]
-    """Drop samples from the arrays ``of_samples``, from ``values`` (m, n), and ``pixels`` into ``kept``: how many are left.
+def _without(signals, d, first, pixels, fine, limits, size, c, s, share, values, kept, dropped):  # type: ignore[no-untyped-def]
+    """Drop samples from ``c``, ``s``, ``share`` and ``values`` (m, n), and from ``pixels`` into ``kept``: how many are left.
 
-    ``limits``: the size that is too large; the largest one that is left is put behind it.
+    ``limits``: the size that is too large; the largest one that is left is put behind it. ``size``: space.
     """
     number = 0
     limits[1] = 0.0
+    size[: pixels.size] = 0.0
+    for i in range(len(signals)):
+        row = signals[i][d, first : first + pixels.size]
+        for t in range(row.size):
+            one = abs(np.float64(row[t]))
+            size[t] = max(size[t], one if one < np.inf else np.inf)  # NaN is not below anything
     for t in range(pixels.size):
-        size = 0.0
-        for i in range(len(signals)):
-            one = abs(np.float64(signals[i][d, first + t]))
-            size = max(size, one) if one < np.inf else np.inf  # NaN is not below anything
-            if not one < np.inf:
-                break
-        if not fine[t] or not size < np.inf or pixels[t] < 0 or size >= limits[0]:
-            why = FLAGGED if not fine[t] else NOT_FINITE if not size < np.inf else OUTSIDE if pixels[t] < 0 else TOO_LARGE
+        if not fine[t] or not size[t] < np.inf or pixels[t] < 0 or size[t] >= limits[0]:
+            why = FLAGGED if not fine[t] else NOT_FINITE if not size[t] < np.inf else OUTSIDE if pixels[t] < 0 else TOO_LARGE
             dropped[why] += 1
             continue
-        limits[1] = max(limits[1], size)
-        kept[number] = pixels[t]
-        for array in of_samples:
-            if array.size:
-                array[number] = array[t]
+        limits[1] = max(limits[1], size[t])
+        kept[number], c[number], s[number] = pixels[t], c[t], s[t]
+        if share.size:
+            share[number] = share[t]
         for i in range(len(signals)):
             values[i, number] = values[i, t]
         number += 1
