@@ -27,10 +27,11 @@ from .coverage import Coverage, Directions
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
+from .looking import Looking
 from .map_layout import check_size, grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
-from .stokes_map import check_polarized, stokes_binnings
+from .stokes_map import angles_of, check_polarized, stokes_binnings
 from .stokes_product import StokesSums
 from .stokes_sums import StokesBinning
 from .stokes_sums import add_block as add_polarized
@@ -122,10 +123,11 @@ class BinMap(MapParameters):
 class Prepared:
     """An observation's pointing, weights and sums.
 
-    ``binnings``: of each half (`halves_of`), one for all signals or one for each with noise of its own. ``directions``: where the
-    map tells how scans cross.
+    ``looking``: in which pixels its detectors look. ``binnings``: of each half (`halves_of`), one for all signals or one for each
+    with noise of its own. ``directions``: where the map tells how scans cross.
     """
 
+    looking: Looking
     binnings: list[Binning] | list[StokesBinning]
     directions: Directions | None
 
@@ -148,26 +150,23 @@ def prepared(step: BinMap, observation: Observation, reference: float, spare: li
         observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
     if "white" not in observation.components and step.noise == "net" and step.contents == "all":
         observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
-    made: list[Any]
-    if step.stokes == "IQU":
-        made = stokes_binnings(step, observation, step.grid, (weight, noise, window), seen, spare)
-    else:
-        made = binnings(step, observation, (weight, noise, window), seen, spare)
-    directions = Directions.of(observation, step.grid, made[0].pointing, seen) if step.crosslinking else None
-    return Prepared(made, directions)
+    looking = Looking.of(observation, step.grid, angles_of(step, observation) if step.stokes == "IQU" else None)
+    how = step, looking, (weight, noise, window), seen, spare
+    made: list[Any] = stokes_binnings(*how) if step.stokes == "IQU" else binnings(*how)
+    directions = Directions.of(looking, seen) if step.crosslinking else None
+    return Prepared(looking, made, directions)
 
 
 def binnings(
-    step: BinMap, observation: Observation, levels: tuple[Any, Any, Any], seen: NDArray[np.bool_], spare: list[Sums]
+    step: BinMap, looking: Looking, levels: tuple[Any, Any, Any], seen: NDArray[np.bool_], spare: list[Sums]
 ) -> list[Binning]:
     """Of each half (`halves_of`), one binning for all signals or one for each; arguments as of `stokes_binnings`."""
-    weight, noise, window = levels
+    observation, (weight, noise, window) = looking.observation, levels
     alike = step.noise == "net" and not window.size and bool((weight == weight[0]).all() and (noise == noise[0]).all())
-    pointing = step.grid.pointing(observation)
     signals = 1 if step.contents == "hits" else len(observation.signals)
     others, count = (0, signals) if step.noise == "scatter" else (signals - 1, 1)
     return [
-        Binning(step.grid, pointing, use, (seen & samples).astype(np.uint8), window, weight, noise, alike, others, spare)
+        Binning(step.grid, looking.pointing, use, (seen & samples).astype(np.uint8), window, weight, noise, alike, others, spare)
         for use, samples in halves_of(step.split, observation)
         for _ in range(count)
     ]
@@ -225,7 +224,7 @@ def add_signals(step: BinMap, block: Block, state: Prepared, reference: float) -
         left = signals
         for binning in half:
             count = 1 + binning.n_others
-            add_block(step, block, tuple(left[:count]), binning, reference)
+            add_block(step, block, tuple(left[:count]), (state.looking, binning), reference)
             left = left[count:]
 
 
@@ -237,23 +236,26 @@ def halves(step: BinMap, state: list[Any]) -> list[Any]:
     return [state] if step.split == "scans" else [state[:middle], state[middle:]]
 
 
-def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], binning: Binning, reference: float) -> None:
+def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], where: tuple[Looking, Binning], reference: float) -> None:
     """Add the signals of a block to this thread's sums."""
+    looking, binning = where
     sums, dropped, largest = binning.of_thread()
     plane, begin, end, rows = block.observation.focalplane, block.samples.start, block.samples.stop, block.detectors
-    xi, eta, use = plane.xi[rows], plane.eta[rows], block.observation.good_detectors[rows] & binning.use[rows]
+    use = block.observation.good_detectors[rows] & binning.use[rows]
     how = (
         use, binning.good[begin:end], binning.window[begin:end], binning.weight[rows], binning.noise[rows],
         step.noise == "scatter", 1 / reference, sums, dropped, largest,
     )  # fmt: skip
     if isinstance(binning.grid, TangentGrid):
-        add_image(signals, binning.pointing, begin, xi, eta, *binning.grid.shape, *how)
+        add_image(signals, binning.pointing, begin, plane.xi[rows], plane.eta[rows], *binning.grid.shape, *how)
         return
+    which = np.arange(rows.start, rows.stop)
     for start in range(begin, end, TILE_SAMPLES):
         stop = min(start + TILE_SAMPLES, end)
-        index = np.empty((len(xi), stop - start), np.int32)
-        binning.grid.pixels(binning.pointing, start, stop, xi, eta, index)
-        add_list(signals, start - begin, index, *how)
+        if binning.good[start:stop].any():
+            add_list(signals, start - begin, looking.pixels(which, start, stop), *how)
+        else:
+            dropped[FLAGGED] += (stop - start) * which.size
 
 
 def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared) -> None:

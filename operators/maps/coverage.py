@@ -28,13 +28,11 @@ from numpy.typing import NDArray
 
 from zonda.core.block import Block
 from zonda.core.compilation.jit import nb
-from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.types import Floats
 
-from .grid import Grid
 from .image_grid import rays
-from .looking import tiles
+from .looking import Looking, tiles
 from .sums import WEIGHT, Sums
 
 SLOWEST = 1e-10
@@ -49,16 +47,13 @@ class Directions:
 
     Attributes
     ----------
-    pointing
-        What `Grid.pointing` gives.
     rays, motion
         (9, n_samp) coefficients of r in the map's frame, and of v.
     good
         (n_samp,) uint8: which samples count.
     """
 
-    grid: Grid
-    pointing: Floats
+    looking: Looking
     rays: Floats
     motion: Floats
     good: NDArray[np.uint8]
@@ -66,11 +61,11 @@ class Directions:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
-    def of(cls, observation: Observation, grid: Grid, pointing: Floats, good: NDArray[np.bool_]) -> Directions:
+    def of(cls, looking: Looking, good: NDArray[np.bool_]) -> Directions:
         """``good`` (n_samp,): which samples count."""
-        towards = rays(observation, grid.frame)
+        towards = rays(looking.observation, looking.grid.frame)
         motion = np.gradient(towards, axis=1) if towards.shape[1] > 1 else np.zeros_like(towards)
-        return cls(grid, pointing, towards, motion, good.astype(np.uint8))
+        return cls(looking, towards, motion, good.astype(np.uint8))
 
     def add(self, signals: list[Any], block: Block) -> None:
         """Add a block's samples that are finite in all ``signals``, each (n_det, n)."""
@@ -81,13 +76,12 @@ class Directions:
         with self.lock:
             sums = self.parts.setdefault(mine, np.zeros((0, 3), np.int64))
             if not len(sums):
-                sums = self.parts[mine] = np.zeros((self.grid.n_pixels, 3), np.int64)
+                sums = self.parts[mine] = np.zeros((self.looking.grid.n_pixels, 3), np.int64)
         plane, begin = block.observation.focalplane, block.samples.start
         for rows, start, stop in tiles(block, block.observation.good_detectors[block.detectors]):
             which = rows + block.detectors.start
             xi, eta = plane.xi[which], plane.eta[which]
-            index = np.empty((rows.size, stop - start), np.int32)
-            self.grid.pixels(self.pointing, start, stop, xi, eta, index)
+            index = self.looking.pixels(which, start, stop)
             add_directions(self.rays, self.motion, start, xi, eta, index, rows, finite, start - begin, self.good, sums)
 
 

@@ -72,10 +72,6 @@ class StokesBinning:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     @property
-    def pointing(self) -> Floats:
-        return self.looking.pointing
-
-    @property
     def columns(self) -> int:
         return DATA + 3 * self.signals + (6 if self.own_noise else 0)
 

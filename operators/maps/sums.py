@@ -162,8 +162,8 @@ def _cells(h, start, a, b, ny, nx, cells):  # type: ignore[no-untyped-def]
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def add_list(signals, first, index, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
     """Add samples first .. of a block to the pixels ``index`` (n_det, n) of a list, -1 outside; the rest as in `_add`."""
-    index += np.int32(1)
-    _add(signals, first, index, 0, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest)
+    places = index + np.int32(1)  # other bands may need the pixels as they are
+    _add(signals, first, places, 0, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
@@ -178,15 +178,15 @@ def _add(signals, first, cells, stride, use, good, window, weight, noise, scatte
     flat, columns = sums.reshape(-1), np.uintp(sums.shape[1])
     base = sums.shape[1] - (m - 1)
     fine = good[first : first + n]
-    all_fine = True
+    n_fine = np.int64(0)
     for t in range(n):  # numpy's all() and flatnonzero() would take a second more to compile
-        all_fine &= fine[t] != 0
+        n_fine += np.int64(fine[t] != 0)
     rows, n_rows = np.empty(use.size, np.int64), 0
     for d in range(use.size):
         if use[d]:
             rows[n_rows] = d
             n_rows += 1
-    rows = rows[:n_rows]
+    rows = rows[: n_rows if n_fine else 0]
     dropped[FLAGGED] += n * (use.size - rows.size)
     shifted, highest = np.empty((m, TOGETHER, n)), np.empty(m)
     units = shifted.view(np.int64)
@@ -195,7 +195,7 @@ def _add(signals, first, cells, stride, use, good, window, weight, noise, scatte
         for k in range(group.size):
             d = group[k]
             limit, factor, square = _scales(weight[d], per_variance, scatter)
-            drop = not all_fine
+            drop = n_fine < n
             for s in range(m):
                 high = _units(signals[s][d, first : first + n], factor, shifted[s, k], units[s, k])
                 highest[s] = float(high + 1)
