@@ -40,7 +40,7 @@ from ..types import AnyFloats
 from .ahead import Ahead
 from .block_maker import BlockMaker, Measured
 from .blocks import least_block
-from .in_step import Sweep, Turns, Waiting, joins, sweep
+from .in_step import Sweep, Turns, Waiting, joins, name_of_all, sweep
 from .schedule import Chain, Planned, Schedule
 from .settings import Settings, Timer
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
@@ -255,7 +255,7 @@ class Execution:
                 forget_pages(stream.array)
 
         what = ", ".join(o.label for o in stage.segment.operators)
-        todo = Sweep(work, self.schedule.blocks(planned), f"{observation.name}: {what}", self._stop.set)
+        todo = Sweep(work, self.schedule.blocks(planned), observation.name, what, name_of_all(observation), self._stop.set)
         if self._in_step:
             yield todo
         else:

@@ -73,15 +73,17 @@ class Sweep:
     ----------
     work
         Called with the detectors and the samples of each of ``blocks``, on several threads.
-    what
-        The scan and the steps, for the progress.
+    scan, what
+        Names of the scan and of the steps, for the progress; ``together``: that of the scan with all bands.
     stop
         Called where a block fails: the others are of no use any more.
     """
 
     work: Callable[[slice, slice], None]
     blocks: Sequence[tuple[slice, slice]]
+    scan: str
     what: str
+    together: str
     stop: Callable[[], None]
 
 
@@ -96,18 +98,18 @@ def joins(operator: Operator) -> bool:
 
 def sweep(one: Sweep, settings: Settings) -> None:
     """Work on every block, on ``settings.threads`` threads; the first error stops all."""
-    blocks, progress, total = one.blocks, settings.progress, len(one.blocks)
+    blocks, progress, total, what = one.blocks, settings.progress, len(one.blocks), f"{one.scan}: {one.what}"
     if settings.threads == 1 or total == 1:
         for done, block in enumerate(blocks, 1):
             one.work(*block)
-            progress(done, total, one.what)
+            progress(done, total, what)
         return
     with ThreadPoolExecutor(settings.threads) as pool:
         futures = [pool.submit(one.work, *block) for block in blocks]
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 future.result()
-                progress(done, total, one.what)
+                progress(done, total, what)
         except BaseException:
             one.stop()
             for future in futures:
@@ -177,7 +179,7 @@ def _sweep(sweeps: Sequence[Sweep], settings: Settings, shared: SharedScan | Non
         for one in sweeps:
             one.stop()
 
-    sweep(replace(first, work=work, stop=stop), settings)
+    sweep(replace(first, work=work, scan=first.together, stop=stop), settings)
 
 
 def _measure(waiting: Sequence[Waiting], models: dict[str, Any], store: Store) -> list[Any]:
@@ -227,11 +229,16 @@ def _joined(streams: Sequence[Stream], store: Store) -> Stream:
     return joined
 
 
+def name_of_all(scan: Observation) -> str:
+    """The name of a scan without that of its band."""
+    return scan.name.removesuffix(f"-{scan.instrument.band.name}")
+
+
 def _all_detectors(scans: Sequence[Observation]) -> Observation:
     """A scan with the detectors of all bands. A sample that one band flags is flagged: the bands have no common mode there."""
     first = scans[0]
     return replace(
-        first, name=f"{first.name.removesuffix('-' + first.instrument.band.name)}, all bands",
+        first, name=f"{name_of_all(first)}, all bands",
         focalplane=Focalplane.of_bands({str(k): scan.focalplane for k, scan in enumerate(scans)}),
         flags=np.bitwise_or.reduce([scan.flags for scan in scans]),
         detector_flags=np.concatenate([scan.detector_flags for scan in scans]), smooth={}, detdata={}, tally=Tally(),
