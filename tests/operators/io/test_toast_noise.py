@@ -145,3 +145,19 @@ def test_a_flagged_detector_needs_no_spectrum(saved: Path, kind: str) -> None:
     assert np.isfinite(observation.focalplane.net).all()
     with pytest.raises(InputError, match=tod.names[3]):
         zonda.LoadTOD(file=path, noise_model="measured", detector_mask=0).scene()
+
+
+def test_units_and_the_frequency_zero(saved: Path) -> None:
+    """TOAST's spectra may be in other units, and begin at 0 Hz."""
+    with h5py.File(saved, "a") as file:
+        names = [row["name"].decode() for row in file["instrument/focalplane"][:]]
+        write_model(file, names, lambda f, k: 0 * f + 1.0, units="mK2 s")
+        group = file["metadata/measured"]
+        rows = group["0a"][:]
+        del group["0a"]
+        group.create_dataset("0a", data=np.hstack([np.zeros((len(rows), 1), "f4"), rows]))
+    step = zonda.LoadTOD(file=saved, noise_model="measured")
+    data = zonda.Data(step.scene())
+    step.observe(data)
+    np.testing.assert_allclose(data.observations[0].focalplane.net[1::2], 1e-3, rtol=1e-6)
+    np.testing.assert_allclose(data.observations[0].focalplane.net[::2], 1e-3 * np.sqrt(5), rtol=1e-6)

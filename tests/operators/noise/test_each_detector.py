@@ -91,3 +91,35 @@ def test_the_plan_counts_a_pass_for_each_slope_in_a_tile(tmp_path: Path) -> None
         sizes.append(planning.memory(context.first))
     assert costs[1].per_sample == pytest.approx(1.5 * costs[0].per_sample)
     assert sizes[1] > sizes[0]
+
+
+def test_it_is_added_to_what_is_there(tmp_path: Path) -> None:
+    """A detector without pink noise of its own keeps the bits of the first step's."""
+    scene = zonda.Scene(
+        site="atacama", instrument=camera(tmp_path), time="2024-06-25T07:00", target="az 180 deg el 50 deg", seed=1
+    )
+    first = zonda.PinkNoise(knee="1 Hz", slope=1.2)
+    one, both = (
+        zonda.Pipeline([zonda.PointingStare(scan_duration="20 s"), *steps, zonda.Efficiency()])
+        .run(scene, threads=1, keep=["pink"])
+        .tod("pink")
+        for steps in ([first], [first, zonda.PinkNoise()])
+    )
+    for row, knee in enumerate(KNEES):
+        assert np.array_equal(one[row], both[row]) == (knee == 0)
+    assert one.any(axis=1).all()
+
+
+def test_the_focal_plane_refers_the_knee_to_the_white_noise(tmp_path: Path) -> None:
+    """NET^2 (knee / f)^slope is the same for twice the NET and another knee; the closed form is the mean of the detectors."""
+    scene = zonda.Scene(
+        site="atacama", instrument=camera(tmp_path), time="2024-06-25T07:00", target="az 180 deg el 50 deg", seed=1
+    )
+    steps = [zonda.WhiteNoise(), zonda.PinkNoise(net=f"{2 * NET} K s(1/2)"), zonda.Efficiency()]
+    data = zonda.Pipeline([zonda.PointingStare(scan_duration="20 s"), *steps]).run(scene, threads=1)
+    (observation,) = data.observations
+    np.testing.assert_allclose(observation.focalplane.knee, KNEES * 2 ** (2 / SLOPES), rtol=1e-12)
+    f = np.array([0.01, 0.3, 4.0])
+    expected = np.mean([2 * (2 * NET) ** 2 * (knee / f) ** slope for knee, slope in zip(KNEES, SLOPES, strict=True)], axis=0)
+    (law,) = observation.closed_forms["pink"]
+    np.testing.assert_allclose(law(f), expected, rtol=1e-9)
