@@ -62,8 +62,8 @@ class LoadTOD(RecordedFiles):
     Pointing, focal plane, flags, intervals, noise and weather are those of the file, and so are instrument and site: a pipeline
     with this step needs neither. The stream enters as the component `recorded`: alone it is the signal, which filters and map
     makers then treat as any other; a `SkyMap` behind it is added to it; with `signal: none` there is the pointing alone, on which
-    the other steps simulate a twin. Streams are read block by block. The mean of each detector stands beside its stream, so that
-    float32 keeps what is on top of tens of kelvin.
+    the other steps simulate a twin. Streams are read block by block. A mean that is large beside the scatter stands beside the
+    stream, so that float32 keeps what is on top of tens of kelvin.
 
     Samples with a bit of `flag_mask` and detectors with one of `detector_mask` are not used; a single sample of a detector that
     the file flags (``detdata/flags``) becomes NaN, which filters bridge and maps drop. Streams compressed with FLAC need the
@@ -100,7 +100,8 @@ class LoadTOD(RecordedFiles):
         out = block.new(RECORDED)
         if state is None:
             return
-        block.means[RECORDED] = state.mean
+        if state.mean is not None:
+            block.means[RECORDED] = state.mean
         spoilt = state.add(block.detectors, block.samples, out)
         block.observation.tally.count(self.label, "samples of single detectors that the file flags", spoilt)
 
@@ -129,6 +130,9 @@ def _look(step: LoadTOD, data: Data) -> list[str]:
 def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
     """Append the observations; the files of each by its number."""
     given, found = data.scene, dict[int, list[File]]()
+    if data.observations:
+        cure = "give all files to one LoadTOD, file: [FILE, ...], and leave out other steps that point the telescope"
+        raise InputError("stands behind a step that has made scans", place=step.label, cure=cure)
     own = step.own_scene(given.instrument)
     if abs(given.time.seconds_since(own["time"])) > MOMENT:
         raise InputError(

@@ -18,6 +18,9 @@ from zonda.core.types import AnyFloats, Floats
 AT_ONCE = 4 * TILE_SAMPLES
 """Samples of `TILE_DETECTORS` detectors that are read at once."""
 
+LITTLE = 10.0
+"""Levels of all detectors up to this many standard deviations of their samples stay in the stream: it has been filtered."""
+
 STRETCHES, LENGTH = 5, 64
 """Parts of a scan, and samples of each, of which a detector's level is the median."""
 
@@ -37,7 +40,7 @@ class RecordedStream:
     mask
         Bits of the flags of a detector's samples that make one NaN.
     level
-        (n_det,) K, constant, that stands beside the stream; ``mean``: the same as a field.
+        (n_det,) K, constant, that stands beside the stream; ``mean``: the same as a field, None where it is zero.
     """
 
     file: Any
@@ -45,7 +48,7 @@ class RecordedStream:
     rows: NDArray[np.intp]
     mask: np.uint8
     level: Floats = field(default_factory=lambda: np.zeros(0))
-    mean: SmoothField = field(init=False)
+    mean: SmoothField | None = None
 
     def __post_init__(self) -> None:
         self._factor = _kelvin(self.file.streams[self.name], self.name, self.file.place)
@@ -53,11 +56,15 @@ class RecordedStream:
     def levelled(self, n_detectors: int, n_samples: int) -> RecordedStream:
         """Itself, with the level of each detector; where that cannot be read the file is closed."""
         try:
-            self.level, _ = levels(self, n_detectors, n_samples)
+            self.level, spread = levels(self, n_detectors, n_samples)
         except BaseException:
             self.file.close()
             raise
-        self.mean = SmoothField.constant(self.level, n_samples)
+        used = (self.file.tod.detector_flags[self.rows] & self.mask) == 0
+        if (np.abs(self.level) <= LITTLE * spread)[used].all():
+            self.level = np.zeros(n_detectors)
+        else:
+            self.mean = SmoothField.constant(self.level, n_samples)
         return self
 
     def add(self, detectors: slice, samples: slice, out: AnyFloats) -> int:

@@ -124,6 +124,13 @@ def test_a_beam_of_a_band_that_is_not_used_may_be_unknown(night: Any, tmp_path: 
     same(load(save_tod(tmp_path / "unknown.h5", whole), band="150 GHz")["map"], load(files[1])["map"])
 
 
+def test_filtered_streams_go_on_into_the_next_filter(night: Any) -> None:
+    """No mean of tens of kelvin is in them."""
+    _, files = night
+    found = load(files, zonda.CommonModeFilter(), MAP)
+    assert found["map_f090"].hits.sum() == load(files)["map_f090"].hits.sum()
+
+
 def test_scans_that_state_no_band_are_all_used(night: Any, tmp_path: Path) -> None:
     """Whatever band is chosen: it is the scene's."""
     _, files = night
@@ -229,6 +236,10 @@ def test_what_does_not_fit_together(night: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has the bands f090, f150, the first scan f090") as caught:
         load([files[0], *files[2:]])
     assert "begin with a scan of all bands" in caught.value.cure
+    for second in (files[1], files[2]):
+        with pytest.raises(InputError, match=r"LoadTOD\.2: stands behind a step that has made scans") as caught:
+            load(files[0], zonda.LoadTOD(file=second), MAP)  # two bands would be in one map
+        assert "give all files to one LoadTOD" in caught.value.cure
     tod = load_tod(files[1])
     tod.boresight_radec = tod.boresight_radec[:, [1, 0, 3, 2]]
     elsewhere = save_tod(tmp_path / "elsewhere.h5", tod)
