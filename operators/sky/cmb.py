@@ -44,7 +44,7 @@ class CMBSky(FullSky):
     realization: int | None = Field(None, ge=0)
     """Number of the sky: the same for every seed. Where absent the seed draws it, and in a campaign every entry has another."""
 
-    _skies: dict[int, tuple[SkyMap, float]] = PrivateAttr(default_factory=dict)
+    _skies: dict[tuple[int, bool], tuple[SkyMap, float]] = PrivateAttr(default_factory=dict)
 
     def check(self, data: Data) -> list[str]:
         """Up to which multipole the spectrum reaches; raises InputError where it is wrong."""
@@ -52,18 +52,19 @@ class CMBSky(FullSky):
 
     def prepare(self, observation: Observation) -> tuple[SkyMap, SkyState]:
         """The step that samples the map, and what that one knows of the scan."""
-        sky, rms = self.sky(observation.seed)
+        sky, rms = self.sky(observation.seed, observation.focalplane.polarized)
         observation.tally.state(self.label, "rms of the sky before the beam", f"{1e6 * rms:.4g} uK_CMB, nside {self.nside}")
         return sky, sky.prepare(observation)
 
-    def sky(self, seed: int) -> tuple[SkyMap, float]:
-        """The step that samples the map of a seed, and the map's rms, K_CMB."""
+    def sky(self, seed: int, polarized: bool) -> tuple[SkyMap, float]:
+        """The step that samples the map of a seed, and the map's rms, K_CMB; I alone where detectors are not ``polarized``."""
         number = seed if self.realization is None else self.realization
-        if number not in self._skies:
-            maps = draw(read_spectrum(str(self.spectrum)), self.nside, stream_key(number, "CMBSky", self.label))
+        if (number, polarized) not in self._skies:
+            spectra = read_spectrum(str(self.spectrum))
+            maps = draw(spectra if polarized else spectra[:1], self.nside, stream_key(number, "CMBSky", self.label))
             self._skies.clear()
-            self._skies[number] = self.sampler(maps, "K_CMB", "C"), float(np.std(maps[0]))
-        return self._skies[number]
+            self._skies[number, polarized] = self.sampler(maps, "K_CMB", "C"), float(np.std(maps[0]))
+        return self._skies[number, polarized]
 
 
 def read_spectrum(place: str) -> Floats:
@@ -97,13 +98,16 @@ def read_spectrum(place: str) -> Floats:
 
 
 def draw(spectra: Floats, nside: int, key: Any) -> Floats:
-    """Equation (1): maps (1 or 3, n_pix) of I, or I, Q and U in COSMO's convention, K_CMB, ring order."""
+    """Equation (1): maps (1 or 3, n_pix) of I, or I, Q and U in COSMO's convention, K_CMB, ring order.
+
+    ``spectra``: TT, EE, BB, TE, or TT alone.
+    """
     import healpy
 
     lmax = min(spectra.shape[1] - 1, 3 * nside - 1)
     ell, m = healpy.Alm.getlm(lmax)
     number = ell * (ell + 1) // 2 + m
-    tt, ee, bb, te = spectra[:, : lmax + 1]
+    tt, *others = spectra[:, : lmax + 1]
 
     def deviates(stream: int) -> Any:
         pairs = normals(key, 0, (lmax + 1) * (lmax + 2), stream=stream).astype(np.float64).reshape(-1, 2)[number]
@@ -112,8 +116,9 @@ def draw(spectra: Floats, nside: int, key: Any) -> Floats:
     first = deviates(0)
     root = np.sqrt(tt)
     intensity = root[ell] * first
-    if not (ee.any() or bb.any()):
+    if not any(power.any() for power in others):
         return np.asarray(healpy.alm2map(intensity, nside, lmax=lmax), np.float64)[None]
+    ee, bb, te = others
     with np.errstate(divide="ignore", invalid="ignore"):
         shared = np.where(tt > 0, te / root, 0.0)
     own = np.sqrt(np.maximum(ee - shared**2, 0.0))

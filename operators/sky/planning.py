@@ -34,6 +34,9 @@ LINEAR = 1.1 * 2 * 8 * math.log(2) / 12
 FASTER = 1.6e-9
 """Seconds per sample that linear sampling saves."""
 
+INTENSITY, POLARIZED = 8e-10, 3.5e-9
+"""Seconds times l_max^2 nside in which healpy makes a map of I, or maps of I, Q and U."""
+
 PYSM = 1.5e-8
 """Seconds of processor time that PySM takes per pixel, frequency and component."""
 
@@ -197,17 +200,29 @@ class CMBPlanning(Planning[Any]):
         return Traits(peak=4.5 * math.sqrt(float(((2 * ell + 1) * spectra[0]).sum()) / (4 * math.pi)))
 
     def memory(self, observation: Observation) -> int:
-        """Maps and their multipoles."""
-        return int(12 * self.operator.nside**2 * 8 * 12)
+        """Bytes while the maps become a table: more than drawing them takes. 47 and 110 were measured for each pixel."""
+        return int(12 * self.operator.nside**2 * (110 if self._polarized(observation) else 50))
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost: maps from multipoles, and what `SkyMap` does with them."""
-        once = 1.2e-10 * self.operator.nside**3 + 3e-7 * 12 * self.operator.nside**2
+        """Its cost: maps from multipoles, of each ring and each pair (l, m); and what `SkyMap` does with them."""
+        from .cmb import read_spectrum
+
+        nside, polarized = self.operator.nside, self._polarized(context.first)
+        highest = min(read_spectrum(str(self.operator.spectrum)).shape[1] - 1, 3 * nside - 1)
+        drawn = (POLARIZED if polarized else INTENSITY) * highest**2 * nside
+        once = drawn + (4.5e-7 if polarized else 3e-7) * 12 * nside**2 + 2.0
         peak = self.traits(context.first).peak or 0.0
         size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
         text = "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB"
         effect = Effect("CMB", (full(f"drawn at nside {self.operator.nside}"),), size, text)
-        return Estimate((effect,), Cost(fixed=0.05, per_time=5e-8, per_sample=5e-9, once=once))
+        per_time, per_sample = (1.5e-7, 1.5e-8) if polarized else (5e-8, 5e-9)
+        return Estimate((effect,), Cost(fixed=0.05, per_time=per_time, per_sample=per_sample, once=once))
+
+    def _polarized(self, observation: Observation) -> bool:
+        """Whether I, Q and U are drawn."""
+        from .cmb import read_spectrum
+
+        return observation.focalplane.polarized and bool(read_spectrum(str(self.operator.spectrum))[1:].any())
 
 
 class PySMPlanning(Planning[Any]):
