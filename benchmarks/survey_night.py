@@ -3,6 +3,7 @@
     python benchmarks/survey_night.py                                # a tenth of it: half a minute
     python benchmarks/survey_night.py --factor 1                     # 30 min, 6.2e8 samples
     python benchmarks/survey_night.py --factor 1 --memory 2.5 --common-mode
+    python benchmarks/survey_night.py --factor 1 --band f090         # one band alone
 
 2 x 1720 detectors in pairs with shared pixels, 100 Hz: constant-elevation scans, atmosphere, white and pink noise, polynomials
 of each detector's scan, the ground's template, maps of I, Q and U and of their half-difference; no stream is saved. With
@@ -28,9 +29,10 @@ BANDS = (("f090", 77, 106, 300), ("f150", 130, 170, 360))
 
 def text(seconds: float, options: argparse.Namespace) -> str:
     """The pipeline file."""
+    chosen = [band for band in BANDS if options.band in ("", band[0])]
     bands = "".join(
         f"    - {{name: {n}, low: {a} GHz, high: {b} GHz, net: {net} uK s(1/2), knee: 0.5 Hz, detectors: {2 * PIXELS}}}\n"
-        for n, a, b, net in BANDS
+        for n, a, b, net in chosen
     )
     return f"""
 site: llano_de_chajnantor
@@ -108,6 +110,7 @@ def main() -> None:
     parser.add_argument("--memory", type=float, help="GB that the run may hold")
     parser.add_argument("--common-mode", action="store_true", help="remove a singular mode of each band")
     parser.add_argument("--half-difference", default="halves", help="that of BinMap (default halves)")
+    parser.add_argument("--band", default="", choices=["", *(name for name, *_ in BANDS)], help="one band alone")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     memory = None if options.memory is None else round(options.memory * 1e9)
@@ -115,7 +118,7 @@ def main() -> None:
         one(Path(options.one), memory)
         return
     seconds = 1800 * options.factor
-    samples = len(BANDS) * 2 * PIXELS * seconds * 100
+    samples = (1 if options.band else len(BANDS)) * 2 * PIXELS * seconds * 100
     with TemporaryDirectory() as folder:
         launch(Path(folder), 12.0, options)
         f = launch(Path(folder), seconds, options)
