@@ -14,6 +14,7 @@ from zonda.core.numerics.random import stream_key
 from zonda.core.plan.look import look
 from zonda.core.plan.planning import planning_of
 from zonda.core.plan.structure import Structure
+from zonda.core.registry import instruments
 from zonda.operators.sky import cmb
 from zonda.operators.sky.cmb import CMBSky, draw, read_spectrum
 from zonda.plugins.checks import scenes
@@ -77,7 +78,7 @@ def test_without_polarized_detectors_the_intensity_alone_is_drawn(tmp_path):
     np.testing.assert_array_equal(intensity.data["I"], every.data["I"])
     costs, sizes = [], []
     for polarization in ("none", "pairs"):
-        instrument = zonda.instruments.create("act_150ghz").varied(polarization=polarization, detectors=14)
+        instrument = instruments.create("act_150ghz").varied(polarization=polarization, detectors=14)
         scene = zonda.Scene(site="atacama", instrument=instrument, time="2024-06-25T07:00", target="az 180 deg el 50 deg")
         pipeline = zonda.Pipeline([zonda.PointingStare(scan_duration="5 s"), step, zonda.BinMap(pixel="1 arcmin")])
         context = look(pipeline, scene, Structure.of_all(pipeline))
