@@ -79,7 +79,7 @@ class PolarizationAngles:
 
         At the pole itself, where psi is not defined, 1 and 0. The bits depend on detector and sample alone.
         """
-        fill_angles(self.poles, self.axes, self.plate, self.gamma, detectors, start, cosine, sine)
+        _fill(self.poles, self.axes, self.plate, self.gamma, detectors, start, cosine, sine)
 
     def add(
         self,
@@ -104,26 +104,30 @@ def seen_from(quaternions: Floats, direction: Floats) -> Floats:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def fill_angles(poles, axes, plate, gamma, detectors, start, cosine, sine):  # type: ignore[no-untyped-def]
-    """The loop of `PolarizationAngles.fill`."""
-    n, has_plate = cosine.shape[1], plate.shape[1] > 0
+def fill_row(poles, axis, plate, gamma, start, c, s):  # type: ignore[no-untyped-def]
+    """`PolarizationAngles.fill` of one detector, with its ``axis`` (2, 3) and ``gamma`` (2,), into ``c``, ``s`` (n,)."""
+    n = c.size
     x, y, z = poles[0, start : start + n], poles[1, start : start + n], poles[2, start : start + n]
-    for k in range(detectors.size):
-        axis, g, h = axes[detectors[k]], gamma[detectors[k], 0], gamma[detectors[k], 1]
-        x0, x1, x2, y0, y1, y2 = axis[0, 0], axis[0, 1], axis[0, 2], axis[1, 0], axis[1, 1], axis[1, 2]
-        c, s = cosine[k], sine[k]
+    x0, x1, x2, y0, y1, y2 = axis[0, 0], axis[0, 1], axis[0, 2], axis[1, 0], axis[1, 1], axis[1, 2]
+    for t in range(n):
+        a = x[t] * x0 + y[t] * x1 + z[t] * x2
+        b = x[t] * y0 + y[t] * y1 + z[t] * y2
+        square = a * a + b * b
+        over = 1.0 / (square if square > 0.0 else 1.0)
+        c[t] = (a * a - b * b) * over if square > 0.0 else 1.0
+        s[t] = -2.0 * a * b * over
+    if plate.shape[1] > 0:
+        p, q, g, h = plate[0, start : start + n], plate[1, start : start + n], gamma[0], gamma[1]
         for t in range(n):
-            a = x[t] * x0 + y[t] * x1 + z[t] * x2
-            b = x[t] * y0 + y[t] * y1 + z[t] * y2
-            square = a * a + b * b
-            over = 1.0 / (square if square > 0.0 else 1.0)
-            c[t] = (a * a - b * b) * over if square > 0.0 else 1.0
-            s[t] = -2.0 * a * b * over
-        if has_plate:
-            p, q = plate[0, start : start + n], plate[1, start : start + n]
-            for t in range(n):
-                u, v = p[t] * g - q[t] * h, p[t] * h + q[t] * g
-                c[t], s[t] = c[t] * u - s[t] * v, c[t] * v + s[t] * u
+            u, v = p[t] * g - q[t] * h, p[t] * h + q[t] * g
+            c[t], s[t] = c[t] * u - s[t] * v, c[t] * v + s[t] * u
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _fill(poles, axes, plate, gamma, detectors, start, cosine, sine):  # type: ignore[no-untyped-def]
+    for k in range(detectors.size):
+        d = detectors[k]
+        fill_row(poles, axes[d], plate, gamma[d], start, cosine[k], sine[k])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
@@ -131,11 +135,11 @@ def _add(poles, axes, plate, gamma, detectors, start, efficiency, q, u, rows, ou
     n, cast = out.shape[1], out.dtype.type
     cosine, sine = np.empty(AT_ONCE), np.empty(AT_ONCE)
     for k in range(detectors.size):
+        d = detectors[k]
         for first in range(0, n, AT_ONCE):
             stop = min(first + AT_ONCE, n)
             c, s = cosine[: stop - first], sine[: stop - first]
-            turn = c.reshape(1, c.size), s.reshape(1, s.size)  # C arrays: slices of rows would not be worked on in vectors
-            fill_angles(poles, axes, plate, gamma, detectors[k : k + 1], start + first, turn[0], turn[1])
+            fill_row(poles, axes[d], plate, gamma[d], start + first, c, s)
             row, one, two, p = out[rows[k], first:stop], q[k, first:stop], u[k, first:stop], efficiency[k]
             for t in range(stop - first):
                 row[t] += cast(p * (np.float64(one[t]) * c[t] + np.float64(two[t]) * s[t]))

@@ -127,6 +127,26 @@ def prefetch(typing_context: Any, array: Any, place: Any) -> Any:
     return types.void(array, types.uint64), generate
 
 
+@intrinsic
+def bits_of(typing_context: Any, value: Any) -> Any:
+    """The bits of a float64 as int64: those of positive numbers are in their order."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(64))
+
+    return types.int64(types.float64), generate
+
+
+@intrinsic
+def of_bits(typing_context: Any, bits: Any) -> Any:
+    """The float64 with these bits, int64."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.DoubleType())
+
+    return types.float64(types.int64), generate
+
+
 def _vector(builder: Any, pointer: Any, kind: Any) -> Any:
     """The eight numbers from ``pointer`` on."""
     return builder.bitcast(pointer, ir.VectorType(kind, 8).as_pointer())
