@@ -9,7 +9,7 @@ from .toast_operator import ToastOperator
 
 
 class ToastPlanning(Planning[ToastOperator]):
-    """What an operator of TOAST costs, and what it changes, is not known."""
+    """Planning of an operator of TOAST, whose cost and effect are not known."""
 
     of = ToastOperator
     smaller = "make the scan shorter: TOAST holds all of it in float64"

@@ -100,7 +100,7 @@ def _telescope(tod: TimeOrderedData) -> Any:
 
 
 def _weather(weather: GroundWeather) -> Any:
-    """Its west wind blows towards east, as ours; there are no clouds."""
+    """The weather as TOAST has it. Its west wind blows towards east, as ours; there are no clouds."""
     import astropy.units as u
 
     found = {theirs: u.Quantity(getattr(weather, ours), unit) for ours, (theirs, unit) in WEATHER.items()}

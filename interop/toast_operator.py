@@ -83,7 +83,7 @@ class ToastOperator(Operator):
         return _changed(self, stream)
 
     def exec(self, block: Block, state: Changed) -> None:
-        """Put what was made in the signal's place."""
+        """Replace the signal by what TOAST made of it."""
         block.detdata["signal"][...] = state.values[block.detectors, block.samples]
         block.means.pop("signal", None)
         if state.mean is not None:
@@ -233,7 +233,7 @@ def _filled(stream: Stream, mean: SmoothField | None) -> tuple[Any, Any]:
 
 
 def _sums(ob: Any) -> AnyFloats:
-    """(n_det, 2) by which a changed signal is known."""
+    """(n_det, 2) sums by which a changed signal is recognized."""
     values = np.asarray(ob.detdata["signal"].data)
     return np.stack([values.sum(axis=1), np.abs(values).sum(axis=1)], axis=1)
 
@@ -260,7 +260,7 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
 
 
 def _is_left(values: AnyFloats, mean: SmoothField, observation: Observation) -> bool:
-    """Whether the mean is still in the signal: what is left is nearer to it than to nothing."""
+    """Whether the mean is still in the signal: its samples are nearer to the mean than to zero."""
     with_it, without, good = 0.0, 0.0, observation.good_samples
     for row in np.flatnonzero(observation.good_detectors):
         part = values[row, good]

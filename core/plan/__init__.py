@@ -1,1 +1,1 @@
-"""What of a scene is worth simulating."""
+"""Plans a run: what of a scene is worth simulating, and what it costs."""

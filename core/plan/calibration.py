@@ -1,4 +1,4 @@
-"""What calibration makes of what enters at a detector, for bounds."""
+"""By how much calibration multiplies what enters at a detector, for bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the bounds are judged by: the scan, the noise of the products, the filters on the way to them."""
+"""What bounds depend on: the scan, the noise of the products, and the filters on the way to them."""
 
 from __future__ import annotations
 

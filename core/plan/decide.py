@@ -26,7 +26,7 @@ class Decided:
 
     @property
     def choice(self) -> Choice:
-        """What is done."""
+        """The form that was chosen."""
         return self.effect.choices[self.chosen]
 
     @property

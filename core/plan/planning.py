@@ -1,4 +1,4 @@
-"""What planning needs to know of an operator: bounds, ladders, cost and bytes; one class for each operator, apart from it."""
+"""Planning classes, one for each operator: error bounds, coarser forms, CPU time and memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plan that was made before: a run of the same file with the same program need not make it again.
+"""Plans that are kept in the user's cache: a run of the same file with the same program is not planned again.
 
 What a run takes from a plan is kept in the user's cache folder under a hash of all that the plan depends on: the resolved file,
 the options, the input files (place, times, size), every file of the program, the versions of what it uses, and the processor.

@@ -38,7 +38,7 @@ class Slice(Operator):
     """Every so many detectors are kept, the outermost four too."""
 
     def observe(self, data: Data) -> None:
-        """Cut."""
+        """Cut every scan to the slice."""
         data.observations[:] = [_cut(o, self.seconds, self.every) for o in data.observations[: self.observations]]
 
 

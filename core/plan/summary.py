@@ -85,7 +85,7 @@ class PlanSummary:
 
 
 def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
-    """Steps named so that each keeps its label, on which its random numbers depend, though a namesake is left out."""
+    """The steps, named where need be: each keeps its label, which its random numbers depend on, though a namesake is left out."""
     named = []
     for step, label, new in zip(steps, labels, Pipeline([s.operator for s in steps]).operators, strict=True):
         same = new.label == label

@@ -24,7 +24,7 @@ from .white import WhiteNoise
 
 
 class WhitePlanning(Planning[WhiteNoise]):
-    """It has no coarser form."""
+    """Planning of `WhiteNoise`, which has no coarser form."""
 
     of = WhiteNoise
 
@@ -43,7 +43,7 @@ class WhitePlanning(Planning[WhiteNoise]):
 
 
 class PinkPlanning(Planning[PinkNoise]):
-    """Poles of the recursive filter, and the noise altogether."""
+    """Planning of `PinkNoise`: fewer poles of its filter, or none of it."""
 
     of = PinkNoise
     knobs = (

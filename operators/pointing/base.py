@@ -154,7 +154,7 @@ class Pointing(Operator):
         return {}
 
     def describe(self, observation: Observation) -> None:
-        """Enter what else should be known of this scan: in the tally, flags and intervals."""
+        """Note what else is known of this scan: in the log, its flags and its intervals."""
 
     def _on_the_sky(self, aim: Aim, seconds: Floats) -> Floats:
         """ICRS unit vectors (n, 3) of a `path` about a celestial target."""

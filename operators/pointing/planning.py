@@ -42,7 +42,7 @@ ABERRATION = 1.0e-4
 
 
 class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule]):
-    """Refraction, aberration, rotation of the field, sampling in time, precision."""
+    """Planning of the pointing: refraction, aberration, rotation of the field, sampling in time, precision."""
 
     of: ClassVar[type[Operator]] = Pointing
     knobs = (Knob("interpolation_error", (0.1, 0.01, 1e-3, 1e-4), "celestial transformation interpolated between nodes in time"),)

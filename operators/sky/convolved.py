@@ -39,7 +39,7 @@ def beam_widths(step: SkyParameters, observation: Observation) -> tuple[Floats, 
 
 
 def grid_of(step: SkyParameters, observation: Observation) -> Grid:
-    """Where the map will be convolved: nothing is convolved or interpolated yet."""
+    """The grid on which the map will be convolved; nothing is convolved or interpolated yet."""
     widths, _ = beam_widths(step, observation)
     beam = REACH * SIGMA * float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)) / step.pixels_per_fwhm
     polarized = observation.focalplane.polarized
@@ -62,7 +62,7 @@ def grid_of(step: SkyParameters, observation: Observation) -> Grid:
 
 
 def brightness_on(grid: Grid, step: SkyParameters, band: Band) -> Brightness:
-    """The map there in K_RJ."""
+    """The map on the grid, in K_RJ."""
 
     def make() -> Brightness:
         found = conversion(grid, band, step.spectral_index)

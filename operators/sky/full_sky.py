@@ -1,4 +1,4 @@
-"""What steps share that make HEALPix maps of the whole sky."""
+"""Base of the steps that make HEALPix maps of the whole sky."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user says of the map of the sky, and the checks that need nothing but its header."""
+"""The parameters of `SkyMap`, and the checks that need the map's header alone."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class SkyParameters(Operator):
 
     @property
     def place(self) -> str:
-        """The map in messages."""
+        """How messages call the map."""
         return f"{self.label}, sky map {self.map.name if self.map else self.file}"
 
     @property

@@ -51,7 +51,7 @@ def chromaticity(band: Band) -> float:
 
 
 class SkyPlanning(Planning[SkyMap]):
-    """Beam, sampling, chromaticity."""
+    """Planning of `SkyMap`: beam, sampling, chromaticity."""
 
     of = SkyMap
     knobs = (
@@ -141,7 +141,7 @@ class SkyPlanning(Planning[SkyMap]):
 
 
 class SourcesPlanning(Planning[Any]):
-    """Exact but for the beam, which is one for the band."""
+    """Planning of `PointSources`, which is exact but for the beam: one for the band."""
 
     of = "zonda.operators.sky.point_sources:PointSources"
 
@@ -187,7 +187,7 @@ class SourcesPlanning(Planning[Any]):
 
 
 class CMBPlanning(Planning[Any]):
-    """It has no coarser form. The map is not drawn for it."""
+    """Planning of `CMBSky`, which has no coarser form. The map is not drawn for it."""
 
     of = "zonda.operators.sky.cmb:CMBSky"
 
@@ -226,7 +226,7 @@ class CMBPlanning(Planning[Any]):
 
 
 class PySMPlanning(Planning[Any]):
-    """It has no coarser form. The map of the band is made for it, and serves the run."""
+    """Planning of `PySMSky`, which has no coarser form. The map of the band is made for it, and serves the run."""
 
     of = "zonda.operators.sky.pysm:PySMSky"
 

@@ -115,14 +115,14 @@ def _lacks(what: str, place: str, download: bool = False) -> InputError:
 
 
 def _texts(config: Any) -> Any:
-    """With paths as text."""
+    """The configuration with paths as text."""
     if isinstance(config, Mapping):
         return {key: _texts(item) for key, item in config.items()}
     return str(config) if isinstance(config, Path) else config
 
 
 def _seeded(config: Any, models: Any) -> Any:
-    """With seeds for classes that draw another sky each time where none are given."""
+    """The configuration with seeds for classes that draw another sky each time where none are given."""
     if not isinstance(config, Mapping):
         return config
     made = getattr(models, str(config.get("class")), None)
@@ -203,7 +203,7 @@ def _offline(wanted: bool) -> Iterator[None]:
 
 @contextmanager
 def _same_numbers() -> Iterator[None]:
-    """Numpy's global generator from a start of its own, and as it was afterwards."""
+    """Seed numpy's global generator, and restore its state afterwards."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(0)  # noqa: NPY002
     try:

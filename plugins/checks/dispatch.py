@@ -58,7 +58,7 @@ def _in_a_process(folder: Path, environment: dict[str, str]) -> dict[str, np.nda
 
 
 def baseline() -> dict[str, str]:
-    """Environment variables that switch off what numba and numpy know beyond the architecture's least."""
+    """Environment variables that restrict numba and numpy to the architecture's basic instruction set."""
     numpy = str(arithmetic()["numpy instructions"])
     return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NPY_DISABLE_CPU_FEATURES": numpy}
 

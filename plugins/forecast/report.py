@@ -113,7 +113,7 @@ def made(asked: Mapping[str, Any], settings: Sequence[str]) -> str:
 
 
 def reached(found: Forecast, wanted: str, seconds: float) -> str:
-    """How long a depth takes, and what it then consists of."""
+    """The integration time that reaches a depth, and the kinds of noise that make it up."""
     parts = ", ".join(f"{p} {in_unit(float(found.depth.part(p, seconds)), 'K_RJ')}" for p in PARTS)
     low, high = ((1 + sign * found.depth.total_error(seconds)) ** 2 * seconds for sign in (-1, 1))
     lines = [

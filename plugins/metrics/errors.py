@@ -135,7 +135,7 @@ class Transfer(Metric):
             raise PipelineError("the metric transfer needs a sky, and no step makes one", place="--metric", cure="add a SkyMap")
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
-        """The sky alone, where no signal of the pipeline is."""
+        """The sky alone, where the pipeline has no such signal."""
         return {} if any(run.only == ["sky"] for run in runs.values()) else {"sky_alone": Signal(only=["sky"])}
 
     def measure(self, data: Data) -> Floats:

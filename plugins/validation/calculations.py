@@ -40,7 +40,7 @@ class Calculation(TextValue):
 
     @classmethod
     def parse(cls, value: Any) -> Calculation:
-        """Work it out. Raises what `mistake` makes."""
+        """Evaluate it. Raises what `mistake` makes."""
         if isinstance(value, Calculation):
             return value
         if not isinstance(value, Mapping) or len(value) != 1:
