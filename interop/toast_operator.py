@@ -247,7 +247,10 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
     new = (ob.detdata["flags"].data & ~before & np.uint8(DETECTOR_MASK)) != 0
     new[:, ~good] = False
     new[~used | (own != 0)] = False
-    instants = new[used].all(axis=0) | (good & ((np.asarray(ob.shared["flags"].data) & ~observation.flags & 15) != 0))
+    left = new[used & (own == 0)]
+    instants = good & ((np.asarray(ob.shared["flags"].data) & ~observation.flags & 15) != 0)
+    if len(left):
+        instants |= left.all(axis=0)
     if stream.signal == MAIN:
         dead = used & (own != 0)
         observation.detector_flags[dead] |= own[dead]

@@ -202,6 +202,19 @@ def test_an_operator_that_changes_nothing_is_told():
     assert "no effect" not in {what for who, what, _ in data.tally if who.startswith("ToastOperator")}
 
 
+def test_where_no_detector_is_left_no_instant_is_flagged():
+    class Dead(Operator):
+        requires = frozenset({"signal"})
+        provides = frozenset({"signal"})
+
+        def prepare(self, observation):
+            observation.detector_flags |= 1
+
+    data = run(Dead(), theirs("PolyFilter", order=3, view="throw"))
+    flagged = [text for who, what, text in data.tally if who.startswith("ToastOperator") and what == "instants that TOAST flagged"]
+    assert flagged == ["0", "0"]
+
+
 def test_an_operator_within_an_operator():
     """TOAST's noise behind a calibration: its PSD is that of the NET."""
     steps = [zonda.PointingBackAndForth(**SCAN), zonda.WhiteNoise(), zonda.Efficiency()]
