@@ -211,7 +211,9 @@ def test_where_no_detector_is_left_no_instant_is_flagged():
             observation.detector_flags |= 1
 
     data = run(Dead(), theirs("PolyFilter", order=3, view="throw"))
-    flagged = [text for who, what, text in data.tally if who.startswith("ToastOperator") and what == "instants that TOAST flagged"]
+    flagged = [
+        text for who, what, text in data.tally if who.startswith("ToastOperator") and what == "instants that TOAST flagged"
+    ]
     assert flagged == ["0", "0"]
 
 

@@ -9,6 +9,8 @@ import pytest
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.polarized import Polarization
+from zonda.operators.diagnostics.comparison.files import read_planes
+from zonda.operators.diagnostics.comparison.stokes import on_meridians_of, planes_of
 from zonda.operators.diagnostics.map_spectra import Wanted, map_spectra
 from zonda.operators.maps.grid import tangent_wcs
 
@@ -118,3 +120,45 @@ def test_what_has_no_spectrum_is_refused():
         map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum")
     with pytest.raises(PipelineError, match="there is no TAN map 'other'"):
         map_spectra({"map": product}, Wanted(["other"], 8, 0.1, None), "MapSpectrum")
+
+
+def test_windows_on_the_sphere():
+    """Hits that fall from the middle of a field: white noise keeps its level, and scatters as the independent modes say."""
+    nside, random, scatter = 128, np.random.default_rng(6), []
+    pixels = healpy.query_disc(nside, [1.0, 0.0, 0.0], np.radians(30))
+    away = np.arccos(np.clip(np.stack(healpy.pix2vec(nside, pixels))[0], -1, 1)) / np.radians(30)
+    hits = np.rint(1000 * np.cos(np.pi / 2 * away) ** 2).astype(np.int64) + 1
+    how = {"header": None, "centre": (0.0, 0.0), "pixel": healpy.nside2resol(nside), "frame": "icrs"}
+    for _ in range(12):
+        noise = np.full(len(pixels), 3.0)
+        signal = noise * random.standard_normal(len(pixels))
+        product = MapProduct(signal, hits, noise, noise, None, fwhm=1e-9, nside=nside, pixels=pixels, **how)
+        found = map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum").spectra
+        use = found.modes > 20
+        scatter.append((found.power["map"][use] / found.white["map"][use] - 1) * np.sqrt(found.modes[use]))
+    size = np.size(scatter)
+    assert size > 40
+    assert abs(np.mean(scatter)) < 4 / np.sqrt(size)
+    assert abs(np.mean(np.square(scatter)) - 1) < 4 * np.sqrt(2 / size)
+
+
+def test_noise_of_each_plane_of_a_healpix_file(tmp_path):
+    pixels = healpy.query_disc(64, [1.0, 0.0, 0.0], 0.3)
+    how = {"header": None, "centre": (0.0, 0.0), "pixel": healpy.nside2resol(64), "frame": "icrs"}
+    product = polarized(*np.ones((3, len(pixels))), noise=(1.0, 2.0, 3.0), nside=64, pixels=pixels, **how)
+    product.write(tmp_path / "map.fits")
+    planes = read_planes(tmp_path / "map.fits").planes
+    assert [np.nanmedian(planes[which].noise) for which in "IQU"] == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_noise_of_q_and_u_is_turned_with_them(sky):
+    """By 2 delta: the sum of the variances stays, and where Q becomes U so does its noise."""
+    product = tan_map(sky, 0.35, pixels=16, noise=(1.0, 2.0, 3.0))
+    planes = planes_of(product, "map")
+    other = tangent_wcs((3.0, -0.4), 1e-3, (16, 16), "galactic").to_header(relax=True)
+    turned = on_meridians_of(dataclasses.replace(planes["I"], header=other), planes)
+    values, before = (np.stack([found[which].values for which in "QU"]) for found in (turned, planes))
+    cosine, sine = ((a * before).sum(axis=0) / (before**2).sum(axis=0) for a in (values, [values[1], -values[0]]))
+    assert np.abs(sine).min() > 0.1  # the frames differ
+    np.testing.assert_allclose(turned["Q"].noise, np.hypot(2 * cosine, 3 * sine), rtol=1e-6)
+    np.testing.assert_allclose(turned["U"].noise, np.hypot(3 * cosine, 2 * sine), rtol=1e-6)
