@@ -31,7 +31,7 @@ from .looking import Looking
 from .map_layout import check_size, grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
-from .stokes_map import angles_of, check_polarized, stokes_binnings
+from .stokes_map import check_polarized, stokes_binnings
 from .stokes_product import StokesSums
 from .stokes_sums import StokesBinning
 from .stokes_sums import add_block as add_polarized
@@ -150,7 +150,7 @@ def prepared(step: BinMap, observation: Observation, reference: float, spare: li
         observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
     if "white" not in observation.components and step.noise == "net" and step.contents == "all":
         observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
-    looking = Looking.of(observation, step.grid, angles_of(step, observation) if step.stokes == "IQU" else None)
+    looking = Looking.of(observation, step.grid)
     how = step, looking, (weight, noise, window), seen, spare
     made: list[Any] = stokes_binnings(*how) if step.stokes == "IQU" else binnings(*how)
     directions = Directions.of(looking, seen) if step.crosslinking else None

@@ -1,4 +1,4 @@
-"""The loops behind `stokes_sums`: cosines and sines in fixed point, and the sums of a tile's samples in their pixels.
+"""The loops behind `stokes_sums`: the sums of a tile's samples in their pixels.
 
 Successive samples of a detector often fall in the same pixel. Their terms are added up along the row, all columns side by side
 (`running_terms`), and each run of samples in one pixel goes to the map at once: what its last sample's sums have more than those
@@ -28,36 +28,21 @@ LAST = 5
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def rounded_angles(poles, axes, plate, gamma, detectors, start, efficiency, out):  # type: ignore[no-untyped-def]
-    """p cos 2 psi and p sin 2 psi in units of 2^-30, into ``out`` (2, n, m) int32; arguments as of `PolarizationAngles`.
-
-    ``detectors`` (n,): numbers; ``efficiency`` (n,): p; ``start``: the first sample.
-    """
-    n, cosine, sine = out.shape[2], np.empty(AT_ONCE), np.empty(AT_ONCE)
-    for k in range(detectors.size):
-        d = detectors[k]
-        for begin in range(0, n, AT_ONCE):
-            size = min(AT_ONCE, n - begin)
-            c, s = cosine[:size], sine[:size]
-            fill_row(poles, axes[d], plate, gamma[d], start + begin, c, s)
-            _rounded(efficiency[k], c, out[0, k, begin : begin + size])
-            _rounded(efficiency[k], s, out[1, k, begin : begin + size])
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _rounded(factor, values, out):  # type: ignore[no-untyped-def]
-    """Values times ``factor`` in units of 2^-30."""
-    for t in range(out.size):
-        out[t] = np.int32(bits_of(factor * values[t] * WEIGHT + MAGIC))
-
-
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def add_stokes(signals, first, rows, at, cells, turn, good, window, weight, noise, own, sums, dropped, largest):  # type: ignore[no-untyped-def]
+def add_stokes(signals, first, rows, at, cells, angles, which, start, good, window, weight, noise, own, sums, dropped, largest):  # type: ignore[no-untyped-def]
     """Add samples first .. of ``rows`` of all ``signals`` (a tuple) to their pixels.
 
-    ``at`` (n_row,): of each, its row in ``cells`` (n, m), pixels or -1 outside, and in ``turn`` (2, n, m), c and s in units of
-    2^-30. ``weight``, ``noise`` (n_row,); ``good`` (m,); ``window`` (m,), or (0,): none; ``own``: N is added up. Count what is
-    dropped, note the largest terms.
+    Parameters
+    ----------
+    at
+        (n_row,) of each, its row in ``cells`` (n, m): pixels, or -1 outside.
+    angles, which, start
+        Poles, axes, plate and gamma (`PolarizationAngles`), p; (n_row,) numbers of the detectors there; the first sample there.
+    good, window, weight, noise
+        (m,); (m,), or (0,): none; (n_row,) each.
+    own
+        N is added up.
+    dropped, largest
+        What is dropped is counted, the largest terms are noted.
     """
     m, n, columns = len(signals), cells.shape[1], np.uint64(sums.shape[1])
     values, size, kept = np.empty((m + 2, AT_ONCE)), np.empty(AT_ONCE), np.empty(AT_ONCE, np.int32)  # of the signals; w; N's
@@ -79,7 +64,10 @@ def add_stokes(signals, first, rows, at, cells, turn, good, window, weight, nois
             pixels = cells[row, begin : begin + number]
             for i in range(m):
                 top = max(top, _scaled(signals[i][rows[k], low : low + number], w0 * VALUE, values[i]))
-            _unpacked(turn[0, row, begin : begin + number], turn[1, row, begin : begin + number], c, s)
+            d = which[k]
+            fill_row(angles[0], angles[1][d], angles[2], angles[3][d], start + begin, c[:number], s[:number])
+            _round(angles[4][d], c[:number])
+            _round(angles[4][d], s[:number])
             for t in range(number if window.size else 0):
                 share[t] = window[begin + t]
             if n_fine < number or top >= bits_of(limit) or _least(pixels) < 0:
@@ -119,9 +107,10 @@ def _scaled(row, factor, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _unpacked(cosine, sine, c, s):  # type: ignore[no-untyped-def]
-    for t in range(cosine.size):
-        c[t], s[t] = cosine[t] / WEIGHT, sine[t] / WEIGHT
+def _round(factor, values):  # type: ignore[no-untyped-def]
+    """Cosines or sines times ``factor``, in steps of 2^-30."""
+    for t in range(values.size):
+        values[t] = ((factor * values[t] * WEIGHT + MAGIC) - MAGIC) / WEIGHT
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -46,26 +46,22 @@ def check_polarized(step: MapParameters, observation: Observation) -> None:
         )
 
 
-def angles_of(step: MapParameters, observation: Observation) -> PolarizationAngles:
-    """The detectors' angles from the meridians of the map. Raises PipelineError where no detector is polarized."""
-    check_polarized(step, observation)
-    return PolarizationAngles.of(observation, observation.boresight_radec, frame_rotation(step.frame)[2])
-
-
 def stokes_binnings(
     step: MapParameters, looking: Looking, levels: tuple[Floats, Floats, Floats], good: Any, spare: list[Sums]
 ) -> list[StokesBinning]:
     """Empty sums for one observation, one for each half of its samples.
 
     ``levels``: weights and noise of the detectors (`bin_map.weights_of`), and the window (n_samp,) or (0,); ``good`` (n_samp,):
-    which samples count.
+    which samples count. Raises PipelineError where no detector is polarized.
     """
-    weight, noise, window = levels
+    observation, (weight, noise, window) = looking.observation, levels
+    check_polarized(step, observation)
     own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
-    signals = len(looking.observation.signals)
+    angles = PolarizationAngles.of(observation, observation.boresight_radec, frame_rotation(step.frame)[2])
+    signals = len(observation.signals)
     return [
-        StokesBinning(looking, use, (good & samples).astype(np.uint8), window, weight, noise, signals, own, spare)
-        for use, samples in halves_of(step.split, looking.observation)
+        StokesBinning(looking, angles, use, (good & samples).astype(np.uint8), window, weight, noise, signals, own, spare)
+        for use, samples in halves_of(step.split, observation)
     ]
 
 

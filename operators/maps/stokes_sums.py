@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.block import Block
+from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import Floats
 
 from .looking import Looking, tiles
@@ -45,8 +46,8 @@ class StokesBinning:
 
     Attributes
     ----------
-    looking
-        The same one of both halves of an observation.
+    looking, angles
+        The same of both halves of an observation.
     use, good, window
         (n_det,), (n_samp,) uint8: which detectors and samples count; (n_samp,): `Observation.window`, or (0,).
     weight, noise
@@ -60,6 +61,7 @@ class StokesBinning:
     """
 
     looking: Looking
+    angles: PolarizationAngles
     use: NDArray[np.bool_]
     good: NDArray[np.uint8]
     window: Floats
@@ -99,20 +101,22 @@ class StokesBinning:
 
 def add_block(binnings: Sequence[StokesBinning], signals: tuple[Any, ...], block: Block) -> None:
     """Add a block's ``signals``, each (n_det, n), to this thread's sums of the ``binnings`` of one observation."""
-    detectors, samples, looking = block.detectors, block.samples, binnings[0].looking
+    detectors, samples, looking, a = block.detectors, block.samples, binnings[0].looking, binnings[0].angles
+    angles = a.poles, a.axes, a.plate, a.gamma, block.observation.focalplane.polarization_efficiency
     good = block.observation.good_detectors[detectors]
     parts = [(one, one.use[detectors] & good, *one.of_thread()) for one in binnings]
     for _, used, _, dropped, _ in parts:
         dropped[FLAGGED] += (samples.stop - samples.start) * int(np.count_nonzero(~used))
     for rows, start, stop in tiles(block, np.any([used for _, used, *_ in parts], axis=0)):
-        which, turn = rows + detectors.start, None
+        index = None
         for one, used, sums, dropped, largest in parts:
             at = np.flatnonzero(used[rows])
             if not one.good[start:stop].any():
                 dropped[FLAGGED] += (stop - start) * at.size
             elif at.size:
-                if turn is None:
-                    index, turn = looking.pixels(which, start, stop), looking.turns(which, start, stop)
-                mine, levels = rows[at], (one.weight[which[at]], one.noise[which[at]])
-                how = at, index, turn, one.good[start:stop], one.window[start:stop], *levels, one.own_noise
-                add_stokes(signals, start - samples.start, mine, *how, sums, dropped, largest)
+                index = looking.pixels(rows + detectors.start, start, stop) if index is None else index
+                mine = rows[at]
+                which = mine + detectors.start
+                where = start - samples.start, mine, at, index, angles, which, start
+                how = one.good[start:stop], one.window[start:stop], one.weight[which], one.noise[which], one.own_noise
+                add_stokes(signals, *where, *how, sums, dropped, largest)

@@ -7,15 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zonda.core.polarization import PolarizationAngles
 from zonda.operators.maps.stokes_kernel import AT_ONCE, DATA, add_stokes
 from zonda.operators.maps.sums import FLAGGED, LARGEST, NOT_FINITE, OUTSIDE, TOO_LARGE, VALUE, WEIGHT
 
 N_PIXELS = 7
 
 
-def term_by_term(signals, first, rows, at, cells, turn, good, window, weight, noise, own, sums, dropped, largest):
+def term_by_term(signals, first, rows, at, cells, angles, which, start, good, window, weight, noise, own, sums, dropped, largest):
     """What `add_stokes` adds up, in plain Python: every term rounded once."""
     m = len(signals)
+    turn = np.empty((2, len(rows), cells.shape[1]))
+    PolarizationAngles(*angles[:4]).fill(which, start, *turn)
+    turn = np.rint(angles[4][which, None] * turn * WEIGHT) / WEIGHT
     for k, d in enumerate(rows):
         high = 0.0
         for t in range(cells.shape[1]):
@@ -32,7 +36,7 @@ def term_by_term(signals, first, rows, at, cells, turn, good, window, weight, no
                 dropped[TOO_LARGE] += 1
             else:
                 high = max(high, size)
-                c, s = turn[:, at[k], t] / WEIGHT
+                c, s = turn[:, k, t]
                 share = window[t] if window.size else 1.0
                 w, n = weight[k] * share * WEIGHT, noise[k] * share * share * WEIGHT
                 data = [weight[k] * VALUE * value for value in values]
@@ -46,7 +50,7 @@ def term_by_term(signals, first, rows, at, cells, turn, good, window, weight, no
     assert sums.shape[1] == DATA + 3 * m + 6 * own
 
 
-def random_tile(seed, *, signals, n, run, own, window, spoilt, dtype, n_rows=3):
+def random_tile(seed, *, signals, n, run, own, window, spoilt, dtype, plate=False, n_rows=3):
     """Arguments of `add_stokes` without what it changes; some ``run`` samples in a pixel, one after the other."""
     rng = np.random.default_rng(seed)
     first, n_cells = int(rng.integers(0, 5)), n_rows + 1
@@ -54,7 +58,11 @@ def random_tile(seed, *, signals, n, run, own, window, spoilt, dtype, n_rows=3):
     rows, at = np.sort(rng.choice(6, n_rows, replace=False)), np.sort(rng.choice(n_cells, n_rows, replace=False))
     cells = rng.integers(0, N_PIXELS, (n_cells, n)).astype(np.int32)
     cells = np.repeat(cells, run, axis=1)[:, :n].copy()
-    turn = rng.integers(-(2**30), 2**30 + 1, (2, n_cells, n)).astype(np.int32)
+    start, which = int(rng.integers(0, 9)), np.sort(rng.choice(8, n_rows, replace=False))
+    plate = rng.normal(size=(2, start + n)) if plate else np.zeros((2, 0))
+    plate /= np.hypot(*plate)
+    gamma, efficiency = np.tile([0.8, -0.6], (8, 1)), rng.uniform(0, 1, 8)
+    angles = rng.normal(size=(3, start + n)), rng.normal(size=(8, 2, 3)), plate, gamma, efficiency
     good = np.ones(n, np.uint8)
     weight, noise = rng.uniform(0.1, 3, (2, n_rows))
     if spoilt:
@@ -64,7 +72,7 @@ def random_tile(seed, *, signals, n, run, own, window, spoilt, dtype, n_rows=3):
             signal[rng.random(signal.shape) < 0.05] = rng.choice([np.nan, np.inf, -np.inf])
             signal[rng.random(signal.shape) < 0.05] = rng.choice([2e4, -2e4])
     share = rng.uniform(0, 1, n) if window else np.zeros(0)
-    return data, first, rows, at, cells, turn, good, share, weight, noise, own
+    return data, first, rows, at, cells, angles, which, start, good, share, weight, noise, own
 
 
 def results(function, tile):
@@ -86,11 +94,10 @@ def test_every_term_is_added(signals, dtype, own, window):
 
 
 @settings(deadline=None, max_examples=60)
-@given(
-    st.integers(0, 2**31), st.integers(1, 60), st.integers(1, 70), st.booleans(), st.integers(1, 2), st.booleans(), st.booleans()
-)
-def test_terms_of_any_tile(seed, n, run, spoilt, signals, own, window):
-    how = {"own": own or window, "window": window, "spoilt": spoilt, "dtype": np.float64}
+@given(st.integers(0, 2**31), st.integers(1, 60), st.integers(1, 70), st.integers(1, 2), st.tuples(*[st.booleans()] * 4))
+def test_terms_of_any_tile(seed, n, run, signals, choices):
+    spoilt, own, window, plate = choices
+    how = {"own": own or window, "window": window, "spoilt": spoilt, "plate": plate, "dtype": np.float64}
     tile = random_tile(seed, signals=signals, n=n, run=run, **how)
     for found, expected in zip(results(add_stokes, tile), results(term_by_term, tile), strict=True):
         np.testing.assert_array_equal(found, expected)
@@ -102,9 +109,9 @@ def test_where_samples_are_cut_does_not_matter(seed, cut, run):
     """Two tiles, one after the other, add up to the bits of one."""
     n = 2 * AT_ONCE + 1
     tile = random_tile(seed, signals=1, n=n, run=run, own=False, window=False, spoilt=True, dtype=np.float32)
-    signals, first, rows, at, cells, turn, good, *rest = tile
-    one = signals, first, rows, at, cells[:, :cut].copy(), turn[..., :cut].copy(), good[:cut], *rest
-    two = signals, first + cut, rows, at, cells[:, cut:].copy(), turn[..., cut:].copy(), good[cut:], *rest
+    signals, first, rows, at, cells, angles, which, start, good, *rest = tile
+    one = signals, first, rows, at, cells[:, :cut].copy(), angles, which, start, good[:cut], *rest
+    two = signals, first + cut, rows, at, cells[:, cut:].copy(), angles, which, start + cut, good[cut:], *rest
     whole, parts = results(add_stokes, tile), [results(add_stokes, part) for part in (one, two)]
     np.testing.assert_array_equal(whole[0], parts[0][0] + parts[1][0])
     np.testing.assert_array_equal(whole[1], parts[0][1] + parts[1][1])
@@ -113,7 +120,7 @@ def test_where_samples_are_cut_does_not_matter(seed, cut, run):
 
 def test_nothing_counts_in_a_tile_without_good_samples():
     tile = list(random_tile(1, signals=1, n=600, run=3, own=False, window=False, spoilt=False, dtype=np.float32))
-    tile[6] = np.zeros(600, np.uint8)
+    tile[8] = np.zeros(600, np.uint8)
     sums, dropped, largest = results(add_stokes, tuple(tile))
     assert not sums.any()
     assert not largest.any()
@@ -123,10 +130,9 @@ def test_nothing_counts_in_a_tile_without_good_samples():
 def test_a_window_enters_the_noise_squared() -> None:
     """Equation (2) of `stokes_sums`: two samples of window 1/2 add 2 x 1/4 of their w^2 sigma^2 to N, 2 x 1/2 of w to A."""
     sums, one, index = np.zeros((1, DATA + 3 + 6), np.int64), np.ones(1), np.zeros(1, np.int64)
-    turn = np.array([[[0.8, 0.8]], [[0.0, 0.0]]]) * WEIGHT
-    how = np.ones(2, np.uint8), np.full(2, 0.5), one, 0.8 * one, True
-    add_stokes((np.ones((1, 2)),), 0, index, index, np.zeros((1, 2), np.int32), turn.astype(np.int32), *how, sums,
-               np.zeros(4, np.int64), np.zeros(2))  # fmt: skip
+    angles = np.ones((3, 2)), np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]), np.zeros((2, 0)), np.zeros((1, 2))  # psi = 0
+    how = (*angles, 0.8 * one), index, 0, np.ones(2, np.uint8), np.full(2, 0.5), one, 0.8 * one, True
+    add_stokes((np.ones((1, 2)),), 0, index, index, np.zeros((1, 2), np.int32), *how, sums, np.zeros(4, np.int64), np.zeros(2))
     assert sums[0, 1] == WEIGHT
     expected = np.array([1, 0.8, 0, 0.64, 0, 0]) * 0.4
     np.testing.assert_allclose(sums[0, DATA + 3 :] / WEIGHT, expected, atol=2 / WEIGHT)
