@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..configuration.units import KINDS
 from ..errors import InputError
 from .files import reading, write_text
 from .table_mistakes import Mistakes, TableError
@@ -106,6 +105,8 @@ class Table:
     def _factor(self, name: str, written: str, unit: str) -> float:
         if not unit and not written:
             return 1.0
+        from ..configuration.units import KINDS  # slow to import, and pictures need tables alone
+
         named = KINDS[unit].display if unit in KINDS else (unit,)
         accepted = f"{', '.join(named[:-1])} or {named[-1]}" if len(named) > 1 else unit
         if not written:

@@ -448,6 +448,8 @@ def test_noise_models_of_toast_are_read(two_bands, tmp_path):
     scaled = [np.sqrt(o["el_noise"].psd(d)[-1] / o["noise_model"].psd(d)[-1]) for d in plane.names]
     assert max(scaled) > 1.1  # that of a flagged detector is left as it is
     # of float32 spectra
-    np.testing.assert_allclose(plane.net, stated.net * np.array(scaled, float), rtol=1e-5)
-    np.testing.assert_allclose(plane.knee, stated.knee, rtol=1e-4)
-    np.testing.assert_allclose(plane.slope, stated.slope, rtol=1e-4)
+    used = np.array([not o.local_detector_flags[d] & 7 for d in plane.names])
+    assert 0 < used.sum() < used.size  # of others, which no map uses, zonda has the median of these
+    np.testing.assert_allclose(plane.net[used], (stated.net * np.array(scaled, float))[used], rtol=1e-5)
+    np.testing.assert_allclose(plane.knee[used], stated.knee[used], rtol=1e-4)
+    np.testing.assert_allclose(plane.slope[used], stated.slope[used], rtol=1e-4)
