@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, field_serializer, field_validator
+from pydantic import Discriminator, Field, PrivateAttr, Tag, field_serializer, field_validator
 
 from zonda.core import flags
 from zonda.core.configuration.files import InputPath
@@ -61,6 +61,12 @@ class File:
     noise: str
 
 
+Files = Annotated[
+    Annotated[InputPath, Tag("one")] | Annotated[list[InputPath], Tag("several")],
+    Discriminator(lambda value: "several" if isinstance(value, list | tuple) else "one"),  # so that mistakes are of one of them
+]
+"""A file, or several."""
+
 Scan = list[RecordedScan]
 """The files of one scan: one, or several with different bands."""
 
@@ -68,7 +74,7 @@ Scan = list[RecordedScan]
 class RecordedFiles(Operator):
     """The parameters of `LoadTOD`."""
 
-    file: InputPath | list[InputPath]
+    file: Files
     """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files are the scans of one run, in this order. Files
     with the same times and other bands are one scan."""
     signal: str | None = "signal"

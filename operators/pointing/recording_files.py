@@ -87,6 +87,7 @@ def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recordi
             magic = file.read(9)
         if magic == BEGINS:
             start, seconds, azimuth, elevation, bits = read_log(path, place)
+            _check_latitude(elevation, "el", place)
             return Recording(start, seconds, azimuth, elevation, "azel", _flags(bits, "toast", mask))
         kind = _hdf5 if magic.startswith(b"\x89HDF") else _fits if magic.startswith(b"SIMPLE  =") else _csv
         return _recording(kind(path, place), clock, mask, place)
@@ -205,9 +206,7 @@ def _recording(table: RecordedTable, clock: Clock, mask: int | None, place: str)
         there = ", ".join(columns) or "none"
         raise InputError(f"has no column {' and '.join(lacks)}; columns: {there}", place=place, cure="name them time, az and el")
     longitude, latitude = (_in_si(*found[name], "rad", name, place) for name in which)
-    if (worst := np.nanmax(np.abs(latitude), initial=0.0)) > np.pi / 2 + 1e-9:
-        row = int(np.nanargmax(np.abs(latitude)))
-        raise InputError(f"{which[1]} is {np.degrees(worst):.6g} deg in row {row}", place=place, cure="check its unit")
+    _check_latitude(latitude, which[1], place)
     if start is not None and "seconds" in found:
         seconds = _in_si(*found["seconds"], "s", "seconds", place)
     else:
@@ -220,6 +219,13 @@ def _recording(table: RecordedTable, clock: Clock, mask: int | None, place: str)
     times = seconds if table.in_seconds or "time" not in found else np.asarray(found["time"][0], np.float64)
     parts = _intervals(table.intervals, times, seconds, place)
     return Recording(start, seconds, longitude, latitude, frame, bits, radec, parts)
+
+
+def _check_latitude(latitude: Floats, name: str, place: str) -> None:
+    """Raise InputError for an elevation or a declination beyond 90 deg."""
+    if (worst := np.nanmax(np.abs(latitude), initial=0.0)) > np.pi / 2 + 1e-9:
+        row = int(np.nanargmax(np.abs(latitude)))
+        raise InputError(f"{name} is {np.degrees(worst):.6g} deg in row {row}", place=place, cure="check its unit")
 
 
 def _flags(values: Any, bits: Literal["toast", "before", "any"], mask: int | None) -> NDArray[np.uint8]:

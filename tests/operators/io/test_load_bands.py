@@ -224,6 +224,9 @@ def test_a_mistake_in_the_step_does_not_ask_for_what_the_file_brings() -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse("operators:\n  - LoadTOD: {file: night.h5, band: f150}\n  - BinMap: {pixel: 5 arcmin}\n")
     assert [mistake.message.partition(":")[0] for mistake in caught.value.diagnostics] == ["LoadTOD, file", "LoadTOD, band"]
+    with pytest.raises(ConfigurationError) as caught:
+        parse(f"operators:\n  - LoadTOD: {{file: [{__file__}, nothing.h5]}}\n  - BinMap: {{pixel: 5 arcmin}}\n")
+    assert [mistake.message.partition(":")[0] for mistake in caught.value.diagnostics] == ["LoadTOD, file.1"]
     with pytest.raises(ConfigurationError, match="needs 'site', 'instrument', 'time'"):
         parse("operators:\n  - BinMap: {pixel: 5 kg}\n")
 

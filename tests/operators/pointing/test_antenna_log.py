@@ -68,12 +68,20 @@ def test_lost_rows_are_a_gap(tmp_path: Path) -> None:
     assert o.good_samples.sum() == 28 - 3
 
 
+def with_elevation(line: str, degrees: str) -> str:
+    """The row with another el-prog(no-cor)."""
+    words = line.split()
+    words[15] = degrees
+    return " ".join(words) + "\n"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda lines: [*lines[:3], lines[3].replace("20171103", "2017111x")], "line 5 is no row of an antenna log"),
         (lambda lines: [*lines[:3], lines[3][:60] + "\n"], "line 5 "),
         (lambda lines: [], "has no row of a scan"),
+        (lambda lines: [*lines[:3], with_elevation(lines[3], "140.00000")], "el is 1[34].* deg in row 3"),
     ],
 )
 def test_bad_logs(tmp_path: Path, change: Any, message: str) -> None:
