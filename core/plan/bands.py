@@ -114,12 +114,12 @@ def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
 
 
 def _added(predictions: list[Prediction]) -> Prediction:
-    """Times add up, less what bands in step need once; and of their memory what each holds while another acts."""
+    """Times add up (what bands share is a small part of them), and of their memory what each holds while another acts."""
     products = sum(p.products for p in predictions)
     seconds: dict[str, float] = {}
-    for label in dict.fromkeys(label for p in predictions for label in p.seconds):
-        each = [p.seconds.get(label, 0.0) for p in predictions]
-        seconds[label] = sum(each) - predictions[0].once.get(label, 0.0) * (sum(each) - max(each))
+    for p in predictions:
+        for label, used in p.seconds.items():
+            seconds[label] = seconds.get(label, 0.0) + used
     return dataclasses.replace(
         predictions[0],
         seconds=seconds,

@@ -138,5 +138,4 @@ def predict(
         products = held + found.bytes + item * longest.n_samples * longest.n_detectors  # its part of the stream of all bands
     shared = room_for(longest.n_detectors, longest.n_samples)
     size = BASE + max(held + found.bytes, after)
-    once = {label: cost.shared for label, cost in costs.items() if cost is not None and in_step is not None}
-    return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared, once)
+    return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared)

@@ -85,8 +85,6 @@ class Cost:
         Seconds for the whole run, whatever the observations and signals (pictures, files).
     kernel
         Which calibration kernel scales it: ``random``, ``stream`` or ``python``.
-    shared
-        Share of the seconds that bands which look through the same pixels need once (`core.run.in_step`).
     """
 
     fixed: float = 0.0
@@ -94,7 +92,6 @@ class Cost:
     per_sample: float = 0.0
     once: float = 0.0
     kernel: Literal["random", "stream", "python"] = "stream"
-    shared: float = 0.0
 
     def seconds(self, n_times: int, n_detectors: int) -> float:
         """CPU seconds of one observation in one run."""

@@ -28,8 +28,6 @@ class Prediction:
     step."""
     shared: float = 0.0
     """Bytes that may be kept for another band of the camera, not part of ``bytes``."""
-    once: Mapping[str, float] = field(default_factory=dict)
-    """Share of the seconds by operator that bands in step need once."""
 
     @property
     def total(self) -> float:
