@@ -79,6 +79,10 @@ class Planning(Generic[O]):
         """Whether `Operator.exec` is much cheaper when it sees all detectors at one time before it goes on to the next."""
         return False
 
+    def shares_blocks(self, observation: Observation) -> bool:
+        """Whether bands that look through the same pixels save time where each block is worked on with one after the other."""
+        return False
+
 
 def planning_of(operator: Operator) -> Planning[Any]:
     """The planning of an operator; of one that has none, `Planning` itself."""

@@ -92,8 +92,11 @@ def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) 
 def share_in_step(chain: Chain, observation: Observation, settings: Settings, bands: int, beside: int) -> Settings | None:
     """The settings of one of several ``bands`` that work on a scan at the same time (`in_step`).
 
-    None where less would then be kept in memory than where it works alone. ``beside``: bytes that the steps of the others hold.
+    None where no step saves time so, or less would be kept in memory than where it works alone. ``beside``: bytes that the steps
+    of the others hold.
     """
+    if not any(planning_of(o).shares_blocks(observation) for o in chain.steps):
+        return None
     memory = (settings.memory - beside) // bands
     if not spares(chain, observation, settings, settings.memory - memory):
         return None

@@ -10,6 +10,7 @@ from zonda.core.plan.estimate import Cost, Estimate, Traits
 from zonda.core.plan.planning import Planning
 
 from .bin_map import BinMap
+from .grid import TangentGrid
 
 
 class BinMapPlanning(Planning[BinMap]):
@@ -30,6 +31,11 @@ class BinMapPlanning(Planning[BinMap]):
         if self.operator.stokes == "IQU":
             return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, more + (1.6e-8 if self.operator.nside else 1.0e-8)))
         return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, more + 3.2e-9))
+
+    def shares_blocks(self, observation: Observation) -> bool:
+        """The pixels, which `looking.Looking` finds once; those of an image of I are found where they are used."""
+        step = self.operator
+        return step.stokes == "IQU" or step.crosslinking or not isinstance(step.grid, TangentGrid)
 
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, two halves, the products of all signals; and the pointing, twice while it is laid out."""

@@ -65,7 +65,7 @@ def pipeline(*filters: zonda.Operator, scans: int = 1, precision: Any = "float32
         zonda.Efficiency(),
         zonda.HighpassFilter(frequency="0.2 Hz"),
         *filters,
-        zonda.BinMap(pixel="1 arcmin"),
+        zonda.BinMap(pixel="1 arcmin", crosslinking=True),
     ]
     return zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"], "modes": "full"}}, precision=precision)
 
@@ -163,12 +163,13 @@ class Watched(zonda.Operator):
         self.discarded.append(observation.instrument.band.name)
 
 
-def watched(scene: zonda.Scene, fail: str = "", filters: Any = (), **options: Any) -> list[str]:
+def watched(scene: zonda.Scene, fail: str = "", filters: Any = (), nside: int = 512, **options: Any) -> list[str]:
     """Names of the bands in the order in which they worked on blocks."""
     Watched.seen.clear()
     Watched.discarded.clear()
     pointing = zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="100 s")
-    steps = [pointing, zonda.WhiteNoise(), Watched(fail=fail), zonda.Efficiency(), *filters, zonda.BinMap(pixel="1 arcmin")]
+    grid = {"nside": nside} if nside else {"pixel": "1 arcmin"}
+    steps = [pointing, zonda.WhiteNoise(), Watched(fail=fail), zonda.Efficiency(), *filters, zonda.BinMap(**grid)]
     zonda.Pipeline(steps).run(scene, threads=1, keep=["watched"], **options)
     return [name for name, *_ in Watched.seen]
 
@@ -182,6 +183,12 @@ def test_bands_that_share_pixels_take_turns_block_by_block() -> None:
 
 def test_bands_with_pixels_of_their_own_follow_each_other() -> None:
     names = watched(scene(pixels="separate"), memory=16_000_000)
+    assert names == sorted(names)
+
+
+def test_bands_that_would_save_nothing_follow_each_other() -> None:
+    """Pixels of an image of I are found where they are used."""
+    names = watched(scene(), nside=0, memory=16_000_000)
     assert names == sorted(names)
 
 
