@@ -31,7 +31,7 @@ Box = tuple[int, int, int, int]
 APRON = 3
 """Cells by which tiles overlap."""
 
-BYTES_KEPT = 512 << 20
+BYTES_KEPT = 256 << 20
 """Memory of the tiles that are kept."""
 
 SQUARE, STRIP = (8, 9), (5, 10)
