@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,10 @@ from zonda.core.types import Floats
 
 COLUMNS = ("start_time", "stop_time", "boresight_angle", "name", "azmin", "azmax", "el", "scan_index", "subscan_index")
 """In the order of version 4."""
+OVERLAP = 1.0
+"""s: rows may overlap by as much, since schedules round their times to seconds."""
+WIDEST_WRAP = np.pi
+"""rad: azmax below azmin is read as a sweep through north; a wider one is taken for exchanged limits."""
 CURE = f"give a schedule of TOAST, version 5 (ECSV with the columns {', '.join(COLUMNS)}) or version 4 (text)"
 
 
@@ -176,22 +180,52 @@ def _rows(table: Table) -> list[Row]:
             elevation=float(angles["el"][k]),
             rotation=float(angles["boresight_angle"][k]),
         )
-        wrong = _what_is_wrong(row)
+        wrong = _what_is_wrong(row) or _wrong_limits(row, float(angles["azmax"][k]))
         if wrong:
-            mistakes.add(table.lines[k], f"{row.label}: {wrong}", "mend or remove that row")
+            message, cure = wrong
+            mistakes.add(table.lines[k], f"{row.label}: {message}", cure)
         found.append(row)
+    _note_overlaps(found, table.lines, mistakes)
     mistakes.tell()
     return found
 
 
-def _what_is_wrong(row: Row) -> str:
+def _what_is_wrong(row: Row) -> tuple[str, str] | None:
+    """Cause and cure."""
+    cure = "mend or remove that row"
     if row.duration <= 0:
-        return "stop_time is not later than start_time"
+        return "stop_time is not later than start_time", cure
     if not 0 < row.elevation <= np.pi / 2:
-        return f"el is {np.degrees(row.elevation):g} deg, not between 0 and 90 deg"
-    if row.azimuth[1] - row.azimuth[0] > 2 * np.pi:
-        return "azmin and azmax are more than a turn apart"
-    return ""
+        return f"el is {np.degrees(row.elevation):g} deg, not between 0 and 90 deg", cure
+    if row.azimuth[1] - row.azimuth[0] > 2 * np.pi * (1 + 1e-12):
+        return "azmin and azmax are more than a turn apart", cure
+    return None
+
+
+def _wrong_limits(row: Row, stated: float) -> tuple[str, str] | None:
+    """Cause and cure of limits that are no sweep. ``stated``: azmax as it is written [rad]."""
+    low, high = row.azimuth
+    text = f"azmin is {np.degrees(low):g} deg and azmax {np.degrees(stated):g} deg"
+    if high - low < 1e-12:
+        return f"{text}: there is no sweep between them", "give limits that differ, or remove that row"
+    if stated < low and high - low > WIDEST_WRAP * (1 + 1e-12):
+        wide = f"azmax: {np.degrees(high):g} deg where the sweep is as wide"
+        return f"{text}: that is a sweep of {np.degrees(high - low):g} deg through north", f"exchange them, or write {wide}"
+    return None
+
+
+def _note_overlaps(rows: list[Row], lines: Sequence[int], mistakes: Mistakes) -> None:
+    """Note each row that begins before an earlier one stops: the telescope is in one place at a time."""
+    sound = [k for k, row in enumerate(rows) if row.duration > 0]
+    begins = {k: rows[k].start.seconds_since(rows[sound[0]].start) for k in sound}
+    before, stops = -1, -math.inf
+    for k in sorted(sound, key=begins.__getitem__):
+        if stops - begins[k] > OVERLAP + 1e-6:
+            other = f"{rows[before].label} (line {lines[before]})"
+            early = f"{rows[k].label}: begins {stops - begins[k]:.6g} s before {other} stops"
+            mistakes.add(lines[k], early, "shift or shorten one of them, or remove one")
+        if begins[k] + rows[k].duration > stops:
+            before, stops = k, begins[k] + rows[k].duration
 
 
 def _times(table: Table, name: str) -> list[Instant]:

@@ -275,6 +275,17 @@ def change(number, **values):
         (change(1, stop_time=ROWS[1][0]), "line 21: patch-0-1: stop_time is not later than start_time"),
         (change(0, el=91.0), "el is 91 deg, not between 0 and 90 deg"),
         (change(0, azmax=600.0), "more than a turn apart"),
+        (change(1, azmin=82.0, azmax=73.0), "line 21: patch-0-1: azmin is 82 deg and azmax 73 deg: that is a sweep of 351 deg"),
+        (change(1, azmin=15.0, azmax=15.0), "line 21: patch-0-1: azmin is 15 deg and azmax 15 deg: there is no sweep"),
+        (change(1, azmin=360.0, azmax=0.0), "line 21: patch-0-1: azmin is 360 deg and azmax 0 deg: there is no sweep"),
+        (
+            change(1, start_time="2025-03-01T06:01:30+00:00"),
+            r"line 21: patch-0-1: begins 30 s before patch-0-0 \(line 20\) stops",
+        ),
+        (
+            change(1, start_time="2025-03-01T05:59:00+00:00"),
+            r"line 20: patch-0-0: begins 240 s before patch-0-1 \(line 21\) stops",
+        ),
         (change(0, azmin="nan"), "line 20: azmin is 'nan', not a finite number"),
         (change(0, start_time="yesterday"), "line 20: start_time: cannot read 'yesterday' as a time"),
         (change(0, azmin="nan", start_time="now"), r"2 mistakes\n  = line 20: azmin is 'nan'.*\n  = line 20: start_time: cannot"),
@@ -285,6 +296,41 @@ def test_bad_rows(tmp_path, rows, match):
     with pytest.raises(InputError, match=match) as caught:
         read_schedule(version_5(tmp_path / "bad.ecsv", rows))
     assert "bad.ecsv" in str(caught.value)
+
+
+def test_rows_that_cannot_be_are_told_together(tmp_path):
+    """A short row within a long one does not hide that the next one overlaps the long one, too."""
+    rows = [
+        ("2025-03-01T06:00:00", "2025-03-01T06:10:00", 0.0, "a", 120.0, 150.0, 50.0, 0, 0),
+        ("2025-03-01T06:01:00", "2025-03-01T06:02:00", 0.0, "b", 120.0, 150.0, 50.0, 0, 0),
+        ("2025-03-01T06:05:00", "2025-03-01T06:12:00", 0.0, "c", 82.0, 73.0, 50.0, 0, 0),
+        ("2025-03-01T06:12:00", "2025-03-01T06:13:00", 0.0, "d", 82.0, 82.0, 50.0, 0, 0),
+    ]
+    with pytest.raises(InputError) as caught:
+        read_schedule(version_5(tmp_path / "bad.ecsv", rows))
+    message = str(caught.value)
+    assert "4 mistakes" in message
+    assert "line 21: b-0-0: begins 540 s before a-0-0 (line 20) stops" in message
+    assert "sweep of 351 deg through north; exchange them, or write azmax: 433 deg" in message
+    assert "line 22: c-0-0: begins 300 s before a-0-0 (line 20) stops" in message
+    assert "line 23: d-0-0: azmin is 82 deg and azmax 82 deg" in message
+
+
+@pytest.mark.parametrize(
+    "change_of_the_second",
+    [
+        {"start_time": "2025-03-01T06:02:00+00:00"},
+        {"start_time": "2025-03-01T06:01:59+00:00"},
+        {"azmin": 350.0, "azmax": 10.0},
+        {"azmin": 270.0, "azmax": 90.0},
+        {"azmin": 82.0, "azmax": 433.0},
+        {"azmin": 0.0, "azmax": 360.0},
+        {"start_time": "2025-03-01T05:00:00+00:00", "stop_time": "2025-03-01T06:00:00+00:00"},
+    ],
+)
+def test_rows_that_can_be(tmp_path, change_of_the_second):
+    """Rows that touch, or overlap by the second to which times are rounded, sweeps through north, and wide ones that say so."""
+    assert len(read_schedule(version_5(tmp_path / "a.ecsv", change(1, **change_of_the_second)))) == 2
 
 
 @pytest.mark.parametrize("text", ["", "hello\n", SITE_LINE, SITE_LINE + "2025 | 2026 | 0\n"])
