@@ -89,13 +89,16 @@ def _depth(operators: Sequence[Operator], observations: Sequence[Observation], c
             total += found.noise**2 if found.each is None else found.each**2
             quietest[operator.label] = min(quietest[operator.label], found.noise)
         variances.append(total)
-        numbers.append(np.full(len(total), float(observation.n_samples)))
+        numbers.append(np.where(observation.good_detectors, float(observation.n_samples), 0.0))
     for label, level in quietest.items():
         context.traits[label] = replace(context.traits[label], noise=level)
     variance, number = np.concatenate(variances), np.concatenate(numbers)
+    if not number.any():
+        return Depth(0.0, 0.0)
     sample = math.sqrt(float(number @ variance / number.sum()))
-    weighs = any(t.weighs for t in context.traits.values()) and bool((variance > 0).all())
-    weighed = math.sqrt(float(number.sum() / (number @ (1 / variance)))) if weighs else sample
+    used = number > 0
+    weighs = any(t.weighs for t in context.traits.values()) and bool((variance[used] > 0).all())
+    weighed = math.sqrt(float(number.sum() / (number[used] @ (1 / variance[used])))) if weighs else sample
     return Depth(sample, weighed)
 
 

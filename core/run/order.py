@@ -10,6 +10,7 @@ from ..mapmaker import changes_components, forms, place_of_signal
 from ..operator import Operator
 from ..output import Output
 from ..registry import makers
+from ..scene import WithScene
 from ..signal import Component
 
 
@@ -66,6 +67,10 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                     "it must require exactly one",
                 )
             )
+        read = next((type(o).__name__ for o in operators[:index] if isinstance(o, WithScene)), None)
+        if read and "boresight" in operator.provides - operator.requires and not isinstance(operator, WithScene):
+            message = f"{name} would add scans to those that {read} has read, with nothing recorded in them"
+            problems.append(OrderProblem(index, message, f"leave {name} out: {read} brings the pointing"))
         if not changes_components(operator):
             have |= operator.provides
     if operators and not any("boresight" in o.provides | o.requires for o in operators):

@@ -141,8 +141,10 @@ def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
             cure="leave time out of the pipeline, and nights out of a campaign",
         )
     data.scene = given.model_copy(update={"site": own["site"], "instrument": own["instrument"]})
-    most = 0
+    most, known = 0, dict[Any, RecordedScan]()
     for scan in step.scans(given.instrument):
+        for part in scan:
+            _check_new(step, part, known)
         number = sum(len(part.cameras) for part in scan)
         most = most or number
         observation = _observation(step, data, _of_bands(step, scan, own["instrument"], most))
@@ -160,6 +162,18 @@ def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
             _tell(step.label, observation, file)
         data.observations.append(observation)
     return found
+
+
+def _check_new(step: LoadTOD, part: RecordedScan, known: dict[Any, RecordedScan]) -> None:
+    """Note the used detectors of a file: start, name and direction. Raises InputError where a file before it has one of them."""
+    tod, xi, eta = part.tod, part.tod.xi.tolist(), part.tod.eta.tolist()
+    rows = np.concatenate(part.rows)
+    for row in rows[(tod.detector_flags[rows] & np.uint8(step.detector_mask)) == 0].tolist():
+        key = str(tod.start), tod.names[row], xi[row], eta[row]
+        if (other := known.setdefault(key, part)) is not part:
+            what = f"the detector {tod.names[row]} at the times at which {other.path.name} has it"
+            cure = "give each file once"
+            raise InputError(f"has {what}: the same data would count twice", place=f"{step.label}, {part.path}", cure=cure)
 
 
 def _tell(label: str, observation: Observation, file: File) -> None:

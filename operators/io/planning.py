@@ -53,10 +53,12 @@ class LoadTODPlanning(Planning[LoadTOD]):
         finally:
             stream.file.close()
         use = observation.good_detectors
-        each = observation.focalplane.net[use] * np.sqrt(observation.sample_rate)
+        each = observation.focalplane.net * np.sqrt(observation.sample_rate)
         rms = float(spread[use].max(initial=0.0))
-        known = bool(each.size and (each > 0).all())
-        return Traits(noise=float(each.min()) if known else 0.0, each=each if known else None, rms=rms)
+        if not use.any() or not (each[use] > 0).all():
+            return Traits(rms=rms)
+        each[~use] = each[use].min()  # they are in no map
+        return Traits(noise=float(each.min()), each=each, rms=rms)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost: the file is opened, and each sample read once."""

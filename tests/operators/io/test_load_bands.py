@@ -13,7 +13,7 @@ from astropy.io import fits
 import zonda
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import INVALID
 from zonda.operators.io.save_tod import load_tod, save_tod
 
@@ -251,3 +251,32 @@ def test_what_does_not_fit_together(night: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at 220 GHz") as caught:
         load(files, band="220 GHz")
     assert "91.5 GHz" in caught.value.cure
+
+
+def test_a_file_that_is_given_twice_is_refused(night: Any, tmp_path: Path) -> None:
+    """Its samples would count twice, and the noise of the map would be too small. A copy under another name too."""
+    files = night[1]
+    copy = tmp_path / "copy.h5"
+    copy.write_bytes(files[0].read_bytes())
+    for twice in ([files[0], files[0]], [files[0], files[1], copy]):
+        with pytest.raises(InputError, match=r"the same data would count twice(.|\n)*give each file once"):
+            load(twice, MAP)
+
+
+def test_a_pointing_step_behind_recorded_data_is_refused(night: Any) -> None:
+    """Its scans would be binned as zeros."""
+    with pytest.raises(PipelineError, match=r"PointingDaisy would add scans(.|\n)*leave PointingDaisy out"):
+        zonda.Pipeline([zonda.LoadTOD(file=night[1]), zonda.PointingDaisy(radius="1 deg"), MAP])
+
+
+def test_dead_detectors_are_no_part_of_a_plan(night: Any, tmp_path: Path) -> None:
+    """The noise that is planned for is that of the others, whatever the file states of dead ones."""
+    tod = load_tod(night[1][0])
+    tod.columns["net"] = np.linspace(1.0, 2.0, len(tod.names)) * 1e-4
+    tod.detector_flags[[0, 3]] = INVALID
+    used = np.delete(tod.columns["net"], [0, 3])
+    made = zonda.plan(
+        parse(f"operators:\n  - LoadTOD: {{file: {save_tod(tmp_path / 'dead.h5', tod)}}}\n  - BinMap: {{pixel: 5 arcmin}}\n")
+    )
+    np.testing.assert_allclose(made.noise[0], np.sqrt(np.mean(used**2) * 40), rtol=1e-6)
+    np.testing.assert_allclose(made.noise[1], 1 / np.sqrt(np.mean(1 / (used**2 * 40))) / made.noise[2] ** 0.5, rtol=0.02)

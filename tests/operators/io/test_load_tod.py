@@ -420,11 +420,12 @@ def test_nan_in_a_stream_is_dropped_and_counted(saved: Any, tmp_path: Path) -> N
 
 
 def test_two_scans_of_one_name_and_two_instruments(saved: Any, tmp_path: Path) -> None:
-    data = load([saved["Filtered"][0]] * 2, MAP)
+    tod = load_tod(saved["Filtered"][0])
+    tod.start = tod.start.replace("T07:00", "T08:00")
+    later = save_tod(tmp_path / "later.h5", tod)
+    data = load([saved["Filtered"][0], later], MAP)
     assert [o.name for o in data.observations] == ["scan-000", "scan-000.2"]
-    other = changed(
-        saved["Filtered"][0], tmp_path / "o.h5", lambda file: file["instrument"].attrs.__setitem__("telescope_name", "other")
-    )
+    other = changed(later, tmp_path / "o.h5", lambda file: file["instrument"].attrs.__setitem__("telescope_name", "other"))
     with pytest.raises(InputError, match="was recorded with other"):
         load([saved["Filtered"][0], other], MAP)
 
