@@ -217,8 +217,9 @@ class Pipeline:
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
         bands = self._of_bands(data)
         self._observe(data, bands, timer, outputs=False, prefix=part.prefix)
-        for _, own in bands:
-            if part.scans is not None:
+        if part.scans is not None:
+            data.pointed = [data.pointed[k] for k in part.scans] if data.pointed else []  # the tally counts these alone
+            for _, own in bands:
                 own.observations = [own.observations[k] for k in part.scans]
         self._execute(bands, settings, (), timer, memory, fresh=False)
         gather(data, [own for _, own in bands])

@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from ..errors import PipelineError
 from .engines import Pool
+from .warned import Registry, Warned, call, show
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -67,14 +68,15 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
         Where the engine has stopped for good.
     """
     waiting, suspects = deque(items), deque[T]()
-    at_work: dict[Future[R], T] = {}
-    ended: set[Future[R]] = set()
+    at_work: dict[Future[tuple[R, list[Warned]]], T] = {}
+    ended: set[Future[tuple[R, list[Warned]]]] = set()
+    shown: Registry = {}
     try:
         while True:
             batch: list[T] = []
             with work.together():
                 for future in ended:
-                    item, result = at_work.pop(future), _result(future, folder)
+                    item, result = at_work.pop(future), _result(future, folder, shown)
                     if work.ended(item, result):
                         (suspects if isinstance(result, Lost) else waiting).append(item)
                 while waiting and not work.stop and len(at_work) + len(batch) < pool.workers + pool.ahead:
@@ -101,23 +103,25 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
         raise
 
 
-def _submit(pool: Pool, function: Callable[..., R], *arguments: Any) -> Future[R]:
+def _submit(pool: Pool, function: Callable[..., R], *arguments: Any) -> Future[tuple[R, list[Warned]]]:
     assert pool.executor is not None
     try:
-        return pool.executor.submit(function, *arguments)
+        return pool.executor.submit(call, function, *arguments)
     except Exception as err:
-        future: Future[R] = Future()
+        future: Future[tuple[R, list[Warned]]] = Future()
         future.set_exception(err if isinstance(err, BrokenExecutor) else CancelledError())  # a worker was killed; all is gone
         return future
 
 
-def _result(future: Future[R], folder: Path) -> R | Lost:
+def _result(future: Future[tuple[R, list[Warned]]], folder: Path, shown: Registry) -> R | Lost:
     try:
-        return future.result()
+        result, found = future.result()
     except CancelledError:
         raise _gone(folder) from None
     except Exception as err:  # of the engine: a Dask worker that died again and again, a task that cannot be sent
         return Lost(err)
+    show(found, shown)
+    return result
 
 
 def _gone(folder: Path) -> PipelineError:

@@ -18,6 +18,7 @@ from typing import Any, cast
 from .. import children
 from ..errors import PipelineError
 from ..machine import available_memory, available_threads
+from . import warned
 from .settings import Engine, Tls
 
 SCHEDULER_FILE_WAIT = 20.0
@@ -176,11 +177,12 @@ def _ctrl_c_held_back() -> Iterator[None]:
 
 
 def begin_worker(safe: str | None = None) -> None:
-    """In a new worker process: leave Ctrl-C to the main process, and end when that is gone, however it went.
+    """In a new worker process: leave Ctrl-C and warnings to the main process, and end when that is gone, however it went.
 
     ``safe``: ``PYTHONSAFEPATH`` of the main process.
     """
     children.restore(safe)
+    warned.keep()
     from ..compilation.compiled import ensure_cache, one_blas_thread
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -62,7 +62,7 @@ def use_recorded(data: Data, operators: Sequence[Operator]) -> None:
 
 
 def distribute(data: Data, bands: Sequence[Data]) -> None:
-    """Give each band its detectors of all scans, and what is laid out for it; what pointing tells is told once."""
+    """Give each band its detectors of all scans, and what is laid out for it."""
     shared = [
         SharedScan(room_for(scan.n_detectors // len(bands), scan.n_samples), _alike(scan.focalplane, len(bands)))
         for scan in data.observations
@@ -71,8 +71,6 @@ def distribute(data: Data, bands: Sequence[Data]) -> None:
         own.observations = [_of_band(scan, number, own, part) for scan, part in zip(data.observations, shared, strict=True)]
         own.layouts = _of(data.layouts, own.band)
     data.pointed = data.observations
-    for scan in data.observations:
-        data.tally.update(scan.tally)
 
 
 def _alike(plane: Focalplane, bands: int) -> int:
@@ -98,9 +96,14 @@ def _of(whole: Mapping[str, Any], band: str) -> dict[str, Any]:
 
 
 def gather(data: Data, bands: Sequence[Data]) -> None:
-    """Put together what the bands made: products and entries of the log bear the band's name; nothing where there is one band."""
+    """Put together what the bands made: products and entries of the log bear the band's name; nothing where there is one band.
+
+    What pointing counted in the scans is added once, not for each band.
+    """
     if bands[0] is data:
         return
+    for scan in data.pointed:
+        data.tally.update(scan.tally)
     scans = zip(*(own.observations for own in bands), strict=True)
     data.observations = [scan for together in scans for scan in together]
     for own in bands:
