@@ -1,4 +1,4 @@
-"""What the bands of a camera share of one scan: found out by the band that needs it first, and released after the last.
+"""What the bands of a camera share of a scan, or of a block: made by the band that needs it first, released after the last.
 
 Nothing that a band computes may depend on the others: what is shared has the bits that each band would make by itself.
 """
@@ -13,21 +13,21 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 ROOM = 64 << 20
-"""Most bytes that are kept of one scan until the last band has used them; for short scans one stream of a band is the limit."""
+"""Most bytes that are kept of the blocks of a scan at a time; of short scans, no more than a stream of one band takes."""
 
 
 def room_for(n_detectors: int, n_samples: int) -> int:
-    """Bytes that are kept of one scan at most."""
+    """Bytes that are kept of the blocks of one scan at most."""
     return min(ROOM, 4 * n_detectors * n_samples)
 
 
 class SharedScan:
-    """One scan of a camera with several bands, which are executed one after the other. Safe for threads.
+    """One scan of a camera with several bands. Safe for threads.
 
     Parameters
     ----------
     room
-        Most bytes that are kept until the last band has used them (`claim`).
+        Most bytes that `of_block` keeps at a time.
     bands
         Number of bands that look through the same pixels; 1: each looks through others.
     """

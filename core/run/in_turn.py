@@ -66,7 +66,7 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Bud
     alone = [
         _divided(band, replace(settings, others=sum(held) - mine), ahead, budget) for band, mine in zip(bands, held, strict=True)
     ]
-    shares = _joined(alone) if joined else None if heard else _shares(bands, alone, ahead.on)
+    shares = _joined_shares(alone) if joined else None if heard else _shares(bands, alone, ahead.on)
     executions = [
         [Execution(band.chain, o, own, timer, *hooks) for o in band.data.observations]
         for band, own in zip(bands, shares or alone, strict=True)
@@ -103,14 +103,14 @@ def _run_in_step(
             _done(execution, band, band is bands[-1])
 
 
-def _joined(alone: Sequence[Settings]) -> list[Settings]:
+def _joined_shares(alone: Sequence[Settings]) -> list[Settings]:
     """The settings of bands whose streams are held side by side, and once more together."""
     n = len(alone)
     return [replace(own, memory=max(own.memory // (2 * n), min(own.least, own.memory)), bands=n, spare=[]) for own in alone]
 
 
 def _shares(bands: Sequence[Band], alone: Sequence[Settings], ahead: bool) -> list[Settings] | None:
-    """The settings of bands in step; None where bands follow each other: they look through other pixels, or would keep less."""
+    """The settings of bands in step; None where they follow each other: they share no pixels, gain nothing or would keep less."""
     if len(bands) == 1 or not _alike(bands):
         return None
     beside = [(2 if ahead else 1) * (band.held(in_step=True) - band.held(in_step=False)) for band in bands]

@@ -149,12 +149,8 @@ def _version_4(path: Path, place: str) -> Table:
 
 
 def _rows(table: Table) -> list[Row]:
-    mistakes, angles, texts, times = (
-        Mistakes(table.place),
-        dict[str, Floats](),
-        dict[str, list[str]](),
-        dict[str, list[Instant]](),
-    )
+    mistakes, angles = Mistakes(table.place), dict[str, Floats]()
+    texts, times = dict[str, list[str]](), dict[str, list[Instant]]()
     for name in ("boresight_angle", "azmin", "azmax", "el"):
         with mistakes.noted():
             angles[name] = table.numbers(name, "rad")
