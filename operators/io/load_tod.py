@@ -39,6 +39,9 @@ MOMENT = 1.0
 SAME_DIRECTION = 1e-9
 """Largest difference of the boresights (quaternions) of files that are bands of one scan."""
 
+SAME_NUMBER = 1e-6
+"""Largest relative difference of the sites and sample rates of such files."""
+
 
 @dataclass(frozen=True)
 class _Band:
@@ -80,14 +83,15 @@ class LoadTOD(RecordedFiles):
     def observe(self, data: Data) -> None:
         """Append an observation for each scan; the scene's instrument and site become those of the files.
 
-        Where the camera has several bands, the scans of each band then get the flags of their own files.
+        Where the camera has several bands, the scans of each band then get the flags, intervals, weather and half-wave plate of
+        their own files.
         """
         if not data.band:
             self._scans.update(_append(self, data))
             return
         for observation in data.observations:
             if file := self.file_of(observation):
-                observation.flags = file.flags.copy()
+                file.state(observation)
                 _tell(self.label, observation, file)
 
     def prepare(self, observation: Observation) -> RecordedStream | None:
@@ -148,15 +152,7 @@ def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
         number = sum(len(part.cameras) for part in scan)
         most = most or number
         observation = _observation(step, data, _of_bands(step, scan, own["instrument"], most))
-        found[observation.index] = [
-            File(
-                part.path,
-                {part.tod.names[row]: row for rows in part.rows for row in rows.tolist()},
-                flags.from_file(part.tod.flags, step.flag_mask),
-                part.noise,
-            )
-            for part in scan
-        ]
+        found[observation.index] = [File.of(part, step.flag_mask) for part in scan]
         if not own["instrument"].bands:
             file = next(file for file in found[observation.index] if observation.focalplane.names[0] in file.rows)
             _tell(step.label, observation, file)
@@ -208,7 +204,19 @@ def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument, most: int) -> l
             if one.shape != other.shape or not np.allclose(one, other, rtol=0, atol=SAME_DIRECTION):
                 text = f"looks elsewhere than {scan[0].path.name}, which has the same times ({name})"
                 raise InputError(text, place=f"{step.label}, {part.path.name}", cure="load them one after the other")
+        for what, stated in (("site", _place), ("sample rate", lambda tod: (tod.sample_rate,))):
+            wanted, own = stated(scan[0].tod), stated(part.tod)
+            if not np.allclose(wanted, own, rtol=SAME_NUMBER, atol=SAME_DIRECTION):
+                both = ", not ".join(" ".join(f"{number:.9g}" for number in numbers) for numbers in (own, wanted))
+                text = f"states another {what} than {scan[0].path.name}, which has the same times: {both}"
+                cure = "correct the one that is wrong, or choose a band"
+                raise InputError(text, place=f"{step.label}, {part.path.name}", cure=cure)
     return [bands[name] for name in instrument.cameras]
+
+
+def _place(tod: TimeOrderedData) -> tuple[float, float, float]:
+    """Latitude and longitude [deg], height [m]."""
+    return float(np.degrees(tod.site[1])), float(np.degrees(tod.site[2])), tod.site[3]
 
 
 def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:

@@ -20,6 +20,7 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Fraction, Hertz
 from zonda.core.errors import InputError
+from zonda.core.intervals import Intervals, runs
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
@@ -32,6 +33,7 @@ from .time_ordered_data import TimeOrderedData
 if TYPE_CHECKING:
     from zonda.core.instrument import Instrument
     from zonda.core.observation import Observation
+    from zonda.core.weather import GroundWeather
 
 NEW_SCANS = 8
 """Files whose pointing is kept after it was read."""
@@ -53,12 +55,29 @@ class RecordedScan:
 
 @dataclass(frozen=True)
 class File:
-    """A file of a scan that is read: the rows of its detectors, its flags of samples (n_samp,), whose noise it has in words."""
+    """A file of a scan that is read: the rows of its detectors, what it states of the scan, whose noise it has in words."""
 
     path: Path
     rows: dict[str, int]
     flags: flags.Flags
+    intervals: Intervals
+    weather: GroundWeather | None
+    hwp_angle: Floats | None
     noise: str
+
+    @classmethod
+    def of(cls, part: RecordedScan, mask: int) -> File:
+        """``mask``: bits of the flags that exclude a sample."""
+        tod, rows = part.tod, np.concatenate(part.rows).tolist()
+        intervals = tod.intervals or {"scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)}
+        of_samples = flags.from_file(tod.flags, mask)
+        names = {tod.names[row]: row for row in rows}
+        return cls(part.path, names, of_samples, intervals, tod.weather, tod.hwp_angle, part.noise)
+
+    def state(self, observation: Observation) -> None:
+        """Give an observation of one band what its own file states of the scan."""
+        observation.flags, observation.intervals = self.flags.copy(), dict(self.intervals)
+        observation.weather, observation.hwp_angle = self.weather, self.hwp_angle
 
 
 Files = Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,44 @@ def test_every_band_has_the_flags_of_its_file(night: Any, tmp_path: Path) -> Non
     twin = load([files[0], flagged], zonda.WhiteNoise(), zonda.Efficiency(), MAP, signal="none")
     for band in ("f090", "f150"):
         same(twin[f"map_{band}"], found[f"map_{band}"], ("hits",))
+
+
+def test_every_band_has_intervals_weather_and_plate_of_its_file(night: Any, tmp_path: Path) -> None:
+    """Whichever file is first; what a filter makes of its intervals has the bits of the band alone."""
+    files, changed = list(night[1][:2]), list[Path]()
+    for k, file in enumerate(files):
+        tod = load_tod(file)
+        middle = float(tod.seconds[500 + 100 * k])
+        tod.intervals = {"scanning": [(0.0, middle), (middle, float(tod.seconds[-1]))]} if k else {}
+        tod.weather = replace(tod.weather, pwv=(1 + k) * 1e-3)
+        tod.hwp_angle = tod.seconds * (1 + k)
+        changed.append(save_tod(tmp_path / f"{k}.h5", tod))
+    steps = [zonda.PolynomialFilter(order=2, interval="scanning"), MAP]
+    alone = [load(file, *steps) for file in changed]
+    for order in (changed, changed[::-1]):
+        found = load(order, *steps)
+        for k, name in enumerate(("f090", "f150")):
+            one, other = found.observations[k], alone[k].observations[0]
+            assert len(one.intervals["scanning"]) == 1 + k
+            assert one.intervals == other.intervals
+            assert one.weather == other.weather
+            np.testing.assert_array_equal(one.hwp_angle, one.seconds * (1 + k))
+            same(found[f"map_{name}"], alone[k]["map"])
+
+
+@pytest.mark.parametrize("what", ["site", "sample rate"])
+def test_bands_of_one_scan_state_the_same_place_and_rate(night: Any, tmp_path: Path, what: str) -> None:
+    tod = load_tod(night[1][1])
+    if what == "site":
+        name, latitude, longitude, altitude = tod.site
+        tod.site = name, latitude, longitude, altitude + 1
+    else:
+        tod.sample_rate *= 1 + 1e-5
+    other = save_tod(tmp_path / "other.h5", tod)
+    with pytest.raises(InputError, match=rf"other\.h5: states another {what} than .*, not ") as caught:
+        load([night[1][0], other])
+    assert "choose a band" in caught.value.cure
+    load([night[1][0], other], band="150 GHz")
 
 
 def test_every_band_says_where_its_noise_comes_from(night: Any, tmp_path: Path) -> None:
