@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.flags import Flags, of_before
+from zonda.core.flags import DETECTOR_MASK, Flags, of_before
 from zonda.core.intervals import Intervals
 from zonda.core.storage.files import reading
 from zonda.core.storage.hdf5_files import check_size, checked
@@ -160,18 +160,22 @@ def _rectangle(item: Any, rows: NDArray[np.intp], samples: slice) -> Any:
 
 
 def read(path: str | os.PathLike[str]) -> TimeOrderedData:
-    """Read all of a file. Raises InputError as `Reader` does."""
+    """Read all of a file; single samples that it flags (`DETECTOR_MASK`) become NaN. Raises InputError as `Reader` does."""
     import h5py
 
     reader = Reader(path)
     try:
         tod = reader.tod
         every = np.arange(tod.n_detectors)
+        flags = reader.flags(every, slice(0, tod.n_samples))
+        spoilt = None if flags is None else (flags & ~tod.detector_flags[:, None] & np.uint8(DETECTOR_MASK)) != 0
         for name in reader.streams:
             item = reader._file["detdata"][name]
             for dataset in [item] if isinstance(item, h5py.Dataset) else []:
                 check_size(dataset, reader.place)
             tod.streams[name] = reader.read(name, every, slice(0, tod.n_samples))
+            if spoilt is not None and spoilt.any():
+                tod.streams[name] = np.where(spoilt, np.nan, tod.streams[name])
     finally:
         reader.close()
     tod.check(reader.place)

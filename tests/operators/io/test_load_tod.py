@@ -251,6 +251,31 @@ def test_flagged_samples_are_counted_whatever_the_blocks(saved: Any, tmp_path: P
     assert data.tally.get("LoadTOD", "samples of single detectors that the file flags") == 10 + n
 
 
+@pytest.mark.parametrize("format", ["hdf5", "fits"])
+@pytest.mark.parametrize("how", ["SaveTOD", "save_tod"])
+def test_flags_of_single_samples_go_through_either_format(saved: Any, tmp_path: Path, format: str, how: str) -> None:
+    """As NaN in the streams. A sample of a detector that is flagged as a whole keeps its number."""
+
+    def flag(file: Any) -> None:
+        flags = np.zeros(file["detdata/flags"].shape, np.uint8)
+        flags[3, 500:510], flags[4, 100:200], flags[5, 200:300], flags[6] = 1, 4, 64, 1
+        file["detdata/flags"][...] = flags
+        file.attrs.modify("observation_detector_flags", json.dumps({f"d{k:02d}": 1 if k == 6 else 0 for k in range(19)}))
+
+    flagged = changed(saved["Filtered"][0], tmp_path / "flagged.h5", flag)
+    if how == "SaveTOD":
+        expected = load(flagged, zonda.SaveTOD(format=format), MAP, output=tmp_path / "out")["map"]
+        path = next((tmp_path / "out").glob("tod_*"))
+    else:
+        expected = load(flagged, MAP)["map"]
+        path = save_tod(tmp_path / f"copy.{'h5' if format == 'hdf5' else 'fits'}", load_tod(flagged))
+        np.testing.assert_array_equal(np.isnan(load_tod(path).streams["signal"]).sum(axis=1)[:7], [0, 0, 0, 10, 100, 0, 0])
+    found = load(path, MAP)["map"]
+    for plane in ("signal", *PLANES):
+        np.testing.assert_array_equal(getattr(found, plane), getattr(expected, plane), err_msg=plane)
+    assert found.hits.sum() == load(saved["Filtered"][0], MAP)["map"].hits.sum() - load(flagged).observations[0].n_samples - 110
+
+
 def test_a_file_of_either_format_may_lack_azimuth_and_elevation(saved: Any, tmp_path: Path) -> None:
     """They are computed on loading; in FITS an absent column is no column of zeros."""
     whole, found = load_tod(saved["Raw"][0]), []
