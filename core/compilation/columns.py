@@ -79,19 +79,22 @@ def fused(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @intrinsic
-def four_columns_at(typing_context: Any, address: Any, stride: Any, v0: Any, v1: Any, v2: Any, v3: Any, out: Any, at: Any) -> Any:
-    """out[at + k] = sum_j v_j f[j stride + k], k = 0 .. 3, for the float32 numbers ``f`` at a memory ``address``.
+def four_columns_at(
+    typing_context: Any, address: Any, stride: Any, v0: Any, v1: Any, v2: Any, v3: Any, fields: Any, out: Any, at: Any
+) -> Any:
+    """out[at + k] = sum_j v_j f[j stride + k], k = 0 .. 4 n - 1, for the float32 numbers ``f`` at a memory ``address``.
 
-    ``out`` is a C array of the type of ``v_j``, float32 or float64; ``address``, ``stride``, ``at`` are uint64; nothing is
-    checked. The sums are not contracted, so that they are the same wherever they are made.
+    ``fields``: a tuple of n numbers, one for each of the fields whose values alternate in ``f``. ``out`` is a C array of the type
+    of ``v_j``, float32 or float64; ``address``, ``stride``, ``at`` are uint64; nothing is checked. The sums are not contracted,
+    so that they are the same wherever they are made.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place, stride, *v, out, at = arguments
-        scalar = context.get_data_type(signature.args[2])
-        single, four, size = ir.VectorType(ir.FloatType(), 4), ir.VectorType(scalar, 4), context.get_abi_sizeof(scalar)
-        nothing, integer = ir.Constant(four, ir.Undefined), ir.IntType(32)
-        zeros = ir.Constant(ir.VectorType(integer, 4), [0] * 4)
+        place, stride, *v, _, out, at = arguments
+        scalar, lanes = context.get_data_type(signature.args[2]), 4 * len(signature.args[6])
+        single, many, size = ir.VectorType(ir.FloatType(), lanes), ir.VectorType(scalar, lanes), context.get_abi_sizeof(scalar)
+        nothing, integer = ir.Constant(many, ir.Undefined), ir.IntType(32)
+        zeros = ir.Constant(ir.VectorType(integer, lanes), [0] * lanes)
 
         def spread(value: Any) -> Any:
             return builder.shuffle_vector(builder.insert_element(nothing, value, ir.Constant(integer, 0)), nothing, zeros)
@@ -100,14 +103,14 @@ def four_columns_at(typing_context: Any, address: Any, stride: Any, v0: Any, v1:
         total = None
         for weight in v:
             row = builder.load(builder.inttoptr(place, single.as_pointer()), align=4)
-            term = builder.fmul(spread(weight), row if four == single else builder.fpext(row, four))
+            term = builder.fmul(spread(weight), row if many == single else builder.fpext(row, many))
             total = term if total is None else builder.fadd(total, term)
             place = builder.add(place, four_bytes)
-        first = make_array(signature.args[6])(context, builder, out).data
-        builder.store(total, builder.bitcast(builder.gep(first, [at]), four.as_pointer()), align=size)
+        first = make_array(signature.args[7])(context, builder, out).data
+        builder.store(total, builder.bitcast(builder.gep(first, [at]), many.as_pointer()), align=size)
         return context.get_dummy_value()
 
-    return types.void(types.uint64, types.uint64, v0, v1, v2, v3, out, types.uint64), generate
+    return types.void(types.uint64, types.uint64, v0, v1, v2, v3, fields, out, types.uint64), generate
 
 
 @intrinsic

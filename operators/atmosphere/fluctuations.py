@@ -12,7 +12,7 @@ import math
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 
@@ -107,12 +107,19 @@ class OfDetectors:
         if self._keeps_all:
             self._most = self._groups * self._times
         self._beside: list[weakref.ref[OfDetectors]] = []
+        self._alike = 0
+        """The number that bands have in common whose detectors look along the same lines."""
 
     def join(self, bands: list[weakref.ref[OfDetectors]]) -> None:
         """Let bands that are in step make units next to each other; ``bands``: a list that all of them are given."""
         if self._keeps_all:
+            self._alike = next((one._alike for one in map(_held, bands) if one is not None and one._looks_as(self)), len(bands))
             self._beside = bands
             bands.append(weakref.ref(self))
+
+    def _looks_as(self, other: OfDetectors) -> bool:
+        same = np.array_equal(self._xi, other._xi) and np.array_equal(self._eta, other._eta)
+        return same and self._layers.looks_as(other._layers)
 
     def drawn(self) -> tuple[int, float, float]:
         """As `AtNodes.drawn`, of the units made so far."""
@@ -151,9 +158,6 @@ class OfDetectors:
                 assert wanted is not None
                 return wanted.result()
             self._fill(key, mine)
-            for other in [band() for band in self._beside]:
-                if other is not None and other is not self:
-                    other._also(key)
             if key == (unit, number):
                 return mine.result()
 
@@ -179,23 +183,28 @@ class OfDetectors:
         return mine
 
     def _fill(self, key: tuple[int, int], mine: Future[dict[str, AnyFloats]]) -> None:
-        """Make a unit that has been begun."""
+        """Make a unit that has been begun, and that of bands beside this one, unless they have begun it."""
+        todo = [(self, mine)]
+        todo += [(other, theirs) for other in map(_held, self._beside) if other and (theirs := other._also(key)) is not None]
         try:
-            mine.set_result(self._make(*key))
+            for alike in sorted({band._alike for band, _ in todo}):
+                these = [one for one in todo if one[0]._alike == alike]
+                drawn, sine = these[0][0]._draw([band._layers for band, _ in these[1:]], *key)
+                for (band, future), g in zip(these, drawn, strict=True):
+                    future.set_result(band._make(key, g, sine))
         except BaseException as error:
-            mine.set_exception(error)
-            with self._lock:
-                self._units.pop(key, None)
-                self._begun = 0
+            for band, future in todo:
+                if not future.done():
+                    future.set_exception(error)
+                    with band._lock:
+                        band._units.pop(key, None)
+                        band._begun = 0
             raise
 
-    def _also(self, key: tuple[int, int]) -> None:
-        """Make a unit that another band has just made, unless it has been begun."""
+    def _also(self, key: tuple[int, int]) -> Future[dict[str, AnyFloats]] | None:
+        """Begin a unit that another band makes, unless it has been begun."""
         with self._lock:
-            if key in self._units:
-                return
-            mine = self._begin(key)
-        self._fill(key, mine)
+            return None if key in self._units else self._begin(key)
 
     def _next(self, unit: int, number: int, reach: int) -> Iterator[tuple[int, int]]:
         """Units that will be needed soon: later ones of the same detectors, the same time of the next detectors."""
@@ -204,16 +213,19 @@ class OfDetectors:
         for k in range(unit + 1, min(unit + reach, self._groups)):
             yield k, number
 
-    def _make(self, unit: int, number: int) -> dict[str, AnyFloats]:
+    def _draw(self, others: Sequence[DriftingLayers], unit: int, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """`DriftingLayers.with_others` for the detectors and times of a unit."""
         rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)
         samples = slice(number * UNIT_SAMPLES, min((number + 1) * UNIT_SAMPLES, self._n_samples))
-        first, count = times(samples, self.step)
-        g, sine = self._layers(self._xi[rows], self._eta[rows], first, count)
+        return self._layers.with_others(others, self._xi[rows], self._eta[rows], *times(samples, self.step))
+
+    def _make(self, key: tuple[int, int], g: NDArray[np.float64], sine: NDArray[np.float64]) -> dict[str, AnyFloats]:
+        own = _own(g.shape[1])
         with self._lock:  # what is made again is not counted again
-            own = _own(count) if (unit, number) not in self._sums else slice(0, 0)
-            self._sums.setdefault((unit, number), (0, 0.0, 0.0))
-        y = self._to_pwv(g, own)
-        self._sums[unit, number] = _sums(y[:, _own(count)])
+            counted = own if key not in self._sums else slice(0, 0)
+            self._sums.setdefault(key, (0, 0.0, 0.0))
+        y = self._to_pwv(g, counted)
+        self._sums[key] = _sums(y[:, own])
         return {name: spline_coefficients(self._response(name, y, sine), np.float32) for name in self._response.names}
 
 
@@ -237,6 +249,10 @@ def units_bytes(n_detectors: int, n_samples: int, step: int, streams: int) -> in
 def _unit_size(n_detectors: int, step: int, streams: int) -> int:
     """Bytes."""
     return 4 * min(UNIT_DETECTORS, n_detectors) * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * streams
+
+
+def _held(band: weakref.ref[OfDetectors]) -> OfDetectors | None:
+    return band()
 
 
 def _sums(y: NDArray[np.float64]) -> tuple[int, float, float]:

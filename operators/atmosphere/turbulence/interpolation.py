@@ -63,23 +63,25 @@ def mark(matrix, boxes, i, j, side_i, side_j, first_i, first_j, wanted):  # type
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, width, addresses, constants, out):  # type: ignore[no-untyped-def]
-    """out += amplitude * the cubic B-spline of the coefficients at ``addresses`` (uint64, one per tile).
+def interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, width, addresses, constants, bands, out):  # type: ignore[no-untyped-def]
+    """out[band] += amplitude * the cubic B-spline of the band's coefficients, for each of the ``bands`` (a tuple).
 
-    (low_i, low_j): the first cell of the first tile; ``width``: cells in a row of a tile. ``constants``: 1/6, 2/3, 1/2, 1 and
-    the amplitude, of the type that the spline is summed in.
+    ``addresses``: (tiles across, tiles along) uint64, of tiles in which the coefficients of the bands alternate. (low_i, low_j):
+    the first cell of the first tile; ``width``: cells in a row of a tile. ``constants``: 1/6, 2/3, 1/2, 1 and the amplitude, of
+    the type that the spline is summed in.
     """
     m0, m1, m2, m3 = matrix[0], matrix[1], matrix[2], matrix[3]
     inside_i, inside_j = nb.int32((1 << side_i) - 1), nb.int32((1 << side_j) - 1)
-    stride, width, columns_of_tiles = nb.uint64(width), nb.int32(width), nb.int32(addresses.shape[1])
+    n_bands = nb.uint64(len(bands))
+    stride, width, columns_of_tiles = nb.uint64(width) * n_bands, nb.int32(width), nb.int32(addresses.shape[1])
     shift_i, shift_j = nb.int32(side_i), nb.int32(side_j)
     # Cells are counted from the first tile's, in 32 bits: what the box of one call holds fits.
     origin_i, origin_j = float(low_i), float(low_j)
     flat = addresses.reshape(-1)
     sixth, two_thirds, half, one, amplitude = constants[0], constants[1], constants[2], constants[3], constants[4]
     tile, inside = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
-    kind = constants.dtype
-    u, v, sums = np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty(4 * CHUNK, kind)
+    kind, size = constants.dtype, nb.uint64(4) * n_bands  # numbers of a point, and bytes of a cell
+    u, v, sums = np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty(4 * len(bands) * CHUNK, kind)
     w0, w1, w2, w3 = np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty(CHUNK, kind), np.empty(CHUNK, kind)
     for n in range(x.shape[0]):
         for start in range(0, x.shape[1], CHUNK):
@@ -98,13 +100,15 @@ def interpolate(matrix, x, y, i, j, side_i, side_j, low_i, low_j, width, address
                 w0[t], w1[t] = amplitude * (q * q * q * sixth), amplitude * (two_thirds - p * p * (one - p * half))
                 w2[t], w3[t] = amplitude * (two_thirds - q * q * (one - q * half)), amplitude * (p * p * p * sixth)
             for t in range(count):
-                where = flat[nb.uint64(tile[t])] + nb.uint64(4) * nb.uint64(inside[t])
-                four_columns_at(where, stride, w0[t], w1[t], w2[t], w3[t], sums, nb.uint64(4) * t)
+                where = flat[nb.uint64(tile[t])] + size * nb.uint64(inside[t])
+                four_columns_at(where, stride, w0[t], w1[t], w2[t], w3[t], bands, sums, size * t)
             for t in range(count):
                 p = v[t]
                 q = one - p
                 w0[t], w1[t] = q * q * q * sixth, two_thirds - p * p * (one - p * half)
                 w2[t], w3[t] = two_thirds - q * q * (one - q * half), p * p * p * sixth
-            row = out[n][start:]
-            for t in range(count):
-                row[t] += w0[t] * sums[4 * t] + w1[t] * sums[4 * t + 1] + w2[t] * sums[4 * t + 2] + w3[t] * sums[4 * t + 3]
+            for b in range(n_bands):
+                row = out[bands[b], n][start:]
+                for t in range(count):
+                    k, m, p, q = size * t + b, n_bands, 2 * n_bands, 3 * n_bands
+                    row[t] += w0[t] * sums[k] + w1[t] * sums[k + m] + w2[t] * sums[k + p] + w3[t] * sums[k + q]

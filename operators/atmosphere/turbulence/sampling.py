@@ -109,31 +109,56 @@ class DriftingLayers:
 
     def __call__(self, xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
         """The sum of the layers and the sine of the elevation, each (len(xi), count), from time ``first``."""
-        stop = first + count
-        total, sine = np.zeros((len(xi), count)), np.empty((len(xi), count))
+        total, sine = self.with_others([], xi, eta, first, count)
+        return total[0], sine
+
+    def with_others(
+        self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
+    ) -> tuple[Floats, Floats]:
+        """As a call, of this band and of ``others`` that look as it does: where they look is found once.
+
+        The sum of the layers is (1 + len(others), len(xi), count).
+        """
+        bands, stop, n_xi = [self, *others], first + count, len(xi)
+        total, sine = np.zeros((len(bands), n_xi, count)), np.empty((n_xi, count))
         for own, path in self.paths.items():
-            ratio, through = own // self._step, [n for n, layer in enumerate(self._drifting) if layer.step == own]
+            ratio, through = own // self._step, self._through(own)
             low, high = (first, stop) if ratio == 1 else _coarse(first, stop, ratio)
-            values = total if ratio == 1 else np.empty((len(xi), high - low))
+            values = total if ratio == 1 else np.empty((len(bands), n_xi, high - low))
             for start in range(low, high, TIMES_AT_ONCE):
                 end = min(start + TIMES_AT_ONCE, high)
                 x, y, up = path(xi, eta, start, end - start)
-                part, boxes = np.zeros(x.shape), boxes_of(x, y)
+                part, boxes = np.zeros((len(bands), *x.shape)), boxes_of(x, y)
                 for n in through:
                     matrix, i, j = self._places[n]
                     i, j = i[start - path.first : end - path.first], j[start - path.first : end - path.first]
-                    cover = self._tilings[n].cover(self._band, matrix, boxes, i, j)
-                    where = *cover.sides, *cover.origin, cover.width, cover.addresses
-                    interpolate(matrix, x, y, i, j, *where, self._constants[n], part)
-                values[:, start - low : end - low] = part
+                    for tiling, which in _by_tiling(bands, n):
+                        cover = tiling.cover(tuple(bands[k]._band for k in which), matrix, boxes, i, j)
+                        where = *cover.sides, *cover.origin, cover.width, cover.addresses
+                        interpolate(matrix, x, y, i, j, *where, self._constants[n], tuple(which), part)
+                values[:, :, start - low : end - low] = part
                 if ratio == 1:
                     sine[:, start - low : end - low] = up
             if ratio > 1:
-                fine = DetectorField(spline_coefficients(values), ratio, (high - low) * ratio)
                 # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has its time -PAD.
                 offset = first - (low + SPLINE_MARGIN + PAD) * ratio
-                total += fine.evaluate(slice(0, len(xi)), slice(offset, offset + count))
+                for coarse, sums in zip(values, total, strict=True):
+                    fine = DetectorField(spline_coefficients(coarse), ratio, (high - low) * ratio)
+                    sums += fine.evaluate(slice(0, n_xi), slice(offset, offset + count))
         return total, sine
+
+    def looks_as(self, other: DriftingLayers) -> bool:
+        """Whether another band looks along the same lines at the same times, and at layers that drift alike."""
+        steps = [[one._step, *(layer.step for layer in one._drifting)] for one in (self, other)]
+        if steps[0] != steps[1] or self._constants[0].dtype != other._constants[0].dtype:
+            return False
+        own, others = ((one._constants, *zip(*one._places, strict=True)) for one in (self, other))
+        layers = (np.array_equal(a, b) for pair in zip(own, others, strict=True) for a, b in zip(*pair, strict=True))
+        return all(layers) and all(path.same_as(other.paths[step]) for step, path in self.paths.items())
+
+    def _through(self, step: int) -> list[int]:
+        """Numbers of the layers that take this step."""
+        return [n for n, layer in enumerate(self._drifting) if layer.step == step]
 
     def _sweep(self, xi: Floats, eta: Floats) -> list[Swept]:
         """What the lines of sight of the rim (xi, eta) of the points sweep over, for each layer."""
@@ -152,6 +177,15 @@ class DriftingLayers:
                         k, m, p, q = whole[n]
                         whole[n] = min(k, a), max(m, b), min(p, c), max(q, d)
         return [Swept(box, min(number, points_of(box))) for box, number in zip(whole, cells, strict=True)]
+
+
+def _by_tiling(bands: Sequence[DriftingLayers], layer: int) -> list[tuple[Tiling, list[int]]]:
+    """The tilings of a layer, each with the numbers of the bands that see it."""
+    found: dict[int, tuple[Tiling, list[int]]] = {}
+    for k, band in enumerate(bands):
+        tiling = band._tilings[layer]
+        found.setdefault(id(tiling), (tiling, []))[1].append(k)
+    return list(found.values())
 
 
 def share_tiles(bands: Sequence[DriftingLayers]) -> list[Counter[int]]:

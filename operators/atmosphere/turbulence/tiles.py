@@ -11,7 +11,7 @@ first makes a tile for those after it too: the numbers are drawn once.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -60,7 +60,10 @@ _WHOLE = 30
 """Side of the only tile, as a power of two of cells: none is so large."""
 
 _Tile = tuple[Field, int]
-"""Coefficients (rows, cells in a row), and their address."""
+"""Coefficients (rows, cells in a row, bands), and their address."""
+
+Bands = tuple[int, ...]
+"""Numbers of bands that look at the same cells at the same times: their coefficients are next to each other."""
 
 
 class Cover(NamedTuple):
@@ -80,17 +83,17 @@ class Tiles:
     """The tiles of several lattices and bands, as many as `BYTES_KEPT` allow. Safe for threads."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[int, int, Box], _Tile] = {}
-        self._making: dict[tuple[int, Box], Future[dict[int, _Tile]]] = {}
+        self._kept: dict[tuple[int, Bands, Box], _Tile] = {}
+        self._making: dict[tuple[int, Box], Future[dict[Bands, _Tile]]] = {}
         self._lock = threading.Lock()
         self._free = BYTES_KEPT
 
-    def get(self, lattice: int, band: int, box: Box, fields: Mapping[int, Turbulence]) -> _Tile:
-        """The cells low <= i < high, low <= j < high of a box, with the apron, as a band sees them.
+    def get(self, lattice: int, bands: Bands, box: Box, fields: Mapping[int, Turbulence]) -> _Tile:
+        """The cells low <= i < high, low <= j < high of a box, with the apron, as some bands see them.
 
         ``fields``: of all bands that look through this lattice, by number.
         """
-        key, place = (lattice, band, box), (lattice, box)
+        key, place = (lattice, bands, box), (lattice, box)
         if (kept := self._kept.get(key)) is not None:
             return kept
         while True:
@@ -100,18 +103,22 @@ class Tiles:
                     return kept
                 if making is None:
                     mine = self._making[place] = Future()
-                    wanted = {b: field for b, field in fields.items() if b >= band and (lattice, b, box) not in self._kept}
+                    later = [(b,) for b in fields if b > bands[0] and b not in bands]
+                    wanted = [bands, *(one for one in later if (lattice, one, box) not in self._kept)]
                     break
-            if band in (made := making.result()):  # or it was made for later bands alone
-                return made[band]
-        return self._make(mine, place, wanted)[band]
+            if bands in (made := making.result()):  # or it was made for others alone
+                return made[bands]
+        return self._make(mine, place, {some: [fields[b] for b in some] for some in wanted})[bands]
 
-    def _make(self, mine: Future[dict[int, _Tile]], place: tuple[int, Box], fields: Mapping[int, Turbulence]) -> dict[int, _Tile]:
+    def _make(
+        self, mine: Future[dict[Bands, _Tile]], place: tuple[int, Box], fields: Mapping[Bands, Sequence[Turbulence]]
+    ) -> dict[Bands, _Tile]:
         lattice, box = place
         try:
             a, b, c, d = box
-            parts = coefficients([*fields.values()], a, b + APRON, c, d + APRON)
-            made = {band: (part, part.ctypes.data) for band, part in zip(fields, parts, strict=True)}
+            parts = iter(coefficients([one for some in fields.values() for one in some], a, b + APRON, c, d + APRON))
+            tiles = {bands: _alternating([next(parts) for _ in bands]) for bands in fields}
+            made = {bands: (tile, tile.ctypes.data) for bands, tile in tiles.items()}
         except BaseException as error:
             mine.set_exception(error)
             with self._lock:
@@ -121,7 +128,7 @@ class Tiles:
             self._free -= sum(tile.nbytes for tile, _ in made.values())
             while self._free < 0 and self._kept:  # the oldest goes first; a thread that works with it still holds it
                 self._free += self._kept.pop(next(iter(self._kept)))[0].nbytes
-            self._kept.update({(lattice, band, box): tile for band, tile in made.items()})
+            self._kept.update({(lattice, bands, box): tile for bands, tile in made.items()})
             del self._making[place]
         mine.set_result(made)
         return made
@@ -170,12 +177,12 @@ class Tiling:
             self._slab = low, high, max(1, min(SLAB // max(high - low, 1), LONGEST)).bit_length() - 1
         self._sides = STRIP if swept.box[1] - swept.box[0] < NARROW else SQUARE
 
-    def cover(self, band: int, matrix: Floats, boxes: Floats, i: Floats, j: Floats) -> Cover:
-        """The tiles under the cells at matrix (x, y) + (i, j), as a band sees them; ``boxes`` of x, y as of `boxes_of`."""
+    def cover(self, bands: Bands, matrix: Floats, boxes: Floats, i: Floats, j: Floats) -> Cover:
+        """The tiles under the cells at matrix (x, y) + (i, j), as some bands see them; ``boxes`` of x, y as of `boxes_of`."""
         low_i, high_i, low_j, high_j = extent(matrix, boxes, i, j)
         piece, slab, sides = self._piece, self._slab, self._sides
         if piece and piece[0] <= low_i <= high_i < piece[1] and piece[2] <= low_j <= high_j < piece[3]:
-            tile, address = self._get(band, piece)
+            tile, address = self._get(bands, piece)
             return Cover((_WHOLE, _WHOLE), (piece[0], piece[2]), tile.shape[1], np.array([[address]], np.uint64), [tile])
         if slab and slab[0] <= low_i <= high_i < slab[1]:
             sides = _WHOLE, slab[2]
@@ -189,12 +196,17 @@ class Tiling:
         addresses, held = np.zeros(wanted.shape, np.uint64), []
         for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
             k, m = begin + a * across, (first_j + b) << sides[1]
-            tile, addresses[a, b] = self._get(band, (k, k + across, m, m + (1 << sides[1])))
+            tile, addresses[a, b] = self._get(bands, (k, k + across, m, m + (1 << sides[1])))
             held.append(tile)
         return Cover(sides, (begin, first_j << sides[1]), held[0].shape[1], addresses, held)
 
-    def _get(self, band: int, box: Box) -> _Tile:
-        return self._tiles.get(self._number, band, box, self.fields)
+    def _get(self, bands: Bands, box: Box) -> _Tile:
+        return self._tiles.get(self._number, bands, box, self.fields)
+
+
+def _alternating(parts: Sequence[Field]) -> Field:
+    """Fields next to each other: (rows, cells, fields)."""
+    return parts[0][:, :, None] if len(parts) == 1 else np.stack(parts, axis=2)
 
 
 def points_of(box: Box) -> float:

@@ -28,21 +28,33 @@ class Response:
         return y
 
 
-def series(made: list[tuple[str, int, int]], name: str = "") -> OfDetectors:
-    """Of layers that note (name, unit, number) of what they are asked for."""
+class Layers:
+    """Layers that note (name, unit, number) of what they are asked for, and how many bands are asked for together."""
 
-    def layers(xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
+    def __init__(self, made: list[tuple[str, int, int]], name: str, looks: str) -> None:
+        self.made, self.name, self.looks = made, name, looks
+        self.together: list[int] = []
+
+    def looks_as(self, other: Layers) -> bool:
+        return self.looks == other.looks
+
+    def with_others(self, others: list[Layers], xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
         number = round(first * STEP / UNIT_SAMPLES)
-        made.append((name, int(xi[0]) // UNIT_DETECTORS, number))
+        self.made += [(one.name, int(xi[0]) // UNIT_DETECTORS, number) for one in (self, *others)]
+        self.together.append(1 + len(others))
         times = np.arange(first, first + count)
-        return np.sin(0.1 * times + xi[:, None]), np.ones((len(xi), count))
+        sums = np.sin(0.1 * times + xi[:, None])
+        return np.stack([sums] * (1 + len(others))), np.ones(sums.shape)
 
+
+def series(made: list[tuple[str, int, int]], name: str = "", looks: str = "", shift: float = 0.0) -> OfDetectors:
+    """Of `Layers`; ``shift`` of the detectors."""
     rows = np.arange(float(DETECTORS))
     nodes: Any = Nodes.__new__(Nodes)
     object.__setattr__(nodes, "xi", rows)
-    object.__setattr__(nodes, "eta", rows)
+    object.__setattr__(nodes, "eta", rows + shift)
     law: Any = lambda g, own: g  # noqa: E731
-    return OfDetectors(nodes, layers, law, Response(), STEP, SAMPLES)  # type: ignore[arg-type]
+    return OfDetectors(nodes, Layers(made, name, looks), law, Response(), STEP, SAMPLES)  # type: ignore[arg-type]
 
 
 def block(state: OfDetectors, detectors: slice, samples: slice) -> Floats:
@@ -73,11 +85,12 @@ def test_where_few_are_kept_only_what_is_wanted_is_made(monkeypatch: pytest.Monk
     np.testing.assert_array_equal(again, whole[:16])
 
 
+@pytest.mark.parametrize("looks", ["xx", "xy"])
 @pytest.mark.parametrize("threads", [1, 4])
-def test_bands_in_step_make_units_next_to_each_other(threads: int) -> None:
+def test_bands_in_step_make_units_next_to_each_other(threads: int, looks: str) -> None:
     made: list[tuple[str, int, int]] = []
     bands: list[weakref.ref[OfDetectors]] = []
-    states = [series(made, name) for name in "ab"]
+    states = [series(made, name, looks) for name, looks in zip("ab", looks, strict=True)]
     for state in states:
         state.join(bands)
     parts = [(slice(k, min(k + 16, DETECTORS)), slice(0, SAMPLES)) for k in range(0, DETECTORS, 16)]
@@ -93,6 +106,19 @@ def test_bands_in_step_make_units_next_to_each_other(threads: int) -> None:
     assert sorted(made) == sorted((name, *key) for name in "ab" for key in EVERY)  # each once
     if threads == 1:
         assert made == [(name, *key) for key in EVERY for name in "ab"]
+
+
+@pytest.mark.parametrize(("looks", "shift", "together"), [("xxx", 0.0, {3}), ("xyx", 0.0, {2, 1}), ("xxx", 1e-9, {2, 1})])
+def test_bands_that_look_alike_are_drawn_together(looks: str, shift: float, together: set[int]) -> None:
+    """Of three bands, of which one may look elsewhere: at another lattice's drift, or with detectors that stand elsewhere."""
+    states = [series([], name, look, shift * (name == "b")) for name, look in zip("abc", looks, strict=True)]
+    bands: list[weakref.ref[OfDetectors]] = []
+    for state in states:
+        state.join(bands)
+    block(states[0], slice(0, DETECTORS), slice(0, SAMPLES))
+    layers: list[Any] = [state._layers for state in states]
+    assert set().union(*(one.together for one in layers)) == together
+    assert [len(one.together) for one in layers] == [len(EVERY), len(EVERY) * (len(together) - 1), 0]
 
 
 def test_a_band_that_is_gone_makes_nothing() -> None:
