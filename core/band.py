@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from .configuration.files import InputPath
 from .configuration.parameters import Parameters, named, named_or_written
 from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond
-from .configuration.values import mistake
+from .configuration.values import mistake, refusal
 from .errors import InputError
 from .registry import RegistryError, bands
 from .storage import packed
@@ -45,7 +45,10 @@ class Band(Parameters):
         if self.file is not None:
             if self.low is not None or self.high is not None:
                 raise ValueError("give either low and high, or file")
-            self._table = _read_passband(self.file)
+            try:
+                self._table = _read_passband(self.file)
+            except InputError as err:
+                raise refusal(err, at=("file",)) from None
         elif self.low is not None and self.high is not None and 0 < self.low < self.high:
             self._table = (np.linspace(self.low, self.high, 61), np.ones(61))
         else:

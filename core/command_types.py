@@ -14,6 +14,9 @@ else:
 
 _UNITS = {"": 1, "B": 1, **{f"{p}{i}B": b ** (k + 1) for k, p in enumerate("KMGT") for i, b in (("", 1000), ("I", 1024))}}
 
+LEAST_BYTES = 1_000_000
+"""A smaller number without a unit was not meant to be bytes."""
+
 
 class Bytes(_Integer):
     """A size such as 4GB or 500MiB, in bytes."""
@@ -30,6 +33,8 @@ class Bytes(_Integer):
             size = float(number) * _UNITS[text[len(number) :].strip().upper()]
         except (ValueError, KeyError):
             self.fail(f"{value!r} is not a size; write e.g. 4GB or 500MiB", param, ctx)
+        if number == text and size < LEAST_BYTES:
+            self.fail(f"{value!r} has no unit and would be bytes; write e.g. 1GB or 500MiB", param, ctx)
         if not 1 <= size < 2**63:
             self.fail(f"{value!r} is not a size a computer has", param, ctx)
         return int(size)

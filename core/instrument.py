@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, ValidationInfo, field_validator, model_serializer, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from .array_table import OF_INSTRUMENT, ArrayTable, read_array, stated_by
@@ -32,6 +40,10 @@ LATTICES = {"hexagon": hexagonal_packing, "rings": rings}
 
 ARRAY = 0.475
 """Radius of an array of one of several bands, in units of the distance between the centres of two that are neighbours."""
+
+
+STAND_INS: dict[str, Any] = {"detectors": 1, "net": "0 K s(1/2)", "main_beam_efficiency": 1.0, "illumination_efficiency": 1.0}
+"""Of what an instrument must state, where bands or a table state it and are mistaken: only their mistakes are told."""
 
 
 class Telescope(Parameters):
@@ -140,6 +152,10 @@ class Instrument(Parameters):
             return camera.model_dump(mode="json") | {"telescope": camera.telescope, "band": camera.band}
         own = [band.model_dump(mode="json") if isinstance(band, CameraBand) else band for band in value["bands"]]
         stated = [key for key in PER_BAND if all(isinstance(band, dict) and band.get(key) is not None for band in own)]
+        try:
+            CameraBand.model_validate({"name": "first", "low": "1 Hz", "high": "2 Hz"} | {key: own[0][key] for key in stated})
+        except ValidationError:  # which the band's own validation tells, at its place
+            return {key: STAND_INS[key] for key in stated if key in STAND_INS} | value
         return {key: own[0][key] for key in stated} | value
 
     @model_validator(mode="after")
@@ -353,8 +369,7 @@ def _completed(given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
     try:
         table = read_array(find(given["focalplane"], info))
     except (ZondaError, PydanticCustomError):  # which the field's own validation tells, at its place
-        efficiencies = {"main_beam_efficiency": 1.0, "illumination_efficiency": 1.0}
-        return {"detectors": 1, "field_of_view": "0 deg", "net": "0 K s(1/2)"} | efficiencies | rest
+        return STAND_INS | {"field_of_view": "0 deg"} | rest
     found: dict[str, Any] = {"field_of_view": f"{2 * math.atan(table.reach)!r} rad"}
     if isinstance(several := given.get("bands"), list) and several:
         rest["bands"] = [_band_with(table, band, rest) for band in several]

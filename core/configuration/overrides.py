@@ -16,7 +16,7 @@ def apply(document: Document, text: str, keys: list[str]) -> list[Diagnostic]:
 
     ``key`` is a key of the file (``seed``, ``site.altitude``), one of ``keys``; or a parameter of a step
     (``PinkNoise.knee``), which goes by its operator's name or by its own; the second of two namesakes is
-    ``WhiteNoise.2.net``. The value is YAML.
+    ``WhiteNoise.2.net``. Entries of a list are counted from 0, as messages do: ``instrument.bands.0.net``. The value is YAML.
     """
     source = Source("--set", text)
     key, equals, value = text.partition("=")
@@ -53,18 +53,26 @@ def _header_path(document: Document, parts: list[str]) -> Path:
     if parts[0] == "instrument" and len(parts) > 1 and isinstance(here.get("instrument"), str):
         here["instrument"] = {LIKE: here["instrument"]}  # a variant of the one that is named
         document.marks[("instrument", LIKE)] = document.mark(("instrument",))
-    for depth, part in enumerate(parts[:-1], 1):
-        if part not in here and (depth == 1 or LIKE in here):
+    path: list[Any] = [*parts]
+    for depth, part in enumerate(path[:-1], 1):
+        where, within = ".".join(parts[:depth]), parts[depth]
+        if isinstance(here, dict) and part not in here and (depth == 1 or LIKE in here):
+            if within.isdecimal():
+                raise _Refused(f"the file has no '{where}'", "", f"set the whole list: {where}='[...]'")
             here[part] = {}
-            document.marks[tuple(parts[:depth])] = document.mark(tuple(parts[: depth - 1]))
-        here = here.get(part)
-        if not isinstance(here, dict):
-            where = ".".join(parts[:depth])
+            document.marks[tuple(path[:depth])] = document.mark(tuple(path[: depth - 1]))
+        here = here[path[depth - 1]] if isinstance(here, list) else here.get(part)
+        if isinstance(here, list):
+            if not (within.isdecimal() and int(within) < len(here)):
+                cure = f"write {' or '.join(f'{where}.{k}' for k in range(len(here)))}" if here else f"set '{where}' itself"
+                raise _Refused(f"'{where}' is a list of {len(here)}: its entries are counted from 0", "", cure)
+            path[depth] = int(within)
+        elif not isinstance(here, dict):
             cure = f"set '{where}' itself, or write it as a mapping in the file"
             if where == "site":
                 cure += ": resolved.yaml of a run has it written out, under x-resolved"
             raise _Refused(f"'{where}' is {'a name' if isinstance(here, str) else 'one value'}, not a mapping", "", cure)
-    return tuple(parts)
+    return tuple(path)
 
 
 def _step_path(document: Document, key: str, keys: list[str]) -> Path:

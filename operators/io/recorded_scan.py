@@ -209,7 +209,7 @@ def _band(tod: TimeOrderedData, columns: Mapping[str, Floats], given: Instrument
     if not 0 < width < 2 * centre:
         cure = "mend bandcenter and bandwidth, or leave them out and give the scene an instrument"
         raise InputError(f"states a band of {width / 1e9:g} GHz about {centre / 1e9:g} GHz", place=place, cure=cure)
-    low, high = centre - width / 2, centre + width / 2
+    low, high = (float(f"{edge:.12g}") for edge in (centre - width / 2, centre + width / 2))  # without the rounding of their sums
     own = str(tod.metadata.get("band", "")) if len(columns["band_centre"]) == tod.n_detectors else ""
     return Band(
         name=_plain(own) or f"f{int(round(centre / 1e9, 6) + 0.5):03d}",

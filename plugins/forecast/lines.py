@@ -10,7 +10,7 @@ from zonda.core.errors import InputError
 
 PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3}
 ALIASES = {"K": "K_RJ"}
-_DEPTH = re.compile(r"\s*(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>\S+)\s*")
+_DEPTH = re.compile(r"\s*(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\s\d.]\S*)?\s*")
 
 
 def read_depth(text: str, factors: Mapping[str, float]) -> float:
@@ -22,6 +22,8 @@ def read_depth(text: str, factors: Mapping[str, float]) -> float:
     match = _DEPTH.fullmatch(text)
     if match is None:
         raise InputError(f"cannot read '{text}' as a depth", place="--reach", cure=cure)
+    if match["unit"] is None:
+        raise InputError(f"{text.strip()} has no unit", place="--reach", cure=cure)
     units = {**ALIASES, **{unit: unit for unit in factors}}
     known = {prefix + name: (size, units[name]) for name in units for prefix, size in PREFIXES.items() if "MJy" not in name}
     known |= {"MJy/sr": (1.0, "MJy/sr"), "kJy/sr": (1e-3, "MJy/sr"), "Jy/sr": (1e-6, "MJy/sr")}

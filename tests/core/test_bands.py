@@ -1,5 +1,6 @@
 """Cameras of several bands: each band has the bits that it has alone, products and files bear its name."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,8 @@ import pytest
 from astropy.io import fits
 
 import zonda
+from zonda.core.configuration.diagnostics import ConfigurationError
+from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import ZondaError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.radiation import to_kelvin_rj
@@ -193,6 +196,57 @@ def two_bands(folder: Path, maps: str) -> Path:
     ]  # fmt: skip
     file.write_text("\n".join(lines))
     return file
+
+
+def written(net: str, passband: str) -> str:
+    """A pipeline file whose bands are written out."""
+    return "\n".join([
+        "site: llano_de_chajnantor", "time: 2022-08-01T23:00", "target: 260d -10d", "instrument:",
+        "  name: x", "  telescope: {name: d, diameter: 6 m}", "  detectors: 7", "  field_of_view: 20 arcmin",
+        "  main_beam_efficiency: 0.8", "  illumination_efficiency: 0.9", "  sample_rate: 50 Hz", "  bands:",
+        f"    - {{name: a, low: 80 GHz, high: 90 GHz, net: {net}}}",
+        f"    - {{name: b, {passband}, net: 1 mK s(1/2)}}",
+        "    - so_145ghz",
+        "operators: [PointingDaisy: {scan_duration: 20 s}, WhiteNoise, Efficiency, BinMap]",
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("net", "passband", "place", "words"),
+    [
+        ("300 uJy", "low: 100 GHz, high: 110 GHz", "t.yaml:13:53", "bands.0.net: expected a noise level"),
+        ("1 mK s(1/2)", "file: bad.txt", "t.yaml:14:23", "bands.1.file: passband file .*: contains NaN or infinity"),
+    ],
+)
+def test_a_mistake_of_a_band_is_told_once_at_its_place(tmp_path: Path, net: str, passband: str, place: str, words: str) -> None:
+    (tmp_path / "bad.txt").write_text("90 1\n100 nan\n110 0\n")
+    text = written(net, passband).replace("    - so_145ghz\n", "")
+    with pytest.raises(ConfigurationError) as caught:
+        parse(text, name="t.yaml", folder=tmp_path)
+    (found,) = caught.value.diagnostics
+    assert found.place == place
+    assert re.search(words, found.message)
+
+
+def test_entries_of_a_list_are_set_by_their_number() -> None:
+    text = written("1 mK s(1/2)", "low: 100 GHz, high: 110 GHz").replace("- so_145ghz", "- {name: so_145ghz, net: 1 mK s(1/2)}")
+    assert parse(text, overrides=["instrument.bands.1.net=3 mK s(1/2)"]).scene().instrument.cameras["b"].net == 3e-3
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("instrument.bands.0.net=3 mK", "bands.0.net: expected a noise level"),
+        ("instrument.bands.3.net=3 mK s(1/2)", "'instrument.bands' is a list of 3: its entries are counted from 0"),
+        ("instrument.bands.a.net=3 mK s(1/2)", "write instrument.bands.0 or instrument.bands.1 or instrument.bands.2"),
+        ("instrument.bands.2.net=3 mK s(1/2)", "'instrument.bands.2' is a name, not a mapping"),
+        ("weather.2.x=1", "the file has no 'weather'(.|\n)*set the whole list: weather='"),
+    ],
+)
+def test_settings_that_do_not_fit_a_list(setting: str, words: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse(written("1 mK s(1/2)", "low: 100 GHz, high: 110 GHz"), overrides=[setting])
+    assert any(re.search(words, found.render()) for found in caught.value.diagnostics)
 
 
 def test_the_plan_of_a_file_with_several_bands(tmp_path: Path) -> None:

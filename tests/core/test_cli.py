@@ -252,6 +252,7 @@ def test_schema(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "p.yaml", "--output", "p.yaml"], "p.yaml"),
         (["run", "p.yaml", "--memory", "4 apples"], "'4 apples' is not a size; write e.g. 4GB or 500MiB"),
         (["run", "p.yaml", "--memory", "1kB"], "memory budget"),
+        (["run", "p.yaml", "--memory", "1000"], "'1000' has no unit and would be bytes; write e.g. 1GB or 500MiB"),
         (["run", "p.yaml", "--threads", "0"], "0 is not in the range"),
         (["run"], "Missing argument"),
         (["rnu", "p.yaml"], "there is no command 'rnu'; did you mean 'run'?"),
@@ -361,7 +362,15 @@ def test_signals_that_are_ignored_or_handled_are_left_alone(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("text", "size"), [("4GB", 4_000_000_000), ("500MiB", 500 << 20), ("1.5 kB", 1500), ("7", 7), ("2gb", 2_000_000_000)]
+    ("text", "size"),
+    [
+        ("4GB", 4_000_000_000),
+        ("500MiB", 500 << 20),
+        ("1.5 kB", 1500),
+        ("4000000000", 4_000_000_000),
+        ("7 B", 7),
+        ("2gb", 2_000_000_000),
+    ],
 )
 def test_sizes(text: str, size: int) -> None:
     assert Bytes().convert(text, None, None) == size

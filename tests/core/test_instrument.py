@@ -71,7 +71,7 @@ def test_passband_from_a_file(tmp_path):
 def test_bad_passband_files(tmp_path, text, words):
     table = tmp_path / "band.txt"
     table.write_text(text)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(ZondaError, match=rf"(?s)Band, file: passband file .*{words}"):
         zonda.Band(name="mine", file=table)
 
 

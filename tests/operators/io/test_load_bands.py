@@ -91,6 +91,10 @@ def test_the_saved_night_gives_the_maps_of_both_bands(night: Any) -> None:
         np.testing.assert_allclose(one.signal, other.signal, rtol=0, atol=1e-8)  # filtered samples of millikelvins in float32
         assert np.nanstd(other.signal) > 1e-5
     camera = found.scene.instrument
+    assert {name: (c.band.low, c.band.high) for name, c in camera.cameras.items()} == {
+        "f090": (77e9, 106e9),
+        "f150": (130e9, 170e9),
+    }
     assert {name: (c.detectors, c.knee, c.fwhm) for name, c in camera.cameras.items()} == {
         name: (c.detectors, c.knee, pytest.approx(c.beam_fwhm)) for name, c in data.scene.instrument.cameras.items()
     }

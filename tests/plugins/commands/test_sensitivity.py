@@ -141,6 +141,7 @@ def test_in_python():
         ((*M2, "--time", "2"), "2 has no unit; write a time such as '3 h'"),
         (("mustang2_cluster", *SHORT, "--set", "CommonModeFilter.modes=3"), "the forecast does not cover modes: 3"),
         (("mustang2_cluster", *SHORT, "--reach", "10 apples"), "'apples' is no unit of a depth"),
+        (("mustang2_cluster", *SHORT, "--reach", "100"), "100 has no unit"),
         (("mustang2_cluster", *SHORT, "--reach", "deep"), "cannot read 'deep' as a depth"),
         (("mustang2_cluster", *SHORT, "--reach", "0 uK"), "no observation reaches"),
         (("mustang2_cluster", *SHORT, "--radius", "1 deg"), "is not on the map"),
