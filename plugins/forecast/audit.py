@@ -14,7 +14,6 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.pipeline import Pipeline
 from zonda.core.signal import product_name, stream_of
-from zonda.core.types import Floats
 from zonda.operators.maps.bin_map import BinMap
 
 from .covered import steps_of
@@ -89,11 +88,15 @@ class Audited:
 
 @dataclass(frozen=True)
 class Forecasted:
-    """What is beside the simulations: the depth of a map, the radius of its circle and its beam's FWHM, rad."""
+    """What is beside the simulations: the depths of a map's planes, the radius of its circle and its beam's FWHM, rad."""
 
-    depth: Depth
+    planes: Mapping[str, Depth]
     radius: float
     fwhm: float
+
+    def parts(self, plane: str) -> list[str]:
+        """The parts of the noise that are forecast of a plane, but for those that it has not."""
+        return [p for p in PARTS if self.planes[plane].variance[p][-1] > 0]
 
 
 def audit(file: PipelineFile, forecasts: Mapping[str, Forecasted], seeds: int, threads: int | None = None) -> dict[str, Audited]:
@@ -104,41 +107,44 @@ def audit(file: PipelineFile, forecasts: Mapping[str, Forecasted], seeds: int, t
     """
     if seeds < 2:
         raise InputError(f"{seeds} simulation has no standard error", place="--audit", cure="ask for 2 or more")
-    parts = {band: [p for p in PARTS if f.depth.variance[p][-1] > 0] for band, f in forecasts.items()}
-    made = [_maps(file, parts, file.scene().seed + k, threads) for k in range(seeds)]
-    return {
-        band: _audited(of, parts[band], np.array([[m.smoothed_rms(m.fwhm, of.radius) ** 2 for m in one[band]] for one in made]))
-        for band, of in forecasts.items()
-    }
+    every = list(dict.fromkeys(p for f in forecasts.values() for p in f.parts("I")))
+    made = [_maps(file, every, list(forecasts), file.scene().seed + k, threads) for k in range(seeds)]
+    return {band: _audited(of, [one[band] for one in made]) for band, of in forecasts.items()}
 
 
-def _audited(of: Forecasted, parts: list[str], found: Floats) -> Audited:
-    """``found``: (seeds, n_part + 1) squared rms [K^2] behind the beam in the circle: of each part, and of all noise."""
-    rows, seeds = [], len(found)
-    for name, squares in zip([*parts, TOGETHER], found.T, strict=True):
-        forecast = sum(float(of.depth.variance[p][-1]) for p in (parts if name == TOGETHER else [name]))
-        mean = math.sqrt(squares.mean())
-        own = float(squares.std(ddof=1)) / (2 * mean)
-        error = max(own, scatter(of.fwhm / FWHM_PER_SIGMA, of.radius) * mean) / math.sqrt(seeds)
-        rows.append(Row(name, math.sqrt(forecast), mean, error, seeds))
+def _audited(of: Forecasted, made: list[dict[str, MapProduct]]) -> Audited:
+    """``made``: of each seed the maps of each part of the noise, and of all of it."""
+    rows, seeds = [], len(made)
+    for plane, depth in of.planes.items():
+        parts = of.parts(plane)
+        together = [TOGETHER] if len(depth.known) == len(PARTS) else []
+        for name in parts + together:
+            forecast = sum(float(depth.variance[p][-1]) for p in (parts if name == TOGETHER else [name]))
+            maps = [one[name] if one[name].polarization is None else one[name].stokes(plane) for one in made]
+            squares = np.array([m.smoothed_rms(m.fwhm, of.radius) ** 2 for m in maps])
+            mean = math.sqrt(squares.mean())
+            own = float(squares.std(ddof=1)) / (2 * mean)
+            error = max(own, scatter(of.fwhm / FWHM_PER_SIGMA, of.radius) * mean) / math.sqrt(seeds)
+            rows.append(Row(name if plane == "I" else f"{plane} {name}", math.sqrt(forecast), mean, error, seeds))
     return Audited(tuple(rows))
 
 
-def _maps(file: PipelineFile, parts: Mapping[str, Sequence[str]], seed: int, threads: int | None) -> dict[str, list[MapProduct]]:
+def _maps(
+    file: PipelineFile, parts: Sequence[str], bands: Sequence[str], seed: int, threads: int | None
+) -> dict[str, dict[str, MapProduct]]:
     """By band the maps of each part, and of all noise."""
     operators = [
         o.model_copy(update={"smooth": None, "half_difference": False}) if isinstance(o, BinMap) else o
         for o in steps_of(file).operators
     ]
-    every = dict.fromkeys(p for own in parts.values() for p in own)
-    runs = {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in every} if len(every) > 1 else {}
+    runs = {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in parts} if len(parts) > 1 else {}
     pipeline = Pipeline(operators, runs=runs, name=file.header.name, precision=file.header.precision)
     scene = file.scene().model_copy(update={"seed": seed})
     products = pipeline.run(scene, threads=threads).products
     name = next(o.product for o in operators if isinstance(o, BinMap))
     found = {}
-    for band, own in parts.items():
+    for band in bands:
         plain = f"{name}_{band}" if band else name
-        of_parts = [products[product_name(stream_of(f"only_{COMPONENTS[p]}"), plain)] if runs else products[plain] for p in own]
-        found[band] = [*of_parts, products[plain]]
+        found[band] = {p: products[product_name(stream_of(f"only_{COMPONENTS[p]}"), plain) if runs else plain] for p in parts}
+        found[band][TOGETHER] = products[plain]
     return found

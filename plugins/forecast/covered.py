@@ -17,6 +17,7 @@ from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.pink import PinkNoise
 from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
+from zonda.operators.optics.half_wave_plate import HalfWavePlate
 from zonda.operators.sky.skymap import SkyMap
 
 if TYPE_CHECKING:
@@ -32,7 +33,9 @@ COVERED: dict[type[Operator], frozenset[str] | None] = {
     CommonModeFilter: frozenset({"method", "residual", "gap", "on_undetermined"}),
     BinMap: frozenset({
         "pixel", "width", "height", "centre", "projection", "frame", "weights", "noise", "half_difference", "smooth", "product",
+        "stokes", "condition_limit",
     }),
+    HalfWavePlate: None,
     SkyMap: None,
 }  # fmt: skip
 """Parameters that may have any value; the others must have their defaults. None: all may."""
@@ -95,7 +98,7 @@ def steps_of(file: PipelineFile) -> Steps:
 
 
 def _only_writes(operator: Operator) -> bool:
-    return not operator.provides
+    return not operator.provides and type(operator) is not HalfWavePlate
 
 
 def _check(operator: Operator, name: str) -> None:

@@ -13,7 +13,7 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.types import Floats
 
-from . import atmosphere_noise, detector_noise
+from . import atmosphere_noise, detector_noise, stokes_noise
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
@@ -49,9 +49,9 @@ class Depth:
     Attributes
     ----------
     seconds
-        (n_scan,) integration time after each scan.
+        (n_scan,) integration time after each scan, from the first on after which a pixel of the circle has a value.
     variance
-        By part (`PARTS`), (n_scan,) K^2.
+        By part (`PARTS`), (n_scan,) K^2; NaN of a part that is not forecast.
     error
         By part, relative error of its rms that is stated.
     """
@@ -59,6 +59,11 @@ class Depth:
     seconds: Floats
     variance: Mapping[str, Floats]
     error: Mapping[str, float]
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """The parts that are forecast."""
+        return tuple(name for name in PARTS if not np.isnan(self.variance[name][-1]))
 
     def part(self, name: str, seconds: Floats | float) -> Floats:
         """The rms of a part of the noise, K_RJ, after ``seconds``: as forecast up to the end of the scans, then as time^-1/2;
@@ -69,12 +74,12 @@ class Depth:
         return np.asarray(np.sqrt(variance / wanted))
 
     def total(self, seconds: Floats | float) -> Floats:
-        """All parts in quadrature, K_RJ."""
-        return np.asarray(np.sqrt(sum(self.part(name, seconds) ** 2 for name in PARTS)))
+        """All parts that are forecast in quadrature, K_RJ."""
+        return np.asarray(np.sqrt(sum(self.part(name, seconds) ** 2 for name in self.known)))
 
     def total_error(self, seconds: float) -> float:
         """Relative error of `total`, the parts' errors in quadrature."""
-        parts = [float(self.part(name, seconds)) ** 2 * self.error[name] for name in PARTS]
+        parts = [float(self.part(name, seconds)) ** 2 * self.error[name] for name in self.known]
         return math.hypot(*parts) / max(float(self.total(seconds)) ** 2, 1e-300)
 
     def reach(self, rms: float) -> float:
@@ -94,19 +99,35 @@ class Depth:
         return float(fine[np.argmax(self.total(fine) <= rms)])
 
 
-def depth_of(survey: Survey, radius: float) -> Depth:
-    """Forecast the noise after smoothing with the beam, averaged over a circle of ``radius`` [rad] about the map's centre.
+def depths_of(survey: Survey, radius: float) -> dict[str, Depth]:
+    """Forecast the noise after smoothing with the beam, averaged over a circle of ``radius`` [rad] about the map's centre: by the
+    plane of the map, ``I`` alone or ``I``, ``Q`` and ``U``.
+
+    The atmosphere is not polarized. Where detectors cancel it (`Survey.cancels`) Q and U have none of it; else what of it is in
+    I, Q and U is not forecast.
 
     Raises PipelineError where the circle is not on the map, or not observed.
     """
     survey.check_radius(radius)
-    variance = detector_noise.variances(survey, radius)
-    if not np.isfinite(variance["white"]).all():
-        raise InputError("nothing is observed in the circle", place="zonda sensitivity", cure="choose a larger --radius")
+    variances = stokes_noise.variances(survey, radius) if survey.polarized else {"I": detector_noise.variances(survey, radius)}
+    known = np.all([np.isfinite(each["white"] + each["1/f"]) for each in variances.values()], axis=0)
+    if not known[-1]:
+        text, cure = "nothing is observed in the circle", "choose a larger --radius"
+        if survey.polarized:
+            text, cure = "the samples in the circle determine I, Q and U in no pixel", f"{cure}, or larger pixels"
+        raise InputError(text, place="zonda sensitivity", cure=cure)
     left = atmosphere_noise.variance(survey, radius)
     # an error of a variance is half as large of its root
     error = WITHIN | {"atmosphere": math.hypot(WITHIN["atmosphere"], left.error / 2)}
-    return Depth(survey.seconds, variance | {"atmosphere": left.variance}, error)
+    atmosphere = {"I": left.variance, "Q": np.zeros_like(left.variance), "U": np.zeros_like(left.variance)}
+    if survey.polarized and left.variance.any() and not survey.cancels:
+        atmosphere = dict.fromkeys(atmosphere, np.full_like(left.variance, np.nan))
+    after = slice(int(known.argmax()), None)
+    parts = {plane: each | {"atmosphere": atmosphere[plane]} for plane, each in variances.items()}
+    return {
+        plane: Depth(survey.seconds[after], {part: values[after] for part, values in each.items()}, error)
+        for plane, each in parts.items()
+    }
 
 
 def scatter(sigma: float, radius: float) -> float:

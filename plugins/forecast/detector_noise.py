@@ -11,22 +11,29 @@ mode takes. With W_d(f) the spectrum of the series (1 - P) w_d, and R(f) the pow
     variance = (1 - 1 / n_det) (1 - shared) sum_i sigma_i^2 w_i^2  <sum_df sigma^2 |W_d|^2 R> / <sum_dt sigma^2 w_d^2>     (2)
 
 R = 1 of white noise. What detectors share is gone behind the common mode. The factor <> / <> needs few detectors, which stand for
-all; w and the sum before it need all of them (few would bias it). The variance is averaged over probes in a circle about the
-map's centre, weighted like the samples of the map; in the factor all probes of a comb are in one series, with random signs.
+all; w and the sum before it need all of them (few would bias it). Where the few are all, the common mode is taken from their
+series, and 1 - 1 / n_det is left out. The variance is averaged over probes in a circle about the map's centre, weighted like the
+samples of the map; in the factor all probes of a comb are in one series, with random signs. Maps of I, Q and U: `stokes_noise`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
 from zonda.core.types import AnyFloats, Floats
 
 from .beams import Comb, combs, kernel_series, kernel_sums
-from .survey import Noise, Survey
+from .survey import Noise, Survey, Track
 
 PROBES, DETECTORS = 16, 24
 """Number of probes in the circle, and of the detectors whose series represent all."""
+ALL = 64
+"""Detectors up to which the series of all are made, and what they have in common is taken from them."""
 SIGNS = 16
 """How often the signs are drawn, all combs together: probes that a detector passes one after the other have noise in common."""
 SAMPLES, INSTANTS = 3e7, 4000
@@ -36,6 +43,9 @@ STEEP = 8
 """Lowest frequencies whose bins are integrated over."""
 FILTERED = 12
 """Scans whose series are filtered: evenly chosen of all."""
+
+Series = Callable[[Track, NDArray[np.intp]], AnyFloats]
+"""(n_det, n_instant) w of detectors (numbers) along a track."""
 
 
 def variances(survey: Survey, radius: float) -> dict[str, Floats]:
@@ -48,14 +58,11 @@ def variances(survey: Survey, radius: float) -> dict[str, Floats]:
     seen = total[-1] > 0
     if not seen.any():
         return {name: np.full(len(total), np.nan) for name in found}
-    filtered = _Filtered(survey, chosen, total[-1])
+    filtered = Filtered(survey, _signed(survey, chosen, total[-1]), survey.rate)
     for k, noise in enumerate(survey.levels[0]):
         sigma2 = np.array([each[k].sample ** 2 for each in survey.levels])
         squares = np.cumsum(sums[..., 1] * (survey.weights**2 * sigma2)[:, None], axis=0)
-        unfiltered = _averaged(squares, total, some)
-        left = 1 - 1 / len(survey.focalplane) if survey.common else 1.0
-        own = 1 - noise.shared if survey.common else 1.0
-        found["white" if noise.spectrum is None else "1/f"] += left * own * filtered.share(k) * unfiltered
+        found[noise.part] += filtered.share(k) * _averaged(squares, total, some)
     return found
 
 
@@ -84,36 +91,62 @@ def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
     return np.array(rows) * (len(survey.offsets) / fewer), fewer < len(survey.offsets)
 
 
-class _Filtered:
-    """What the filters leave of each noise, <> / <> of equation (2)."""
+def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
+    """Series of the kernels of all probes of a comb with random signs, for the factor of equation (2). ``total``: sum a K."""
+    rng = np.random.default_rng(2)
+    begin = 0
+    draws: list[Series] = []
+    for comb in chosen:
+        there = total[begin : begin + int(comb.inside.sum())]
+        begin += len(there)
+        for _ in range(max(1, SIGNS // len(chosen))):
+            factors, signs = np.zeros(comb.inside.shape), rng.choice([-1.0, 1.0], len(there))
+            factors[comb.inside] = np.where(there > 0, signs / np.sqrt(np.where(there > 0, there, 1.0)), 0.0)
+            draws.append(partial(_kernels, survey, comb, factors))
+    return draws
 
-    def __init__(self, survey: Survey, chosen: list[Comb], total: Floats) -> None:
+
+def _kernels(survey: Survey, comb: Comb, factors: Floats, track: Track, few: NDArray[np.intp]) -> AnyFloats:
+    return kernel_series(survey, track, comb, factors, survey.offsets[few])
+
+
+class Filtered:
+    """What the filters leave of each noise, <> / <> of equation (2), and of what is before it.
+
+    Parameters
+    ----------
+    draws
+        Each makes the series w of some detectors along a track.
+    rate
+        Instants per second that they need, Hz.
+    """
+
+    def __init__(self, survey: Survey, draws: Sequence[Series], rate: float) -> None:
         number = len(survey.levels[0])
+        self._survey = survey
         self._left, self._all = np.zeros(number), np.zeros(number)
-        rng = np.random.default_rng(2)
-        every = survey.offsets
-        few = every[np.sort(np.random.default_rng(1).permutation(len(every))[:DETECTORS])]
+        self._every = len(survey.offsets) <= ALL
+        few = np.arange(len(survey.offsets))
+        if not self._every:
+            few = np.sort(np.random.default_rng(1).permutation(few)[:DETECTORS])
         scans = sorted({round(k) for k in np.linspace(0, len(survey.observations) - 1, FILTERED)})
-        begin = 0
-        for comb in chosen:
-            factors = np.zeros(comb.inside.shape)
-            stop = begin + int(comb.inside.sum())
-            there = total[begin:stop]
-            for _ in range(max(1, SIGNS // len(chosen))):
-                signs = rng.choice([-1.0, 1.0], len(there))
-                factors[comb.inside] = np.where(there > 0, signs / np.sqrt(np.where(there > 0, there, 1.0)), 0.0)
-                for scan in scans:
-                    self._add(survey, scan, kernel_series(survey, survey.track(scan, survey.rate), comb, factors, few))
-            begin = stop
+        for scan in scans:
+            track = survey.track(scan, rate)
+            for series in draws:
+                self._add(scan, track, series(track, few))
 
-    def _add(self, survey: Survey, scan: int, rows: AnyFloats) -> None:
-        track = survey.track(scan, survey.rate)
-        rows = rows[rows.any(axis=1)]
-        if not len(rows):
+    def _add(self, scan: int, track: Track, rows: AnyFloats) -> None:
+        survey = self._survey
+        common = survey.common and self._every
+        if not common:
+            rows = rows[rows.any(axis=1)]
+        if not rows.any():
             return
         weight = survey.weights[scan] ** 2 * track.step
         before = weight * float(np.einsum("dt,dt->", rows, rows, dtype=np.float64))
         survey.filter(track, rows)
+        if common:
+            rows -= rows.mean(axis=0)
         frequency, energy = _power(rows, track.rate)
         for k, noise in enumerate(survey.levels[scan]):
             self._left[k] += weight * noise.sample**2 * float(energy @ _spectrum(noise, frequency))
@@ -121,7 +154,13 @@ class _Filtered:
 
     def share(self, noise: int) -> float:
         """Of one of the noises."""
-        return float(self._left[noise] / self._all[noise]) if self._all[noise] > 0 else 0.0
+        if not self._all[noise] > 0:
+            return 0.0
+        found = float(self._left[noise] / self._all[noise])
+        if self._survey.common:
+            found *= 1 - self._survey.levels[0][noise].shared
+            found *= 1.0 if self._every else 1 - 1 / len(self._survey.offsets)
+        return found
 
 
 def _spectrum(noise: Noise, frequency: Floats) -> Floats:

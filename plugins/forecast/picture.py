@@ -32,7 +32,7 @@ def figure(found: Forecast) -> Any:
     hours = t / 3600
     for part in PARTS:
         values = found.depth.part(part, t) * factor
-        if not values.any():
+        if part not in found.depth.known or not values.any():
             continue
         error, colour = found.depth.error[part], PART_COLOURS[part]
         ax.fill_between(hours, values * (1 - error), values * (1 + error), color=colour, alpha=0.2, lw=0)
@@ -41,6 +41,10 @@ def figure(found: Forecast) -> Any:
     inside = t <= end * (1 + 1e-9)
     ax.plot(hours[inside], total[inside], color="black", lw=2, label="together")
     ax.plot(hours[~inside], total[~inside], color="black", lw=2, ls="--", label="together, as time$^{-1/2}$")
+    for plane, depth in found.polarization.items():
+        ax.plot(
+            hours, depth.total(t) * factor, color="black", lw=1.2, ls="-." if plane == "Q" else ":", label=f"{plane}, together"
+        )
     if found.audit is not None:
         row = found.audit.together
         ax.errorbar(end / 3600, row.mean * factor, row.error * factor, fmt="o", color="#D55E00", label=f"{row.seeds} simulations")

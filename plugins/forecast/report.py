@@ -14,7 +14,7 @@ from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, check_output_folder, write_text
 
 from . import default_pipeline
-from .depth import PARTS, UNITS, WITHIN, scatter
+from .depth import PARTS, UNITS, WITHIN, Depth, scatter
 from .lines import duration, in_unit, number, prefixed
 from .survey import Survey, elevations
 
@@ -28,7 +28,8 @@ TITLES = {"Jy": "point source"}
 
 def text(found: Forecast) -> str:
     """The table and what it stands for."""
-    parts = [_header(found), _table(found), _errors(found)]
+    tables = [([plane] if found.polarization else []) + _table(found, depth) for plane, depth in found.planes.items()]
+    parts = [_header(found), *tables, _errors(found)]
     if found.calculated is not None:
         parts.append(_calculated(found))
     if found.audit is not None:
@@ -65,17 +66,17 @@ def _filters(survey: Survey) -> list[str]:
     return [*found, "common mode"] if survey.common else found
 
 
-def _table(found: Forecast) -> list[str]:
-    here = found.depth.total(found.seconds)
+def _table(found: Forecast, depth: Depth) -> list[str]:
+    here = depth.total(found.seconds)
     scale = {unit: prefixed(float(here) * found.factors[unit], unit) for unit in UNITS}
     kelvin, name = scale["K_RJ"]
     head = ["time", name, *PARTS, *(TITLES.get(u, "") + (" " if u in TITLES else "") + scale[u][1] for u in UNITS[1:])]
     rows = [head]
     for t in found.times.tolist():
-        total = float(found.depth.total(t))
-        each = [number(float(found.depth.part(p, t)) * kelvin) for p in PARTS]
+        total = float(depth.total(t))
+        each = [number(float(depth.part(p, t)) * kelvin) if p in depth.known else "-" for p in PARTS]
         others = [number(total * found.factors[u] * scale[u][0]) for u in UNITS[1:]]
-        mark = "" if found.depth.seconds[0] * (1 - 1e-9) <= t <= found.depth.seconds[-1] * (1 + 1e-9) else " *"
+        mark = "" if depth.seconds[0] * (1 - 1e-9) <= t <= depth.seconds[-1] * (1 + 1e-9) else " *"
         rows.append([duration(t) + mark, number(total * kelvin), *each, *others])
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
     return ["  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
@@ -85,6 +86,9 @@ def _errors(found: Forecast) -> list[str]:
     error = found.depth.error
     each = [f"{p} {100 * error[p]:.0f} %" for p in PARTS if found.depth.variance[p][-1] > 0]
     lines = [f"stated errors of the rms: {', '.join(each)}; together {100 * found.depth.total_error(found.seconds):.0f} %"]
+    if found.depth.known != PARTS:
+        what = "the detectors at one place do not keep it out of Q and U"
+        lines.append(f"-: what is left of the atmosphere is not forecast, and comes on top: {what}")
     if found.depth.variance["atmosphere"][-1] > 0:
         lines.append("the atmosphere is indicative: one state of the weather, and pwv_rms is an assumption of the pipeline")
     lines.append(
@@ -113,14 +117,19 @@ def made(asked: Mapping[str, Any], settings: Sequence[str]) -> str:
 
 
 def reached(found: Forecast, wanted: str, seconds: float) -> str:
-    """The integration time that reaches a depth, and the kinds of noise that make it up."""
-    parts = ", ".join(f"{p} {in_unit(float(found.depth.part(p, seconds)), 'K_RJ')}" for p in PARTS)
-    low, high = ((1 + sign * found.depth.total_error(seconds)) ** 2 * seconds for sign in (-1, 1))
-    lines = [
-        (f"band {found.band}: " if found.band else "")
-        + f"{wanted} after {duration(seconds)} of integration, {low / 3600:.3g} to {high / 3600:.3g} h by the stated errors",
-        f"  {parts}",
-    ]
+    """The integration time that reaches a depth, of a map of I, Q and U in each, and the kinds of noise that make it up;
+    ``seconds``: that of I."""
+    lines = []
+    for plane, depth in found.planes.items():
+        seconds = seconds if plane == "I" else found.reach(wanted, plane)
+        parts = ", ".join(f"{p} {in_unit(float(depth.part(p, seconds)), 'K_RJ')}" for p in depth.known)
+        low, high = ((1 + sign * depth.total_error(seconds)) ** 2 * seconds for sign in (-1, 1))
+        lines += [
+            (f"band {found.band}: " if found.band else "")
+            + (f"{plane}: " if found.polarization else "")
+            + f"{wanted} after {duration(seconds)} of integration, {low / 3600:.3g} to {high / 3600:.3g} h by the stated errors",
+            f"  {parts}",
+        ]
     end = float(found.depth.seconds[-1])
     if seconds > end:
         text = f"  white and 1/f noise fall as time^-1/2; the atmosphere is forecast for the first {duration(end)}"
@@ -137,16 +146,6 @@ def as_dict(found: Forecast) -> dict[str, Any]:
     """See `Sensitivity.as_dict`."""
     survey, c = found.survey, found.calculated
     low, high = elevations(survey)
-    rows = [
-        {
-            "seconds": t,
-            "followed": bool(found.depth.seconds[0] * (1 - 1e-9) <= t <= found.depth.seconds[-1] * (1 + 1e-9)),
-            "depth": {u: float(found.depth.total(t)) * found.factors[u] for u in UNITS},
-            "K_RJ": {p: float(found.depth.part(p, t)) for p in PARTS},
-            "relative_error": found.depth.total_error(t),
-        }
-        for t in found.times.tolist()
-    ]
     return {
         "pipeline": found.file.header.name,
         "instrument": survey.scene.instrument.name,
@@ -163,12 +162,27 @@ def as_dict(found: Forecast) -> dict[str, Any]:
         "relative_error": dict(found.depth.error),
         "audited_within": WITHIN,
         "scatter_of_one_map": scatter(found.survey.sigma, found.radius),
-        "table": rows,
+        "table": _rows(found, found.depth),
+        **({"stokes": {p: _rows(found, d) for p, d in found.polarization.items()}} if found.polarization else {}),
         "calculator": None
         if c is None
         else {"Jy_at_centre": c.centre, "Jy_over_band": c.band, "seconds": c.seconds, "pwv_m": c.pwv},
         "audit": None if found.audit is None else found.audit.as_dict(),
     }
+
+
+def _rows(found: Forecast, depth: Depth) -> list[dict[str, Any]]:
+    """Of a plane's table, for JSON; null: not forecast."""
+    return [
+        {
+            "seconds": t,
+            "followed": bool(depth.seconds[0] * (1 - 1e-9) <= t <= depth.seconds[-1] * (1 + 1e-9)),
+            "depth": {u: float(depth.total(t)) * found.factors[u] for u in UNITS},
+            "K_RJ": {p: float(depth.part(p, t)) if p in depth.known else None for p in PARTS},
+            "relative_error": depth.total_error(t),
+        }
+        for t in found.times.tolist()
+    ]
 
 
 def write(found: Forecast, folder: Path) -> list[Path]:
@@ -190,15 +204,16 @@ def write_depth(found: Forecast, folder: Path) -> list[Path]:
     stem = f"sensitivity_{found.band}" if found.band else "sensitivity"
     seconds = found.times
     columns = [Column("time", seconds, "s", "integration time")]
-    for unit in UNITS:
-        what = "flux density of a point source" if unit == "Jy" else "rms behind the beam"
-        name = "depth_" + unit.replace("/", "_per_")
-        fits = "K" if unit.startswith("K_") else unit
-        columns.append(Column(name, found.depth.total(seconds) * found.factors[unit], fits, f"{what}, {unit}, all noise"))
-    for part in PARTS:
-        columns.append(
-            Column(part.replace("1/f", "one_over_f"), found.depth.part(part, seconds), "K", f"rms of the {part} noise, K_RJ")
-        )
+    for plane, depth in found.planes.items():
+        before, of = ("", "") if plane == "I" else (f"{plane}_", f" of {plane}")
+        for unit in UNITS:
+            what = "flux density of a point source" if unit == "Jy" else "rms behind the beam"
+            name = f"{before}depth_" + unit.replace("/", "_per_")
+            fits = "K" if unit.startswith("K_") else unit
+            columns.append(Column(name, depth.total(seconds) * found.factors[unit], fits, f"{what}, {unit}, all noise{of}"))
+        for part in depth.known:
+            name = before + part.replace("1/f", "one_over_f")
+            columns.append(Column(name, depth.part(part, seconds), "K", f"rms of the {part} noise{of}, K_RJ"))
     meta = {
         "PIPELINE": found.file.header.name,
         "INSTRUMENT": found.survey.scene.instrument.name,

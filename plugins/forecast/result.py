@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from zonda.core.errors import InputError
@@ -28,7 +28,7 @@ class Forecast:
     file, survey
         The pipeline, and its scans.
     depth
-        White noise, 1/f noise and atmosphere behind the beam, K_RJ.
+        White noise, 1/f noise and atmosphere behind the beam, K_RJ; of I where the map is one of I, Q and U.
     radius
         Of the circle that they are averaged over, rad.
     seconds
@@ -41,6 +41,8 @@ class Forecast:
         Simulated depths, see `Sensitivity.audited`; None: nothing was simulated.
     band
         Name of the band, where the camera has several.
+    polarization
+        The depths of Q and of U by these names, where the map is one of I, Q and U.
     """
 
     file: PipelineFile
@@ -52,6 +54,12 @@ class Forecast:
     calculated: Calculated | None
     audit: Audited | None = None
     band: str = ""
+    polarization: Mapping[str, Depth] = field(default_factory=dict)
+
+    @property
+    def planes(self) -> dict[str, Depth]:
+        """The depths of all planes of the map: of I, or of I, Q and U."""
+        return {"I": self.depth, **self.polarization}
 
     @property
     def camera(self) -> str:
@@ -59,10 +67,11 @@ class Forecast:
         name = self.survey.scene.instrument.name
         return f"{name}, band {self.band}" if self.band else name
 
-    def rms(self, seconds: float | None = None, unit: str = "K_RJ", part: str = "") -> float:
-        """The depth after an integration time [s] in a unit (`depth.UNITS`): of a part (`depth.PARTS`), or of all.
+    def rms(self, seconds: float | None = None, unit: str = "K_RJ", part: str = "", stokes: str = "I") -> float:
+        """The depth after an integration time [s] in a unit (`depth.UNITS`): of a part (`depth.PARTS`), or of all; ``stokes``: of
+        which plane of the map. NaN of a part that is not forecast, and of all without it.
 
-        Raises InputError for an unknown unit or part, and a time that is not positive.
+        Raises InputError for an unknown unit, part or plane, and a time that is not positive.
         """
         wanted = self.seconds if seconds is None else seconds
         if unit not in self.factors or part not in ("", *PARTS):
@@ -70,16 +79,24 @@ class Forecast:
             raise InputError(f"no depth in {unit!r} of {part!r}", place="sensitivity", cure=cure)
         if not wanted > 0:
             raise InputError(f"a time of {wanted:g} s is not positive", place="sensitivity")
-        found = self.depth.part(part, wanted) if part else self.depth.total(wanted)
+        depth = self._plane(stokes)
+        found = depth.part(part, wanted) if part else depth.total(wanted)
         return float(found) * self.factors[unit]
 
-    def reach(self, rms: str | float) -> float:
+    def reach(self, rms: str | float, stokes: str = "I") -> float:
         """Integration time [s] after which the map is as deep as ``rms``: text with a unit of `depth.UNITS` (``10 uK``, which is
-        K_RJ; ``10 uK_CMB``, ``0.1 mJy/beam``), or K_RJ. Beyond the scans of the pipeline all parts fall as time^-1/2.
+        K_RJ; ``10 uK_CMB``, ``0.1 mJy/beam``), or K_RJ. Beyond the scans of the pipeline all parts fall as time^-1/2. ``stokes``:
+        which plane of the map.
 
         Raises InputError for what cannot be read or reached.
         """
-        return self.depth.reach(lines.read_depth(rms, self.factors) if isinstance(rms, str) else rms)
+        return self._plane(stokes).reach(lines.read_depth(rms, self.factors) if isinstance(rms, str) else rms)
+
+    def _plane(self, stokes: str) -> Depth:
+        if stokes not in self.planes:
+            cure = f"choose from: {', '.join(self.planes)}; BinMap: {{stokes: IQU}} makes Q and U"
+            raise InputError(f"the map has no {stokes!r}", place="sensitivity", cure=cure)
+        return self.planes[stokes]
 
     @property
     def times(self) -> Any:

@@ -14,7 +14,7 @@ from zonda.core.numerics.angles import ARCMIN
 from zonda.core.registry import instruments
 
 from . import calculator, default_pipeline, lines
-from .depth import depth_of, factors
+from .depth import depths_of, factors
 from .result import Forecast
 from .survey import survey_of
 
@@ -144,18 +144,19 @@ def _forecast(file: PipelineFile, radius: str | float | None, asked: Mapping[str
         size = default_pipeline.positive("--radius", Unit("rad"), radius, size)
     elif radius is not None:
         size = float(radius)
-    depth = depth_of(survey, size)
+    planes = depths_of(survey, size)
+    depth = planes.pop("I")
     seconds = default_pipeline.positive("--time", Unit("s", "3 h"), asked.get("time"), float(depth.seconds[-1]))
     instrument = survey.scene.instrument
     units = factors(instrument.band, survey.fwhm)
-    return Sensitivity(file, survey, depth, size, seconds, units, calculator.of_survey(survey, seconds), band=band)
+    return Sensitivity(file, survey, depth, size, seconds, units, calculator.of_survey(survey, seconds), None, band, planes)
 
 
 def _audited(found: Mapping[str, Sensitivity], file: PipelineFile, seeds: int, threads: int | None) -> dict[str, Sensitivity]:
     """The forecasts, by band, with what simulations find."""
     from .audit import Forecasted, audit
 
-    forecasts = {band: Forecasted(one.depth, one.radius, one.survey.fwhm) for band, one in found.items()}
+    forecasts = {band: Forecasted(one.planes, one.radius, one.survey.fwhm) for band, one in found.items()}
     audits = audit(file, forecasts, seeds, threads)
     return {band: replace(one, audit=audits[band]) for band, one in found.items()}
 

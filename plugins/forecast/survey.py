@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -17,18 +17,21 @@ from scipy.fft import dct, idct
 from zonda.core.errors import PipelineError
 from zonda.core.focalplane import Focalplane
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
-from zonda.core.numerics.projection import boresights, homographies
+from zonda.core.numerics.projection import boresights, frame_rotation, homographies
 from zonda.core.observation import Observation
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.look import observed
+from zonda.core.polarization import PolarizationAngles
 from zonda.core.run.signals import note_signals
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.maps.grid import TangentGrid, tangent_wcs
+from zonda.operators.maps.stokes_map import check_polarized
 from zonda.operators.noise.pink import PinkNoise, PinkSpectrum, level_of
 from zonda.operators.noise.planning import calibrated as calibrated_level
 from zonda.operators.noise.white import WhiteNoise
+from zonda.operators.optics.half_wave_plate import HalfWavePlate
 
 from .covered import Steps, steps_of
 
@@ -48,6 +51,9 @@ UNEVEN = 0.05
 FLAGGED = 0.01
 """Largest share of flagged samples that is taken as none."""
 
+CANCELLED = 1e-9
+"""Largest sum of exp(2 i gamma) of detectors that is taken as none."""
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -66,6 +72,11 @@ class Noise:
     sample: float
     spectrum: Callable[[Floats], Floats] | None = None
     shared: float = 0.0
+
+    @property
+    def part(self) -> str:
+        """Which part of the map's noise it makes."""
+        return "white" if self.spectrum is None else "1/f"
 
 
 @dataclass(frozen=True)
@@ -160,6 +171,29 @@ class Survey:
         return self.steps.common is not None and len(self.focalplane) > 1
 
     @property
+    def polarized(self) -> bool:
+        """Whether the map is one of I, Q and U."""
+        return self.steps.binning.stokes == "IQU"
+
+    @cached_property
+    def modulation(self) -> float:
+        """Frequency at which a half-wave plate modulates polarization, Hz; 0: there is none that turns."""
+        plates: list[HalfWavePlate] = self.steps.of(HalfWavePlate)
+        return 4 * abs(plates[-1].frequency) if plates else 0.0
+
+    @property
+    def cancels(self) -> bool:
+        """Whether what is not polarized and the same for detectors that look at one place, such as the atmosphere, is in I alone:
+        alike detectors there have angles of which cos 2 psi and sin 2 psi add up to zero."""
+        plane, good = self.focalplane, self.observations[0].good_detectors
+        seen = np.stack([plane.xi, plane.eta, plane.fwhm, plane.main_beam_efficiency, plane.illumination_efficiency], axis=1)
+        places, which = np.unique(seen[good], axis=0, return_inverse=True)
+        angles = (plane.polarization_efficiency * np.exp(2j * plane.polarization_angle))[good]
+        sums = np.zeros(len(places), complex)
+        np.add.at(sums, which.ravel(), angles)
+        return bool((abs(sums) < CANCELLED).all())
+
+    @property
     def atmosphere(self) -> AtmosphereLayers | None:
         """The step that makes the atmosphere."""
         found: list[AtmosphereLayers] = self.steps.of(AtmosphereLayers)
@@ -192,7 +226,7 @@ class Survey:
         step = min(max(1, int(o.sample_rate / rate)), max(1, o.n_samples // 16))
         if (scan, step) not in self._tracks:
             index = np.arange(step // 2, o.n_samples // step * step, step)
-            grid = self._grid
+            grid = self.grid
             plane = tangent_wcs(grid.origin, 1.0, (1, 1), grid.frame)
             matrices = np.ascontiguousarray(homographies(o.boresight_radec[index], plane))
             self._tracks[scan, step] = Track(o, index, step, o.sample_rate / step, matrices)
@@ -215,7 +249,8 @@ class Survey:
         rows -= low.astype(rows.dtype)
 
     @property
-    def _grid(self) -> TangentGrid:
+    def grid(self) -> TangentGrid:
+        """The map's pixels. Raises PipelineError where it is not a TAN map."""
         grid = self.steps.binning.grid
         if not isinstance(grid, TangentGrid):
             text, cure = "the forecast is made for TAN maps", "leave nside and projection of BinMap out"
@@ -224,7 +259,7 @@ class Survey:
 
     def check_radius(self, radius: float) -> None:
         """Raise PipelineError where a circle [rad] about the map's centre is not on the map."""
-        grid = self._grid
+        grid = self.grid
         half = min(grid.shape) * grid.pixel / 2
         if radius > half:
             wide, reach = (math.degrees(angle) * 60 for angle in (radius, half))
@@ -244,6 +279,8 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
     steps = Steps.among(pipeline.operators)  # copies, which know the scans
     data = observed(pipeline.operators, file.scene(), band)
     observations = data.observations
+    if observations:
+        check_polarized(steps.binning, observations[0])
     note_signals(observations, pipeline.signals.components, pipeline.signals.formed)
     chosen_scans = sorted({round(k) for k in np.linspace(0, len(observations) - 1, min(CONFIGURED, len(observations)))})
     for k in chosen_scans:
@@ -258,6 +295,15 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
         nets = np.array([_rms(observations[k].expected_net()) for k in nearest])
         weights = np.where(nets > 0, (nets[0] / np.where(nets > 0, nets, 1.0)) ** 2, 1.0)
     return Survey(data.scene, steps, observations, [levels[k] for k in nearest], weights, nearest)
+
+
+def polarization_angles(survey: Survey, observation: Observation, index: Any) -> PolarizationAngles:
+    """Those of the samples ``index`` (n,), from the meridians of the map's frame."""
+    for plate in survey.steps.of(HalfWavePlate):
+        plate.configure(observation)
+    pole = frame_rotation(survey.steps.binning.frame)[2]
+    found = PolarizationAngles.of(observation, observation.boresight_radec[index], pole)
+    return replace(found, plate=np.ascontiguousarray(found.plate[:, index])) if found.plate.size else found
 
 
 def _check_scans(observations: Sequence[Observation], name: str) -> None:
