@@ -35,18 +35,19 @@ def focal_plane_figure(instrument: Instrument, plane: Focalplane) -> Figure:
     centre, reach = _middle(plane)
     _draw(middle, instrument, plane, reach, centre, ticks=True)
     whole.set_title("focal plane" + (", wafers outlined" if _outlines(whole, plane, largest) else ""), fontsize=10)
-    middle.set_title("inside: beams (FWHM) to scale" + (", polarization angles" if plane.polarized else ""), fontsize=10)
+    inside = "inside a wafer" if len(np.unique(plane.wafer)) > 1 else "inside"
+    middle.set_title(f"{inside}: beams (FWHM) to scale" + (", polarization angles" if plane.polarized else ""), fontsize=10)
     return figure
 
 
 def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
-    """Where the pixel in the middle of the innermost array or wafer looks; how far around it there are `PLACES`."""
+    """Where the pixel in the middle of the innermost array or wafer looks; how far around it this one has `PLACES`."""
     first = int(np.argmin(np.hypot(plane.xi, plane.eta)))
     own = np.flatnonzero((plane.band == plane.band[first]) & (plane.wafer == plane.wafer[first]))
     x, y = plane.xi[own], plane.eta[own]
     middle = int(np.argmin(np.hypot(x - x.mean(), y - y.mean())))
     centre = float(x[middle]), float(y[middle])
-    places = np.unique(np.stack([plane.xi, plane.eta], axis=1).round(12), axis=0)
+    places = np.unique(np.stack([x, y], axis=1).round(12), axis=0)
     away = np.sort(np.hypot(*(places - centre).T))
     return centre, float(away[min(PLACES, len(away) - 1)]) + float(plane.fwhm.max())
 

@@ -78,6 +78,19 @@ def test_beams_and_angles_are_to_scale() -> None:
     assert len(whole.patches) == 3  # the outlines of the wafers
 
 
+def test_the_inner_panel_shows_one_wafer_alone() -> None:
+    """Of two wafers with 7 pixels each, which are fewer than the panel asks for."""
+    camera = of(layout="wafers", wafers=2, detectors=14, fwhm="1 arcmin")
+    plane = camera.focalplane()
+    _, middle = focal_plane_figure(camera, plane).axes
+    xi, eta = np.degrees([plane.xi, plane.eta]) * 60
+    (left, right), (low, high) = middle.get_xlim(), middle.get_ylim()
+    seen = (left < xi) & (xi < right) & (low < eta) & (eta < high)
+    np.testing.assert_array_equal(seen, plane.wafer == plane.wafer[seen][0])
+    assert "inside a wafer" in middle.get_title()
+    np.testing.assert_allclose([(left + right) / 2, (low + high) / 2], [xi[seen].mean(), eta[seen].mean()], atol=1e-6)
+
+
 @pytest.mark.parametrize("more", [{"detectors": 1, "field_of_view": "0 deg"}, {"detectors": 2}])
 def test_few_detectors(more: dict[str, Any]) -> None:
     camera = of(**more)
