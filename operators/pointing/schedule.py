@@ -48,7 +48,7 @@ class PointingSchedule(ScheduleParameters):
     def check(self, data: Data) -> list[str]:
         """How many scans there are, where they look, how fast, and how near to Sun and Moon."""
         first, rate = len(data.observations), self.sample_rate or data.scene.instrument.sample_rate
-        rows = read_schedule(self.schedule)
+        rows = read_schedule(self.schedule, self.nod.duration)
         total = sum(row.duration for row in rows)
         self._observe(data, min(rate, CHECKED / total))
         made = data.observations[first:]
@@ -79,7 +79,7 @@ class PointingSchedule(ScheduleParameters):
 
     def _observe(self, data: Data, rate: float) -> None:
         scene, before = data.scene, len(data.observations)
-        rows = read_schedule(self.schedule)
+        rows = read_schedule(self.schedule, self.nod.duration)
         self._compare_sites(data)
         if abs(scene.time.seconds_since(rows[0].start)) > ANOTHER_DAY:
             text = f"the schedule begins {rows[0].start}, the weather is that of {scene.time}: set the scene's time"

@@ -121,12 +121,15 @@ def _degrees(value: Any) -> float:
     return float(degrees)
 
 
-def read_schedule(path: Path) -> list[Row]:
-    """The rows of a schedule. Raises InputError for a file that is none, and for a row that makes no sense."""
+def read_schedule(path: Path, nods: float = 0.0) -> list[Row]:
+    """The rows of a schedule. Raises InputError for a file that is none, and for a row that makes no sense.
+
+    ``nods``: seconds before each scan in which the telescope nods.
+    """
     place = str(path)
     with reading(place, "a schedule", CURE), path.open(encoding="utf-8") as file:
         first = file.readline()
-    return _rows(read_table(path) if first.startswith("# %ECSV") else _version_4(path, place))
+    return _rows(read_table(path) if first.startswith("# %ECSV") else _version_4(path, place), nods)
 
 
 def _version_4(path: Path, place: str) -> Table:
@@ -148,7 +151,7 @@ def _version_4(path: Path, place: str) -> Table:
     return Table(place, named, [*lines[1:], lines[0]])
 
 
-def _rows(table: Table) -> list[Row]:
+def _rows(table: Table, nods: float) -> list[Row]:
     mistakes, angles = Mistakes(table.place), dict[str, Floats]()
     texts, times = dict[str, list[str]](), dict[str, list[Instant]]()
     for name in ("boresight_angle", "azmin", "azmax", "el"):
@@ -181,7 +184,7 @@ def _rows(table: Table) -> list[Row]:
             message, cure = wrong
             mistakes.add(table.lines[k], f"{row.label}: {message}", cure)
         found.append(row)
-    _note_overlaps(found, table.lines, mistakes)
+    _note_overlaps(found, nods, table.lines, mistakes)
     mistakes.tell()
     return found
 
@@ -210,16 +213,20 @@ def _wrong_limits(row: Row, stated: float) -> tuple[str, str] | None:
     return None
 
 
-def _note_overlaps(rows: list[Row], lines: Sequence[int], mistakes: Mistakes) -> None:
-    """Note each row that begins before an earlier one stops: the telescope is in one place at a time."""
+def _note_overlaps(rows: list[Row], nods: float, lines: Sequence[int], mistakes: Mistakes) -> None:
+    """Note each row that begins, with its ``nods`` [s] before it, before an earlier one stops: the telescope is in one place at
+    a time."""
     sound = [k for k, row in enumerate(rows) if row.duration > 0]
     begins = {k: rows[k].start.seconds_since(rows[sound[0]].start) for k in sound}
     before, stops = -1, -math.inf
     for k in sorted(sound, key=begins.__getitem__):
-        if stops - begins[k] > OVERLAP + 1e-6:
+        early, what, cure = stops - begins[k], "begins", "shift or shorten one of them, or remove one"
+        if early <= OVERLAP + 1e-6 and nods:
+            early, cure = early + nods, f"leave {nods:.6g} s between the rows for the nods, or change elevation_nods"
+            what = f"its elevation nods of {nods:.6g} s begin"
+        if early > OVERLAP + 1e-6:
             other = f"{rows[before].label} (line {lines[before]})"
-            early = f"{rows[k].label}: begins {stops - begins[k]:.6g} s before {other} stops"
-            mistakes.add(lines[k], early, "shift or shorten one of them, or remove one")
+            mistakes.add(lines[k], f"{rows[k].label}: {what} {early:.6g} s before {other} stops", cure)
         if begins[k] + rows[k].duration > stops:
             before, stops = k, begins[k] + rows[k].duration
 

@@ -73,13 +73,18 @@ class ScheduleParameters(Operator):
             raise ValueError("nods end at the elevation of the scan: write 0 deg as the last of them")
         return value
 
+    @property
+    def nod(self) -> Nod:
+        """The motion before each scan."""
+        return Nod(tuple(self.elevation_nods), self.elevation_speed, self.elevation_acceleration)
+
 
 def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: LargestMotion) -> Observation:
     """The observation of a row, sampled at ``rate`` [Hz]."""
     scene, place = data.scene, f"{step.label}, {step.schedule}, {row.label}"
     mount = step.speed / math.cos(row.elevation)
     sweep = Sweep(row.azimuth[1] - row.azimuth[0], mount, step.acceleration, step.turnaround == "smooth")
-    nod = Nod(tuple(step.elevation_nods), step.elevation_speed, step.elevation_acceleration)
+    nod = step.nod
     ahead = math.ceil(nod.duration * rate * (1 - 1e-12))
     seconds = np.arange(ahead + max(int(row.duration * rate * (1 + 1e-12)), 1)) / rate
     delay = ahead / rate

@@ -333,6 +333,23 @@ def test_rows_that_can_be(tmp_path, change_of_the_second):
     assert len(read_schedule(version_5(tmp_path / "a.ecsv", change(1, **change_of_the_second)))) == 2
 
 
+def test_nods_that_begin_before_the_row_before_stops(tmp_path):
+    """They last 2 x (1 s + 1 s): with the second to which times are rounded, a gap of 3 s is enough and one of 2.9 s is not."""
+    nods = {"elevation_nods": ["1 deg", "0 deg"], "elevation_speed": "1 deg/s", "elevation_acceleration": "1 deg/s2"}
+    first = ("2025-03-01T06:00:00", "2025-03-01T06:02:00", 0.0, "a", 120.0, 150.0, 50.0, 0, 0)
+    for begins, fits in (("06:02:03", True), ("06:02:02.9", False)):
+        path = version_5(tmp_path / "a.ecsv", [first, (f"2025-03-01T{begins}", "2025-03-01T06:04:00", *first[2:8], 1)])
+        assert len(scans(path)) == 2
+        if fits:
+            assert len(scans(path, **nods)) == 2
+            continue
+        with pytest.raises(InputError, match=r"its elevation nods of 4 s begin 1.1 s before a-0-0 \(line 20\) stops"):
+            scans(path, **nods)
+        data = Data(Scene(site=SITE, instrument="act_150ghz", time="2025-03-01T06:00"))
+        with pytest.raises(InputError, match="leave 4 s between the rows"):
+            PointingSchedule(schedule=path, **{**FAST, **nods}).check(data)
+
+
 @pytest.mark.parametrize("text", ["", "hello\n", SITE_LINE, SITE_LINE + "2025 | 2026 | 0\n"])
 def test_files_that_are_no_schedule(tmp_path, text):
     path = tmp_path / "bad.txt"
