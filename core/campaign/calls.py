@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from ..errors import PipelineError
 from .engines import Pool
-from .warned import Registry, Warned, call, show
+from .warned import Registry, Warned, call, here, show
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -106,7 +106,7 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
 def _submit(pool: Pool, function: Callable[..., R], *arguments: Any) -> Future[tuple[R, list[Warned]]]:
     assert pool.executor is not None
     try:
-        return pool.executor.submit(call, function, *arguments)
+        return pool.executor.submit(call, here(), function, *arguments)
     except Exception as err:
         future: Future[tuple[R, list[Warned]]] = Future()
         future.set_exception(err if isinstance(err, BrokenExecutor) else CancelledError())  # a worker was killed; all is gone

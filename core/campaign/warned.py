@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import platform
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 R = TypeVar("R")
@@ -15,6 +19,14 @@ Registry = dict[str | tuple[str, type[Warning], int], int]
 """What was shown, as `warnings` notes it."""
 
 _kept: list[Warned] = []
+_lock = threading.Lock()
+_at_work: list[Any] = []
+"""How this process showed warnings before it kept them, once for each call at work in it."""
+
+
+def here() -> str:
+    """Name of this process."""
+    return f"{platform.node()} {os.getpid()}"
 
 
 def keep() -> None:
@@ -22,12 +34,31 @@ def keep() -> None:
     warnings.showwarning = _keep
 
 
-def call(function: Callable[..., R], *arguments: Any) -> tuple[R, list[Warned]]:
-    """The result of a call, and the warnings that this process has kept; none where it shows them itself."""
-    result = function(*arguments)
-    found = _kept.copy()
-    del _kept[: len(found)]
+def call(main: str, function: Callable[..., R], *arguments: Any) -> tuple[R, list[Warned]]:
+    """The result of a call, and the warnings that this process has kept; none in ``main`` (`here`), which shows them itself."""
+    if here() == main:
+        return function(*arguments), []
+    with _kept_during():
+        result = function(*arguments)
+    with _lock:
+        found = _kept.copy()
+        _kept.clear()
     return result, found
+
+
+@contextlib.contextmanager
+def _kept_during() -> Iterator[None]:
+    """Keep the warnings of all threads; as before when the last call in this process is done (Dask's may have several)."""
+    with _lock:
+        _at_work.append(warnings.showwarning)
+        keep()
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _at_work.pop()
+            if not _at_work:
+                warnings.showwarning = before
 
 
 def show(found: Sequence[Warned], shown: Registry) -> None:

@@ -24,6 +24,19 @@ def test_dask_cluster_of_two_workers(undisturbed, bench):
     assert bench.planes(out) == bench.planes(undisturbed)
 
 
+TOO_FAST = ("50 arcsec/s", "500 arcsec/s")
+"""For the sample rate: planning and tasks warn of it."""
+
+
+def test_workers_of_dask_leave_their_warnings_to_the_main_process(bench, capfd, recwarn):
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install 'zonda[dask]'")
+    options = {"n_workers": 1, "threads_per_worker": 2, "processes": True, "dashboard_address": None, "host": "127.0.0.1"}
+    with distributed.LocalCluster(**options) as cluster:
+        bench.run("{nights: 2}", "--scheduler", cluster.scheduler_address, changes=(TOO_FAST,))
+    assert "samples per FWHM" not in capfd.readouterr().err
+    assert sum("samples per FWHM" in str(one.message) for one in recwarn) == 1
+
+
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory):
     """``ca.pem``, ``node.pem`` which it signed, ``other.pem`` which it did not; each with its ``.key``."""
@@ -119,21 +132,34 @@ def test_wrong_certificates_are_one_clean_error(bench, certificates, encrypted, 
     assert not out.exists()
 
 
-def test_mpi_with_two_processes(undisturbed, bench):
+@pytest.fixture
+def mpi(bench):
+    """Runs a campaign in so many processes of MPI; the output folder, and what they said."""
     pytest.importorskip("mpi4py", reason="mpi4py is not installed: pip install 'zonda[mpi]'")
     beside = Path(sys.executable).with_name("mpiexec")
     mpiexec = str(beside) if beside.exists() else shutil.which("mpiexec")
     if mpiexec is None:
         pytest.skip("there is no mpiexec: pip install mpich")
-    out = bench.new()
-    arguments = ["run", str(bench.file(bench.CAMPAIGN)), "--engine", "mpi", "--output", str(out)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(
-        [mpiexec, "-n", "2", sys.executable, "-m", "zonda.core.cli", *arguments], capture_output=True, text=True, env=environment
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == f"{out}/\n"
-    assert bench.planes(out) == bench.planes(undisturbed)
+
+    def run(number, campaign, *changes):
+        out = bench.new()
+        arguments = ["run", str(bench.file(campaign, *changes)), "--engine", "mpi", "--output", str(out)]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+        command = [mpiexec, "-n", str(number), sys.executable, "-m", "zonda.core.cli", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == f"{out}/\n"
+        return out, done.stderr
+
+    return run
+
+
+def test_mpi_with_two_processes(undisturbed, bench, mpi):
+    assert bench.planes(mpi(2, bench.CAMPAIGN)[0]) == bench.planes(undisturbed)
+
+
+def test_workers_of_mpi_leave_their_warnings_to_the_main_process(mpi):
+    assert mpi(3, "{nights: 2}", TOO_FAST)[1].count("samples per FWHM") == 1
 
 
 @pytest.mark.parametrize(("name", "module"), [("mpi", "mpi4py"), ("dask", "distributed")])

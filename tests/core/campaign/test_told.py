@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import pytest
 
@@ -43,20 +46,30 @@ def test_workers_leave_their_warnings_to_the_main_process(bench, capfd, recwarn)
     assert sum("samples per FWHM" in str(one.message) for one in recwarn) == 1
 
 
-def test_a_warning_is_sent_with_the_result_and_shown_once():
+def test_warnings_of_a_worker_are_sent_with_the_results_and_shown_once(recwarn):
+    """Also of two calls at once in one process, as Dask's workers have them; it then shows warnings as before."""
+    both = threading.Barrier(2, timeout=20)
+
     def work(number):
+        both.wait()
         warnings.warn("it is late", stacklevel=1)
+        both.wait()
         return number
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        warned.keep()
-        results = [warned.call(work, number) for number in (1, 2)]
+    warnings.simplefilter("always")
+    with ThreadPoolExecutor(2) as threads:
+        results = list(threads.map(partial(warned.call, "another process", work), (1, 2)))
     assert [result for result, _ in results] == [1, 2]
-    with warnings.catch_warnings(record=True) as record:
-        warnings.simplefilter("default")
-        shown = {}
-        for _, found in results:
-            assert len(found) == 1
-            warned.show(found, shown)
-    assert [str(one.message) for one in record] == ["it is late"]
+    assert sorted(len(found) for _, found in results) == [0, 2]
+    assert not recwarn.list
+    warnings.simplefilter("default")
+    shown = {}
+    for _, found in results:
+        warned.show(found, shown)
+    assert [str(one.message) for one in recwarn.list] == ["it is late"]
+
+
+def test_the_main_process_shows_its_warnings_at_once(recwarn):
+    """Of the tasks of the engine `serial`, and of Dask's workers that are threads of it."""
+    assert warned.call(warned.here(), warnings.warn, "it is late") == (None, [])
+    assert [str(one.message) for one in recwarn.list] == ["it is late"]
