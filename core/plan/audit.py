@@ -27,6 +27,7 @@ from .context import Context
 from .coverage import DEEP
 from .decide import Decided
 from .estimate import Choice, add
+from .figures import figure
 from .planner import Wishes, plan_band
 from .result import Plan
 from .slices import SECONDS, sliced
@@ -123,7 +124,7 @@ class Audit:
     def __str__(self) -> str:
         table = [("effect", "decision", "metric", "bound", "actual", "standard error", "")]
         for r in self.rows:
-            bound, actual, error = (f"{v:.2e}" for v in (r.bound, r.actual, r.error))
+            bound, actual, error = (figure(r.metric, v) for v in (r.bound, r.actual, r.error))
             table.append((r.effect, r.what, r.metric, bound, actual, error, r.verdict))
         widths = [max(len(row[k]) for row in table) for k in range(6)]
         lines = [f"audit of {self.slice}"]

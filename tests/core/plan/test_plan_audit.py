@@ -74,6 +74,14 @@ def test_a_violated_bound_is_seen(file, made):
     assert Checked("a", "b", "tod", 1.0, math.nan, 0.0).violated
 
 
+def test_the_table_has_units():
+    """Temperatures in kelvin; the transfer function has none."""
+    rows = Checked("a", "b", "map_rms", 1.21e-5, 0.0, 0.0), Checked("a", "b", "transfer", 5.3e-4, 1.2e-4, 0.0)
+    kelvin, plain = (line.split("  ") for line in str(Audit(rows, "test")).splitlines()[2:4])
+    assert [cell.strip() for cell in kelvin if cell] == ["a", "b", "map_rms", "12.1 uK", "0 K", "0 K", "holds"]
+    assert [cell.strip() for cell in plain if cell] == ["a", "b", "transfer", "5.3e-04", "1.2e-04", "0.0e+00", "holds"]
+
+
 def test_command_audit(capsys, monkeypatch):
     status, out, _ = _command(capsys, "plan", "mustang2_cluster", *SET, "--drop", "poles", "--audit", "--threads", "1")
     assert status == 0
