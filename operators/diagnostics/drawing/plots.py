@@ -66,7 +66,8 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
     """One-sided power spectra, log-log: thin lines as measured, thick ones averaged in logarithmic bins.
 
     Dashed are closed forms: the level of white noise, 2 NET^2, and the laws of 1/f noise and of the atmosphere. The dotted line
-    is the knee, where pink noise equals white. Shades and names above tell which of the three laws dominates.
+    is the measured knee, where the spectrum of pink noise crosses that of white noise; it scatters about the knee of the law.
+    Shades and names above tell which of the three laws dominates.
     """
     ax = new_axes(ax, left=0.95)
     names = {"signal": "signal (all)", "sky": "astronomical sky", "pink": "pink noise", "white": "white noise"}
@@ -125,7 +126,7 @@ def _mark_levels(ax: Any, level: float, knee: float | None) -> None:
     if knee is not None:
         ax.axvline(knee, color="black", linestyle=":", linewidth=1.0, zorder=2)
         place = {"xycoords": ("data", "axes fraction"), "xytext": (4, 0), "rotation": 90, "va": "bottom", "bbox": PALE}
-        ax.annotate(f"knee {knee:.2g} Hz", (knee, 0.06), textcoords="offset points", fontsize=8, zorder=4, **place)
+        ax.annotate(f"measured knee {knee:.2g} Hz", (knee, 0.06), textcoords="offset points", fontsize=8, zorder=4, **place)
 
 
 def _name(ax: Any, across: str, up: str, grey: str = "0.9") -> None:

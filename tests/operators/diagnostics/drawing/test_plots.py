@@ -219,7 +219,7 @@ def test_spectra_mark_the_white_level_and_the_knee(spectrum):
     ax = drawn(plot_spectra(spectrum))
     assert ax.get_xscale() == ax.get_yscale() == "log"
     assert any("2 NET²" in t and "1.73 mK" in t for t in texts(ax))  # sqrt(6e-6 / 2)
-    assert any(t.startswith("knee 0.5") for t in texts(ax))
+    assert any(t.startswith("measured knee 0.5") for t in texts(ax))
     labels = [t.get_text() for t in ax.get_legend().get_texts()]
     assert labels == ["signal (all)", "white noise", "pink noise"]
     assert "Hz" in ax.get_xlabel()
