@@ -92,7 +92,7 @@ def accuracy(
 
     from . import store as stored
     from .figure import save
-    from .table import fragment, lines, percent
+    from .table import fragment, lines, not_met, percent
 
     text = "\n".join(lines(found))
     write_text(folder / "accuracy.txt", text + "\n")
@@ -107,6 +107,8 @@ def accuracy(
         import json
 
         click.echo(json.dumps(stored.as_json(found, file), indent=2))
+        if not found.chosen:
+            click.echo("\n".join(not_met(found)), err=True)
     else:
         click.echo(text)
         click.echo(f"\n{folder}/")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
 
@@ -84,8 +85,6 @@ def _heading(study: Study) -> Iterator[str]:
         yield f"  of it {percent(study.sweep.left - study.sweep.left_of_turned)} of knobs that stay as in the file: {parts}"
     floor = "none" if study.floor is None else percent(study.floor)
     yield f"instrument noise in units of the error: {floor}; realization scatter: {percent(study.scatter)}"
-    if study.sweep.left > setup.target:
-        yield f"the reference is not known to better than {percent(study.sweep.left)}: no setting can be shown to meet the target"
 
 
 def _alone(alone: Alone) -> Iterator[str]:
@@ -128,7 +127,7 @@ def _front(study: Study, width: int) -> Iterator[str]:
 def _recommended(study: Study) -> Iterator[str]:
     target, left = study.setup.target, study.sweep.left
     if study.chosen is None:
-        yield f"no setting is shown to meet {percent(target)}"
+        yield from not_met(study)
         return
     chosen, reference, best = study.chosen, study.points[0], least(study.points, target, left)
     words, cost = f"{percent(chosen.error)} (+ {percent(left)} of the reference)", _cost(chosen.seconds, chosen.spread)
@@ -140,6 +139,29 @@ def _recommended(study: Study) -> Iterator[str]:
         yield f"setting within {percent(target)}: {words}, {cost} CPU s, the most accurate of those that cost as much as the"
         yield f"  cheapest within its spread; that is {percent(best.error)}, {_cost(best.seconds, best.spread)} CPU s"
     yield f"  {arguments(chosen.setting)}"
+
+
+def not_met(study: Study) -> Iterator[str]:
+    """Why no setting is shown to meet the target, what the reference's own error comes from most, and what to do about it."""
+    setup, left = study.setup, study.sweep.left
+    yield f"no setting is shown to meet {percent(setup.target)}: the reference is not known to better than {percent(left)}"
+    worst = max(study.sweep.alone, key=lambda a: a.stays if a.knob.redraws else a.left)
+    key, cures = worst.knob.key, []
+    if not worst.knob.redraws:
+        yield f"  cause: {key}, {percent(worst.left)}: {worst.how}"
+    elif any(r.resolution and (r.error or 0.0) <= 2 * r.resolution for r in worst.rungs):
+        seeds = len(setup.seeds)
+        yield f"  cause: {key}, {percent(worst.stays)}: twice the standard error of means over {seeds} seeds"
+        cures.append(f"--seeds {math.ceil(seeds * (left / setup.target) ** 2)}" if left < 10 * setup.target else "more --seeds")
+    else:
+        yield f"  cause: {key}, {percent(worst.stays)}: it stays at {worst.knob.present}, as in the file"
+        cures.append(f"--set {key}={worst.knob.tightest}")
+    if setup.shorter:
+        cures.append("longer scans (--duration)")
+    if 0 < left < math.inf:
+        digit = 10.0 ** math.floor(math.log10(left))
+        cures.append(f"--target '{100 * digit * (math.floor(left / digit) + 1):.3g} %'")
+    yield f"  cure: {', or '.join(cures)}"
 
 
 def _marks(point: Point, study: Study) -> str:

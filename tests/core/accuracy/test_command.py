@@ -137,8 +137,10 @@ def test_no_setting_meets_the_target(toy_file, tmp_path, capsys):
         tmp_path / "out",
     )
     assert command("accuracy", toy_file, *options) == 1
-    values = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr()
+    values = json.loads(printed.out)
     assert values["chosen"] is None
+    assert "cause: ZaIntegral.n" in printed.err
     assert values["reference_error"] > 1e-7
     assert values["realization_scatter"] is None
 

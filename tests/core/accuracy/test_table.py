@@ -11,13 +11,13 @@ from zonda.core.accuracy.sweep import Alone, Bench, Rung, Sweep, sweep, tightest
 from zonda.core.accuracy.table import lines
 
 
-def study_of(found, points, target=0.01):
-    setup = Setup("toy", (), "value", target, {})
+def study_of(found, points, target=0.01, shorter=None, **more):
+    setup = Setup("toy", (), "value", target, shorter or {}, **more)
     return Study(setup, "a toy", found, points[0], tuple(points), cheapest(points, target, found.left), None, None, 1.0)
 
 
-def said(found, points):
-    return "\n".join(lines(study_of(found, points)))
+def said(found, points, **more):
+    return "\n".join(lines(study_of(found, points, **more)))
 
 
 def test_what_is_called_the_cheapest_is_the_cheapest():
@@ -69,6 +69,9 @@ def test_the_reference_is_charged_with_the_knobs_that_stay_as_in_the_file(toy, p
     text = said(found, [point])
     assert f"of knobs that stay as in the file: Step0.n={present} " in text
     assert ("no setting is shown to meet 1 %" in text) == (found.left > 0.01)
+    if present == "4":
+        assert "cause: Step0.n, 2.5 %: it stays at 4, as in the file" in text
+        assert text.endswith("cure: --set Step0.n=32, or --target '3 %'")
 
 
 def test_what_is_not_resolved_is_charged_with_twice_its_standard_error(toy):
@@ -79,6 +82,19 @@ def test_what_is_not_resolved_is_charged_with_twice_its_standard_error(toy):
     expected = 2 * 0.1 * (4 / 3) ** 0.5 / 2 / (1 + 0.4 / 32**2)
     assert alone.rung("8").error < expected
     assert alone.stays - alone.left == pytest.approx(expected)
+    assert alone.stays == pytest.approx(0.231, abs=0.001)  # of the tightest rung, whose neighbour is not resolved either, as much
+    text = said(found, [Point({}, 0.0, 1.0, 0.1, 100)], seeds=range(4))
+    assert "cause: Step0.n, 23 %: twice the standard error of means over 4 seeds" in text
+    assert text.endswith("cure: more --seeds, or --target '30 %'")
+    text = said(found, [Point({}, 0.0, 1.0, 0.1, 100)], target=0.1, seeds=range(4), shorter={"Scan.scan_duration": "30 s"})
+    assert text.endswith("cure: --seeds 22, or longer scans (--duration), or --target '30 %'")
+
+
+def test_a_ladder_that_does_not_converge_is_the_cause(toy, metric):
+    found = sweep(toy.bench(metric), toy.knobs())
+    text = said(found, [Point({}, 0.0, 1.0, 0.1, 100)], target=1e-6)
+    assert "cause: Step0.n, " in text
+    assert "times the one before: the rest of that series" in text
 
 
 def test_a_value_beside_the_ladder_counts_as_the_worst_rung(toy):
