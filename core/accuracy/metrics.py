@@ -60,7 +60,7 @@ class Metric:
         return float(np.linalg.norm(a - b)) / size if size > 0 else float(np.any(a != b))
 
     def errors(self, found: Any, reference: Any) -> Mapping[str, float]:
-        """`error` by the names of parts of which the largest counts (bands); empty where there is one part."""
+        """`error` by the names of parts of which the largest counts (bands, planes of a map); empty where there is one part."""
         return {}
 
     def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:

@@ -32,7 +32,7 @@ def percent(value: float | None) -> str:
 
 
 def by_band(errors: Mapping[str, float]) -> str:
-    """Errors of bands in a line."""
+    """Errors of bands, or of a map's planes, in a line."""
     return ", ".join(f"{name} {percent(error)}" for name, error in errors.items())
 
 

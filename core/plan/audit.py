@@ -4,6 +4,13 @@ A slice of the scan, short enough for its cost, is simulated in full, and once m
 coarsens, with the same random numbers, through the same filters. The bounds are those that the operators state for the slice. An
 actual error violates its bound where it exceeds it by more than two of its own standard errors, which follow from its scatter
 between parts of the slice.
+
+Of a map of I, Q and U each plane S is compared. A bound is one of I, the mean of the H samples of a pixel. For samples of
+weight a with errors e_i, whose correlations add up to c at most,
+
+    |sum g_i e_i|^2 <= c sum g_i^2 e^2 = (c / H) e^2 / s,   s = w_S / (a H),   g = a (A^-1)_S r,   w_S = 1 / (A^-1)_SS     (1)
+
+(`operators.maps.stokes_sums`), so that it holds for the error of S times s^(1/2), which is what is reported.
 """
 
 from __future__ import annotations
@@ -290,12 +297,12 @@ def _with_sky_given(file: PipelineFile) -> PipelineFile:
 def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: Context) -> list[Checked]:
     rows = []
 
-    def add(metric: str, actual: float, error: float, rounding: float) -> None:
+    def add(metric: str, actual: float, error: float, rounding: float, plane: str = "") -> None:
         if metric in choice.bound and math.isfinite(actual):
             bound = choice.bound[metric]
             # where nothing may change, that nothing did is what is asked for, if there was something
             exercised = actual > 0 or (bound == 0 and rounding > 0)
-            rows.append(Checked(name, choice.what, metric, bound + rounding, actual, error, exercised))
+            rows.append(Checked(name, choice.what, f"{metric} {plane}".strip(), bound + rounding, actual, error, exercised))
 
     scale = ROUNDING * _rms([float((s * s).mean()) for s in full.signal if s.size])
     if [a.shape for a in full.signal] == [b.shape for b in other.signal]:
@@ -307,20 +314,34 @@ def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: 
         ]
         add("tod", _rms(squares), _rms_error(squares), scale)
     if full.map is not None and other.map is not None and context.coverage is not None:
-        difference, hits = np.ravel(full.map.signal - other.map.signal), np.ravel(full.map.hits)
-        deep = (hits >= context.coverage.hits / 2) & np.isfinite(difference)
-        if deep.any():
-            scaled = difference[deep] ** 2 * hits[deep] / context.coverage.hits
-            squares = [float(p.mean()) for p in np.array_split(scaled, PARTS) if p.size]
-            add("map_rms", _rms(squares), _rms_error(squares), scale)
+        hits = np.ravel(full.map.hits)
+        for plane, share, one, two in _planes(full.map, other.map):
+            difference = np.ravel((one.signal - two.signal) * share)
+            deep = (hits >= context.coverage.hits / 2) & np.isfinite(difference)
+            if deep.any():
+                scaled = difference[deep] ** 2 * hits[deep] / context.coverage.hits
+                squares = [float(p.mean()) for p in np.array_split(scaled, PARTS) if p.size]
+                add("map_rms", _rms(squares), _rms_error(squares), scale, plane)
     if full.sky is not None and other.sky is not None:
-        difference = np.abs(full.sky.signal - other.sky.signal)
-        largest = float(np.nanmax(difference, initial=0.0))
         strongest = float(np.nanmax(np.abs((full.sky if full.given is None else full.given).signal), initial=0.0))
-        add("peak", largest, 0.0, ROUNDING * strongest)
-        if strongest > 0:
-            add("transfer", largest / strongest, 0.0, ROUNDING)
+        for plane, share, one, two in _planes(full.sky, other.sky):
+            largest = float(np.nanmax(np.abs(one.signal - two.signal) * share, initial=0.0))
+            add("peak", largest, 0.0, ROUNDING * strongest, plane)
+            if strongest > 0:
+                add("transfer", largest / strongest, 0.0, ROUNDING, plane)
     return rows
+
+
+def _planes(full: Any, other: Any) -> list[tuple[str, Any, Any, Any]]:
+    """Of each plane of two maps its name (of I none), s^(1/2) of equation (1), and the maps of it."""
+    if getattr(full, "polarization", None) is None:
+        return [("", 1.0, full, other)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        most = float(np.nanmax(full.weights / full.hits, initial=0.0))  # a, or a little less
+        both = [(plane, full.stokes(plane), other.stokes(plane)) for plane in "IQU"]
+        return [
+            (plane.strip("I"), np.sqrt(one.weights / (most * np.maximum(full.hits, 1))), one, two) for plane, one, two in both
+        ]
 
 
 def _rms(squares: Sequence[float]) -> float:

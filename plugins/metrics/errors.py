@@ -1,6 +1,7 @@
 """The built-in metrics of `zonda accuracy`: equations (1) to (5).
 
-m is a run's, m0 that of the tightest setting with the same random numbers.
+m is a run's, m0 that of the tightest setting with the same random numbers. Of a map of I, Q and U, (1) to (3) are taken of each
+plane, and the largest counts.
 
 ``map_rms``, the rms of the difference map in units of the map's own noise (pixels with hits in both; weights w and instrument
 noise n of the reference; the rms of m0 itself where the noise is not known):
@@ -10,13 +11,13 @@ noise n of the reference; the rms of m0 itself where the noise is not known):
 It bounds the change of the map's rms, because | |m| - |m0| | <= |m - m0| for every norm.
 
 ``peak``, the extreme value p of the beam-smoothed map, of the sky alone where a signal keeps only that, among pixels with at
-least `COVERED` of the usual coverage:
+least `COVERED` of the usual coverage (of Q and U its absolute value, where it is more than `POLARIZED` of that of I):
 
     E = |p - p0| / |p0|                                                                                   (2)
 
 ``transfer``, the share T of each angular scale of the input map a (convolved with the beam, under the window of the coverage)
 that is left in the map b of the sky alone, as `TransferFunction` measures it; rings i of equal width in log k, from the map's
-extent to the beam, that hold power:
+extent to the beam, that hold power (of Q and U where the input map has them):
 
     T_i = Re sum_ring b a* / sum_ring |a|^2,    E = sqrt( mean_i (T_i - T0_i)^2 )                         (3)
 
@@ -57,8 +58,11 @@ from zonda.operators.diagnostics.time_streams import TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
 
 from .common import COVERED, as_seen, at_beam, covered, extreme, input_of
+from .planes import OfPlanes, planes_of
 
 RINGS, BINS, LAGS, SEPARATIONS = 8, 24, 12, 6
+POLARIZED = 1e-3
+"""Of the extreme value of I: below it that of Q or U is taken as zero, which has no relative error."""
 TRACED = 64
 """Detectors whose atmosphere is kept for the structure functions."""
 INSTANTS = 4096
@@ -66,7 +70,7 @@ INSTANTS = 4096
 TRACE = "accuracy-structure"
 
 
-class MapRms(Metric):
+class MapRms(OfPlanes):
     """Equation (1)."""
 
     says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
@@ -74,11 +78,13 @@ class MapRms(Metric):
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("map_rms", operators)
 
-    def measure(self, data: Data) -> dict[str, Floats]:
-        product = _map(data)
-        return {"signal": product.signal, "weights": product.weights, "noise": product.noise}
+    def measure(self, data: Data) -> dict[str, dict[str, Floats]]:
+        return {
+            plane: {"signal": one.signal, "weights": one.weights, "noise": one.noise}
+            for plane, one in planes_of(_map(data)).items()
+        }
 
-    def error(self, found: dict[str, Floats], reference: dict[str, Floats]) -> float:
+    def between(self, found: dict[str, Floats], reference: dict[str, Floats]) -> float:
         if found["signal"].shape != reference["signal"].shape:
             cure = "fix the map: set BinMap.width and BinMap.centre"
             raise InputError("the map's size depends on the knobs", place="map_rms", cure=cure)
@@ -91,7 +97,7 @@ class MapRms(Metric):
         known = np.isfinite(found["signal"])
         return np.array([math.sqrt(_mean_square(found["signal"], found["weights"], known) / self._unit(found))])
 
-    def floor(self, reference: dict[str, Floats]) -> float | None:
+    def floor_of(self, reference: dict[str, Floats]) -> float | None:
         """1, where the map knows its noise."""
         return 1.0 if np.isfinite(reference["noise"]).any() else None
 
@@ -101,7 +107,7 @@ class MapRms(Metric):
         return _mean_square(values, of["weights"], np.isfinite(values)) or 1.0
 
 
-class Peak(Metric):
+class Peak(OfPlanes):
     """Equation (2)."""
 
     says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
@@ -109,22 +115,28 @@ class Peak(Metric):
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("peak", operators)
 
-    def measure(self, data: Data) -> Floats:
+    def measure(self, data: Data) -> dict[str, Floats]:
         main, sky = _map(data), _map(data, _sky_alone(data.provenance.get("runs", {})))
-        smooth, noise = at_beam(sky), at_beam(main).noise
-        where, peak = extreme(smooth.signal, covered(smooth), "peak")
-        return np.array([peak, noise.flat[where]])
+        noises, found = planes_of(at_beam(main)), {}
+        for plane, smooth in planes_of(at_beam(sky)).items():
+            where, peak = extreme(smooth.signal, covered(smooth), "peak")
+            size = peak if plane == "I" else abs(peak)
+            found[plane] = np.array([size, noises[plane].noise.flat[where]])
+        return {plane: one for plane, one in found.items() if plane == "I" or one[0] > POLARIZED * abs(found["I"][0])}
+
+    def between(self, found: Floats, reference: Floats) -> float:
+        return Metric.error(self, found, reference)
 
     def summary(self, found: Floats) -> Floats:
         return np.asarray(found[:1], np.float64)
 
-    def floor(self, reference: Floats) -> float | None:
+    def floor_of(self, reference: Floats) -> float | None:
         """The smoothed map's instrument noise at the peak."""
         value = abs(reference[1] / reference[0]) if reference[0] else math.nan
         return float(value) if math.isfinite(value) else None
 
 
-class Transfer(Metric):
+class Transfer(OfPlanes):
     """Equation (3)."""
 
     says: ClassVar[str] = "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is lost)"
@@ -138,8 +150,8 @@ class Transfer(Metric):
         """The sky alone, where the pipeline has no such signal."""
         return {} if any(run.only == ["sky"] for run in runs.values()) else {"sky_alone": Signal(only=["sky"])}
 
-    def measure(self, data: Data) -> Floats:
-        """(2, n): T_i, and its standard deviation from the instrument's noise in the main map."""
+    def measure(self, data: Data) -> dict[str, Floats]:
+        """By plane (2, n): T_i, and its standard deviation from the instrument's noise in the main map."""
         sky, main = _map(data, _sky_alone(data.provenance.get("runs", {}))), _map(data)
         if sky.projection != "TAN":
             raise InputError(
@@ -150,18 +162,24 @@ class Transfer(Metric):
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
         side = np.array(window.shape) * sky.pixel
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
-        noise = float((window**2 * np.nan_to_num(main.noise) ** 2).sum())  # variance of each mode
-        rings = compare(as_seen(image, sky), sky.signal, window, sky.pixel, edges)
-        use = rings.power > 1e-6 * rings.power.max()
-        return np.array([rings.transfer[use], np.sqrt(noise / 2 / rings.power[use])])
+        noises, found = planes_of(main), {}
+        for plane, one in planes_of(sky).items():
+            given = image if plane == "I" else image.stokes(plane) if image.polarization is not None else None
+            if given is None or not np.nan_to_num(given.values).any():
+                continue
+            noise = float((window**2 * np.nan_to_num(noises[plane].noise) ** 2).sum())  # variance of each mode
+            rings = compare(as_seen(given, one), one.signal, window, sky.pixel, edges)
+            use = rings.power > 1e-6 * rings.power.max()
+            found[plane] = np.array([rings.transfer[use], np.sqrt(noise / 2 / rings.power[use])])
+        return found
 
-    def error(self, found: Floats, reference: Floats) -> float:
+    def between(self, found: Floats, reference: Floats) -> float:
         return float(np.sqrt(np.mean((found[0] - reference[0]) ** 2)))
 
     def summary(self, found: Floats) -> Floats:
         return np.asarray(found[0], np.float64)
 
-    def floor(self, reference: Floats) -> float | None:
+    def floor_of(self, reference: Floats) -> float | None:
         return float(np.sqrt(np.mean(reference[1] ** 2)))
 
 

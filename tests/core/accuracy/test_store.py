@@ -40,7 +40,7 @@ def toy_run(setting, seeds, yardstick):
     loose = float(setting.get("CommonModeFilter.residual", 1e-6))
     signal = np.full((4, 4), 1 + 0.1 * coarse + loose)
     seconds = {"HighpassFilter": (1 / coarse,) * 3, "CommonModeFilter": (-float(np.log10(loose)),) * 3}
-    product = {"signal": signal, "weights": np.ones((4, 4)), "noise": np.ones((4, 4))}
+    product = {"I": {"signal": signal, "weights": np.ones((4, 4)), "noise": np.ones((4, 4))}}
     return Measured((product,) * len(seeds), seconds, (), 1.0, 10**8)
 
 

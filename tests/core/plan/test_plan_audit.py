@@ -185,3 +185,49 @@ def test_an_audit_without_a_good_sample_compares_nothing(recwarn):
     ]
     assert not any(r.violated for r in _compare("x", choice, _Result(empty, None, sky), _Result(empty, None, sky), None))
     assert not recwarn.list
+
+
+POLARIZED = """
+name: polarized
+seed: 3
+site: green_bank
+time: 2024-11-25T07:00
+target: 75 deg 20 deg
+instrument: {name: test, telescope: {name: dish, diameter: 30 m}, band: {name: b, low: 85 GHz, high: 95 GHz}, detectors: 38,
+  field_of_view: 3 arcmin, fwhm: 20 arcsec, net: 2 mK s(1/2), knee: 0.5 Hz, pink_minimum_frequency: 10 mHz, sample_rate: 25 Hz,
+  main_beam_efficiency: 0.6, illumination_efficiency: 0.9, polarization: pairs}
+operators:
+  - PointingDaisy: {radius: 2 arcmin, speed: 60 arcsec/s, scan_duration: 20 s}
+  - SkyMap: {file: sky.fits}
+  - WhiteNoise
+  - PinkNoise
+  - Efficiency
+  - HighpassFilter: {frequency: 0.1 Hz}
+  - BinMap: {pixel: 5 arcsec, stokes: IQU, width: 8 arcmin}
+"""
+
+
+def test_an_error_of_polarization_alone_is_seen(tmp_path):
+    """A sky of uniform I and a filament of Q: without a beam I is as it was. Each plane has its row."""
+    from astropy.io import fits
+
+    y = (np.arange(160) - 79.5)[:, None] * np.ones(160) * 6.0
+    cube = np.stack([np.full_like(y, 1e-3), 5e-4 * np.exp(-(y**2) / 2 / 6**2), 0 * y])
+    cards = {
+        "CTYPE1": "RA---TAN", "CRVAL1": 75.0, "CRPIX1": 80.5, "CDELT1": -6 / 3600, "CUNIT1": "deg",
+        "CTYPE2": "DEC--TAN", "CRVAL2": 20.0, "CRPIX2": 80.5, "CDELT2": 6 / 3600, "CUNIT2": "deg",
+        "CTYPE3": "STOKES", "CRVAL3": 1.0, "CRPIX3": 1.0, "CDELT3": 1.0, "BUNIT": "K_RJ", "POLCCONV": "COSMO",
+    }  # fmt: skip
+    fits.PrimaryHDU(cube, fits.Header(cards)).writeto(tmp_path / "sky.fits")
+    (tmp_path / "polarized.yaml").write_text(POLARIZED)
+    file = zonda.load(tmp_path / "polarized.yaml")
+    found = audit(file, zonda.plan(file, drop=["beam convolution", "poles"], threads=1), threads=1, seconds=20.0)
+    assert not found.violated, str(found)
+    actual = {(r.effect, r.metric): r.actual for r in found.rows}
+    assert actual["SkyMap.beam convolution", "peak"] < 1e-8
+    # the beam of 20 arcsec takes 1 - 14 / (14^2 + 20^2)^(1/2) = 43 % of a filament of FWHM 14; pixels and filters some of it
+    assert actual["SkyMap.beam convolution", "peak Q"] == pytest.approx(0.43 * 5e-4, rel=0.4)
+    # relative to what the samples of a pixel determine of a plane, independent noise of the detectors is the same in all planes;
+    # of the deep pixels a few ten are independent
+    for plane in "QU":
+        assert actual["PinkNoise.poles", f"map_rms {plane}"] == pytest.approx(actual["PinkNoise.poles", "map_rms"], rel=0.3)

@@ -11,6 +11,7 @@ from zonda.core.accuracy import metrics
 from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.polarized import Polarization
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 
@@ -65,7 +66,7 @@ def test_map_rms_is_the_difference_in_units_of_the_noise():
     assert metric.error(found, reference) == pytest.approx(expected)
     assert metric.error(reference, reference) == 0
     assert metric.floor(reference) == 1
-    bound = abs(metric.summary(found) - metric.summary(reference))[0]
+    bound = abs(metric.summary(found["I"]) - metric.summary(reference["I"]))[0]
     assert bound <= metric.error(found, reference)
     unknown = metric.measure(data(map=product(signal, np.nan, weights)))
     assert metric.floor(unknown) is None
@@ -86,11 +87,11 @@ def test_peak_of_the_sky_alone():
 
     reference = measured(-2.0)  # a decrement
     beside = np.exp(-(2 * (PIXEL / 2) ** 2) / 2 / (np.sqrt(544) / FWHM_PER_SIGMA) ** 2)
-    assert reference[0] == pytest.approx(-2 * 400 / 544 * beside, rel=1e-3)
+    assert reference["I"][0] == pytest.approx(-2 * 400 / 544 * beside, rel=1e-3)
     assert metric.error(measured(-2.02), reference) == pytest.approx(0.01)
     # white noise of 0.1 per pixel under a beam of sigma pixels: 0.1 / sqrt(4 pi sigma^2)
     sigma = FWHM / FWHM_PER_SIGMA / PIXEL
-    assert metric.floor(reference) == pytest.approx(0.1 / np.sqrt(4 * np.pi) / sigma / abs(reference[0]), rel=0.01)
+    assert metric.floor(reference) == pytest.approx(0.1 / np.sqrt(4 * np.pi) / sigma / abs(reference["I"][0]), rel=0.01)
 
 
 def test_transfer_of_a_map_that_lost_half():
@@ -104,10 +105,49 @@ def test_transfer_of_a_map_that_lost_half():
         return metric.measure(data(runs, map=product(seen), noiseless__map=product(factor * seen), input=image))
 
     half, whole = measured(0.5), measured(1.0)
-    assert whole[0] == pytest.approx(1, abs=0.01)
-    assert half[0] == pytest.approx(0.5, abs=0.01)
+    assert whole["I"][0] == pytest.approx(1, abs=0.01)
+    assert half["I"][0] == pytest.approx(0.5, abs=0.01)
     assert metric.error(half, whole) == pytest.approx(0.5, abs=0.01)
     assert 0 < metric.floor(whole) < 1
+
+
+def polarized(i, q, u, noise=0.1):
+    """A map whose Q and U have noise and weights of their own."""
+    planes = np.ones((2, *i.shape))
+    covariance = np.zeros((6, *i.shape))
+    covariance[0], covariance[3], covariance[5] = noise**2, 2 * noise**2, 4 * noise**2
+    found = Polarization(q, u, covariance, planes / [[[2]], [[4]]], 2 * planes[0], np.full(i.shape, 50))
+    return product(i, noise, polarization=found)
+
+
+def test_each_plane_of_a_map_has_its_error():
+    """I alone would say that nothing is wrong: what is changed is in Q."""
+    runs = {"noiseless": {"only": ["sky"]}}
+    given = Image(blob(16.0), wcs(SIDE, PIXEL), polarization=np.stack([blob(16.0, 0.2), 0 * blob()]), axis=np.array([0, 0, 1.0]))
+    beam = np.hypot(16.0, FWHM)
+    seen = blob(beam, (16.0 / beam) ** 2)
+
+    def measured(name, factor):
+        whole = polarized(seen, 0.2 * factor * seen, 1e-6 * factor * seen)
+        return metrics.get(name).measure(data(runs, map=whole, noiseless__map=whole, input=given))
+
+    rms = float(np.sqrt((seen**2).mean()))
+    # of U there is next to nothing: no relative error; of the input no transfer function
+    expected = {
+        "map_rms": {"I": 0.0, "Q": 0.1 * 0.2 * rms / np.sqrt(2) / 0.1, "U": 0.1 * 1e-6 * rms / 2 / 0.1},
+        "peak": {"I": 0.0, "Q": 0.1},
+        "transfer": {"I": 0.0, "Q": 0.1},
+    }
+    for name, parts in expected.items():
+        metric = metrics.get(name)
+        found, reference = measured(name, 0.9), measured(name, 1.0)
+        assert metric.errors(found, reference) == pytest.approx(parts, rel=0.02, abs=1e-12), name
+        assert metric.error(found, reference) == max(metric.errors(found, reference).values())
+        assert metric.errors({"I": found["I"]}, {"I": reference["I"]}) == {}
+        moved, error = metric.mean_error([found, found], [reference, reference])
+        assert moved > 0.04, name  # of the summaries: Q fell by a tenth
+        assert error == pytest.approx(0, abs=1e-12)
+        assert metric.floor(reference) is not None
 
 
 def test_psd_is_relative_in_every_bin():
