@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -60,12 +61,28 @@ class SharedScan:
     def block(self) -> Iterator[None]:
         """While one thread works on a block with one band after the other: `of_block` keeps what it makes until the end."""
         kept: dict[Hashable, tuple[Any, int]] = {}
-        self._of_thread.kept = kept
+        self._of_thread.kept, self._of_thread.put_off = kept, {}
         try:
             yield
         finally:
-            self._of_thread.kept = None
+            self._of_thread.kept = self._of_thread.put_off = None
             self.claim(-sum(size for _, size in kept.values()))
+
+    def put_off(self, label: str, key: Hashable, part: Any, work: Callable[[list[Any]], None]) -> bool:
+        """Let ``work`` be called once for the parts of all bands that have this ``key``, after the last of them.
+
+        The step ``label`` must be the same. False, and nothing is put off, outside of `block`.
+        """
+        put_off = getattr(self._of_thread, "put_off", None)
+        if put_off is None:
+            return False
+        put_off.setdefault((label, key), (work, []))[1].append(part)
+        return True
+
+    def left(self) -> Iterator[tuple[str, Callable[[], None]]]:
+        """What the bands have put off in this block: the step's label, and the work."""
+        for (label, _), (work, parts) in self._of_thread.put_off.items():
+            yield label, partial(work, parts)
 
     def of_block(self, key: Hashable, size: int, make: Callable[[], T]) -> T:
         """What is the same in a block for all bands that have this ``key``, of ``size`` bytes: made by the first that asks.

@@ -6,7 +6,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
 FLAGS = ("contract", "nsz")
 
@@ -150,72 +150,105 @@ def of_bits(typing_context: Any, bits: Any) -> Any:
     return types.float64(types.int64), generate
 
 
-def _vector(builder: Any, pointer: Any, kind: Any) -> Any:
-    """The eight numbers from ``pointer`` on."""
-    return builder.bitcast(pointer, ir.VectorType(kind, 8).as_pointer())
+def _vector(builder: Any, pointer: Any, kind: Any, size: int = 8) -> Any:
+    """The numbers from ``pointer`` on."""
+    return builder.bitcast(pointer, ir.VectorType(kind, size).as_pointer())
 
 
-def _eight_times(builder: Any, value: Any) -> Any:
-    """A vector of eight times one number."""
-    nothing, lane = ir.Constant(ir.VectorType(value.type, 8), ir.Undefined), ir.IntType(32)
+def _times(builder: Any, value: Any, size: int = 8) -> Any:
+    """A vector of one number."""
+    nothing, lane = ir.Constant(ir.VectorType(value.type, size), ir.Undefined), ir.IntType(32)
     first = builder.insert_element(nothing, value, lane(0))
-    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(lane, 8), [0] * 8))
+    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(lane, size), [0] * size))
+
+
+def _together(builder: Any, values: Any) -> Any:
+    """Numbers in a vector, of which many are the same."""
+    size, lane = len(values), ir.IntType(32)
+    found = ir.Constant(ir.VectorType(values[0].type, size), ir.Undefined)
+    for value in {id(one): one for one in values}.values():
+        places = ir.Constant(ir.VectorType(lane, size), [k + size * (one is value) for k, one in enumerate(values)])
+        found = builder.shuffle_vector(found, _times(builder, value, size), places)
+    return found
 
 
 @intrinsic
-def running_terms(typing_context: Any, c: Any, s: Any, x: Any, y: Any, magic: Any, run: Any, size: Any, out: Any) -> Any:
+def running_terms(
+    typing_context: Any, c: Any, s: Any, x: Any, y: Any, first: Any, fields: Any, magic: Any, run: Any, size: Any, out: Any
+) -> Any:
     """Sums over the samples 0 .. t of the bits of (x c, x s, x c c, x c s, x s s, y, y c, y s) + ``magic``, each in float64.
 
-    They go to out[8 run[t]] and on, so that those of the last sample of each run stay. With 1.5 2^52 for ``magic``, the sum over
-    a run of integers of up to 51 bits is the difference of two of these, less the bits of ``magic`` once a sample: exact, as all
-    of it is taken modulo 2^64. C arrays: ``c``, ``s``, ``x``, ``y`` float64, ``run`` int32, ``out`` int64; ``size`` (int64)
-    samples; nothing is checked.
+    ``y`` are rows from ``first`` (uint64) on, one for each element of the tuple ``fields``, whose y, y c, y s follow each other.
+    The sums go to out[L run[t]] and on, so that those of the last sample of each run stay; L is `lanes_of` their number. With
+    1.5 2^52 for ``magic``, the sum over a run of integers of up to 51 bits is the difference of two of these, less the bits of
+    ``magic`` once a sample: exact, as all of it is taken modulo 2^64. C arrays: ``c``, ``s``, ``x``, ``y`` float64, ``run``
+    int32, ``out`` int64; ``size`` (int64) samples; nothing is checked.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         from numba.core import cgutils
 
-        kinds, (size, magic) = signature.args, (arguments[6], arguments[4])
-        c, s, x, y, run, out = (make_array(kinds[k])(context, builder, arguments[k]).data for k in (0, 1, 2, 3, 5, 7))
-        double, integer, lane = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
-        ones = ir.Constant(ir.VectorType(double, 8), [1.0] * 8)
-        magic = _eight_times(builder, magic)
-
-        def choose(a: Any, b: Any, lanes: str) -> Any:
-            """Lanes of ``a``, where there is a 1 those of ``b``."""
-            places = [k + 8 * int(which) for k, which in enumerate(lanes)]
-            return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(lane, 8), places))
-
-        total = cgutils.alloca_once_value(builder, ir.Constant(ir.VectorType(integer, 8), [0] * 8))
+        kinds, (size, magic) = signature.args, (arguments[8], arguments[6])
+        c, s, x, run, out = (make_array(kinds[k])(context, builder, arguments[k]).data for k in (0, 1, 2, 7, 9))
+        double, integer, n = ir.DoubleType(), ir.IntType(64), len(kinds[5])
+        matrix = make_array(kinds[3])(context, builder, arguments[3])
+        width = builder.extract_value(matrix.shape, 1)
+        rows = [builder.gep(matrix.data, [builder.mul(width, builder.add(arguments[4], integer(k)))]) for k in range(n)]
+        one, lanes = ir.Constant(double, 1.0), lanes_of(n)
+        groups = [range(k, min(k + 8, lanes)) for k in range(0, lanes, 8)]
+        totals = [cgutils.alloca_once_value(builder, ir.Constant(ir.VectorType(integer, len(g)), [0] * len(g))) for g in groups]
         with cgutils.for_range(builder, size) as loop:
-            at = [_eight_times(builder, builder.load(builder.gep(data, [loop.index]))) for data in (c, s, x, y)]
-            first = choose(at[2], at[3], "00000111")
-            second = choose(choose(ones, at[0], "00110000"), at[1], "00001000")
-            third = choose(choose(at[0], at[1], "01011001"), ones, "00000100")
-            term = builder.fadd(builder.fmul(builder.fmul(first, second), third), magic)
-            added = builder.add(builder.load(total), builder.bitcast(term, ir.VectorType(integer, 8)))
-            builder.store(added, total)
-            place = builder.mul(builder.zext(builder.load(builder.gep(run, [loop.index])), integer), integer(8))
-            builder.store(added, _vector(builder, builder.gep(out, [place]), integer), align=8)
+            cosine, sine, weight, *data = (builder.load(builder.gep(row, [loop.index])) for row in (c, s, x, *rows))
+            factors = [(weight, one, cosine), (weight, one, sine), (weight, cosine, cosine), (weight, cosine, sine)]
+            factors += [(weight, sine, sine), *((value, one, turn) for value in data for turn in (one, cosine, sine))]
+            factors += factors[-1:] * (lanes - len(factors))
+            place = builder.mul(builder.zext(builder.load(builder.gep(run, [loop.index])), integer), integer(lanes))
+            for group, total in zip(groups, totals, strict=True):
+                a, b, d = (_together(builder, values) for values in zip(*(factors[k] for k in group), strict=True))
+                term = builder.fadd(builder.fmul(builder.fmul(a, b), d), _times(builder, magic, len(group)))
+                added = builder.add(builder.load(total), builder.bitcast(term, ir.VectorType(integer, len(group))))
+                builder.store(added, total)
+                to = builder.gep(out, [builder.add(place, integer(group.start))])
+                builder.store(added, _vector(builder, to, integer, len(group)), align=8)
         return context.get_dummy_value()
 
-    return types.void(c, s, x, y, magic, run, size, out), generate
+    return types.void(c, s, x, y, types.uint64, fields, magic, run, size, out), generate
+
+
+@register_jitable
+def lanes_of(n: int) -> int:
+    """Numbers that `running_terms` keeps of a run, of n ``y``: a multiple of four."""
+    return -(-(5 + 3 * n) // 4) * 4
 
 
 @intrinsic
-def add_change(typing_context: Any, f: Any, at: Any, sums: Any, run: Any, less: Any) -> Any:
-    """f[at + k] += sums[8 run + k] - sums[8 run - 8 + k] - less, k = 0 .. 7, of int64 C arrays; ``at``, ``run`` are uint64."""
+def add_change(typing_context: Any, f: Any, at: Any, sums: Any, run: Any, data: Any, fields: Any, less: Any) -> Any:
+    """f[at + k] += sums[L run + j] - sums[L run - L + j] - less, with j = k for k = 0 .. 4, and j = data + k - 5 for k = 5 .. 7.
+
+    L is `lanes_of` the length of the tuple ``fields``. int64 C arrays; ``at``, ``run``, ``data`` are uint64; ``data`` is at
+    least 5, and 5 where ``fields`` has one element; nothing is checked.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kinds, (_, at, _, run, less) = signature.args, arguments
+        kinds, (_, at, _, run, data, _, less) = signature.args, arguments
         f, sums = (make_array(kinds[k])(context, builder, arguments[k]).data for k in (0, 2))
         integer = ir.IntType(64)
-        last = builder.gep(sums, [builder.mul(run, integer(8))])
-        pointers = (last, builder.gep(last, [integer(-8)]), builder.gep(f, [at]))
-        now, before, to = (_vector(builder, pointer, integer) for pointer in pointers)
-        change = builder.sub(builder.load(now, align=8), builder.load(before, align=8))
-        change = builder.sub(change, _eight_times(builder, less))
+        lanes = ir.Constant(ir.VectorType(ir.IntType(32), 8), [0, 1, 2, 3, 4, 13, 14, 15])
+
+        def eight(run: Any) -> Any:
+            place = builder.mul(run, integer(lanes_of(len(kinds[5]))))
+            first = builder.load(_vector(builder, builder.gep(sums, [place]), integer), align=8)
+            if len(kinds[5]) == 1:
+                return first
+            place = builder.add(place, builder.sub(data, integer(5)))
+            return builder.shuffle_vector(
+                first, builder.load(_vector(builder, builder.gep(sums, [place]), integer), align=8), lanes
+            )
+
+        change = builder.sub(eight(run), eight(builder.sub(run, integer(1))))
+        change = builder.sub(change, _times(builder, less))
+        to = _vector(builder, builder.gep(f, [at]), integer)
         builder.store(builder.add(builder.load(to, align=8), change), to, align=8)
         return context.get_dummy_value()
 
-    return types.void(f, types.uint64, sums, types.uint64, types.int64), generate
+    return types.void(f, types.uint64, sums, types.uint64, types.uint64, fields, types.int64), generate

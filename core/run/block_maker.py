@@ -133,7 +133,10 @@ class BlockMaker:
         self._exec(rest[:1], block, signals)
         if reach != samples:
             block = trimmed(block, samples)
-        self._exec(rest[1:], block, signals)
+        last = next((k for k, o in enumerate(rest) if all(isinstance(step, MapMaker) for step in rest[k:])), len(rest))
+        self._exec(rest[1 : max(last, 1)], block, signals)
+        block.stays = True  # nothing changes it any more
+        self._exec(rest[max(last, 1) :], block, signals)
         held = self._local.__dict__
         buffers = [*held.get("blocks", {}).values(), held.get("pieces", {}), held.get("whole", {})]
         size = sum(array.nbytes for held in buffers for array in held.values())

@@ -135,7 +135,7 @@ def run_in_step(bands: Sequence[Turns], settings: Settings, timer: Timer, shared
             answers: list[Any] = [None] * len(bands)
             sweeps = {k: one for k, one in enumerate(asked) if isinstance(one, Sweep)}
             if sweeps:
-                _sweep(list(sweeps.values()), settings, shared)
+                _sweep(list(sweeps.values()), settings, timer, shared)
                 ready = list(sweeps)
             else:
                 ready = [k for k, one in enumerate(asked) if one is not None]
@@ -162,7 +162,7 @@ def _resume(band: Turns, answer: Any) -> Waiting | Sweep | None:
         return None
 
 
-def _sweep(sweeps: Sequence[Sweep], settings: Settings, shared: SharedScan | None) -> None:
+def _sweep(sweeps: Sequence[Sweep], settings: Settings, timer: Timer, shared: SharedScan | None) -> None:
     """Work on the blocks of several bands: on each with all of them where their blocks are the same."""
     first = sweeps[0]
     if shared is None or any(one.blocks != first.blocks for one in sweeps):
@@ -174,6 +174,10 @@ def _sweep(sweeps: Sequence[Sweep], settings: Settings, shared: SharedScan | Non
         with shared.block():
             for one in sweeps:
                 one.work(detectors, samples)
+            for label, left in shared.left():
+                start = time.thread_time()
+                left()
+                timer.add(label, "exec", time.thread_time() - start)
 
     def stop() -> None:
         for one in sweeps:

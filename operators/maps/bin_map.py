@@ -218,7 +218,7 @@ def add_signals(step: BinMap, block: Block, state: Prepared, reference: float) -
     if state.directions is not None:
         state.directions.add(signals, block)
     if step.stokes == "IQU":
-        add_polarized(state.binnings, tuple(signals), block)  # type: ignore[arg-type]
+        add_polarized(step.label, state.binnings, tuple(signals), block)  # type: ignore[arg-type]
         return
     for half in halves(step, list(state.binnings)):
         left = signals

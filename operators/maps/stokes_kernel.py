@@ -3,13 +3,14 @@
 Successive samples of a detector often fall in the same pixel. Their terms are added up along the row, all columns side by side
 (`running_terms`), and each run of samples in one pixel goes to the map at once: what its last sample's sums have more than those
 of the run before. Sums are integers modulo 2^64, so that this is exact, and how samples are cut in runs is not seen in the map.
+Angles and runs are found once for all bands that see the same pixels, and the terms of A where their weights are equal.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from zonda.core.compilation.columns import add_change, bits_of, of_bits, prefetch, running_terms
+from zonda.core.compilation.columns import add_change, bits_of, lanes_of, of_bits, prefetch, running_terms
 from zonda.core.compilation.jit import nb
 from zonda.core.polarization import fill_row
 
@@ -24,75 +25,100 @@ DATA = 7
 AT_ONCE = 512
 """Samples of a detector whose terms are in the first cache together."""
 LAST = 5
-"""Of the eight terms that are made at a time: how many come from weights; the others are w d, w d c, w d s."""
+"""Of the terms that are made at a time: how many come from weights; w d, w d c, w d s of each signal follow."""
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def add_stokes(signals, first, rows, at, cells, angles, which, start, good, window, weight, noise, own, sums, dropped, largest):  # type: ignore[no-untyped-def]
+def add_stokes(signals, first, rows, at, cells, angles, which, start, good, window, own, bands):  # type: ignore[no-untyped-def]
     """Add samples first .. of ``rows`` of all ``signals`` (a tuple) to their pixels.
 
     Parameters
     ----------
+    signals
+        Those of the first band, then as many of the next.
     at
         (n_row,) of each, its row in ``cells`` (n, m): pixels, or -1 outside.
     angles, which, start
         Poles, axes, plate and gamma (`PolarizationAngles`), p; (n_row,) numbers of the detectors there; the first sample there.
-    good, window, weight, noise
-        (m,); (m,), or (0,): none; (n_row,) each.
+    good, window
+        (m,); (m,), or (0,): none.
     own
         N is added up.
-    dropped, largest
-        What is dropped is counted, the largest terms are noted.
+    bands
+        Of each band weight (n_row,), noise (n_row,), sums, dropped, largest. What is dropped is counted, the largest terms are
+        noted. What one band drops is of no matter to the others.
     """
-    m, n, columns = len(signals), cells.shape[1], np.uint64(sums.shape[1])
-    values, size, kept = np.empty((m + 2, AT_ONCE)), np.empty(AT_ONCE), np.empty(AT_ONCE, np.int32)  # of the signals; w; N's
+    n_bands, n = len(bands), cells.shape[1]
+    m = len(signals) // n_bands
+    values, size, kept = np.empty((len(signals) + 2, AT_ONCE)), np.empty(AT_ONCE), np.empty(AT_ONCE, np.int32)  # signals; w; N's
     c, s, share = np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty(AT_ONCE if window.size else 0)
     run, begins, places = np.empty(AT_ONCE, np.int32), np.empty(AT_ONCE + 1, np.int64), np.empty(AT_ONCE + 1, np.int32)
-    terms = np.zeros(8 * (AT_ONCE + 1), np.int64)
+    terms, tops = np.zeros(lanes_of(len(signals)) * (AT_ONCE + 1), np.int64), np.empty(n_bands, np.int64)
+    few = np.zeros(lanes_of(1) * (AT_ONCE + 1), np.int64)
     for begin in range(0, n, AT_ONCE):
-        number = min(AT_ONCE, n - begin)
-        fine, n_fine = good[begin : begin + number], np.int64(0)
-        for t in range(number):
+        length, low = min(AT_ONCE, n - begin), first + begin
+        fine, n_fine = good[begin : begin + length], np.int64(0)
+        for t in range(length):
             n_fine += np.int64(fine[t] != 0)
         if not n_fine:
-            dropped[FLAGGED] += number * rows.size
+            for b in range(n_bands):
+                bands[b][3][FLAGGED] += length * rows.size
             continue
         for k in range(rows.size):
-            w0, row, low = weight[k], at[k], first + begin
-            limit = LARGEST / VALUE / max(w0, 1.0)
-            number, top = min(AT_ONCE, n - begin), np.int64(0)
-            pixels = cells[row, begin : begin + number]
-            for i in range(m):
-                top = max(top, _scaled(signals[i][rows[k], low : low + number], w0 * VALUE, values[i]))
-            d = which[k]
-            fill_row(angles[0], angles[1][d], angles[2], angles[3][d], start + begin, c[:number], s[:number])
-            _round(angles[4][d], c[:number])
-            _round(angles[4][d], s[:number])
-            for t in range(number if window.size else 0):
-                share[t] = window[begin + t]
-            if n_fine < number or top >= bits_of(limit) or _least(pixels) < 0:
-                number, top = _without(signals, rows[k], low, pixels, fine, limit, size, c, s, share, values, kept, dropped)
-                pixels = kept[:number]
-            largest[0] = max(largest[0], max(w0, noise[k]) * WEIGHT)
-            largest[1] = max(largest[1], of_bits(top) * w0 * VALUE + 1.0)
-            n_runs = _runs(pixels, run, begins, places)
-            _fetch(sums, columns, places, n_runs)
-            _scale(w0, noise[k], share, values[m, :number], values[m + 1])
-            running_terms(c, s, values[m], values[0], MAGIC, run, number, terms)
-            all_alike = 0 if window.size else np.int64((w0 * WEIGHT + MAGIC) - MAGIC)
-            for r in range(n_runs):
-                pixel, count = np.uint64(places[r]), begins[r + 1] - begins[r]
-                sums[pixel, HIT] += count
-                sums[pixel, FIRST] += count * all_alike
-                add_change(sums, pixel * columns + np.uint64(FIRST + 1), terms, np.uint64(r + 1), count * MAGIC_BITS)
-            for i in range(1, m + 2):
-                if (i == m and not window.size) or (i == m + 1 and not own):
-                    continue
-                column, lanes = (DATA + 3 * i, 3) if i < m else (FIRST if i == m else DATA + 3 * m, 1)
-                running_terms(c, s, values[i], values[i], MAGIC, run, number, terms)
-                _add(sums, column, terms, LAST, lanes, places, begins, n_runs)
-                if i > m:
-                    _add(sums, column + 1, terms, 0, LAST, places, begins, n_runs)
+            d, cell = which[k], cells[at[k], begin : begin + length]
+            spoilt = n_fine < length or _least(cell) < 0
+            for b in range(n_bands):
+                tops[b] = 0
+                for i in range(b * m, b * m + m):
+                    tops[b] = max(tops[b], _scaled(signals[i][rows[k], low : low + length], bands[b][0][k] * VALUE, values[i]))
+                spoilt = spoilt or tops[b] >= bits_of(_limit(bands[b][0][k]))
+            for lot in range(n_bands if spoilt else 1):  # each for itself, or all together
+                b0, b1, number, pixels = (lot, lot + 1, length, cell) if spoilt else (0, n_bands, length, cell)
+                fill_row(angles[0], angles[1][d], angles[2], angles[3][d], start + begin, c[:length], s[:length])
+                _round(angles[4][d], c[:length])
+                _round(angles[4][d], s[:length])
+                for t in range(length if window.size else 0):
+                    share[t] = window[begin + t]
+                if spoilt:
+                    limit, dropped = _limit(bands[lot][0][k]), bands[lot][3]
+                    where = rows[k], low, lot * m, m
+                    number, top = _without(signals, where, cell, fine, limit, size, c, s, share, values, kept, dropped)
+                    pixels, tops[lot] = kept[:number], top
+                n_runs, alike = _runs(pixels, run, begins, places), n_bands == 1 or not spoilt
+                for b in range(b0 + 1, b1):
+                    alike = alike and bands[b][0][k] == bands[b0][0][k]
+                for b in range(b0, b1):
+                    w0, noise, sums, largest = bands[b][0][k], bands[b][1][k], bands[b][2], bands[b][4]
+                    largest[0] = max(largest[0], max(w0, noise) * WEIGHT)
+                    largest[1] = max(largest[1], of_bits(tops[b]) * w0 * VALUE + 1.0)
+                    _fetch(sums, places, n_runs)
+                    _scale(w0, noise, share, values[-2, :number], values[-1])
+                    every_w = 0 if window.size else np.int64((w0 * WEIGHT + MAGIC) - MAGIC)
+                    if alike:  # weights, so that the terms of A are made once
+                        if b == b0:
+                            running_terms(c, s, values[-2], values, np.uint64(0), signals, MAGIC, run, number, terms)
+                        _add(sums, terms, signals, b * m, places, begins, n_runs, every_w)
+                        for i in range(1, m):
+                            _add_lanes(sums, DATA + 3 * i, terms, signals, LAST + 3 * (b * m + i), 3, places, begins, n_runs)
+                    for i in range(0 if alike else m):
+                        running_terms(c, s, values[-2], values, np.uint64(b * m + i), signals[:1], MAGIC, run, number, few)
+                        if i == 0:
+                            _add(sums, few, signals[:1], 0, places, begins, n_runs, every_w)
+                        else:
+                            _add_lanes(sums, DATA + 3 * i, few, signals[:1], LAST, 3, places, begins, n_runs)
+                    if window.size:
+                        running_terms(c, s, values[-2], values, np.uint64(n_bands * m), signals[:1], MAGIC, run, number, few)
+                        _add_lanes(sums, FIRST, few, signals[:1], LAST, 1, places, begins, n_runs)
+                    if own:
+                        running_terms(c, s, values[-1], values, np.uint64(n_bands * m + 1), signals[:1], MAGIC, run, number, few)
+                        _add_lanes(sums, DATA + 3 * m, few, signals[:1], LAST, 1, places, begins, n_runs)
+                        _add_lanes(sums, DATA + 3 * m + 1, few, signals[:1], 0, LAST, places, begins, n_runs)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _limit(weight):  # type: ignore[no-untyped-def]
+    """The size of a sample that is too large."""
+    return LARGEST / VALUE / max(weight, 1.0)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
@@ -130,17 +156,19 @@ def _scale(weight, noise, share, w, n):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _without(signals, d, first, pixels, fine, limit, size, c, s, share, values, kept, dropped):  # type: ignore[no-untyped-def]
-    """Drop samples from ``c``, ``s``, ``share`` and ``values`` (m, n), and from ``pixels`` into ``kept``.
+def _without(signals, where, pixels, fine, limit, size, c, s, share, values, kept, dropped):  # type: ignore[no-untyped-def]
+    """Drop samples of a band from ``c``, ``s``, ``share`` and ``values`` (m, n), and from ``pixels`` into ``kept``.
 
-    How many are left, and the bits of the largest. ``limit``: the size that is too large; ``size``: space.
+    How many are left, and the bits of the largest. ``where``: row and first sample, first signal and number of signals;
+    ``limit``: the size that is too large; ``size``: space.
     """
+    d, first, begin, m = where
     number, high = 0, 0.0
-    for i in range(len(signals)):
+    for i in range(begin, begin + m):
         row = signals[i][d, first : first + pixels.size]
         for t in range(row.size):
             one = abs(np.float64(row[t]))
-            size[t] = max(size[t] if i else 0.0, one if one < np.inf else np.inf)  # NaN is not below anything
+            size[t] = max(size[t] if i > begin else 0.0, one if one < np.inf else np.inf)  # NaN is not below anything
     for t in range(pixels.size):
         if not fine[t] or not size[t] < np.inf or pixels[t] < 0 or size[t] >= limit:
             why = FLAGGED if not fine[t] else NOT_FINITE if not size[t] < np.inf else OUTSIDE if pixels[t] < 0 else TOO_LARGE
@@ -150,7 +178,7 @@ def _without(signals, d, first, pixels, fine, limit, size, c, s, share, values, 
         kept[number], c[number], s[number] = pixels[t], c[t], s[t]
         if share.size:
             share[number] = share[t]
-        for i in range(len(signals)):
+        for i in range(begin, begin + m):
             values[i, number] = values[i, t]
         number += 1
     return number, bits_of(high)
@@ -171,8 +199,9 @@ def _runs(pixels, run, begins, places):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _fetch(sums, columns, places, n_runs):  # type: ignore[no-untyped-def]
+def _fetch(sums, places, n_runs):  # type: ignore[no-untyped-def]
     """Fetch the sums of some pixels, which are in memory, while their terms are made."""
+    columns = np.uint64(sums.shape[1])
     for r in range(n_runs):
         place = np.uint64(places[r]) * columns
         for column in range(np.uint64(0), columns, np.uint64(8)):
@@ -181,10 +210,25 @@ def _fetch(sums, columns, places, n_runs):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add(sums, column, terms, lane, lanes, places, begins, n_runs):  # type: ignore[no-untyped-def]
-    """Add lanes of the runs' terms to columns from ``column`` on."""
+def _add(sums, terms, fields, of, places, begins, n_runs, every_w):  # type: ignore[no-untyped-def]
+    """Add hits, A, and the data of the first signal of a band, which is number ``of`` of the ``fields``, to the pixels of runs.
+
+    ``every_w``: the weight of each sample, or 0.
+    """
+    columns, data = np.uint64(sums.shape[1]), np.uint64(LAST + 3 * of)
+    for r in range(n_runs):
+        pixel, count = np.uint64(places[r]), begins[r + 1] - begins[r]
+        sums[pixel, HIT] += count
+        sums[pixel, FIRST] += count * every_w
+        add_change(sums, pixel * columns + np.uint64(FIRST + 1), terms, np.uint64(r + 1), data, fields, count * MAGIC_BITS)
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _add_lanes(sums, column, terms, fields, lane, lanes, places, begins, n_runs):  # type: ignore[no-untyped-def]
+    """Add some of the `running_terms` of runs, from ``lane`` on, to columns from ``column`` on."""
+    back = lanes_of(len(fields))
     for r in range(n_runs):
         pixel, less = np.uint64(places[r]), (begins[r + 1] - begins[r]) * MAGIC_BITS
-        last = 8 * (r + 1) + lane
+        last = back * (r + 1) + lane
         for k in range(lanes):
-            sums[pixel, np.uint64(column + k)] += terms[np.uint64(last + k)] - terms[np.uint64(last + k - 8)] - less
+            sums[pixel, np.uint64(column + k)] += terms[np.uint64(last + k)] - terms[np.uint64(last + k - back)] - less

@@ -19,7 +19,7 @@ from zonda.core.types import Floats
 
 from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES, halves_of
-from .looking import Looking
+from .looking import Looking, fingerprint
 from .parameters import MapParameters
 from .stokes_kernel import HIT
 from .stokes_product import StokesSums
@@ -58,11 +58,12 @@ def stokes_binnings(
     check_polarized(step, observation)
     own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
     angles = PolarizationAngles.of(observation, observation.boresight_radec, frame_rotation(step.frame)[2])
-    signals = len(observation.signals)
-    return [
-        StokesBinning(looking, angles, use, (good & samples).astype(np.uint8), window, weight, noise, signals, own, spare)
-        for use, samples in halves_of(step.split, observation)
-    ]
+    signals, key = len(observation.signals), None
+    halves = [(use, (good & samples).astype(np.uint8)) for use, samples in halves_of(step.split, observation)]
+    if looking.key is not None:
+        seen = angles.poles, angles.axes, angles.plate, angles.gamma, observation.focalplane.polarization_efficiency, window
+        key = looking.key, own, fingerprint(*seen, *(mask for half in halves for mask in half))
+    return [StokesBinning(looking, angles, *half, window, weight, noise, signals, own, spare, key) for half in halves]
 
 
 @dataclass(frozen=True)

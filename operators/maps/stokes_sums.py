@@ -19,16 +19,16 @@ of threads or workers.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.block import Block
 from zonda.core.polarization import PolarizationAngles
-from zonda.core.types import Floats
+from zonda.core.types import AnyFloats, Floats
 
 from .looking import Looking, tiles
 from .stokes_kernel import DATA, FIRST, HIT, add_stokes
@@ -58,6 +58,9 @@ class StokesBinning:
         Whether N is not A, and is added up.
     spare
         Arrays of zeros that served the scans before.
+    key
+        The same for all bands whose samples fall in the same pixels at the same angles, whatever their weights; None where there
+        is no other band.
     """
 
     looking: Looking
@@ -70,6 +73,7 @@ class StokesBinning:
     signals: int
     own_noise: bool
     spare: list[Sums] = field(default_factory=list)
+    key: Hashable = None
     parts: dict[int, tuple[Sums, Sums, Floats]] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -99,24 +103,56 @@ class StokesBinning:
         self.parts.clear()
 
 
-def add_block(binnings: Sequence[StokesBinning], signals: tuple[Any, ...], block: Block) -> None:
-    """Add a block's ``signals``, each (n_det, n), to this thread's sums of the ``binnings`` of one observation."""
-    detectors, samples, looking, a = block.detectors, block.samples, binnings[0].looking, binnings[0].angles
+class Part(NamedTuple):
+    """What a block adds to the sums of one band: ``signals`` (n_det, n) each, ``binnings`` of the halves of its observation."""
+
+    binnings: Sequence[StokesBinning]
+    signals: tuple[AnyFloats, ...]
+    block: Block
+
+    def used(self) -> list[NDArray[np.bool_]]:
+        """Of each half, which of the block's detectors count (n_det,)."""
+        rows = self.block.detectors
+        return [one.use[rows] & self.block.observation.good_detectors[rows] for one in self.binnings]
+
+
+def add_block(label: str, binnings: Sequence[StokesBinning], signals: tuple[AnyFloats, ...], block: Block) -> None:
+    """Add a block's ``signals``, each (n_det, n), to this thread's sums of the ``binnings`` of one observation.
+
+    It is done for all bands in step at once whose samples fall in the same pixels at the same angles (`StokesBinning.key`).
+    """
+    part, shared, key = Part(binnings, signals, block), block.observation.shared, binnings[0].key
+    same = key, len(signals), signals[0].dtype.str
+    if key is None or not block.stays or shared is None or not shared.put_off(label, same, part, add_parts):
+        add_parts([part])
+
+
+def add_parts(parts: Sequence[Part]) -> None:
+    """Add the parts of bands that have the same key."""
+    used = [part.used() for part in parts]
+    for k in range(1, len(parts)):
+        if not np.array_equal(used[k], used[0]):  # detectors that a filter has flagged
+            for part in parts:
+                add_parts([part])
+            return
+    block, looking, a = parts[0].block, parts[0].binnings[0].looking, parts[0].binnings[0].angles
+    detectors, samples, halves = block.detectors, block.samples, list(zip(*(part.binnings for part in parts), strict=True))
     angles = a.poles, a.axes, a.plate, a.gamma, block.observation.focalplane.polarization_efficiency
-    good = block.observation.good_detectors[detectors]
-    parts = [(one, one.use[detectors] & good, *one.of_thread()) for one in binnings]
-    for _, used, _, dropped, _ in parts:
-        dropped[FLAGGED] += (samples.stop - samples.start) * int(np.count_nonzero(~used))
-    for rows, start, stop in tiles(block, np.any([used for _, used, *_ in parts], axis=0)):
+    signals = tuple(signal for part in parts for signal in part.signals)
+    sums = [[band.of_thread() for band in half] for half in halves]
+    for of_half, mine in zip(used[0], sums, strict=True):
+        for _, dropped, _ in mine:
+            dropped[FLAGGED] += (samples.stop - samples.start) * int(np.count_nonzero(~of_half))
+    for rows, start, stop in tiles(block, np.any(used[0], axis=0)):
         index = None
-        for one, used, sums, dropped, largest in parts:
-            at = np.flatnonzero(used[rows])
-            if not one.good[start:stop].any():
-                dropped[FLAGGED] += (stop - start) * at.size
+        for half, of_half, mine in zip(halves, used[0], sums, strict=True):
+            at, good = np.flatnonzero(of_half[rows]), half[0].good[start:stop]
+            if not good.any():
+                for _, dropped, _ in mine:
+                    dropped[FLAGGED] += (stop - start) * at.size
             elif at.size:
                 index = looking.pixels(rows + detectors.start, start, stop) if index is None else index
-                mine = rows[at]
-                which = mine + detectors.start
-                where = start - samples.start, mine, at, index, angles, which, start
-                how = one.good[start:stop], one.window[start:stop], one.weight[which], one.noise[which], one.own_noise
-                add_stokes(signals, *where, *how, sums, dropped, largest)
+                which = rows[at] + detectors.start
+                where = start - samples.start, rows[at], at, index, angles, which, start
+                bands = tuple((band.weight[which], band.noise[which], *own) for band, own in zip(half, mine, strict=True))
+                add_stokes(signals, *where, good, half[0].window[start:stop], half[0].own_noise, bands)

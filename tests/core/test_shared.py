@@ -34,3 +34,21 @@ def test_of_block_makes_alone_outside_of_a_block_and_in_other_threads():
         other.start()
         other.join()
     assert len(made) == 4
+
+
+def test_what_bands_put_off_is_done_once_for_all_that_have_the_same_key():
+    shared, done = SharedScan(ROOM), []
+    assert not shared.put_off("BinMap", "key", 0, done.append)  # outside of a block nothing is put off
+    for _ in range(2):
+        with shared.block():
+            assert all(shared.put_off("BinMap", key, part, done.append) for key, part in [("a", 1), ("b", 2), ("a", 3)])
+            assert shared.put_off("BinMap 2", "a", 4, done.append)
+            assert not done
+            labels = []
+            for label, work in shared.left():
+                labels.append(label)
+                work()
+        assert labels == ["BinMap", "BinMap", "BinMap 2"]
+        assert done == [[1, 3], [2], [4]]
+        done.clear()
+    assert not shared.put_off("BinMap", "key", 0, done.append)

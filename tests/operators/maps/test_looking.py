@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import zonda
 from zonda.core.shared import SharedScan
+from zonda.operators.maps import stokes_sums
 from zonda.operators.maps.grid import HealpixGrid
 from zonda.operators.maps.looking import Looking
 from zonda.plugins.checks.scenes import scan
@@ -82,18 +83,21 @@ class Spoilt(zonda.Operator):
 
     requires = frozenset({"signal"})
     provides = frozenset({"signal"})
+    what: str = "dead flagged nan"
 
     def prepare(self, observation: zonda.Observation) -> None:
         if observation.instrument.band.name == "f150":
-            observation.detector_flags[3] = 1
-            observation.flags[700:900] |= 1
+            if "dead" in self.what:
+                observation.detector_flags[3] = 1
+            if "flagged" in self.what:
+                observation.flags[700:900] |= 1
 
     def exec(self, block: zonda.Block, state: Any) -> None:
-        if block.observation.instrument.band.name == "f090" and block.detectors.start == 0:
+        if "nan" in self.what and block.observation.instrument.band.name == "f090" and block.detectors.start == 0:
             block.detdata["signal"][2, ::50] = np.nan
 
 
-def maps(bands: Any, how: Any) -> Any:
+def maps(bands: Any, how: Any, steps: Any = (Spoilt(),)) -> Any:
     camera = zonda.Instrument(
         name="camera", telescope={"name": "dish", "diameter": "6 m"}, detectors=38, field_of_view="20 arcmin",
         polarization="pairs", main_beam_efficiency=0.8, illumination_efficiency=0.9, sample_rate="50 Hz",
@@ -102,7 +106,7 @@ def maps(bands: Any, how: Any) -> Any:
     scene = zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
     steps = [
         zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="70 s"),
-        zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %"), zonda.WhiteNoise(), zonda.Efficiency(), Spoilt(),
+        zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %"), zonda.WhiteNoise(), zonda.Efficiency(), *steps,
         zonda.BinMap(stokes="IQU", half_difference="directions", crosslinking=True, **how),
         zonda.BinMap(product="intensity", half_difference="halves", crosslinking=True, **how),
     ]  # fmt: skip
@@ -130,8 +134,12 @@ def test_maps_of_bands_side_by_side_are_those_of_each_alone(how: Any, monkeypatc
     monkeypatch.setattr(SharedScan, "of_block", noted)
     together = maps(BANDS, how)
     assert 0.2 < np.mean(taken) < 0.9  # not in the tile where a detector is dead in one band
+    assert_as_alone(together, how, (Spoilt(),))
+
+
+def assert_as_alone(together: Any, how: Any, steps: Any) -> None:
     for one in BANDS:
-        alone = maps([one], how)
+        alone = maps([one], how, steps)
         for product in ("map", "intensity"):
             expected = planes(alone.products[f"{product}_{one['name']}"])
             for name, plane in planes(together.products[f"{product}_{one['name']}"]).items():
@@ -139,3 +147,23 @@ def test_maps_of_bands_side_by_side_are_those_of_each_alone(how: Any, monkeypatc
         counted = {(who, what, value) for who, what, value in alone.tally if "BinMap" in who}
         assert counted <= {(who, what, value) for who, what, value in together.tally}
         assert any("dropped" in what for _, what, _ in counted)
+
+
+@pytest.mark.parametrize("weights", ["inverse_variance", "uniform"])
+@pytest.mark.parametrize(("spoilt", "shares"), [("", 1.0), ("nan", 1.0), ("dead", 0.7), ("flagged", 0.0)])
+def test_samples_of_bands_go_to_their_maps_together(
+    spoilt: str, shares: float, weights: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind a step that needs whole scans, whose blocks stay. One of five tiles has the detector that is dead in one band."""
+    taken, add = [], stokes_sums.add_stokes
+
+    def noted(signals: Any, *others: Any) -> None:
+        taken.append(len(others[-1]))
+        add(signals, *others)
+
+    monkeypatch.setattr(stokes_sums, "add_stokes", noted)
+    how, steps = {"nside": 1024, "weights": weights}, (Spoilt(what=spoilt), zonda.PolynomialFilter(order=1))
+    together = maps(BANDS, how, steps)
+    assert set(taken) <= {1, 2}
+    assert taken.count(2) / len(taken) == pytest.approx(shares, abs=0.2 if 0 < shares < 1 else 0)
+    assert_as_alone(together, how, steps)

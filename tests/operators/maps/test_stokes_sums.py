@@ -82,6 +82,12 @@ def results(function, tile):
     return sums, dropped, largest
 
 
+def added(*of):
+    """`add_stokes` of one band."""
+    *tile, weight, noise, own, sums, dropped, largest = of
+    add_stokes(*tile, own, ((weight, noise, sums, dropped, largest),))
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("signals", [1, 2, 3])
 @pytest.mark.parametrize(("own", "window"), [(False, False), (True, False), (True, True)])
@@ -89,7 +95,7 @@ def test_every_term_is_added(signals, dtype, own, window):
     """Also over the ends of what is worked on at once, and where only some of it counts."""
     for seed, (n, run, spoilt) in enumerate([(2 * AT_ONCE + 3, 1, False), (AT_ONCE + 40, 9, True), (AT_ONCE, 9, False)]):
         tile = random_tile(seed, signals=signals, n=n, run=run, own=own, window=window, spoilt=spoilt, dtype=dtype)
-        for found, expected in zip(results(add_stokes, tile), results(term_by_term, tile), strict=True):
+        for found, expected in zip(results(added, tile), results(term_by_term, tile), strict=True):
             np.testing.assert_array_equal(found, expected)
 
 
@@ -99,8 +105,30 @@ def test_terms_of_any_tile(seed, n, run, signals, choices):
     spoilt, own, window, plate = choices
     how = {"own": own or window, "window": window, "spoilt": spoilt, "plate": plate, "dtype": np.float64}
     tile = random_tile(seed, signals=signals, n=n, run=run, **how)
-    for found, expected in zip(results(add_stokes, tile), results(term_by_term, tile), strict=True):
+    for found, expected in zip(results(added, tile), results(term_by_term, tile), strict=True):
         np.testing.assert_array_equal(found, expected)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 2**31), st.integers(1, 60), st.integers(1, 70), st.integers(1, 2), st.tuples(*[st.booleans()] * 5))
+def test_bands_have_the_bits_that_they_have_alone(seed, n, run, signals, choices):
+    """Of equal weights or others; what is spoilt is so in one of them or in both."""
+    alike, spoilt, own, window, other = choices
+    how = {"signals": signals, "n": n, "run": run, "own": own or window, "window": window, "dtype": np.float64}
+    one = random_tile(seed, spoilt=spoilt, **how)
+    rng = np.random.default_rng(seed)
+    data = tuple(rng.normal(0, 3, array.shape) for array in one[0])
+    if other:
+        data[0][rng.random(data[0].shape) < 0.05] = np.nan
+    weight, noise = (one[-3], one[-2]) if alike else rng.uniform(0.1, 3, (2, one[-3].size))
+    two = (data, *one[1:-3], weight, noise, one[-1])
+    expected = [results(term_by_term, tile) for tile in (one, two)]
+    found = [(np.zeros_like(sums), np.zeros_like(dropped), np.zeros_like(largest)) for sums, dropped, largest in expected]
+    bands = tuple((tile[-3], tile[-2], *mine) for tile, mine in zip((one, two), found, strict=True))
+    add_stokes(one[0] + data, *one[1:-3], one[-1], bands)
+    for mine, theirs in zip(found, expected, strict=True):
+        for a, b in zip(mine, theirs, strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 @settings(deadline=None, max_examples=20)
@@ -112,7 +140,7 @@ def test_where_samples_are_cut_does_not_matter(seed, cut, run):
     signals, first, rows, at, cells, angles, which, start, good, *rest = tile
     one = signals, first, rows, at, cells[:, :cut].copy(), angles, which, start, good[:cut], *rest
     two = signals, first + cut, rows, at, cells[:, cut:].copy(), angles, which, start + cut, good[cut:], *rest
-    whole, parts = results(add_stokes, tile), [results(add_stokes, part) for part in (one, two)]
+    whole, parts = results(added, tile), [results(added, part) for part in (one, two)]
     np.testing.assert_array_equal(whole[0], parts[0][0] + parts[1][0])
     np.testing.assert_array_equal(whole[1], parts[0][1] + parts[1][1])
     np.testing.assert_array_equal(whole[2], np.maximum(parts[0][2], parts[1][2]))
@@ -121,7 +149,7 @@ def test_where_samples_are_cut_does_not_matter(seed, cut, run):
 def test_nothing_counts_in_a_tile_without_good_samples():
     tile = list(random_tile(1, signals=1, n=600, run=3, own=False, window=False, spoilt=False, dtype=np.float32))
     tile[8] = np.zeros(600, np.uint8)
-    sums, dropped, largest = results(add_stokes, tuple(tile))
+    sums, dropped, largest = results(added, tuple(tile))
     assert not sums.any()
     assert not largest.any()
     np.testing.assert_array_equal(dropped, [0, 3 * 600, 0, 0])
@@ -132,7 +160,7 @@ def test_a_window_enters_the_noise_squared() -> None:
     sums, one, index = np.zeros((1, DATA + 3 + 6), np.int64), np.ones(1), np.zeros(1, np.int64)
     angles = np.ones((3, 2)), np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]), np.zeros((2, 0)), np.zeros((1, 2))  # psi = 0
     how = (*angles, 0.8 * one), index, 0, np.ones(2, np.uint8), np.full(2, 0.5), one, 0.8 * one, True
-    add_stokes((np.ones((1, 2)),), 0, index, index, np.zeros((1, 2), np.int32), *how, sums, np.zeros(4, np.int64), np.zeros(2))
+    added((np.ones((1, 2)),), 0, index, index, np.zeros((1, 2), np.int32), *how, sums, np.zeros(4, np.int64), np.zeros(2))
     assert sums[0, 1] == WEIGHT
     expected = np.array([1, 0.8, 0, 0.64, 0, 0]) * 0.4
     np.testing.assert_allclose(sums[0, DATA + 3 :] / WEIGHT, expected, atol=2 / WEIGHT)
