@@ -23,9 +23,14 @@ from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
 from .comparison.radial import RadialSpectra, radial_spectra, ring_edges
-from .series import about, key_of
+from .series import about, key_of, kinds_of_maps
 from .stokes_spectra import on_the_plane, sphere_spectra
 from .transfer_function import window_of
+
+USABLE = frozenset({"TAN", "HEALPix"})
+"""Kinds of maps of which there is a spectrum."""
+SEVERAL_HEALPIX = "spectra of HEALPix maps are of one map at a time"
+NO_MAP, CURE = "there is no TAN or HEALPix map of the signal", "leave projection and contents of the map out"
 
 HALVES = {"": "", "_E": " (E)", "_B": " (B)"}
 """How the spectra of the half-difference are called."""
@@ -87,6 +92,18 @@ class MapSpectrum(Output):
     taper: Angle | None = Field(None, gt=0)
     """Width of the window's cosine edge; where absent, it reaches to the middle."""
 
+    def check(self, data: Data) -> list[str]:
+        """Raises PipelineError where the maps that will be made are none of which there is a spectrum."""
+        made = kinds_of_maps(data)
+        kinds = [made.get(name.rpartition("/")[2], "TAN") for name in self.maps]
+        if len(kinds) > 1 and "HEALPix" in kinds:
+            raise PipelineError(SEVERAL_HEALPIX, place=self.label, cure="name one map in each MapSpectrum")
+        if bad := [name for name, kind in zip(self.maps, kinds, strict=True) if kind not in USABLE]:
+            raise PipelineError(f"there is no TAN map {bad[0]!r}", place=self.label, cure=CURE)
+        if not self.maps and made and not set(made.values()) & USABLE:
+            raise PipelineError(NO_MAP, place=self.label, cure=CURE)
+        return []
+
     def finalize(self, data: Data) -> None:
         """Raises PipelineError where there is no map, or none of which there is a spectrum."""
         found = map_spectra(data.products, Wanted(self.maps, self.bins, self.least_coverage, self.taper), self.label)
@@ -111,18 +128,19 @@ def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapS
     whole = {name: product for name, product in maps_of(products, split=False).items() if product.contents == "all"}
     flat = {name: product for name, product in whole.items() if product.projection == "TAN"}
     flat |= {name: product for name, product in maps_of(flat).items() if name not in whole}
-    usable = [name for name in whole if "/" not in name and whole[name].projection in ("TAN", "HEALPix")]
+    usable = [name for name in whole if "/" not in name and whole[name].projection in USABLE]
     names = wanted.maps or usable[:1]
     if len(names) == 1 and names[0] in whole and whole[names[0]].projection == "HEALPix":
         product = whole[names[0]]
         found = sphere_spectra(names[0], product, wanted.bins, wanted.least, place)
         return MapSpectra(found, {name: name for name in found.power}, product.fwhm)
+    if len(names) > 1 and any(name in whole and whole[name].projection == "HEALPix" for name in names):
+        raise PipelineError(SEVERAL_HEALPIX, place=place, cure="name one map in each MapSpectrum")
     if missing := [name for name in names if name not in flat]:
-        cure = f"name some of these: {', '.join(flat)}" if flat else "leave projection and contents of the map out"
+        cure = f"name some of these: {', '.join(flat)}" if flat else CURE
         raise PipelineError(f"there is no TAN map {missing[0]!r}", place=place, cure=cure)
     if not names:
-        cure = "leave projection and contents of the map out"
-        raise PipelineError("there is no TAN or HEALPix map of the signal", place=place, cure=cure)
+        raise PipelineError(NO_MAP, place=place, cure=CURE)
     return _of_planes(flat, names, wanted, place)
 
 

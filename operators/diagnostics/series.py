@@ -157,6 +157,11 @@ def key_of(step: Operator, usual: str) -> str:
     return step.name or (usual if step.label == type(step).__name__ else step.label)
 
 
+def kinds_of_maps(data: Data) -> dict[str, str]:
+    """In `Operator.check`: the kind of each map that will be made, by its product: its projection, HEALPix, or hits."""
+    return {str(layout["product"]): str(layout["kind"]) for layout in data.layouts.values() if "kind" in layout}
+
+
 def plane_key(key: str, plane: str) -> str:
     """Name of a product of I, Q or U: ``key``, ``key_Q``, ``key_U``."""
     return key if plane == "I" else f"{key}_{plane}"

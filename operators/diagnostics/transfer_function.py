@@ -42,7 +42,9 @@ from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
 from .comparison.radial import tapered
-from .series import key_of, plane_key
+from .series import key_of, kinds_of_maps, plane_key
+
+NOT_TAN, CURE = "a transfer function needs a TAN map of the signal", "leave nside, projection and contents of the map out"
 
 NO_POWER = 1e-12
 """Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
@@ -90,6 +92,12 @@ class TransferFunction(Output):
         modes: Literal["own", "full"] = "full" if self.modes == "full" else "own"
         return Signal(only=["sky"], modes=modes), Signal(only=["sky"], modes=modes, filters="none")
 
+    def check(self, data: Data) -> list[str]:
+        """Raises PipelineError where the map that will be made cannot be compared."""
+        if kinds_of_maps(data).get(self.map, "TAN") != "TAN":
+            raise PipelineError(NOT_TAN, place=self.label, cure=CURE)
+        return []
+
     def finalize(self, data: Data) -> None:
         """Compare the two maps. Raises PipelineError where there is none, or none that can be compared."""
         after, before = (_map(data, name, self.map, self.label) for name in self.shown)
@@ -100,14 +108,21 @@ class TransferFunction(Output):
             what = "of the complete data" if self.shown[0] else "of the complete data, which are the sky alone"
             data.tally.state(self.label, "singular modes", what)
         for plane in ("I",) if before.polarization is None else IQU:
-            a, b = (m if m.polarization is None else m.stokes(plane) for m in (before, after))
-            rings = compare(a.signal, b.signal, window, before.pixel, edges)
-            empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
-            data.tally.count(self.label, f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN", empty)
-            key, of = (plane_key(name, plane) for name in (key_of(self, "transfer_function"), self.map))
-            found = data.products[key] = Transfer(rings, edges, self.modes, before.fwhm, self.label, of)
-            if data.output is not None:
-                found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
+            _add(self, data, plane, (before, after), (window, edges))
+
+
+def _add(
+    step: TransferFunction, data: Data, plane: str, maps: tuple[MapProduct, MapProduct], where: tuple[Floats, Floats]
+) -> None:
+    """Make the product of one of I, Q and U. ``maps``: before and after the filters; ``where``: window and edges of the rings."""
+    (window, edges), (b, a) = where, (m if m.polarization is None else m.stokes(plane) for m in maps)
+    rings = compare(a.signal, b.signal, window, b.pixel, edges)
+    empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
+    data.tally.count(step.label, f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN", empty)
+    key, of = (plane_key(name, plane) for name in (key_of(step, "transfer_function"), step.map))
+    found = data.products[key] = Transfer(rings, edges, step.modes, maps[0].fwhm, step.label, of)
+    if data.output is not None:
+        found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
 
 
 def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
@@ -115,8 +130,7 @@ def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
     product = data.products.get(product_name(stream_of(signal), name))
     any_map = product or data.products.get(name)
     if isinstance(any_map, MapProduct) and (any_map.projection != "TAN" or any_map.contents == "hits"):
-        cure = "leave nside, projection and contents of the map out"
-        raise PipelineError("a transfer function needs a TAN map of the signal", place=place, cure=cure)
+        raise PipelineError(NOT_TAN, place=place, cure=CURE)
     if not isinstance(product, MapProduct):
         cure = "set map to the product of the step that makes it, or that step's product to map"
         raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)

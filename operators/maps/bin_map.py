@@ -75,7 +75,8 @@ class BinMap(MapParameters):
     _spare: list[Sums] = PrivateAttr(default_factory=list)
 
     def check(self, data: Data) -> list[str]:
-        """The share of the samples outside a map of a given width."""
+        """The share of the samples outside a map of a given width. `Data.layouts` has what kind of map there will be."""
+        data.layouts[self.label] = {"product": self.product, "kind": self.kind}
         if not data.observations:
             return []
         check_polarized(self, data.observations[0])

@@ -67,6 +67,11 @@ class MapParameters(MapMaker):
     """Name of the map among the products."""
 
     @property
+    def kind(self) -> str:
+        """Its projection, HEALPix, or hits."""
+        return "hits" if self.contents == "hits" else "HEALPix" if self.nside else self.projection
+
+    @property
     def split(self) -> Split:
         """Which halves are kept apart."""
         return "scans" if isinstance(self.half_difference, bool) or self.contents == "hits" else self.half_difference

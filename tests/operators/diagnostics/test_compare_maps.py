@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from astropy.wcs import WCS
 from matplotlib.figure import Figure
 
 import zonda
@@ -16,6 +17,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
+from zonda.core.run.first_look import first_look
 from zonda.operators.diagnostics.compare_maps import CompareMaps
 from zonda.operators.diagnostics.comparison.files import plane_of
 from zonda.operators.diagnostics.comparison.noise import with_noise
@@ -182,3 +184,28 @@ def test_pictures(tmp_path, products):
     for name in names:
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert not list(tmp_path.glob("*.pdf"))
+
+
+@pytest.mark.parametrize(
+    ("maps", "step", "message"),
+    [
+        ([{"projection": "CAR", "pixel": "4 arcsec"}], MapSpectrum(), "no TAN or HEALPix map of the signal"),
+        ([{"contents": "hits"}], MapSpectrum(maps=["map"]), "no TAN map 'map'"),
+        ([{"nside": 64}, {"nside": 32, "product": "b"}], MapSpectrum(maps=["map", "b"]), "HEALPix maps are of one map at a time"),
+        ([{"nside": 64}, {"product": "b"}], MapSpectrum(maps=["b", "source_free/map"]), "HEALPix maps are of one map at a time"),
+        ([{"nside": 64}], zonda.TransferFunction(), "needs a TAN map of the signal"),
+        ([{"projection": "CAR", "pixel": "4 arcsec"}, {"product": "b"}], MapSpectrum(), ""),
+        ([{"nside": 64}, {"product": "b"}], MapSpectrum(maps=["map"]), ""),
+        ([{"nside": 64}, {"product": "b"}], zonda.TransferFunction(map="b"), ""),
+    ],
+)
+def test_maps_that_do_not_suit_are_refused_before_the_run(maps, step, message):
+    sky = zonda.SkyMap(map=source(9.0), wcs=WCS(world()), unit="K_RJ")
+    steps = [zonda.PointingDaisy(scan_duration="2 s"), sky, zonda.WhiteNoise(), zonda.Efficiency()]
+    steps += [zonda.BinMap(**given) for given in maps]
+    pipeline = zonda.Pipeline([*steps, step], runs={"source_free": {"without": ["sky"], "modes": "full"}})
+    if not message:
+        first_look(pipeline, scenes.scene(), saved=False)
+        return
+    with pytest.raises(PipelineError, match=message):
+        first_look(pipeline, scenes.scene(), saved=False)
