@@ -115,8 +115,8 @@ def _add(
     step: TransferFunction, data: Data, plane: str, maps: tuple[MapProduct, MapProduct], where: tuple[Floats, Floats]
 ) -> None:
     """Make the product of one of I, Q and U. ``maps``: before and after the filters; ``where``: window and edges of the rings."""
-    (window, edges), (b, a) = where, (m if m.polarization is None else m.stokes(plane) for m in maps)
-    rings = compare(a.signal, b.signal, window, b.pixel, edges)
+    (window, edges), (a, b) = where, (m if m.polarization is None else m.stokes(plane) for m in maps)
+    rings = compare(a.signal, b.signal, window, a.pixel, edges)
     empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
     data.tally.count(step.label, f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN", empty)
     key, of = (plane_key(name, plane) for name in (key_of(step, "transfer_function"), step.map))
