@@ -60,7 +60,7 @@ def compare(
     to one beam; the one with the larger pixels is interpolated (cubic splines) onto the pixels of the other.
 
     Of maps of I, Q and U (an axis STOKES, extensions, or columns of a HEALPix table) each plane is compared, Q and U from the
-    meridians of MAP's frame.
+    meridians of MAP's frame. Maps whose headers state different bands (RESTFRQ, BAND) are compared with a warning.
     """
     from zonda.core.configuration.units import Unit
     from zonda.operators.diagnostics.comparison.statistics import Settings
@@ -126,6 +126,9 @@ def _compare(
     from zonda.operators.diagnostics.series import plane_key
 
     read = [read_planes(path, _name(path, paths)) for path in paths]
+    if not read[0].is_of_the_band_of(read[1]):
+        both_bands = " and ".join(f"{_name(path, paths)} of {one.band_in_words}" for path, one in zip(paths, read, strict=True))
+        click.echo(f"warning: the maps are of different bands, {both_bands}: the sky itself differs between them", err=True)
     maps = read[1].planes
     references = on_meridians_of(maps["I"], read[0].planes)
     both, written = [plane for plane in maps if plane in references], []

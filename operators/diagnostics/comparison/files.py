@@ -31,6 +31,8 @@ from .statistics import Comparison
 
 MOST = 2000
 """Points along each side of the plane onto which a HEALPix map is brought."""
+SAME_BAND = 1e-3
+"""Relative difference of frequencies of one band."""
 FRAMES = {"C": "icrs", "Q": "icrs", "ICRS": "icrs", "G": "galactic"}
 NOISES = {"NOISE": "noise I", "COV_II": "noise I", "COV_QQ": "noise Q", "COV_UU": "noise U"}
 """Of a file's extensions and columns: standard errors, or variances."""
@@ -47,13 +49,27 @@ class ReadMap:
         I, and Q and U where they are there, by these letters.
     frequency
         RESTFRQ, Hz; None: not stated.
+    band
+        BAND, its name; empty: not stated.
     notes
         Why Q and U that are in the file are not taken.
     """
 
     planes: dict[str, Plane]
     frequency: float | None
+    band: str
     notes: list[str]
+
+    def is_of_the_band_of(self, other: ReadMap) -> bool:
+        """False where the frequencies that both state differ, or the names where one of them states no frequency."""
+        if self.frequency and other.frequency:
+            return math.isclose(self.frequency, other.frequency, rel_tol=SAME_BAND)
+        return not (self.band and other.band) or self.band == other.band
+
+    @property
+    def band_in_words(self) -> str:
+        """Name and frequency, as far as they are stated."""
+        return " ".join([*([self.band] if self.band else []), *([f"{self.frequency / 1e9:.4g} GHz"] if self.frequency else [])])
 
 
 def read_planes(path: Path, name: str = "") -> ReadMap:
@@ -101,7 +117,7 @@ def _read(name: str, found: tuple[Any, dict[str, Floats]], told: tuple[Any, Any]
             noise = values.get(f"noise {key}")
             plane = Plane(name if key == "I" else f"{name} {key}", sign * values[key], header, "", fwhm, noise)
             planes[key] = plane.scaled(factor, label)
-    return ReadMap(planes, hertz, notes)
+    return ReadMap(planes, hertz, str(about.get("BAND", "")).strip(), notes)
 
 
 def _images(hdus: Any, hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any]:

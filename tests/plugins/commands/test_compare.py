@@ -82,6 +82,28 @@ def test_units_are_converted_at_a_frequency(tmp_path, values, capsys):
     assert rows(capsys.readouterr().out)["peak of the reference"].endswith("kJy/sr")
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        (
+            {"RESTFRQ": 93e9, "BAND": "f093"},
+            {"RESTFRQ": 150e9, "BAND": "f150"},
+            "a.fits of f093 93 GHz and b.fits of f150",
+        ),
+        ({"RESTFREQ": 93e9}, {"RESTFRQ": 150e9, "BAND": "f150"}, "a.fits of 93 GHz and b.fits of f150 150 GHz:"),
+        ({"BAND": "f093"}, {"RESTFRQ": 150e9, "BAND": "f150"}, "a.fits of f093 and b.fits of f150 150 GHz:"),
+        ({"RESTFRQ": 93e9, "BAND": "f090"}, {"RESTFRQ": 93.00001e9, "BAND": "f093"}, ""),
+        ({"RESTFRQ": 93e9}, {"BAND": "f150"}, ""),
+        ({}, {}, ""),
+    ],
+)
+def test_maps_of_different_bands(tmp_path, values, capsys, first, second, words):
+    a, b = write(tmp_path / "a.fits", values, **first), write(tmp_path / "b.fits", values, **second)
+    assert compare(a, b, "--output", tmp_path / "out") == 0
+    said = capsys.readouterr().err
+    assert (f"warning: the maps are of different bands, {words}" in said) if words else "different bands" not in said
+
+
 def test_a_sky_gets_the_beam(tmp_path, values, capsys):
     y, x = (np.indices((SIDE, SIDE)) - 23.5) * 2.0
     wide = np.hypot(30.0, 12.0)
