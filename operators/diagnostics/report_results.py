@@ -49,6 +49,8 @@ def results(data: Data, diameter: float) -> str:
         (f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s", "on the sky"),
         (f"{samples:,}".replace(",", "\u202f"), "samples of all detectors"),
     ]
+    whole = maps_of(data.products, split=False)
+    cards += [card for name, product in whole.items() if "/" not in name for card in _unsolved(name, product)]
     for figure in noise_figures(maps, diameter):
         cards += _noise(figure, maps[figure.product], diameter)
     main = [(name, product) for name, product in maps.items() if "/" not in name]
@@ -62,6 +64,16 @@ def results(data: Data, diameter: float) -> str:
             cards.append((brightness(_extreme(values)), f"strongest pixel of the {what}"))
     body = "".join(f"<div class=card><b>{escape(b)}</b><span>{escape(s)}</span></div>" for b, s in cards)
     return f'<div class="cards">{body}</div>'
+
+
+def _unsolved(name: str, product: MapProduct) -> list[Card]:
+    """In how many pixels with samples a map has no I, Q and U: a card, or none where there are all."""
+    if (found := product.polarization) is None:
+        return []
+    hit, solved = int(np.count_nonzero(found.hits)), int(np.count_nonzero(product.hits))
+    label = "" if name == "map" else f", {name}"
+    text = f"pixels with samples are NaN: too few angles of polarization for I, Q and U{label}"
+    return [(f"{hit - solved} of {hit}", text)] if solved < hit else []
 
 
 def _noise(figure: NoiseFigure, product: MapProduct, diameter: float) -> list[Card]:

@@ -24,6 +24,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.tiles import TILE_SAMPLES
 
 from .coverage import Coverage, Directions
+from .few_angles import warn_before
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
@@ -80,6 +81,7 @@ class BinMap(MapParameters):
         if not data.observations:
             return []
         check_polarized(self, data.observations[0])
+        warn_before(self, data.observations)
         if self.nside is None:
             check_size(self, data.observations)
         return [] if self.width is None else [outside(self, data.observations)]

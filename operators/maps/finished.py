@@ -18,6 +18,7 @@ from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
 from zonda.core.types import Floats
 
+from .few_angles import warn_after
 from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES
 from .map_sums import MapSums
@@ -43,6 +44,7 @@ def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any
         if stream == MAIN:
             _with_coverage(product, grid, sums)
             state_choices(step, product, sums, data.tally)
+            warn_after(step, product, data.band)
         if step.smooth is not None:
             product = product.smoothed(layout["fwhm"] if step.smooth == "beam" else float(step.smooth))
         data.products[key] = product

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Hertz
-from zonda.core.observation import Observation
+from zonda.core.data import Data, Observation
 from zonda.core.operator import Operator
 
 
@@ -26,6 +26,12 @@ class HalfWavePlate(Operator):
     """Turns per second; negative: the other way. 0 for a plate that is stepped by `angle`."""
     angle: Angle = quantity("0 deg")
     """At the start of each scan."""
+
+    def check(self, data: Data) -> list[str]:
+        """Set it for the checks of later steps."""
+        for observation in data.observations:
+            self.configure(observation)
+        return []
 
     def configure(self, observation: Observation) -> None:
         """Set `Observation.hwp_angle`."""

@@ -31,5 +31,6 @@ def test_pictures_and_report(tmp_path):
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "map_Q" in text
     assert "do not determine I, Q and U" in text
+    assert "too few angles of polarization for I, Q and U" in text
     ax = data.products["map"].plot(plane="U")
     assert np.isfinite(ax.images[0].get_array().compressed()).all()

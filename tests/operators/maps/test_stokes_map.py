@@ -1,5 +1,8 @@
 """Maps of I, Q and U: recovery, exact sums, covariance, halves, files, and what is refused."""
 
+import warnings
+from dataclasses import replace
+
 import healpy
 import numpy as np
 import pytest
@@ -191,6 +194,49 @@ def test_pixels_that_are_not_determined_are_nan_and_counted():
     assert count["pixels whose samples do not determine I, Q and U: NaN"].startswith(str(int(hit.sum())))
     assert not product.hits.any()
     assert not product.weights.any()
+
+
+def pairs_at(degrees, **changes):
+    """One scan of pairs whose first detectors are at these angles [deg], as `BinMap.check` sees it."""
+    o = observation(2 * len(degrees), 400)
+    o.focalplane.polarization_angle[:] = np.radians([a + b for a in degrees for b in (0.0, 90.0)])
+    return replace(o, **changes)
+
+
+def warnings_of(o, **parameters):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        BinMap(stokes="IQU", pixel="60 arcsec", **parameters).check(Data(scene=scenes.scene(o.instrument), observations=[o]))
+    return [str(w.message) for w in caught]
+
+
+def test_too_few_angles_are_told_beforehand():
+    """One pair determines I and Q of its own axes; behind a plate, or with one at 45 deg, all three."""
+    (text,) = warnings_of(pairs_at([0.0, 90.0, 0.0]))
+    assert "hardly a pixel will have I, Q and U" in text
+    assert "HalfWavePlate" in text
+    assert not warnings_of(pairs_at([0.0, 45.0]))
+    assert not warnings_of(pairs_at([0.0], hwp_angle=11.0 * np.arange(400) / 100))
+    one_of_two = pairs_at([0.0, 45.0])
+    one_of_two.detector_flags[2:] = 1
+    assert len(warnings_of(one_of_two)) == 1
+    assert not warnings_of(pairs_at([0.0, 3.0]))
+    assert len(warnings_of(pairs_at([0.0, 3.0]), condition_limit=50.0)) == 1  # 2 / (1 - cos 6 deg), and a little more
+    o = pairs_at([0.0])
+    assert not zonda.HalfWavePlate(frequency="2 Hz").check(Data(scene=scenes.scene(o.instrument), observations=[o]))
+    assert not warnings_of(o)
+
+
+def test_a_map_of_nan_is_told():
+    for degrees, words in (([0.0], "BinMap: the whole map is NaN"), ([0.0, 45.0], "")):
+        o = pairs_at(degrees)
+        o.focalplane.xi[:], o.focalplane.eta[:] = 0.0, 0.0
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            product = mapped(o, np.ones((o.n_detectors, o.n_samples)), pixel="60 arcsec")
+        told = [str(w.message) for w in caught if "angles of polarization" in str(w.message)]
+        assert [text.startswith(words) for text in told] == [True] * bool(words)
+        assert bool(product.hits.any()) == (not words)
 
 
 def test_a_lower_limit_of_the_condition_number_leaves_pixels_out():

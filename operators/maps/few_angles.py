@@ -1,0 +1,75 @@
+"""Warnings where I, Q and U are wanted and samples see too few angles of polarization to determine them."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Observation
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.projection import frame_rotation
+from zonda.core.polarization import PolarizationAngles
+from zonda.core.types import Floats
+
+from .parameters import MapParameters
+
+SCANS, SAMPLES, DETECTORS = 4, 64, 2000
+"""How many scans, samples of each and detectors are looked at beforehand, about."""
+CURE = (
+    "add detectors at other angles (two pairs at 45 deg whose paths cross), scans at other parallactic angles, or a HalfWavePlate"
+)
+
+
+def warn_before(step: MapParameters, observations: Sequence[Observation]) -> None:
+    """Warn where the samples of all scans, taken together, do not determine I, Q and U within `condition_limit`."""
+    if step.stokes != "IQU":
+        return
+    bands = np.unique(observations[0].focalplane.band)
+    for band in bands:
+        some = observations[:: math.ceil(len(observations) / SCANS)]
+        condition = _condition(np.sum([_weights(step, o, np.flatnonzero(o.focalplane.band == band)) for o in some], axis=0))
+        if condition > step.condition_limit:
+            of = f", {list(observations[0].instrument.cameras)[band]}" if len(bands) > 1 else ""
+            text = "all samples together see too few angles of polarization, hardly a pixel will have I, Q and U"
+            number = f"(condition number {condition:.2g}, condition_limit {step.condition_limit:g})"
+            warnings.warn(f"{step.label}{of}: {text} {number}; {CURE}", stacklevel=4)
+
+
+def warn_after(step: MapParameters, product: MapProduct, band: str) -> None:
+    """Warn where I, Q and U of most pixels with samples are NaN."""
+    if (found := product.polarization) is None:
+        return
+    hit, solved = int(np.count_nonzero(found.hits)), int(np.count_nonzero(product.hits))
+    if 2 * solved < hit:
+        number = f"{hit - solved} of {hit} pixels with samples have no I, Q and U" if solved else "the whole map is NaN"
+        text = f"{number}: the samples in a pixel see too few angles of polarization"
+        warnings.warn(f"{step.label}{f', {band}' if band else ''}: {text}; {CURE}, or larger pixels", stacklevel=5)
+
+
+def _weights(step: MapParameters, observation: Observation, rows: NDArray[np.intp]) -> Floats:
+    """(3, 3) sum of (1, c, s) (1, c, s)^T over some samples of detectors ``rows``, equation (1) of `core.polarization`."""
+    rows = rows[observation.good_detectors[rows]]
+    rows = rows[:: 1 + 2 * (rows.size // DETECTORS)]  # an odd step: both of a pair, both kinds of pairs
+    at = (np.linspace(0, 1, SAMPLES) ** 2 * (observation.n_samples - 1)).astype(np.intp)  # in step with no plate
+    plate = None if observation.hwp_angle is None else observation.hwp_angle[at]
+    pole = frame_rotation(step.frame)[2]
+    angles = PolarizationAngles.of(replace(observation, hwp_angle=plate), observation.boresight_radec[at], pole)
+    x, y = np.moveaxis(angles.axes[rows] @ angles.poles, 1, 0)
+    turned = (x - 1j * y) ** 2
+    turned /= np.maximum(abs(turned), 1e-30)
+    if plate is not None:
+        turned *= (angles.gamma[rows] @ [1, 1j])[:, None] * (angles.plate[0] + 1j * angles.plate[1])
+    turned *= observation.focalplane.polarization_efficiency[rows, None]
+    terms = np.stack([np.ones(turned.size), turned.real.ravel(), turned.imag.ravel()])
+    return np.asarray(terms @ terms.T)
+
+
+def _condition(a: Floats) -> float:
+    """Condition number of a symmetric matrix; infinite within rounding, 0 where it is zero (all detectors are flagged)."""
+    low = np.linalg.eigvalsh(a)
+    return float(low[-1] / low[0]) if low[0] > 1e-12 * low[-1] else math.inf if low[-1] > 0 else 0.0
