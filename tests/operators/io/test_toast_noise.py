@@ -16,7 +16,7 @@ from zonda.core.made_up import Given, Points, made_up_scene
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.operators.io.toast_noise import fit
 
-TRUTH = [(3e-4, 0.1, 1e-3, 1.0), (3e-4, 5.0, 1e-4, 2.5), (1e-3, 0.01, 1e-5, 1.3)]
+TRUTH = [(3e-4, 0.1, 1e-3, 1.0), (3e-4, 5.0, 1e-4, 2.5), (1e-3, 0.01, 1e-5, 1.3), (3e-4, 1.0, 1e-2, 3.8), (3e-4, 0.1, 1e-3, 0.3)]
 """NET, knee, minimum frequency, slope."""
 
 
@@ -48,6 +48,35 @@ def test_a_measured_spectrum_and_a_white_one() -> None:
     white = fit(f, 1e-6 * scatter, "here")
     assert abs(white[0] / 1e-3 - 1) < 0.01
     assert white[1] == 0
+
+
+@pytest.mark.parametrize(("rise", "knee"), [(1.4, 0.0), (1.6, 0.1)])
+def test_a_spectrum_that_hardly_rises_is_white(rise: float, knee: float) -> None:
+    """Up to half as much power again. The spectrum ``toasts`` rises to (knee / low)^slope of the white level."""
+    f = np.geomspace(1e-3, 10, 200)
+    net, found, *_ = fit(f, toasts(f, 1e-3, 0.1, 0.1 / rise, 1.0), "here")
+    assert net == pytest.approx(1e-3, rel=0.003)  # 1 / f is a hundredth at the highest frequencies
+    assert found == pytest.approx(knee, rel=1e-5)
+
+
+@pytest.mark.parametrize("form", [toasts, ours])
+def test_a_spectrum_that_is_flat_nowhere_begins_with_its_frequencies(form: Any) -> None:
+    """Nothing is known below the lowest."""
+    f = np.geomspace(1e-3, 10, 200)
+    np.testing.assert_allclose(fit(f, form(f, 1e-3, 0.1, 1e-9, 1.0), "here"), [1e-3, 0.1, f[0], 1.0], rtol=1e-5)
+
+
+def test_a_fit_does_not_depend_on_where_a_spectrum_is_sampled() -> None:
+    """Of a spectrum that has neither form: it rises ever more steeply. The fit stands between 1 and 2.5 for the same share."""
+
+    def steeper(f: Any) -> Any:
+        return 1 + 0.5 / f + (0.2 / f) ** 2.5
+
+    (_, knee, _, slope), (_, other_knee, _, other_slope) = (
+        fit(f, steeper(f), "here") for f in (np.linspace(0.05, 15, 3000), np.geomspace(0.05, 15, 300))
+    )
+    assert knee == pytest.approx(other_knee, abs=0.01)  # 0.036 where each of the 3000 counts alike
+    assert slope == pytest.approx(other_slope, abs=0.03)  # 0.10
 
 
 def write_model(file: Any, names: list[str], spectra: Any, units: str = "K2 s", model: str = "measured") -> None:

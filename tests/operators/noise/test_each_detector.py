@@ -12,6 +12,7 @@ import zonda
 from zonda.core.plan.look import look
 from zonda.core.plan.planning import planning_of
 from zonda.core.plan.structure import Structure
+from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.operators.noise.estimate import fit, spectrum
 
 pytestmark = pytest.mark.filterwarnings("ignore:Pointing")
@@ -22,9 +23,10 @@ NET = 1e-3
 MEDIAN = float(np.median(KNEES))
 
 
-def camera(folder: Path, knees: Any = KNEES, slopes: Any = SLOPES) -> dict[str, Any]:
-    lines = ["name, xi [arcmin], eta [arcmin], knee [Hz], slope"]
-    lines += [f"d{k:02d}, {k / 20}, 0, {knee}, {slope}" for k, (knee, slope) in enumerate(zip(knees, slopes, strict=True))]
+def camera(folder: Path, knees: Any = KNEES, slopes: Any = SLOPES, dead: Any = (0,) * 20) -> dict[str, Any]:
+    lines = ["name, xi [arcmin], eta [arcmin], knee [Hz], slope, dead"]
+    rows = enumerate(zip(knees, slopes, dead, strict=True))
+    lines += [f"d{k:02d}, {k / 20}, 0, {knee}, {slope}, {lost}" for k, (knee, slope, lost) in rows]
     path = folder / f"array{len(list(folder.iterdir()))}.csv"
     path.write_text("\n".join(lines))
     return {
@@ -110,14 +112,54 @@ def test_it_is_added_to_what_is_there(tmp_path: Path) -> None:
     assert one.any(axis=1).all()
 
 
-def test_the_focal_plane_refers_the_knee_to_the_white_noise(tmp_path: Path) -> None:
-    """NET^2 (knee / f)^slope is the same for twice the NET and another knee; the closed form is the mean of the detectors."""
+def short(instrument: Any, *steps: Any) -> Any:
+    scene = zonda.Scene(site="atacama", instrument=instrument, time="2024-06-25T07:00", target="az 180 deg el 50 deg", seed=1)
+    return zonda.Pipeline([zonda.PointingStare(scan_duration="20 s"), *steps, zonda.Efficiency()]).run(scene, threads=1)
+
+
+def test_slopes_that_differ_are_rounded_to_tenths_of_0_1_to_3(tmp_path: Path) -> None:
+    """Recorded data may state any."""
     scene = zonda.Scene(
         site="atacama", instrument=camera(tmp_path), time="2024-06-25T07:00", target="az 180 deg el 50 deg", seed=1
     )
-    steps = [zonda.WhiteNoise(), zonda.PinkNoise(net=f"{2 * NET} K s(1/2)"), zonda.Efficiency()]
-    data = zonda.Pipeline([zonda.PointingStare(scan_duration="20 s"), *steps]).run(scene, threads=1)
-    (observation,) = data.observations
+    steps = [zonda.PointingStare(scan_duration="20 s"), zonda.WhiteNoise(), zonda.Efficiency(), zonda.SaveTOD()]
+    (path,) = zonda.Pipeline(steps).run(scene, output=tmp_path / "out", threads=1).products["tod_file"]
+    tod = load_tod(path)
+    tod.columns |= {"knee": np.ones(20), "slope": np.repeat([0.02, 0.96, 1.34, 2.97, 3.4], 4)}
+    step = zonda.LoadTOD(file=save_tod(tmp_path / "other.h5", tod), signal="none")
+    data = zonda.Pipeline([step, zonda.PinkNoise(poles=16), zonda.Efficiency()]).run(step.scene(), threads=1)
+    np.testing.assert_allclose(data.observations[0].focalplane.slope, np.repeat([0.1, 1.0, 1.3, 3.0, 3.0], 4))
+
+
+@pytest.mark.parametrize(
+    ("knees", "slopes", "expected"),
+    [
+        (np.ones(20), np.ones(20), "(f / 1 Hz)^-1 from"),
+        (KNEES, np.ones(20), "knee 0 to 5 Hz; at the median (f / 1.25 Hz)^-1 from"),
+        (np.ones(20), SLOPES, "slope 1 to 1.7; at the median (f / 1 Hz)^-1.35 from"),
+        (KNEES, SLOPES, "knee 0 to 5 Hz, slope 1 to 1.7; at the median (f / 1.25 Hz)^-1.35 from"),
+    ],
+)
+def test_the_log_says_how_far_detectors_differ(tmp_path: Path, knees: Any, slopes: Any, expected: str) -> None:
+    data = short(camera(tmp_path, knees, slopes), zonda.PinkNoise())
+    (told,) = [text for _, what, text in data.tally if what == "power over that of white noise"]
+    assert told.startswith(expected)
+
+
+def test_the_closed_form_is_the_mean_of_the_detectors_that_work(tmp_path: Path) -> None:
+    """As the measured spectra, in which dead detectors are not."""
+    dead = np.zeros(20, int)
+    dead[[2, 3, 13]] = 1
+    (observation,) = short(camera(tmp_path, dead=dead), zonda.PinkNoise()).observations
+    assert observation.good_detectors.sum() == 17
+    f, (law,) = np.array([0.01, 0.3, 4.0]), observation.closed_forms["pink"]
+    used = zip(KNEES[dead == 0], SLOPES[dead == 0], strict=True)
+    np.testing.assert_allclose(law(f), np.mean([2 * NET**2 * (knee / f) ** slope for knee, slope in used], axis=0), rtol=1e-9)
+
+
+def test_the_focal_plane_refers_the_knee_to_the_white_noise(tmp_path: Path) -> None:
+    """NET^2 (knee / f)^slope is the same for twice the NET and another knee; the closed form is the mean of the detectors."""
+    (observation,) = short(camera(tmp_path), zonda.WhiteNoise(), zonda.PinkNoise(net=f"{2 * NET} K s(1/2)")).observations
     np.testing.assert_allclose(observation.focalplane.knee, KNEES * 2 ** (2 / SLOPES), rtol=1e-12)
     f = np.array([0.01, 0.3, 4.0])
     expected = np.mean([2 * (2 * NET) ** 2 * (knee / f) ** slope for knee, slope in zip(KNEES, SLOPES, strict=True)], axis=0)
