@@ -196,6 +196,8 @@ def audit(
     words = f"the first {seconds:.3g} s of {observations} scan{'s' if observations > 1 else ''}"
     if size.every > 1:
         words += f", every {size.every}th detector"
+    if made.context.joined:
+        words += f", this band alone: with the others, which {made.context.joined} joins, the bounds need not hold"
     fewer = tuple(label for label in whole.operators if label in made.structure.operators or label == "Slice")
     rows = _noise(dataclasses.replace(whole_plan, structure=whole).apply(part), whole_plan, threads)
     if not chosen and fewer == whole.operators:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..data import Observation
 from ..numerics.radiation import LEAST_TRANSMISSION
 from ..operator import Operator
+from ..run.in_step import joins
 from ..scene import Scene
 from ..signal import MAIN, Component, Formed
 from .estimate import Traits
@@ -184,6 +185,12 @@ class Context:
     def map_noise(self) -> float:
         """White noise of a map pixel in the deep part, K: sigma / sqrt(hits)."""
         return self.depth.weighed / math.sqrt(self.coverage.hits) if self.coverage else 0.0
+
+    @property
+    def joined(self) -> str:
+        """Labels of the steps that measure the detectors of all bands together, where there are several. Bounds are those of one
+        band: what it alone has in common is not removed, and what of another band goes into it is not counted."""
+        return " and ".join(o.label for o in self.operators if self.band and joins(o))
 
     @property
     def removes_common(self) -> bool:

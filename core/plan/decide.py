@@ -68,6 +68,7 @@ def decide(
     kept: Collection[str] = (),
     forced: Collection[str] = (),
     prune_all: bool = True,
+    joined: str = "",
 ) -> list[Decided]:
     """Choose one form of each effect, so that the sums of bounds stay within the budget.
 
@@ -81,11 +82,13 @@ def decide(
         Names of effects that stay as the pipeline asks for them, and of those that take their coarsest form.
     prune_all
         False: nothing is coarsened but what is forced.
+    joined
+        Steps for which the bounds do not hold (`Context.joined`): likewise.
     """
     chosen = {d.name: len(d.effect.choices) - 1 if d.name in forced else 0 for d in effects}
     left = {m: allowed[m] - sum(d.bound(chosen[d.name], m) for d in effects if d.name in forced) for m in allowed}
     worth = LEAST_SAVING * predicted.total
-    free = [d for d in effects if prune_all and d.name not in kept and d.name not in forced]
+    free = [d for d in effects if prune_all and not joined and d.name not in kept and d.name not in forced]
     while True:
         steps: list[tuple[float, Decided, int]] = []
         for d in free:
@@ -106,6 +109,8 @@ def decide(
     found = []
     for d in effects:
         reason = _within(d, left) if not d.simulated else stated.get(d.name) or ("within the budget" if chosen[d.name] else "")
+        if joined and len(d.effect.choices) > 1:
+            reason = reason or f"{joined} joins the bands"
         reason = reason or coarser_forms or _why_in_full(d, predicted, worth)
         found.append(replace(d, chosen=chosen[d.name], reason=reason))
     return found

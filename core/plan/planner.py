@@ -76,6 +76,7 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
         kept=named(keep, effects, labels),
         forced={d.name for d in effects if d.operator in whole or {d.name, d.effect.name, d.operator} & {*drop}},
         prune_all=prune_all,
+        joined=context.joined,
     )
     if wishes.measure and (unknown := [label for label, cost in costs.items() if cost is None]):
         costs |= measured(file, unknown)

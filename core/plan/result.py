@@ -97,6 +97,7 @@ def as_dict(plan: Plan) -> dict[str, Any]:
         "budget": {m: {"limit": v, "spent": plan.spent[m]} for m, v in plan.limits.items()},
         "left_out": [{"run": r.run, "operator": r.operator, "reason": r.reason} for r in plan.structure.rows],
         "derived": dict(plan.structure.derived),
+        "joins_bands": plan.context.joined,
         "effects": [_effect_as_dict(plan, d) for d in plan.decided],
         "prediction": {"cpu_seconds": p.total, "bytes": p.bytes, "by_operator": dict(p.seconds), "unknown": list(p.unknown)},
         "everything_on": {"cpu_seconds": u.total, "bytes": u.bytes},
@@ -129,6 +130,9 @@ def text(plan: Plan, width: int | None = None) -> str:
     lines = [_noise(plan)]
     for metric, limit in plan.limits.items():
         lines.append(f"budget for {metric}: {figure(metric, plan.spent[metric])} of {figure(metric, limit)} spent")
+    if joined := plan.context.joined:
+        said = f"{joined} joins the bands: the bounds are of this band alone and need not hold, so that nothing is coarsened"
+        lines += textwrap.wrap(said, width, subsequent_indent="    ")
     groups: dict[tuple[str, str], list[str]] = {}
     for row in plan.structure.rows:
         groups.setdefault((row.run, row.reason), []).append(row.operator)
