@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import (
@@ -82,6 +82,9 @@ class Telescope(Parameters):
 
 class Instrument(Parameters):
     """A camera on a telescope: detectors in a round field of view, laid out or from a table. Subclass to lay out others."""
+
+    polarized_by: ClassVar[str] = "set polarization: pairs of the instrument"
+    """What makes detectors polarized that are not those of a table."""
 
     name: str
     """Registered name."""

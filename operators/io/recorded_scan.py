@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,11 @@ POSITIVE = ("fwhm", "slope")
 
 class RecordedInstrument(Instrument):
     """A camera whose detectors are those of files."""
+
+    polarized_by: ClassVar[str] = (
+        "state angles and efficiencies in the focal plane of the file "
+        "(HDF5: gamma, pol_leakage; FITS: POLARIZATION_ANGLE, POLARIZATION_EFFICIENCY)"
+    )
 
     _planes: dict[str, Focalplane] = PrivateAttr(default_factory=dict)
     """The detectors of each band, by its name."""

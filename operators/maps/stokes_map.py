@@ -38,12 +38,14 @@ UNSOLVED = "pixels whose samples do not determine I, Q and U: NaN"
 
 def check_polarized(step: MapParameters, observation: Observation) -> None:
     """Raise PipelineError where I, Q and U are wanted and no detector is polarized."""
-    if step.stokes == "IQU" and not observation.focalplane.polarized:
-        raise PipelineError(
-            f"stokes: IQU needs polarized detectors, and none of {observation.instrument.name} is",
-            place=step.label,
-            cure="set polarization: pairs of the instrument, or stokes: I",
-        )
+    if step.stokes != "IQU" or observation.focalplane.polarized:
+        return
+    camera = observation.instrument
+    by = camera.polarized_by
+    if (table := camera.focalplane_table) is not None:
+        by = f"add the column polarization_angle to {table} (polarization_efficiency, if it is there, must be above 0)"
+    message = f"stokes: IQU needs polarized detectors, and none of {camera.name} is"
+    raise PipelineError(message, place=step.label, cure=f"{by}, or set stokes: I")
 
 
 def stokes_binnings(

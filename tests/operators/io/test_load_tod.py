@@ -15,7 +15,7 @@ import pytest
 import zonda
 import zonda.testing
 from zonda.core.configuration.pipeline_file import parse
-from zonda.core.errors import InputError, ZondaError
+from zonda.core.errors import InputError, PipelineError, ZondaError
 from zonda.core.flags import INVALID, SUN_UP, TURNAROUND
 from zonda.core.made_up import Given, Points, made_up_scene
 from zonda.operators.io.save_tod import load_tod, save_tod
@@ -107,6 +107,11 @@ def test_same_bits_for_all_blocks_and_threads(saved: Any, threads: int, memory: 
     other = load(saved["Raw"], *steps, threads=threads, memory=memory)["map"]
     for plane in ("signal", *PLANES):
         np.testing.assert_array_equal(getattr(one, plane), getattr(other, plane), err_msg=plane)
+
+
+def test_no_polarized_map_of_detectors_without_angles(saved: Any) -> None:
+    with pytest.raises(PipelineError, match=r"state angles and efficiencies in the focal plane of the file \(HDF5: gamma"):
+        load(saved["Filtered"], zonda.BinMap(pixel="5 arcsec", stokes="IQU"))
 
 
 def test_a_filter_acts_on_the_stream_that_was_saved(saved: Any) -> None:

@@ -1,5 +1,6 @@
 """Maps of I, Q and U: recovery, exact sums, covariance, halves, files, and what is refused."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -313,6 +314,22 @@ def test_smoothing_units_and_planes():
         product.stokes("V")
     with pytest.raises(InputError, match="no Q and U"):
         product.stokes("I").stokes("Q")
+
+
+def test_the_cure_for_detectors_without_angles_names_what_states_them(tmp_path):
+    table, data = tmp_path / "plane.csv", Data(scenes.scene())
+    data.observations = [scan(7, 500)]
+    with pytest.raises(PipelineError, match=r"is\n  = set polarization: pairs of the instrument, or set stokes: I"):
+        BinMap(stokes="IQU").check(data)
+    for columns, cure in (
+        ("", f"add the column polarization_angle to {table}"),
+        (", polarization_angle [deg], polarization_efficiency", "(polarization_efficiency, if it is there, must be above 0)"),
+    ):
+        own = ", 45, 0" if columns else ""
+        table.write_text(f"name, xi [arcmin], eta [arcmin]{columns}\na, 0, 0{own}\nb, 1, 0{own}\n")
+        data.observations = [scan(instrument=scenes.camera().varied(focalplane=table, detectors=2))]
+        with pytest.raises(PipelineError, match=re.escape(cure)):
+            BinMap(stokes="IQU").check(data)
 
 
 def test_what_is_refused():
