@@ -29,7 +29,7 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.maps.grid import TangentGrid
 from zonda.operators.maps.looking import Looking
-from zonda.operators.maps.stokes_sums import MATRIX, PLACES, StokesBinning, add_block
+from zonda.operators.maps.stokes_sums import MATRIX, PLACES, Part, StokesBinning, add_parts
 from zonda.operators.maps.sums import WEIGHT
 
 from .beams import Comb, combs
@@ -120,7 +120,7 @@ def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
                 detectors = slice(first, min(first + DETECTORS, len(plane)))
                 block = Block(o, detectors, slice(start, min(start + INSTANTS, index.size)))
                 n_det, n = block.shape
-                add_block([binning], (np.ascontiguousarray(signal[:n_det, :n]),), block)
+                add_parts([Part([binning], (np.ascontiguousarray(signal[:n_det, :n]),), block)])
         total = np.zeros((grid.n_pixels, 6))
         for pixels, found, *_ in binning.taken():
             total[pixels] += found[:, MATRIX] * (o.n_samples / index.size / WEIGHT)
