@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..notebook import html_table
-from ..numerics.angles import ARCMIN, FWHM_PER_SIGMA
+from ..numerics.angles import FWHM_PER_SIGMA, angle_text
 from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
 from ..types import Floats
+from .central import central_diameter
 from .map_arrays import MapArrays
 
 if TYPE_CHECKING:
@@ -78,20 +79,26 @@ class MapProduct(MapArrays):
 
         return write_map(self, path, overwrite)
 
-    def rms(self, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal") -> float:
-        """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre (the central arcmin).
+    @property
+    def central_radius(self) -> float:
+        """Of the circle in which `rms` is taken, rad: `central.central_diameter`."""
+        return central_diameter(self.fwhm, self.pixel) / 2
+
+    def rms(self, radius: float | None = None, of: Literal["signal", "half_difference"] = "signal") -> float:
+        """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre (`central_radius`).
 
         NaN where no pixel there has a value.
         """
         values = getattr(self, of)
         if values is None:
             raise InputError("the map has no half-difference", place="map", cure="set half_difference and make two scans")
-        return _rms(values, self.weights, self.distance() <= radius)
+        return _rms(values, self.weights, self.distance() <= (self.central_radius if radius is None else radius))
 
     def smoothed_rms(
-        self, fwhm: float, radius: float = 0.5 * ARCMIN, of: Literal["signal", "half_difference"] = "signal"
+        self, fwhm: float, radius: float | None = None, of: Literal["signal", "half_difference"] = "signal"
     ) -> float:
         """``smoothed(fwhm).rms(radius, of)``; of an image, only what the circle sees is smoothed."""
+        radius = self.central_radius if radius is None else radius
         if self.polarization is not None:
             return self.stokes("I").smoothed_rms(fwhm, radius, of)
         if self.header is None or getattr(self, of) is None:
@@ -205,7 +212,7 @@ class MapProduct(MapArrays):
             ("pixels hit", int(hit.sum())),
             ("smoothed by", f"{math.degrees(self.smoothed_by) * 3600:.3g} arcsec" if self.smoothed_by else "nothing"),
             ("resolution (FWHM)", f"{math.degrees(self.resolution) * 3600:.3g} arcsec"),
-            ("rms in the central arcmin", f"{self.rms():.3g} {self.unit}"),
+            (f"rms within {angle_text(self.central_radius)} of the centre", f"{self.rms():.3g} {self.unit}"),
         ]
         if self.half_difference is not None:
             rows.append(("half-difference rms there", f"{self.rms(of='half_difference'):.3g} {self.unit}"))

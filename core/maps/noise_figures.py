@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from .central import central_diameter
 from .map_product import MapProduct
 from .stokes import planes_of
 
@@ -31,24 +32,29 @@ class NoiseFigure:
     """How noisy a map is near its centre.
 
     ``of``: ``half_difference`` or ``source_free``; ``rms``: in K, NaN where there is no pixel; ``smoothed``: the same after
-    smoothing with the beam (NaN where the map cannot be or is already smoothed).
+    smoothing with the beam (NaN where the map cannot be or is already smoothed); ``diameter`` [rad] of the circle.
     """
 
     product: str
     of: Noise
     rms: float
     smoothed: float
+    diameter: float
 
 
-def noise_figures(maps: Mapping[str, MapProduct], diameter: float) -> list[NoiseFigure]:
-    """Weighted rms about zero within ``diameter`` / 2 [rad] of the centre, of what holds noise alone: `noise_sources`."""
+def noise_figures(maps: Mapping[str, MapProduct], given: float | None = None) -> list[NoiseFigure]:
+    """Weighted rms about zero in the middle, of what holds noise alone: `noise_sources`.
+
+    ``given``: diameter of the circle, rad; None: `central_diameter` of each map.
+    """
     found = []
     for name in maps:
         for of, (product, plane) in noise_sources(maps, name).items():
+            diameter = central_diameter(product.fwhm, product.pixel, given)
             rms = product.rms(diameter / 2, of=plane)
             again = product.header is not None and product.fwhm > 0 and not product.smoothed_by
             smoothed = product.smoothed_rms(product.fwhm, diameter / 2, of=plane) if again else math.nan
-            found.append(NoiseFigure(name, of, rms, smoothed))
+            found.append(NoiseFigure(name, of, rms, smoothed, diameter))
     return found
 
 

@@ -14,7 +14,6 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, PrivateAttr
 
-from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.drawable import Drawable, Sketch
@@ -84,8 +83,9 @@ class Plots(Output):
 
     smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = "beam"
     """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a Gaussian of this FWHM, or not."""
-    central_diameter: Angle = quantity("1 arcmin", gt=0)
-    """Diameter of the circle that noise maps show, in which their rms is taken."""
+    central_diameter: Angle | None = Field(None, gt=0)
+    """Diameter of the circle that noise maps show, in which their rms is taken; where absent 1 arcmin, or five beams or pixels
+    where these are wider."""
     least_coverage: float = Field(0.1, ge=0, lt=1)
     """Map pixels with fewer samples than this share of the 99th percentile are left grey in the pictures."""
     contours: list[float] = Field([], max_length=20)
@@ -287,7 +287,8 @@ def _flat(
             there = found.pop("per_beam")
             per_beam = np.where(np.isfinite(there), there, np.nanmean(there))
         header = wcs.to_header(relax=True)
-        rms = {} if style is None else {p: product.rms(style.central_diameter / 2, of=p) for p in planes if p != "crosslinking"}
+        radius = None if style is None or style.central_diameter is None else style.central_diameter / 2
+        rms = {} if style is None else {p: product.rms(radius, of=p) for p in planes if p != "crosslinking"}
     arrays = {plane: np.asarray(values, np.float32) for plane, values in found.items()}
     return FlatMap(
         {plane: arrays[plane] for plane in planes}, arrays["hits"], np.nan_to_num(arrays["weights"]), SkyAxes.of(header),

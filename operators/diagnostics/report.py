@@ -6,15 +6,15 @@ import base64
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from html import escape
 from importlib import resources
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.docstrings import described, own_doc
-from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.figures import Figures
@@ -47,8 +47,9 @@ class Report(Output):
     optional: ClassVar[frozenset[str]] = DRAWN | {"pictures", "map_file", "tod_file", "figures"}
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
 
-    central_diameter: Angle = quantity("1 arcmin", gt=0)
-    """Diameter of the circle about the map's centre in which the noise is stated."""
+    central_diameter: Angle | None = Field(None, gt=0)
+    """Diameter of the circle about the map's centre in which the noise is stated; where absent 1 arcmin, or five beams or pixels
+    where these are wider."""
 
     _known: dict[str, str] | None = PrivateAttr(None)
 
@@ -67,17 +68,17 @@ class Report(Output):
         folder = output_folder(data, self.label)
         shown = data.products.get("pictures")
         if shown is None:
-            shown = pictures(data, Plots(central_diameter=f"{self.central_diameter!r} rad").style())
+            shown = pictures(data, replace(Plots().style(), central_diameter=self.central_diameter))
         known, self._known = self._known, None
         data.products["report"] = write_text(folder / "report.html", page(data, shown, self.central_diameter, known))
 
 
-def _known(data: Data, central_diameter: float) -> dict[str, str]:
+def _known(data: Data, central_diameter: float | None) -> dict[str, str]:
     """The sections that are settled once all maps are made."""
     return {"results": results(data, central_diameter), "scene": _scene(data), "scans": _scans(data), "steps": _steps(data)}
 
 
-def page(data: Data, shown: Sequence[Picture], central_diameter: float, known: Mapping[str, str] | None = None) -> str:
+def page(data: Data, shown: Sequence[Picture], central_diameter: float | None, known: Mapping[str, str] | None = None) -> str:
     """The whole page. Everything that is not markup of this module is escaped. ``known``: `_known`, where it was made before."""
     known = _known(data, central_diameter) if known is None else known
     style = resources.files(__package__).joinpath("data/report.css").read_text(encoding="utf-8")

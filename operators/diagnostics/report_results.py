@@ -12,6 +12,7 @@ import numpy as np
 from zonda.core.band import Band
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
+from zonda.core.maps.central import central_diameter, in_beams
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
 from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.radiation import to_kelvin_rj
@@ -39,9 +40,11 @@ def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
     return scaled(jansky, ((1, "\u00a0Jy"), (1e3, "\u00a0mJy"), (1e6, "\u00a0µJy")), least=0.9995)
 
 
-def results(data: Data, diameter: float) -> str:
-    """Cards: how much was observed, how noisy and how deep the maps are. ``diameter`` [rad] of the circle where that is taken."""
+def results(data: Data, given: float | None) -> str:
+    """Cards: how much was observed, how noisy and how deep the maps are. ``given``: diameter [rad] of the circle where that is
+    taken; None: `central_diameter` of each map."""
     maps = maps_of(data.products)
+    wide = {name: central_diameter(product.fwhm, product.pixel, given) for name, product in maps.items()}
     seconds = sum(o.duration for o in data.scans)
     samples = sum(o.n_samples * o.n_detectors for o in data.observations)
     cards: list[Card] = [
@@ -51,12 +54,12 @@ def results(data: Data, diameter: float) -> str:
     ]
     whole = maps_of(data.products, split=False)
     cards += [card for name, product in whole.items() if "/" not in name for card in _unsolved(name, product)]
-    for figure in noise_figures(maps, diameter):
-        cards += _noise(figure, maps[figure.product], diameter)
+    for figure in noise_figures(maps, given):
+        cards += _noise(figure, maps[figure.product])
     main = [(name, product) for name, product in maps.items() if "/" not in name]
-    cards += [card for name, product in main if name in data.products for card in _depth(name, product, diameter)]
+    cards += [card for name, product in main if name in data.products for card in _depth(name, product, wide[name])]
     if has_white_noise(data):
-        cards += [card for name, product in main for card in expected(name, product, diameter)]
+        cards += [card for name, product in main for card in expected(name, product, wide[name])]
     strongest = {"input": getattr(data.products.get("input"), "values", None)}
     strongest["noiseless map"] = getattr(maps.get("noiseless/map"), "signal", None)
     for what, values in strongest.items():
@@ -76,10 +79,10 @@ def _unsolved(name: str, product: MapProduct) -> list[Card]:
     return [(f"{hit - solved} of {hit}", text)] if solved < hit else []
 
 
-def _noise(figure: NoiseFigure, product: MapProduct, diameter: float) -> list[Card]:
+def _noise(figure: NoiseFigure, product: MapProduct) -> list[Card]:
     """How noisy the centre of a map is, smoothed with the beam where that can be done, and as it is."""
     of = {"half_difference": product.difference.replace(" - ", " − "), "source_free": "all but the sky"}[figure.of]
-    where = f"rms, {_central(diameter)}, {of}"
+    where = f"rms, {_central(figure.diameter, product)}, {of}"
     label = "" if figure.product == "map" else f", {figure.product}"
     if math.isfinite(figure.smoothed):
         how = _smoothed(figure.smoothed, product)
@@ -90,8 +93,8 @@ def _noise(figure: NoiseFigure, product: MapProduct, diameter: float) -> list[Ca
     return [("unknown", f"{where}{label}: too few pixels; set central_diameter")]
 
 
-def _central(diameter: float) -> str:
-    return f"central {np.degrees(diameter) * 60:.3g}′"
+def _central(diameter: float, product: MapProduct) -> str:
+    return f"central {np.degrees(diameter) * 60:.3g}′{in_beams(diameter, product.fwhm)}"
 
 
 def has_white_noise(data: Data) -> bool:
@@ -111,7 +114,7 @@ def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
         return []
     rms = float(1 / np.sqrt(np.sum(noise[known] ** -2.0) / noise.size))  # of the mean weight
     label = "" if name == "map" else f", {name}"
-    where = _central(diameter)
+    where = _central(diameter, product)
     factor = product.pixel / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
     if product.smoothed_by or factor > 0.5:  # pixels that are not small beside the beam
         return [(brightness(rms), f"white noise by NET and samples, {where}{label}")]
@@ -135,7 +138,7 @@ def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:
     samples, each = product.hits[near], np.broadcast_to(np.asarray(factor), product.hits.shape)[near]
     seconds = float(np.median(samples * each))
     time = f"{seconds:.3g}\u00a0s" if seconds < 6000 else f"{seconds / 3600:.3g}\u00a0h"
-    where = _central(diameter) + ("" if name == "map" else f", {name}")
+    where = _central(diameter, product) + ("" if name == "map" else f", {name}")
     counted = f"{np.median(samples):.4g} samples per {angle_text(product.pixel)} pixel"
     return [(time, f"of all detectors per {angle_text(product.fwhm)} beam, {where}; {counted}")]
 

@@ -8,7 +8,6 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
@@ -27,8 +26,8 @@ class SaveMap(Output):
     made, HALF_DIFFERENCE, all with the same world coordinates; HEALPix maps are explicit-index (partial) tables that healpy
     reads. Of polarized maps I, Q, U (POLCCONV = COSMO), HITS, WEIGHTS, the covariance COV_II ... COV_UU and CONDITION.
     CROSSLINKING and the table SCAN_HITS where `BinMap` kept them.
-    ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the central
-    arcminute. Every file carries beam, seed, versions, the resolved YAML and the log of the run.
+    ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the middle
+    (`central_diameter`). Every file carries beam, seed, versions, the resolved YAML and the log of the run.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
@@ -36,8 +35,9 @@ class SaveMap(Output):
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
     provides: ClassVar[frozenset[str]] = frozenset({"map_file"})
 
-    central_diameter: Angle = quantity("1 arcmin", gt=0)
-    """Diameter of the circle about the target in which the noise map's rms is taken."""
+    central_diameter: Angle | None = Field(None, gt=0)
+    """Diameter of the circle about the target in which the noise map's rms is taken; where absent 1 arcmin, or five beams or
+    pixels where these are wider."""
     overwrite: bool = Field(True)
     """Replace files of an earlier run; if false, they are an error."""
 
@@ -55,7 +55,7 @@ class SaveMap(Output):
         for name, product in maps.items():
             if sources := noise_sources(maps, name):
                 planes: dict[str, AnyFloats] = {of: getattr(found, plane) for of, (found, plane) in sources.items()}
-                cards = noise_cards([f for f in figures if f.product == name], self.central_diameter)
+                cards = noise_cards([f for f in figures if f.product == name])
                 files[product_path(folder, f"noise_{name}", ".fits")] = MapFile(f"noise_{name}", product, planes, cards)
         if not self.overwrite:
             for path in files:
@@ -69,12 +69,12 @@ class SaveMap(Output):
         data.products["map_file"] = [file.result() for file in written]
 
 
-def noise_cards(figures: list[NoiseFigure], diameter: float) -> Cards:
+def noise_cards(figures: list[NoiseFigure]) -> Cards:
     """Header cards of a noise map: weighted rms about zero in the central circle; undefined where no pixel is there."""
-    where = f"central {np.degrees(diameter) * 60:.3g} arcmin"
     cards = Cards()
     for figure in figures:
         keyword = {"half_difference": "RMSHALF", "source_free": "RMSFREE"}[figure.of]
+        where = f"central {np.degrees(figure.diameter) * 60:.3g} arcmin"
         cards[keyword] = (figure.rms if np.isfinite(figure.rms) else None, f"[K] rms, {where}")
         if np.isfinite(figure.smoothed):
             cards[f"{keyword}B"] = (figure.smoothed, "[K] the same smoothed with the beam")

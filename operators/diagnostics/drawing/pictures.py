@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.drawable import Drawable, Sketch
+from zonda.core.maps.central import central_diameter, in_beams
 from zonda.core.numerics.angles import angle_text
 from zonda.core.types import AnyFloats
 
@@ -38,10 +39,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Style:
-    """Parameters of `Plots`; angles in rad, ``smooth`` None: with the beam, 0: not."""
+    """Parameters of `Plots`; angles in rad, ``smooth`` None: with the beam, 0: not; ``central_diameter`` None: as the map."""
 
     smooth: float | None
-    central_diameter: float
+    central_diameter: float | None
     least_coverage: float
     contours: tuple[float, ...] = ()
     formats: tuple[str, ...] = ("png",)
@@ -95,21 +96,23 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Ske
     """Maps of noise alone: ``half_difference`` (of the map, which comes first) and ``source_free`` (plane ``signal``)."""
     words = {"source_free": "all but the sky"}
     panels, figures, limits, how = [], [], [], ""
-    window = next(iter(sources.values())).window()
+    first = next(iter(sources.values()))
+    window, diameter = first.window(), central_diameter(first.fwhm, first.pixel, style.central_diameter)
     for of, source in sources.items():
         words.setdefault(of, source.difference)
         shown, how = _shown(source.cropped(window), style)
         plane = next(iter(shown.planes))
         panels.append((shown, _titled(_named(f"Noise: {words[of]}", file, "noise"), shown)))
         limits.append(shown.limit(plane, panels[0][0].hits, 99.7))
-        rms = shown.central_rms(plane, style.central_diameter / 2)
+        rms = shown.central_rms(plane, diameter / 2)
         if math.isfinite(rms):
             figures.append(f"{words[of]} {rms * 1e6:.4g} µK_RJ")
     limit = max((x for x in limits if x), default=None)
-    ax = _panels(panels, style, limit, circle=True)
+    ax = _panels(panels, style, limit, diameter)
     text = f"Noise maps on one scale, {how}.{_resolution(panels[0][0])}"
     if figures:
-        text += f" Weighted rms within the dotted circle of {np.degrees(style.central_diameter) * 60:.3g}′: {', '.join(figures)}."
+        wide = f"{np.degrees(diameter) * 60:.3g}′{in_beams(diameter, first.fwhm)}"
+        text += f" Weighted rms within the dotted circle of {wide}: {', '.join(figures)}."
     return [Sketch(file, "Noise", text, ax)]
 
 
@@ -237,8 +240,8 @@ def _titled(title: str, shown: FlatMap) -> str:
     return f"{title}, smoothed to {angle_text(math.hypot(shown.fwhm, shown.smoothed_by))}"
 
 
-def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | None, circle: bool = False) -> Any:
-    """The first plane of each map with its title, side by side, where the first map is well covered."""
+def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | None, circle: float = 0.0) -> Any:
+    """The first plane of each map with its title, side by side, where the first map is well covered; ``circle``: diameter."""
     whole = panels[0][0]
     covered = whole.covered(style.least_coverage)
     fwhm = math.hypot(whole.fwhm, whole.smoothed_by)
@@ -247,5 +250,5 @@ def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | 
         values = np.where(covered, next(iter(shown.planes.values())), np.float32(np.nan))
         plot_map(values, whole.sky, ax=ax, title=title, fwhm=fwhm or None, limit=limit)
         if circle:
-            plot_circle(ax, whole.sky, values.shape, style.central_diameter)
+            plot_circle(ax, whole.sky, values.shape, circle)
     return axes[0]

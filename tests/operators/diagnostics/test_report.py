@@ -8,13 +8,14 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import zonda
 from zonda.core.configuration.target import Target
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
 from zonda.operators.diagnostics.report import Report, _target
-from zonda.operators.diagnostics.report_results import expected, flux_density, results
+from zonda.operators.diagnostics.report_results import brightness, expected, flux_density, results
 from zonda.operators.diagnostics.report_text import readable, sexagesimal
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
@@ -281,8 +282,28 @@ def test_the_depth_of_a_map_is_told_per_beam():
     seconds = np.median(product.hits[near]) / 40 * np.pi / (4 * np.log(2)) * (8.5 / 3) ** 2
     shown = results(data, np.radians(2 / 60))
     assert f"{seconds:.3g}\u00a0s" in shown
-    assert "of all detectors per 8.5″ beam, central 2′; " in shown
+    assert "of all detectors per 8.5″ beam, central 2′ (14 beams); " in shown
     assert f"{np.median(product.hits[near]):.4g} samples per 3″ pixel" in shown
+
+
+def test_the_central_circle_holds_several_beams(tmp_path):
+    """Beams of 2 arcmin, of which an arcminute is the half: five of them, in the report, its pictures and the files alike."""
+    camera = {"like": "mustang2", "detectors": 61, "field_of_view": "20 arcmin", "fwhm": "2 arcmin"}
+    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1)
+    daisy = zonda.PointingDaisy(radius="10 arcmin", scan_duration="20 s", scans=2, sample_rate="40 Hz")
+    steps = [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="30 arcsec"), zonda.SaveMap(), zonda.Report()]
+    data = zonda.Pipeline(steps).run(scene, output=tmp_path)
+    product, text = data.products["map"], (tmp_path / "report.html").read_text(encoding="utf-8")
+    radius = np.radians(5 / 60)
+    assert product.rms() == product.rms(radius) != product.rms(np.radians(0.5 / 60))
+    assert text.count("central 10′ (5 beams)") == 3
+    assert "within the dotted circle of 10′ (5 beams): " in text
+    half = product.smoothed_rms(product.fwhm, radius, of="half_difference")
+    assert brightness(half) in text
+    header = fits.getheader(tmp_path / "noise_map.fits")
+    assert header["RMSHALF"] == pytest.approx(product.rms(radius, of="half_difference"))
+    assert "central 10 arcmin" in header.comments["RMSHALF"]
+    assert "central 3′ (1.5 beams)" in results(data, np.radians(3 / 60))  # as it is asked for
 
 
 def test_the_net_is_that_of_all_scans(data, report, make_observation):
