@@ -32,6 +32,9 @@ from .rows import AT_ONCE, Mask, Rows, read, write
 DETERMINED = 1e-14
 """Eigenvalues of B_g B_g^T below this share of the largest count as zero."""
 
+MANY = 100
+"""Functions from which those that overlap with few others are solved for by a factor with as few diagonals."""
+
 
 @dataclass(frozen=True)
 class Basis:
@@ -62,8 +65,16 @@ class Basis:
 
     def inverse(self, use: Mask) -> Floats:
         """(K, K): the pseudoinverse of B_g B_g^T for the samples ``use`` (N,)."""
-        found = np.linalg.pinv(self.normal(use), rcond=DETERMINED, hermitian=True)
-        return np.asarray((found + found.T) / 2, np.float64)
+        return _inverse(self.normal(use))
+
+    def solver(self, use: Mask) -> Floats:
+        """What `solved` takes for the samples ``use`` (N,): `inverse`, or of `MANY` functions, all of them determined and each
+        overlapping with few, a factor (taps, K).
+        """
+        normal, factor = self.normal(use), np.zeros((len(self.functions), self.size))
+        if self.size < max(MANY, len(factor)) or not _factor(normal, DETERMINED * normal.diagonal().max(), factor):
+            return _inverse(normal)
+        return factor
 
     def normal(self, use: Mask) -> Floats:
         """(K, K): B_g B_g^T for the samples ``use`` (N,)."""
@@ -105,7 +116,7 @@ def splines(n: int, spacing: float) -> Basis:
 
 @dataclass(frozen=True)
 class Fit:
-    """Equation (1) for scans whose samples ``use`` (N,) are used; ``inverse`` (K, K): `Basis.inverse` of these."""
+    """Equation (1) for scans whose samples ``use`` (N,) are used; ``inverse``: `Basis.inverse` of these, or `Basis.solver`."""
 
     basis: Basis
     use: Mask
@@ -114,7 +125,7 @@ class Fit:
     @classmethod
     def of(cls, basis: Basis, use: Mask) -> Fit:
         """A fit of these functions to the samples ``use`` (N,)."""
-        return cls(basis, use, basis.inverse(use))
+        return cls(basis, use, basis.solver(use))
 
     def remove(self, rows: Rows, masked: Mask | None = None) -> int:
         """Equation (1) on rows in place. ``masked`` (n_det, N): samples that are not used, of each detector, where equation (2)
@@ -140,7 +151,7 @@ class Fit:
             use, inverse = self.use, self.inverse
             if not finite.all():
                 use = use & finite
-                inverse = self.basis.inverse(use)
+                inverse = self.basis.solver(use)
                 spoilt += int(np.count_nonzero(~finite))
             if masked is not None and masked[d].any():
                 use, inverse = self._outside(use, inverse, masked[d])
@@ -150,21 +161,32 @@ class Fit:
     def _outside(self, use: Mask, inverse: Floats, masked: Mask) -> tuple[Mask, Floats]:
         """Samples to use outside of a mask (N,), and their inverse; those that are given where equation (2) forbids it."""
         left, basis = use & ~masked, self.basis
+        whole = inverse if len(inverse) == basis.size else basis.inverse(use)
         found, inside = basis.inverse(left), basis.normal(use & masked)
-        lost = np.trace(inverse @ basis.normal(use)) - np.trace(found @ basis.normal(left))
+        lost = np.trace(whole @ basis.normal(use)) - np.trace(found @ basis.normal(left))
         if lost > 0.5 or np.trace(found @ inside) > np.count_nonzero(use & masked):
             return use, inverse
         return left, found
 
 
 def solved(inverse: Floats, sums: Floats) -> Floats:
-    """(n_det, K): ``inverse`` (K, K), symmetric, times each row of ``sums`` (n_det, K).
+    """(n_det, K): ``inverse`` (K, K), symmetric, times each row of ``sums`` (n_det, K); or the solutions by a factor (taps, K).
 
     Not by BLAS, whose bits depend on how many rows there are.
     """
+    if len(inverse) < inverse.shape[1]:
+        out = sums.copy()
+        _substitute(inverse, out)
+        return out
     out = np.zeros(sums.shape)
     _solve(inverse, sums, out)
     return out
+
+
+def _inverse(normal: Floats) -> Floats:
+    """The pseudoinverse (K, K)."""
+    found = np.linalg.pinv(normal, rcond=DETERMINED, hermitian=True)
+    return np.asarray((found + found.T) / 2, np.float64)
 
 
 # A sum may be formed in any order within a chunk of one row: the compiler chooses it once, whatever rows stand beside it.
@@ -192,6 +214,45 @@ def _solve(inverse, sums, out):  # type: ignore[no-untyped-def]
     for k in range(sums.shape[1]):
         for d in range(sums.shape[0]):
             lessen(out[d], -sums[d, k], inverse[k])
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _factor(normal, least, factor):  # type: ignore[no-untyped-def]
+    """Cholesky's factor L of a matrix (K, K) with few diagonals: factor[i, j] = L[j + i, j], and 1 / L[j, j] at i = 0.
+
+    False where a square of L[j, j] is not above ``least``: there are functions that no used sample determines.
+    """
+    taps, size = factor.shape
+    for j in range(size):
+        for i in range(j, min(j + taps, size)):
+            value = normal[i, j]
+            for k in range(max(0, i - taps + 1), j):
+                value -= factor[i - k, k] * factor[j - k, k]
+            if i > j:
+                factor[i - j, j] = value * factor[0, j]
+            elif value > least:
+                factor[0, j] = 1 / math.sqrt(value)
+            else:
+                return False
+    return True
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+def _substitute(factor, rows):  # type: ignore[no-untyped-def]
+    """Solve L L^T c = row for each of the ``rows`` (n_row, K), in place."""
+    taps, size = factor.shape
+    for d in range(rows.shape[0]):
+        row = rows[d]
+        for j in range(size):
+            value = row[j]
+            for i in range(1, min(taps, j + 1)):
+                value -= factor[i, j - i] * row[j - i]
+            row[j] = value * factor[0, j]
+        for j in range(size - 1, -1, -1):
+            value = row[j]
+            for i in range(1, min(taps, size - j)):
+                value -= factor[i, j] * row[j + i]
+            row[j] = value * factor[0, j]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -62,10 +62,12 @@ def test_polynomials_are_the_least_squares_fit(order):
         np.testing.assert_array_equal(after[~finite], before[~finite])
 
 
-@pytest.mark.parametrize("spacing", [9.0, 200.0, 1500.0])
-def test_splines_are_the_least_squares_fit(spacing):
+@pytest.mark.parametrize(("spacing", "gap"), [(9.0, 4), (9.0, 150), (3.3, 4), (200.0, 4), (1500.0, 4)])
+def test_splines_are_the_least_squares_fit(spacing, gap):
+    """Also of so many functions that they are solved for by a factor, and where none of the samples in a gap determines some."""
     use = np.ones(N, bool)
-    use[1100:1104] = False
+    use[1100 : 1100 + gap] = False
+    assert (len(Fit.of(splines(N, spacing), use).inverse) == 4) == (spacing < 10 and gap < 100)
     x, masked = rows_of_all_kinds(N, use)
     x[4] = x[0]
     masked[:] = False
