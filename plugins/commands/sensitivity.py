@@ -43,7 +43,7 @@ def sensitivity(
     """Forecast how deep a map becomes, without a run: of a pipeline, or of an instrument at a site.
 
     The depth is the rms of the noise behind the beam, split into white noise, 1/f noise and atmosphere. Without a pipeline one is
-    made: daisy scans of the area, a high-pass filter, the common mode; it is shown.
+    made: daisy scans of the area, a high-pass filter, the common mode; it is shown. A map of I, Q and U has a depth of each.
 
       zonda sensitivity mustang2_cluster
 
@@ -61,7 +61,7 @@ def sensitivity(
     if output is not None:
         check_output_folder(output)
     found = forecast(pipeline, settings=settings, **asked)
-    each = found.bands.values() if isinstance(found, SensitivityOfBands) else (found,)
+    each = [*found.bands.values()] if isinstance(found, SensitivityOfBands) else [found]
     needed = [] if reach is None else [one.reach(reach) for one in each]
     if audit is not None:
         found = found.audited(audit, threads)
@@ -69,7 +69,11 @@ def sensitivity(
     if as_json:
         import json
 
-        text = found.as_dict() | ({"reach": {"depth": reach, "seconds": max(needed)}} if needed else {})
+        text = found.as_dict()
+        if reach is not None:
+            text["reach"] = {"depth": reach, "seconds": max(needed)}
+            if planes := each[0].polarization:
+                text["reach"]["stokes"] = {plane: max(one.reach(reach, plane) for one in each) for plane in planes}
         click.echo(json.dumps(text, indent=2))
         return
     if pipeline is None:

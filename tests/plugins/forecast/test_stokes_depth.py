@@ -151,6 +151,10 @@ def test_what_is_written_and_said(tmp_path, capsys):
     for part, column in zip(PARTS, ("white", "one_over_f", "atmosphere"), strict=True):
         assert table[f"Q_{column}"][0] == pytest.approx(found.rms(float(table["time"][0]), part=part, stokes="Q"))
     assert found.reach("100 uK", "Q") > found.reach("100 uK")
+    assert cli.main(["sensitivity", str(tmp_path / "pipeline.yaml"), *arguments[:4], "--json"]) == 0
+    reach = json.loads(capsys.readouterr().out)["reach"]
+    assert reach["seconds"] == pytest.approx(found.reach("100 uK"))
+    assert reach["stokes"] == pytest.approx({plane: found.reach("100 uK", plane) for plane in "QU"})
     with pytest.raises(InputError, match="the map has no 'V'"):
         found.rms(stokes="V")
 
