@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from glob import escape, glob
 from pathlib import Path
 from typing import Annotated, Any, Protocol, Self, runtime_checkable
 
@@ -11,6 +12,9 @@ from pydantic import BaseModel, BeforeValidator, ValidationInfo
 
 from .diagnostics import nearest
 from .values import mistake
+
+MOST_NAMED = 4
+"""Files of a folder that a message names."""
 
 
 def find(value: Any, info: ValidationInfo) -> Path:
@@ -29,11 +33,26 @@ def find(value: Any, info: ValidationInfo) -> Path:
     for candidate in tried:
         if candidate.exists():
             message = f"'{value}' is not a file" + (" but a folder" if candidate.is_dir() else "")
-            raise mistake(message, help=f"it is {candidate}")
+            inside = _names(Path(escape(str(path)), "*"), folders) if candidate.is_dir() else ""
+            raise mistake(message, help=f"it is {candidate}" + (f"; name a file in it: {inside}" if inside else ""))
+    found = _names(path, folders)
+    if found or {"*", "?"} & set(str(value)):
+        stands_for = f"write the names that it stands for: {found}" if found else "write the names of files; it stands for none"
+        raise mistake(f"'{value}' is a pattern, not the path of a file", help=stands_for)
     where = " and ".join(str(p.parent) for p in tried)
     beside = ((path.name, path.parent.iterdir()) for path in tried if path.parent.is_dir())
     hints = (nearest(name, (p.name for p in others if p.is_file())) for name, others in beside)
     raise mistake(f"no such file: '{value}', looked in {where}", next(filter(None, hints), ""))
+
+
+def _names(pattern: Path, folders: list[Path]) -> str:
+    """The first files that match in one of the folders, and how many more there are; empty: none."""
+    for folder in folders:
+        names = sorted(name for name in glob(str(pattern), root_dir=folder) if (folder / name).is_file())
+        if names:
+            more = [f"and {len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else []
+            return ", ".join([*names[:MOST_NAMED], *more])
+    return ""
 
 
 def paths_in(value: Any) -> Iterator[Path]:

@@ -94,8 +94,8 @@ class RecordedFiles(Operator):
     """The parameters of `LoadTOD`."""
 
     file: Files
-    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files are the scans of one run, in this order. Files
-    with the same times and other bands are one scan."""
+    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files, [a.h5, b.h5], are the scans of one run, in this order.
+    Files with the same times and other bands are one scan."""
     signal: str | None = "signal"
     """Name of the stream; none: no stream is read, the file's pointing alone is used."""
     band: Hertz | None = Field(None, gt=0)

@@ -385,8 +385,16 @@ def test_input_paths(toys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert found.label == "did you mean 'b.fits'?"
     assert str(beside) in found.message
     assert str(here) in found.message
-    with pytest.raises(ConfigurationError, match="is not a file but a folder"):
+    with pytest.raises(ConfigurationError, match=r"a folder(.|\n)*; name a file in it: ../here/b.fits, ../here/c.fits"):
         sky("../here")
+    with pytest.raises(ConfigurationError, match=r"'\?\.fits' is a pattern(.|\n)*it stands for: a\.fits, b\.fits\n"):
+        sky("'?.fits'")
+    with pytest.raises(ConfigurationError, match=r"'\.\./h\*/\[c\]\.fits' is a pattern(.|\n)*stands for: \.\./here/c\.fits"):
+        sky("'../h*/[c].fits'")
+    with pytest.raises(ConfigurationError, match=r"'\*\.h5' is a pattern(.|\n)*it stands for none"):
+        sky("'*.h5'")
+    with pytest.raises(ConfigurationError, match=r"no such file: '\[d\]\.fits'"):
+        sky("'[d].fits'")
     with pytest.raises(ConfigurationError, match="no such file: '~nobody-of-that-name/x'"):
         sky("~nobody-of-that-name/x")
     with pytest.raises(ConfigurationError, match="expected the path of a file, got 3"):
