@@ -28,7 +28,6 @@ from zonda.core.types import Floats
 
 from .averaging import shares
 from .drawing import bytes_of_units, in_time_order
-from .fluctuations import BYTES_KEPT
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
 from .turbulence.geometry import ScanPlane, axes, crossing, rays
@@ -80,8 +79,8 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         return in_time_order(self.operator.model(observation))
 
     def shares_blocks(self, observation: Observation) -> bool:
-        """Tiles of the turbulence, where those of a whole scan are too many to wait for the next band."""
-        return bytes_of_units(self.operator.model(observation)) > BYTES_KEPT
+        """Lines of sight, and tiles of the turbulence, where each detector is evaluated by itself."""
+        return bytes_of_units(self.operator.model(observation)) > 0
 
     def traits(self, observation: Observation) -> Traits:
         """rms of the fluctuation, and of what of it is faster than a frequency."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,23 +32,25 @@ class Looking:
     ----------
     pointing
         What `Grid.pointing` gives.
-    key
-        Fingerprint of what pixels are made of; None where there is no other band.
     """
 
     observation: Observation
     grid: Grid
     pointing: Floats
-    key: Hashable = None
 
     @classmethod
     def of(cls, observation: Observation, grid: Grid) -> Looking:
         """Where all detectors of an observation look."""
-        pointing, key, plane = grid.pointing(observation), None, observation.focalplane
-        if observation.shared is not None:
-            known = (grid.nside, grid.nest, fingerprint(grid.pixels_covered)) if isinstance(grid, HealpixGrid) else grid
-            key = "pixels", known, fingerprint(pointing, plane.xi, plane.eta)
-        return cls(observation, grid, pointing, key)
+        return cls(observation, grid, grid.pointing(observation))
+
+    @cached_property
+    def key(self) -> Hashable:
+        """Fingerprint of what pixels are made of; None where there is no other band."""
+        if self.observation.shared is None:
+            return None
+        grid, plane = self.grid, self.observation.focalplane
+        known = (grid.nside, grid.nest, fingerprint(grid.pixels_covered)) if isinstance(grid, HealpixGrid) else grid
+        return "pixels", known, fingerprint(self.pointing, plane.xi, plane.eta)
 
     def pixels(self, which: NDArray[np.intp], start: int, stop: int) -> NDArray[np.int32]:
         """(n, stop - start) pixels of the detectors ``which`` (n,), -1 outside. Read only."""

@@ -121,44 +121,43 @@ class DriftingLayers:
         """
         bands, stop, n_xi = [self, *others], first + count, len(xi)
         total, sine = np.zeros((len(bands), n_xi, count)), np.empty((n_xi, count))
-        for own, path in self.paths.items():
-            ratio, through = own // self._step, self._through(own)
+        for own in sorted(set().union(*(band.paths for band in bands))):
+            path = next(band.paths[own] for band in bands if own in band.paths)
+            ratio, groups = own // self._step, _groups(bands, own)
             low, high = (first, stop) if ratio == 1 else _coarse(first, stop, ratio)
             values = total if ratio == 1 else np.empty((len(bands), n_xi, high - low))
             for start in range(low, high, TIMES_AT_ONCE):
                 end = min(start + TIMES_AT_ONCE, high)
                 x, y, up = path(xi, eta, start, end - start)
                 part, boxes = np.zeros((len(bands), *x.shape)), boxes_of(x, y)
-                for n in through:
-                    matrix, i, j = self._places[n]
+                for n, which in groups:
+                    one = bands[which[0]]
+                    matrix, i, j = one._places[n]
                     i, j = i[start - path.first : end - path.first], j[start - path.first : end - path.first]
-                    for tiling, which in _by_tiling(bands, n):
-                        cover = tiling.cover(tuple(bands[k]._band for k in which), matrix, boxes, i, j)
-                        where = *cover.sides, *cover.origin, cover.width, cover.addresses
-                        interpolate(matrix, x, y, i, j, *where, self._constants[n], tuple(which), part)
+                    cover = one._tilings[n].cover(tuple(bands[k]._band for k in which), matrix, boxes, i, j)
+                    where = *cover.sides, *cover.origin, cover.width, cover.addresses
+                    interpolate(matrix, x, y, i, j, *where, one._constants[n], which, part)
                 values[:, :, start - low : end - low] = part
                 if ratio == 1:
                     sine[:, start - low : end - low] = up
-            if ratio > 1:
+            for k in sorted({k for _, which in groups for k in which}) if ratio > 1 else ():
+                fine = DetectorField(spline_coefficients(values[k]), ratio, (high - low) * ratio)
                 # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has its time -PAD.
                 offset = first - (low + SPLINE_MARGIN + PAD) * ratio
-                for coarse, sums in zip(values, total, strict=True):
-                    fine = DetectorField(spline_coefficients(coarse), ratio, (high - low) * ratio)
-                    sums += fine.evaluate(slice(0, n_xi), slice(offset, offset + count))
+                total[k] += fine.evaluate(slice(0, n_xi), slice(offset, offset + count))
         return total, sine
 
     def looks_as(self, other: DriftingLayers) -> bool:
         """Whether another band looks along the same lines at the same times, and at layers that drift alike."""
-        steps = [[one._step, *(layer.step for layer in one._drifting)] for one in (self, other)]
-        if steps[0] != steps[1] or self._constants[0].dtype != other._constants[0].dtype:
+        if self._step != other._step or len(self._drifting) != len(other._drifting):
             return False
-        own, others = ((one._constants, *zip(*one._places, strict=True)) for one in (self, other))
-        layers = (np.array_equal(a, b) for pair in zip(own, others, strict=True) for a, b in zip(*pair, strict=True))
-        return all(layers) and all(path.same_as(other.paths[step]) for step, path in self.paths.items())
-
-    def _through(self, step: int) -> list[int]:
-        """Numbers of the layers that take this step."""
-        return [n for n, layer in enumerate(self._drifting) if layer.step == step]
+        if not all(path.same_as(other.paths[step]) for step, path in self.paths.items() if step in other.paths):
+            return False
+        for n, (layer, theirs) in enumerate(zip(self._drifting, other._drifting, strict=True)):
+            own, others = (*self._places[n], self._constants[n]), (*other._places[n], other._constants[n])
+            if layer.step == theirs.step and not all(map(np.array_equal, own, others)):
+                return False
+        return self._constants[0].dtype == other._constants[0].dtype
 
     def _sweep(self, xi: Floats, eta: Floats) -> list[Swept]:
         """What the lines of sight of the rim (xi, eta) of the points sweep over, for each layer."""
@@ -179,13 +178,15 @@ class DriftingLayers:
         return [Swept(box, min(number, points_of(box))) for box, number in zip(whole, cells, strict=True)]
 
 
-def _by_tiling(bands: Sequence[DriftingLayers], layer: int) -> list[tuple[Tiling, list[int]]]:
-    """The tilings of a layer, each with the numbers of the bands that see it."""
-    found: dict[int, tuple[Tiling, list[int]]] = {}
-    for k, band in enumerate(bands):
-        tiling = band._tilings[layer]
-        found.setdefault(id(tiling), (tiling, []))[1].append(k)
-    return list(found.values())
+def _groups(bands: Sequence[DriftingLayers], step: int) -> list[tuple[int, tuple[int, ...]]]:
+    """(layer, numbers of bands) of the layers that take a step in time: bands that see one tiling are together."""
+    found: dict[tuple[int, int], tuple[int, ...]] = {}
+    for n in range(len(bands[0]._drifting)):
+        for k, band in enumerate(bands):
+            if band._drifting[n].step == step:
+                key = n, id(band._tilings[n])
+                found[key] = (*found.get(key, ()), k)
+    return [(n, which) for (n, _), which in found.items()]
 
 
 def share_tiles(bands: Sequence[DriftingLayers]) -> list[Counter[int]]:

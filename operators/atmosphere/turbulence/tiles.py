@@ -5,7 +5,7 @@ bits whenever it is made. Where a scan sweeps over few cells they are made as on
 wide as that, since squares would hold more than is used; along a narrow path that turns, in strips.
 
 Bands of one camera whose beams are alike look through the same random numbers, each with kernels of its own. The band that comes
-first makes a tile for those after it too: the numbers are drawn once.
+first makes a tile for the others too: the numbers are drawn once.
 """
 
 from __future__ import annotations
@@ -85,6 +85,8 @@ class Tiles:
     def __init__(self) -> None:
         self._kept: dict[tuple[int, Bands, Box], _Tile] = {}
         self._making: dict[tuple[int, Box], Future[dict[Bands, _Tile]]] = {}
+        self._begun: set[tuple[int, Bands, Box]] = set()
+        """What was made, whether it is kept or not: it is made once for bands that did not ask."""
         self._lock = threading.Lock()
         self._free = BYTES_KEPT
 
@@ -103,8 +105,9 @@ class Tiles:
                     return kept
                 if making is None:
                     mine = self._making[place] = Future()
-                    later = [(b,) for b in fields if b > bands[0] and b not in bands]
-                    wanted = [bands, *(one for one in later if (lattice, one, box) not in self._kept)]
+                    others = [(b,) for b in fields if b not in bands]
+                    wanted = [bands, *(one for one in others if (lattice, one, box) not in self._begun)]
+                    self._begun.update((lattice, some, box) for some in wanted)
                     break
             if bands in (made := making.result()):  # or it was made for others alone
                 return made[bands]

@@ -104,14 +104,24 @@ def test_bands_of_other_nodes_and_steps_share_tiles(
 
 
 def test_tiles_that_are_dropped_are_made_again_for_a_band_alone(drawn: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there is no room to keep them for a band to come."""
-    alone = run(scene("6 deg", "f150"), keep=["signal"], threads=1)
+    """Where there is no room to keep them for a band to come, whose step in time is another."""
+    steps = "0.46 %"
+    alone = run(scene("6 deg", "f150"), steps, keep=["signal"], threads=1)
     points, drawn["points"] = drawn["points"], 0
     monkeypatch.setattr(tiles, "BYTES_KEPT", 0)
-    both = run(scene("6 deg", "f090", "f150"), keep=["signal"], threads=1)
+    both = run(scene("6 deg", "f090", "f150"), steps, keep=["signal"], threads=1)
     for scan in range(2):
         np.testing.assert_array_equal(alone.tod(scan=scan), both.tod(scan=f"scan-{scan:03d}-f150"))
     assert drawn["points"] >= 2 * points
+
+
+def test_bands_that_look_alike_need_no_room_for_tiles_of_each(drawn: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are interpolated together."""
+    run(scene("6 deg", "f150"), threads=1)
+    points, drawn["points"] = drawn["points"], 0
+    monkeypatch.setattr(tiles, "BYTES_KEPT", 0)
+    run(scene("6 deg", "f090", "f150"), threads=1)
+    assert drawn["points"] == points
 
 
 @pytest.mark.parametrize(("tolerance", "steps"), [("1 %", 1), ("0.5 %", 2)], ids=["same steps", "other steps"])
