@@ -112,11 +112,17 @@ def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Fl
     return found[0], found[1]
 
 
-def _kelvin(unit: str, name: str, place: str) -> float:
-    """Kelvin per unit of a stream."""
+def kelvin_per(unit: str) -> float | None:
+    """Kelvin per unit of a temperature; None: of another quantity."""
     kelvin = read_unit("K")
     measure = read_unit(unit.replace("K_RJ", "K")) if unit.strip() else None
-    if measure is None or kelvin is None or measure.powers != kelvin.powers:
+    return None if measure is None or kelvin is None or measure.powers != kelvin.powers else float(measure.factor)
+
+
+def _kelvin(unit: str, name: str, place: str) -> float:
+    """Kelvin per unit of a stream."""
+    found = kelvin_per(unit)
+    if found is None:
         cure = "calibrate it to a Rayleigh-Jeans temperature, and state its units, e.g. K"
         raise InputError(f"the stream {name} is in {unit or 'no unit'!r}, not in kelvin", place=place, cure=cure)
-    return float(measure.factor)
+    return found

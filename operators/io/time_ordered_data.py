@@ -49,7 +49,7 @@ class TimeOrderedData:
         band_centre, band_width [Hz], main_beam_efficiency, illumination_efficiency, polarization_angle [rad],
         polarization_efficiency, wafer (whole numbers).
     streams
-        (n_det, n_samp) arrays; K_RJ but for `transmission`, which is relative. NaN: a single sample that is not to be used.
+        (n_det, n_samp) arrays; K_RJ, but for what is no temperature. NaN: a single sample that is not to be used.
     intervals
         By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`).
     weather

@@ -20,6 +20,7 @@ from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 
 from . import toast_noise
+from .recorded_stream import kelvin_per
 from .time_ordered_data import TimeOrderedData
 from .toast_hdf5 import COLUMNS, FLAGS_ARE, OFFSETS, WEATHER
 
@@ -160,7 +161,10 @@ def _rectangle(item: Any, rows: NDArray[np.intp], samples: slice) -> Any:
 
 
 def read(path: str | os.PathLike[str]) -> TimeOrderedData:
-    """Read all of a file; single samples that it flags (`DETECTOR_MASK`) become NaN. Raises InputError as `Reader` does."""
+    """Read all of a file. Temperatures are converted to K; single samples that it flags (`DETECTOR_MASK`) become NaN.
+
+    Raises InputError as `Reader` does.
+    """
     import h5py
 
     reader = Reader(path)
@@ -174,6 +178,8 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
             for dataset in [item] if isinstance(item, h5py.Dataset) else []:
                 check_size(dataset, reader.place)
             tod.streams[name] = reader.read(name, every, slice(0, tod.n_samples))
+            if (factor := kelvin_per(reader.streams[name]) or 1.0) != 1.0:
+                tod.streams[name] = tod.streams[name] * factor
             if spoilt is not None and spoilt.any():
                 tod.streams[name] = np.where(spoilt, np.nan, tod.streams[name])
     finally:

@@ -300,6 +300,7 @@ def test_other_units_are_kelvin(saved: Any, tmp_path: Path) -> None:
     path = changed(saved["Filtered"][0], tmp_path / "mk.h5", milli)
     one, other = (load(p, MAP)["map"].signal for p in (saved["Filtered"][0], path))
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(load_tod(path).streams["signal"], load_tod(saved["Filtered"][0]).streams["signal"], rtol=1e-12)
     volts = changed(path, tmp_path / "v.h5", lambda file: file["detdata/signal"].attrs.__setitem__("units", "pW"))
     with pytest.raises(InputError, match="in 'pW', not in kelvin"):
         load(volts, MAP)
