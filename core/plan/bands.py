@@ -114,7 +114,7 @@ def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
 
 
 def _added(predictions: list[Prediction]) -> Prediction:
-    """Times add up (what bands share is a small part of them), and of their memory what each holds while another acts."""
+    """Times add up, and of their memory what each holds while another acts."""
     products = sum(p.products for p in predictions)
     seconds: dict[str, float] = {}
     for p in predictions:

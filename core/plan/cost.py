@@ -129,7 +129,9 @@ def predict(
         if cost is not None:
             each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
             again = found.again.get(label, 0) * (each - cost.fixed * len(context.observations))  # prepared once, made again
-            seconds[label] = factors[cost.kernel] * (work.times.get(label, 1.0) * (each + again) + cost.once)
+            # decisions, which are portable, are those of the band alone
+            own = 1.0 if in_step is None or portable else 1 - cost.shared * (1 - 1 / bands)
+            seconds[label] = factors[cost.kernel] * (work.times.get(label, 1.0) * (own * each + again) + cost.once)
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     startup = factors[STARTUP.kernel] * STARTUP.once
     if in_step is not None:

@@ -85,6 +85,8 @@ class Cost:
         Seconds for the whole run, whatever the observations and signals (pictures, files).
     kernel
         Which calibration kernel scales it: ``random``, ``stream`` or ``python``.
+    shared
+        Share of it that is done once for all bands in step (`Planning.shares_blocks`).
     """
 
     fixed: float = 0.0
@@ -92,6 +94,7 @@ class Cost:
     per_sample: float = 0.0
     once: float = 0.0
     kernel: Literal["random", "stream", "python"] = "stream"
+    shared: float = 0.0
 
     def seconds(self, n_times: int, n_detectors: int) -> float:
         """CPU seconds of one observation in one run."""

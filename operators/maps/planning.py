@@ -29,7 +29,8 @@ class BinMapPlanning(Planning[BinMap]):
         """Its cost."""
         n, more = self.operator.grid.n_pixels, 2e-8 if self.operator.crosslinking else 0.0
         if self.operator.stokes == "IQU":
-            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, more + (1.6e-8 if self.operator.nside else 1.0e-8)))
+            each, shared = (1.6e-8, 0.6) if self.operator.nside else (1.0e-8, 0.4)
+            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, more + each, shared=shared))
         return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, more + 3.2e-9))
 
     def shares_blocks(self, observation: Observation) -> bool:
