@@ -12,6 +12,7 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.types import Floats
 
@@ -55,7 +56,11 @@ def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Flo
     scale = np.radians(np.sqrt(abs(np.linalg.det(image.wcs.pixel_scale_matrix))))
     smooth = gaussian_filter(np.nan_to_num(image.values), width / FWHM_PER_SIGMA / scale)
     rows, columns = np.indices(product.signal.shape)
-    x, y = image.wcs.world_to_pixel_values(*product.wcs.pixel_to_world_values(columns, rows))
+    lon, lat = np.radians(product.wcs.pixel_to_world_values(columns, rows))
+    directions = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+    directions = directions @ wcs_frame_rotation(product.wcs) @ wcs_frame_rotation(image.wcs).T  # either may be galactic
+    lon, lat = np.arctan2(directions[..., 1], directions[..., 0]), np.arcsin(np.clip(directions[..., 2], -1, 1))
+    x, y = image.wcs.world_to_pixel_values(np.degrees(lon), np.degrees(lat))
     return np.asarray(map_coordinates(smooth, [y, x], order=1), np.float64)
 
 

@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 
 import zonda
@@ -18,6 +20,7 @@ from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.diagnostics.power_spectrum import Spectrum, Welch
 from zonda.plugins.checks import scenes
+from zonda.plugins.metrics.common import as_seen
 from zonda.plugins.metrics.maps import central_rms
 from zonda.plugins.metrics.streams import slope
 
@@ -72,6 +75,26 @@ def test_all_are_registered_and_described():
     for name in NAMES:
         assert isinstance(metrics.get(name), zonda.FigureMetric)
         assert Choice.parse(name).name == name == metrics.get(name).own_name()
+
+
+@pytest.mark.parametrize("galactic", ["input", "map"])
+def test_an_input_map_is_seen_where_it_is_whatever_its_frame(galactic):
+    """A blob 40 arcsec from the middle. Linear interpolation errs by h^2 / 8 s^2 in x and in y: 4^2 / (4 x 25.5^2) = 6.2e-3."""
+    middle = SkyCoord(*CENTRE, unit="rad")
+    source = middle.directional_offset_by(60 * u.deg, 40 * u.arcsec)
+    turned, plain = dict(header(SIDE, PIXEL)), header(SIDE, PIXEL)
+    turned |= {"CTYPE1": "GLON-TAN", "CTYPE2": "GLAT-TAN", "CRVAL1": middle.galactic.l.deg, "CRVAL2": middle.galactic.b.deg}
+    for key in ("RADESYS", "LONPOLE", "LATPOLE"):
+        turned.pop(key, None)
+
+    def of(cards):
+        y, x = np.indices((SIDE, SIDE))
+        away = WCS(cards).pixel_to_world(x, y).separation(source).arcsec
+        return np.exp(-(away**2) / 2 / (60 / FWHM_PER_SIGMA) ** 2)
+
+    before, after = (turned, plain) if galactic == "input" else (plain, turned)
+    seen = as_seen(Image(of(before), before), replace(product(of(after)), header=after), fwhm=1e-3 * ARCSEC)
+    np.testing.assert_allclose(seen[16:-16, 16:-16], of(after)[16:-16, 16:-16], atol=6.2e-3)
 
 
 # ---- central_rms
