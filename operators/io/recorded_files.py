@@ -170,7 +170,8 @@ class RecordedFiles(Operator):
         opened = reader(file.path)
         try:
             rows = np.array([file.rows[name] for name in observation.focalplane.names], np.intp)
-            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask))
+            good = flags.good(file.flags, flags.EXCLUDE_SAMPLE)
+            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask), good)
         except BaseException:
             opened.close()
             raise

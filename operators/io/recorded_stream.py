@@ -21,6 +21,9 @@ AT_ONCE = 4 * TILE_SAMPLES
 LITTLE = 10.0
 """Levels of all detectors up to this many standard deviations of their samples stay in the stream: it has been filtered."""
 
+LARGEST = 1e9
+"""K: what is larger is no temperature, but damage."""
+
 STRETCHES, LENGTH = 5, 64
 """Parts of a scan, and samples of each, of which a detector's level is the median."""
 
@@ -39,6 +42,8 @@ class RecordedStream:
         (n_det,) rows of the file.
     mask
         Bits of the flags of a detector's samples that make one NaN.
+    good
+        (n_samp,) which instants the file's flags leave; None: all.
     level
         (n_det,) K, constant, that stands beside the stream; ``mean``: the same as a field, None where it is zero.
     """
@@ -47,6 +52,7 @@ class RecordedStream:
     name: str
     rows: NDArray[np.intp]
     mask: np.uint8
+    good: NDArray[np.bool_] | None = None
     level: Floats = field(default_factory=lambda: np.zeros(0))
     mean: SmoothField | None = None
 
@@ -83,18 +89,33 @@ class RecordedStream:
     def read(self, detectors: slice, samples: slice) -> tuple[Floats, int]:
         """(n, m) float64 K at absolute detectors and samples, NaN where the file flags one.
 
-        How many these are, too, but for detectors that the file excludes altogether.
+        How many these are, too, but for detectors that the file excludes altogether. Raises InputError where a sample that is
+        used is larger than `LARGEST`.
         """
         rows = self.rows[detectors]
         values = np.array(self.file.read(self.name, rows, samples), np.float64)
         if self._factor != 1.0:
             values *= self._factor
         flagged = self.file.flags(rows, samples)
+        if flagged is not None:
+            bad = (flagged & self.mask) != 0
+            values[bad] = np.nan
+        if values.size and not max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None)) <= LARGEST:
+            self._refuse_damage(values, rows, samples)
         if flagged is None:
             return values, 0
-        bad = (flagged & self.mask) != 0
-        values[bad] = np.nan
         return values, int(np.count_nonzero(bad[(self.file.tod.detector_flags[rows] & self.mask) == 0]))
+
+    def _refuse_damage(self, values: Floats, rows: NDArray[np.intp], samples: slice) -> None:
+        """InputError for the first sample that is used and cannot be a temperature."""
+        used = (self.file.tod.detector_flags[rows] & self.mask) == 0
+        large = (np.abs(values) > LARGEST) & used[:, None] & (True if self.good is None else self.good[samples])
+        for row, column in np.argwhere(large)[:1]:
+            name, sample = self.file.tod.names[rows[row]], samples.start + column
+            cure = "the data are damaged: copy or make the file again; or flag the detector or the samples"
+            text = f"the stream {self.name} is {values[row, column]:.3g} K at sample {sample} of detector {name}"
+            raise InputError(f"{text}: no temperature", place=self.file.place, cure=cure)
+        values[np.abs(values) > LARGEST] = np.nan  # of what is not used
 
 
 def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Floats, Floats]:

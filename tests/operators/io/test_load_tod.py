@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -571,3 +572,17 @@ def test_the_command_line_shows_the_step_of_a_bad_file(saved: Any, tmp_path: Pat
     assert "p.yaml:2:5" in err
     assert "truncated" in err
     assert "Traceback" not in err
+
+
+def test_a_stream_that_is_no_temperature_is_refused(saved: Any, tmp_path: Path) -> None:
+    """In any part of the scan, with the file, the detector and the sample; not where the file flags it."""
+    import h5py
+
+    path = Path(shutil.copy(saved["Filtered"][0], tmp_path / "bad.h5"))
+    with h5py.File(path, "a") as file:
+        file["detdata/signal"][2, 777] = -1e102
+    with pytest.raises(InputError, match=r"bad\.h5: the stream signal is -1e\+102 K at sample 777 of detector"):
+        load(path, MAP)
+    with h5py.File(path, "a") as file:
+        file["shared/flags"][777] = 1
+    assert np.isfinite(load(path, MAP)["map"].signal).any()
