@@ -100,19 +100,18 @@ def add_stokes(signals, first, rows, at, cells, angles, which, start, good, wind
                         _add(sums, terms, signals, b * m, places, begins, n_runs, every_w)
                         for i in range(1, m):
                             _add_lanes(sums, DATA + 3 * i, terms, signals, LAST + 3 * (b * m + i), 3, places, begins, n_runs)
-                    for i in range(0 if alike else m):
-                        running_terms(c, s, values[-2], values, np.uint64(b * m + i), signals[:1], MAGIC, run, number, few)
+                    for i in range(m if alike else 0, m + 2):  # other signals, w, N
+                        if (i == m and not window.size) or (i == m + 1 and not own):
+                            continue
+                        x, line = values[-1] if i == m + 1 else values[-2], b * m + i if i < m else (n_bands - 1) * m + i
+                        running_terms(c, s, x, values, np.uint64(line), signals[:1], MAGIC, run, number, few)
                         if i == 0:
                             _add(sums, few, signals[:1], 0, places, begins, n_runs, every_w)
-                        else:
-                            _add_lanes(sums, DATA + 3 * i, few, signals[:1], LAST, 3, places, begins, n_runs)
-                    if window.size:
-                        running_terms(c, s, values[-2], values, np.uint64(n_bands * m), signals[:1], MAGIC, run, number, few)
-                        _add_lanes(sums, FIRST, few, signals[:1], LAST, 1, places, begins, n_runs)
-                    if own:
-                        running_terms(c, s, values[-1], values, np.uint64(n_bands * m + 1), signals[:1], MAGIC, run, number, few)
-                        _add_lanes(sums, DATA + 3 * m, few, signals[:1], LAST, 1, places, begins, n_runs)
-                        _add_lanes(sums, DATA + 3 * m + 1, few, signals[:1], 0, LAST, places, begins, n_runs)
+                            continue
+                        column, lanes = (FIRST, 1) if i == m else (DATA + 3 * min(i, m), 3 if i < m else 1)
+                        _add_lanes(sums, column, few, signals[:1], LAST, lanes, places, begins, n_runs)
+                        if i > m:
+                            _add_lanes(sums, column + 1, few, signals[:1], 0, LAST, places, begins, n_runs)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
