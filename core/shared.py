@@ -79,7 +79,7 @@ class SharedScan:
         put_off.setdefault((label, key), (work, []))[1].append(part)
         return True
 
-    def left(self) -> Iterator[tuple[str, Callable[[], None]]]:
+    def due(self) -> Iterator[tuple[str, Callable[[], None]]]:
         """What the bands have put off in this block: the step's label, and the work."""
         for (label, _), (work, parts) in self._of_thread.put_off.items():
             yield label, partial(work, parts)

@@ -174,9 +174,9 @@ def _sweep(sweeps: Sequence[Sweep], settings: Settings, timer: Timer, shared: Sh
         with shared.block():
             for one in sweeps:
                 one.work(detectors, samples)
-            for label, left in shared.left():
+            for label, work_due in shared.due():
                 start = time.thread_time()
-                left()
+                work_due()
                 timer.add(label, "exec", time.thread_time() - start)
 
     def stop() -> None:

@@ -3,7 +3,7 @@
 At nodes everything is drawn once, before the blocks: few nodes stand for all detectors. Where each detector is its own node
 its series are made on demand, a unit of detectors and samples at a time, so that a scan of any length needs
 little memory; a unit has the same bits whenever it is made. Where all units of a scan are kept they are made in order of time,
-those of bands in step next to each other: tiles of the turbulence serve all detectors of that moment.
+those of bands in step together: tiles of the turbulence serve all detectors of that moment.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class OfDetectors:
         """The number that bands have in common whose detectors look along the same lines."""
 
     def join(self, bands: list[weakref.ref[OfDetectors]]) -> None:
-        """Let bands that are in step make units next to each other; ``bands``: a list that all of them are given."""
+        """Let bands that are in step make units together; ``bands``: a list that all of them are given."""
         if self._keeps_all:
             self._alike = next((one._alike for one in map(_held, bands) if one is not None and one._looks_as(self)), len(bands))
             self._beside = bands

@@ -45,7 +45,7 @@ def test_what_bands_put_off_is_done_once_for_all_that_have_the_same_key():
             assert shared.put_off("BinMap 2", "a", 4, done.append)
             assert not done
             labels = []
-            for label, work in shared.left():
+            for label, work in shared.due():
                 labels.append(label)
                 work()
         assert labels == ["BinMap", "BinMap", "BinMap 2"]
