@@ -781,17 +781,17 @@ def test_a_thread_that_would_wait_makes_what_comes_next(monkeypatch: pytest.Monk
     expected = whole(o, operator(layers=1, lowest="3 km").prepare(o))
     monkeypatch.setattr(fluctuations, "UNIT_SAMPLES", 256)
     state = operator(layers=1, lowest="3 km").prepare(o)
-    begun, later, real = threading.Event(), threading.Event(), OfDetectors._make
+    begun, later, real = threading.Event(), threading.Event(), OfDetectors._draw
 
-    def slow(self: OfDetectors, unit: int, number: int) -> Any:
+    def slow(self: OfDetectors, others: Any, unit: int, number: int) -> Any:
         if number == 0:
             begun.set()
             assert later.wait(60), "nobody made another unit meanwhile"
         else:
             later.set()
-        return real(self, unit, number)
+        return real(self, others, unit, number)
 
-    monkeypatch.setattr(OfDetectors, "_make", slow)
+    monkeypatch.setattr(OfDetectors, "_draw", slow)
     found: list[Floats] = []
     threads = [threading.Thread(target=lambda: found.append(whole(o, state))) for _ in range(2)]
     threads[0].start()
