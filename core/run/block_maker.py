@@ -110,6 +110,7 @@ class BlockMaker:
         ``signals``: those that are of use in it; None: all that are not made again where they are mapped.
         """
         segment, again = stage.segment, again or stage.swept
+        outermost = signals is None
         if signals is None:
             signals = [s for s in self._chain.signals if s.stream not in self._apart]
         n_samples = self._observation.n_samples
@@ -135,7 +136,7 @@ class BlockMaker:
             block = trimmed(block, samples)
         last = next((k for k, o in enumerate(rest) if all(isinstance(step, MapMaker) for step in rest[k:])), len(rest))
         self._exec(rest[1 : max(last, 1)], block, signals)
-        block.stays = True  # nothing changes it any more
+        block.stays = outermost  # of one that is made for another, the next may take the place
         self._exec(rest[max(last, 1) :], block, signals)
         held = self._local.__dict__
         buffers = [*held.get("blocks", {}).values(), held.get("pieces", {}), held.get("whole", {})]

@@ -113,7 +113,9 @@ class OfDetectors:
     def join(self, bands: list[weakref.ref[OfDetectors]]) -> None:
         """Let bands that are in step make units together; ``bands``: a list that all of them are given."""
         if self._keeps_all:
-            self._alike = next((one._alike for one in map(_held, bands) if one is not None and one._looks_as(self)), len(bands))
+            others = [one for one in map(_held, bands) if one is not None]
+            unlike = {one._alike for one in others if not one._looks_as(self)}
+            self._alike = next((one._alike for one in others if one._alike not in unlike), len(bands))
             self._beside = bands
             bands.append(weakref.ref(self))
 

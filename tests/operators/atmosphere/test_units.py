@@ -121,6 +121,18 @@ def test_bands_that_look_alike_are_drawn_together(looks: str, shift: float, toge
     assert [len(one.together) for one in layers] == [len(EVERY), len(EVERY) * (len(together) - 1), 0]
 
 
+def test_bands_are_drawn_together_only_where_each_looks_as_every_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """a looks as b and as c, which take steps that a has not: b and c need not look alike."""
+    monkeypatch.setattr(Layers, "looks_as", lambda self, other: {self.name, other.name} != {"b", "c"})
+    states = [series([], name) for name in "abc"]
+    bands: list[weakref.ref[OfDetectors]] = []
+    for state in states:
+        state.join(bands)
+    block(states[0], slice(0, DETECTORS), slice(0, SAMPLES))
+    layers: list[Any] = [state._layers for state in states]
+    assert [set(one.together) for one in layers] == [{2}, set(), {1}]
+
+
 def test_a_band_that_is_gone_makes_nothing() -> None:
     made: list[tuple[str, int, int]] = []
     bands: list[weakref.ref[OfDetectors]] = []

@@ -167,3 +167,38 @@ def test_samples_of_bands_go_to_their_maps_together(
     assert set(taken) <= {1, 2}
     assert taken.count(2) / len(taken) == pytest.approx(shares, abs=0.2 if 0 < shares < 1 else 0)
     assert_as_alone(together, how, steps)
+
+
+def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map before a step that reads its neighbours' samples, from streams that are made again: the block does not stay."""
+    camera = zonda.Instrument(
+        name="camera", telescope={"name": "dish", "diameter": "6 m"}, detectors=38, field_of_view="20 arcmin",
+        polarization="pairs", main_beam_efficiency=0.8, illumination_efficiency=0.9, sample_rate="50 Hz",
+        bands=[dict(b) for b in BANDS],
+    )  # fmt: skip
+    scene = zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
+    put_off, answers = SharedScan.put_off, set()
+
+    def noted(self: SharedScan, label: str, *what: Any) -> bool:
+        answer = put_off(self, label, *what)
+        answers.add((label, answer))
+        return answer
+
+    monkeypatch.setattr(SharedScan, "put_off", noted)
+
+    def run(**options: Any) -> Any:
+        steps = [
+            zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="1800 s"),
+            zonda.WhiteNoise(), zonda.Efficiency(), zonda.Crosstalk(),
+            zonda.BinMap(product="before", stokes="IQU", nside=256), zonda.TimeConstant(tau="50 ms"),
+            zonda.BinMap(product="after", stokes="IQU", nside=256),
+        ]  # fmt: skip
+        return zonda.Pipeline(steps).run(scene, threads=1, **options)
+
+    ample = run()
+    little = run(memory=24_000_000)
+    assert any("made again" in f"{what} {text}" for _, what, text in little.tally)
+    assert True in {answer for _, answer in answers}
+    for name in ("before_f090", "before_f150", "after_f090", "after_f150"):
+        for plane, expected in planes(ample.products[name]).items():
+            np.testing.assert_array_equal(planes(little.products[name])[plane], expected, err_msg=f"{name} {plane}")
