@@ -44,8 +44,10 @@ class Image:
     polarization: Floats | None = None
     axis: Floats | None = None
 
-    def stokes(self, which: str) -> Image:
+    def stokes(self, which: str, pole: Floats | None = None) -> Image:
         """I, Q or U as an image of its own, COSMO, from the meridians of its frame; NaN where I is.
+
+        ``pole``: from those through this ICRS direction (3,) instead.
 
         Raises InputError for an image without Q and U, and for other names.
         """
@@ -54,7 +56,10 @@ class Image:
         if which not in ("I", "Q", "U"):
             raise InputError(f"{which!r} is none of I, Q and U", place="image.stokes", cure="write image.stokes('Q')")
         plain = replace(self, polarization=None, axis=None)
-        return plain if which == "I" else replace(plain, values=_turned(self.polarization, self.axis, self, "QU".index(which)))
+        if which == "I":
+            return plain
+        to = wcs_frame_rotation(self.wcs)[2] if pole is None else pole
+        return replace(plain, values=_turned(self.polarization, (self.axis, to), self, "QU".index(which)))
 
     @property
     def wcs(self) -> Any:
@@ -70,9 +75,9 @@ class Image:
         return draw(Shown(self.values, self.wcs, self.unit, title), ax, limit)
 
 
-def _turned(q_and_u: Floats, axis: Floats, image: Image, number: int) -> Floats:
-    """Q or U (ny, nx) from the meridians of an image's own frame, some rows at a time."""
-    to_sky, pole = np.linalg.inv(pixel_matrix(image.wcs)), wcs_frame_rotation(image.wcs)[2]
+def _turned(q_and_u: Floats, poles: tuple[Floats, Floats], image: Image, number: int) -> Floats:
+    """Q or U (ny, nx), which stand to meridians through the first of the ``poles``, from those through the second."""
+    to_sky, (axis, pole) = np.linalg.inv(pixel_matrix(image.wcs)), poles
     found: Floats = np.empty_like(image.values, np.float64)
     for start in range(0, len(found), ROWS):
         rows = slice(start, start + ROWS)

@@ -13,8 +13,8 @@ def describe(bound: Bound, metrics: Iterable[str]) -> str:
 
 
 def figure(metric: str, value: float) -> str:
-    """A bound in its metric's unit."""
-    return f"{value:.1e}" if metric in ("transfer", "psd") else kelvin(value)
+    """A bound in the unit of its metric, which may name a plane too: ``transfer Q``."""
+    return f"{value:.1e}" if metric.split()[0] in ("transfer", "psd") else kelvin(value)
 
 
 def kelvin(value: float) -> str:

@@ -72,7 +72,7 @@ class Basis:
         overlapping with few, a factor (taps, K).
         """
         normal, factor = self.normal(use), np.zeros((len(self.functions), self.size))
-        if self.size < max(MANY, len(factor)) or not _factor(normal, DETERMINED * normal.diagonal().max(), factor):
+        if self.size < max(MANY, len(factor) + 1) or not _factor(normal, DETERMINED * normal.diagonal().max(), factor):
             return _inverse(normal)
         return factor
 

@@ -18,8 +18,9 @@ from zonda.core.types import Floats
 
 from .parameters import MapParameters
 
-SCANS, SAMPLES, DETECTORS = 4, 64, 2000
-"""How many scans, samples of each and detectors are looked at beforehand, about."""
+SCANS, SAMPLES, DETECTORS = 32, 256, 2000
+"""How many scans, samples of all of them and detectors are looked at beforehand, at most; scans and detectors drawn at random,
+as angles may repeat from one to the next."""
 CURE = (
     "add detectors at other angles (two pairs at 45 deg whose paths cross), scans at other parallactic angles, or a HalfWavePlate"
 )
@@ -31,13 +32,15 @@ def warn_before(step: MapParameters, observations: Sequence[Observation]) -> Non
         return
     bands = np.unique(observations[0].focalplane.band)
     for band in bands:
-        some = observations[:: math.ceil(len(observations) / SCANS)]
-        condition = _condition(np.sum([_weights(step, o, np.flatnonzero(o.focalplane.band == band)) for o in some], axis=0))
+        some = [observations[k] for k in _some(len(observations), SCANS)]
+        number = SAMPLES // len(some)
+        found = [_weights(step, o, np.flatnonzero(o.focalplane.band == band), number) for o in some]
+        condition = _condition(np.sum(found, axis=0))
         if condition > step.condition_limit:
             of = f", {list(observations[0].instrument.cameras)[band]}" if len(bands) > 1 else ""
             text = "all samples together see too few angles of polarization, hardly a pixel will have I, Q and U"
-            number = f"(condition number {condition:.2g}, condition_limit {step.condition_limit:g})"
-            warnings.warn(f"{step.label}{of}: {text} {number}; {CURE}", stacklevel=4)
+            limit = f"(condition number {condition:.2g}, condition_limit {step.condition_limit:g})"
+            warnings.warn(f"{step.label}{of}: {text} {limit}; {CURE}", stacklevel=4)
 
 
 def warn_after(step: MapParameters, product: MapProduct, band: str) -> None:
@@ -51,11 +54,16 @@ def warn_after(step: MapParameters, product: MapProduct, band: str) -> None:
         warnings.warn(f"{step.label}{f', {band}' if band else ''}: {text}; {CURE}, or larger pixels", stacklevel=5)
 
 
-def _weights(step: MapParameters, observation: Observation, rows: NDArray[np.intp]) -> Floats:
-    """(3, 3) sum of (1, c, s) (1, c, s)^T over some samples of detectors ``rows``, equation (1) of `core.polarization`."""
+def _some(n: int, most: int) -> NDArray[np.intp]:
+    """Numbers below ``n``: all, or ``most`` at random."""
+    return np.random.default_rng(0).permutation(n)[:most]
+
+
+def _weights(step: MapParameters, observation: Observation, rows: NDArray[np.intp], number: int) -> Floats:
+    """(3, 3) sum of (1, c, s) (1, c, s)^T over a ``number`` of samples of some detectors: equation (1) of `core.polarization`."""
     rows = rows[observation.good_detectors[rows]]
-    rows = rows[:: 1 + 2 * (rows.size // DETECTORS)]  # an odd step: both of a pair, both kinds of pairs
-    at = (np.linspace(0, 1, SAMPLES) ** 2 * (observation.n_samples - 1)).astype(np.intp)  # in step with no plate
+    rows = rows[_some(rows.size, DETECTORS)]
+    at = (np.linspace(0, 1, number) ** 2 * (observation.n_samples - 1)).astype(np.intp)  # in step with no plate
     plate = None if observation.hwp_angle is None else observation.hwp_angle[at]
     pole = frame_rotation(step.frame)[2]
     angles = PolarizationAngles.of(replace(observation, hwp_angle=plate), observation.boresight_radec[at], pole)

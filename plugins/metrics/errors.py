@@ -50,6 +50,7 @@ from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.mapmaker import made_by
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.operator import Operator
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
@@ -122,7 +123,11 @@ class Peak(OfPlanes):
             where, peak = extreme(smooth.signal, covered(smooth), "peak")
             size = peak if plane == "I" else abs(peak)
             found[plane] = np.array([size, noises[plane].noise.flat[where]])
-        return {plane: one for plane, one in found.items() if plane == "I" or one[0] > POLARIZED * abs(found["I"][0])}
+        return found
+
+    def counted(self, reference: Mapping[str, Floats]) -> list[str]:
+        """I, and Q and U that are more than next to nothing in the reference, whatever is left of them."""
+        return [plane for plane, one in reference.items() if plane == "I" or one[0] > POLARIZED * abs(reference["I"][0])]
 
     def between(self, found: Floats, reference: Floats) -> float:
         return Metric.error(self, found, reference)
@@ -162,15 +167,17 @@ class Transfer(OfPlanes):
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
         side = np.array(window.shape) * sky.pixel
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
-        noises, found = planes_of(main), {}
+        noises, found, pole = planes_of(main), {}, wcs_frame_rotation(sky.wcs)[2]
         for plane, one in planes_of(sky).items():
-            given = image if plane == "I" else image.stokes(plane) if image.polarization is not None else None
+            given = image if plane == "I" else None if image.polarization is None else image.stokes(plane, pole)
             if given is None or not np.nan_to_num(given.values).any():
                 continue
             noise = float((window**2 * np.nan_to_num(noises[plane].noise) ** 2).sum())  # variance of each mode
             rings = compare(as_seen(given, one), one.signal, window, sky.pixel, edges)
             use = rings.power > 1e-6 * rings.power.max()
             found[plane] = np.array([rings.transfer[use], np.sqrt(noise / 2 / rings.power[use])])
+        if not found:
+            raise InputError("the input map is zero everywhere", place="transfer", cure="use a sky with a source")
         return found
 
     def between(self, found: Floats, reference: Floats) -> float:

@@ -13,7 +13,7 @@ from zonda.core.maps.stokes import IQU
 class OfPlanes(Metric):
     """Base of metrics whose `measure` finds something of each plane: by its name, ``I`` alone or ``I``, ``Q`` and ``U``.
 
-    A subclass has `between` and `summary` of one plane, and `floor_of`.
+    A subclass has `between` and `summary` of one plane, and `floor_of`; `counted`, where not all planes of a reference count.
     """
 
     def error(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
@@ -24,14 +24,18 @@ class OfPlanes(Metric):
         return each if len(each) > 1 else {}
 
     def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
-        planes = [p for p in IQU if all(p in one for one in (*found, *reference))]
+        planes = [p for p in IQU if all(p in self.counted(one) for one in reference) and all(p in one for one in found)]
         return max(super(OfPlanes, self).mean_error([one[p] for one in found], [one[p] for one in reference]) for p in planes)
 
     def floor(self, reference: Mapping[str, Any]) -> float | None:
         """The lowest of all planes; None where one has none."""
-        floors = [self.floor_of(one) for one in reference.values()]
+        floors = [self.floor_of(reference[plane]) for plane in self.counted(reference)]
         known = [floor for floor in floors if floor is not None]
         return min(known) if len(known) == len(floors) else None
+
+    def counted(self, reference: Mapping[str, Any]) -> Sequence[str]:
+        """The planes of a reference in which errors are looked for."""
+        return list(reference)
 
     def between(self, found: Any, reference: Any) -> float:
         """`error` of one plane."""
@@ -42,7 +46,7 @@ class OfPlanes(Metric):
         raise NotImplementedError
 
     def _each(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
-        return {plane: self.between(found[plane], one) for plane, one in reference.items() if plane in found}
+        return {plane: self.between(found[plane], reference[plane]) for plane in self.counted(reference) if plane in found}
 
 
 def planes_of(product: MapProduct) -> dict[str, MapProduct]:

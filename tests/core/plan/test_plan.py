@@ -20,7 +20,7 @@ from zonda.core.plan.context import Context, Coverage
 from zonda.core.plan.coverage import cover
 from zonda.core.plan.decide import Decided
 from zonda.core.plan.estimate import Choice, Effect, full
-from zonda.core.plan.figures import kelvin
+from zonda.core.plan.figures import figure, kelvin
 from zonda.core.plan.result import as_dict
 from zonda.core.plan.summary import Prediction
 
@@ -391,3 +391,8 @@ def test_decisions_do_not_depend_on_the_machine(monkeypatch):
     assert slow.settings() == made.settings()
     assert made.settings()  # something is coarsened in this scene
     assert slow.operators == made.operators
+
+
+def test_a_figure_of_a_plane_has_the_unit_of_its_metric() -> None:
+    assert figure("transfer Q", 2e-3) == figure("transfer", 2e-3) == "2.0e-03"
+    assert figure("map_rms U", 2e-3) == figure("map_rms", 2e-3) == "2 mK"

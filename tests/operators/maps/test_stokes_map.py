@@ -204,10 +204,11 @@ def pairs_at(degrees, **changes):
     return replace(o, **changes)
 
 
-def warnings_of(o, **parameters):
+def warnings_of(*scans, **parameters):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        BinMap(stokes="IQU", pixel="60 arcsec", **parameters).check(Data(scene=scenes.scene(o.instrument), observations=[o]))
+        whole = Data(scene=scenes.scene(scans[0].instrument), observations=list(scans))
+        BinMap(stokes="IQU", pixel="60 arcsec", **parameters).check(whole)
     return [str(w.message) for w in caught]
 
 
@@ -226,6 +227,19 @@ def test_too_few_angles_are_told_beforehand():
     o = pairs_at([0.0])
     assert not zonda.HalfWavePlate(frequency="2 Hz").check(Data(scene=scenes.scene(o.instrument), observations=[o]))
     assert not warnings_of(o)
+
+
+@pytest.mark.parametrize("n", [1998, 2001, 2997, 3999, 6003])
+def test_angles_that_repeat_from_detector_to_detector_are_seen(n):
+    o = observation(n, 400)
+    o.focalplane.polarization_angle[:] = np.radians(np.resize([0.0, 60.0, 120.0], n))
+    assert not warnings_of(o)
+
+
+@pytest.mark.parametrize("n", [8, 40, 96])
+def test_angles_that_repeat_from_scan_to_scan_are_seen(n):
+    """A plate that is stepped by 22.5 deg and back."""
+    assert not warnings_of(*(pairs_at([0.0], hwp_angle=np.full(400, np.radians(22.5 * (k % 2)))) for k in range(n)))
 
 
 def test_a_map_of_nan_is_told():

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 
 from zonda.core import registry
@@ -148,6 +149,46 @@ def test_each_plane_of_a_map_has_its_error():
         assert moved > 0.04, name  # of the summaries: Q fell by a tenth
         assert error == pytest.approx(0, abs=1e-12)
         assert metric.floor(reference) is not None
+
+
+def galactic():
+    """The header of `wcs` in galactic coordinates."""
+    made, middle = WCS(naxis=2), SkyCoord(75, 20, unit="deg").galactic
+    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = ["GLON-TAN", "GLAT-TAN"], [middle.l.deg, middle.b.deg], [SIDE / 2 + 0.5] * 2
+    made.wcs.cdelt, made.wcs.cunit = [-PIXEL / 3600, PIXEL / 3600], ["deg", "deg"]
+    return made.to_header()
+
+
+def test_transfer_of_q_is_that_of_the_maps_meridians_whatever_the_frame_of_the_input():
+    """Q about the ICRS pole in an image with galactic axes: of resampling it loses what I loses."""
+    runs = {"noiseless": {"only": ["sky"]}}
+    given = Image(blob(16.0), galactic(), polarization=np.stack([blob(16.0, 0.2), 0 * blob()]), axis=np.array([0, 0, 1.0]))
+    beam = np.hypot(16.0, FWHM)
+    seen = blob(beam, (16.0 / beam) ** 2)
+    reference, found = (
+        metrics.get("transfer").measure(data(runs, map=whole, noiseless__map=whole, input=given))
+        for whole in (polarized(seen, 0.2 * factor * seen, 0 * seen) for factor in (1.0, 0.9))
+    )
+    assert reference["Q"][0] == pytest.approx(reference["I"][0], abs=0.01)
+    assert reference["Q"][0][:4] == pytest.approx(1, abs=0.01)
+    assert metrics.get("transfer").errors(found, reference)["Q"] == pytest.approx(0.1, rel=0.06)
+
+
+def test_a_plane_that_is_lost_altogether_has_an_error():
+    runs = {"noiseless": {"only": ["sky"]}}
+    metric, seen = metrics.get("peak"), blob()
+    whole, lost = (polarized(seen, factor * seen, 0 * seen) for factor in (0.2, 0.0))
+    reference, found = (metric.measure(data(runs, map=one, noiseless__map=one)) for one in (whole, lost))
+    assert metric.errors(found, reference) == pytest.approx({"I": 0.0, "Q": 1.0})
+    assert metric.error(found, reference) == pytest.approx(1.0)
+    assert metric.mean_error([found, found], [reference, reference])[0] == pytest.approx(1.0)
+
+
+def test_there_is_no_transfer_function_of_an_empty_sky():
+    nothing = product(0 * blob())
+    image = Image(0 * blob(), wcs(SIDE, PIXEL))
+    with pytest.raises(InputError, match="zero everywhere"):
+        metrics.get("transfer").measure(data({"noiseless": {"only": ["sky"]}}, map=nothing, noiseless__map=nothing, input=image))
 
 
 def test_psd_is_relative_in_every_bin():
