@@ -97,20 +97,23 @@ class Spoilt(zonda.Operator):
             block.detdata["signal"][2, ::50] = np.nan
 
 
-def maps(bands: Any, how: Any, steps: Any = (Spoilt(),)) -> Any:
+def scene(bands: Any) -> zonda.Scene:
     camera = zonda.Instrument(
         name="camera", telescope={"name": "dish", "diameter": "6 m"}, detectors=38, field_of_view="20 arcmin",
         polarization="pairs", main_beam_efficiency=0.8, illumination_efficiency=0.9, sample_rate="50 Hz",
         bands=[dict(b) for b in bands],
     )  # fmt: skip
-    scene = zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
+    return zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
+
+
+def maps(bands: Any, how: Any, steps: Any = (Spoilt(),)) -> Any:
     steps = [
         zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="70 s"),
         zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %"), zonda.WhiteNoise(), zonda.Efficiency(), *steps,
         zonda.BinMap(stokes="IQU", half_difference="directions", crosslinking=True, **how),
         zonda.BinMap(product="intensity", half_difference="halves", crosslinking=True, **how),
     ]  # fmt: skip
-    return zonda.Pipeline(steps).run(scene)
+    return zonda.Pipeline(steps).run(scene(bands))
 
 
 def planes(product: Any) -> dict[str, Any]:
@@ -171,12 +174,6 @@ def test_samples_of_bands_go_to_their_maps_together(
 
 def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """A map before a step that reads its neighbours' samples, from streams that are made again: the block does not stay."""
-    camera = zonda.Instrument(
-        name="camera", telescope={"name": "dish", "diameter": "6 m"}, detectors=38, field_of_view="20 arcmin",
-        polarization="pairs", main_beam_efficiency=0.8, illumination_efficiency=0.9, sample_rate="50 Hz",
-        bands=[dict(b) for b in BANDS],
-    )  # fmt: skip
-    scene = zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
     put_off, answers = SharedScan.put_off, set()
 
     def noted(self: SharedScan, label: str, *what: Any) -> bool:
@@ -193,7 +190,7 @@ def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(
             zonda.BinMap(product="before", stokes="IQU", nside=256), zonda.TimeConstant(tau="50 ms"),
             zonda.BinMap(product="after", stokes="IQU", nside=256),
         ]  # fmt: skip
-        return zonda.Pipeline(steps).run(scene, threads=1, **options)
+        return zonda.Pipeline(steps).run(scene(BANDS), threads=1, **options)
 
     ample = run()
     little = run(memory=24_000_000)
