@@ -387,3 +387,14 @@ def test_warnings_are_one_line(here: Path, plugin: Callable[..., Path]) -> None:
 def test_a_shipped_pipeline_given_as_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["mustang2_cluster"]) == 2
     assert "did you mean 'zonda run mustang2_cluster'?" in capsys.readouterr().err
+
+
+def test_python_m_zonda_is_the_command() -> None:
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, "-m", "zonda", *arguments], capture_output=True, text=True, check=False)
+
+    assert __version__ in run("--version").stdout
+    wrong = run("check", "nowhere.yaml")
+    assert wrong.returncode == 2
+    assert "nowhere.yaml" in wrong.stderr
+    assert "Traceback" not in wrong.stderr
