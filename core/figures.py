@@ -18,7 +18,7 @@ import numpy as np
 from .accuracy.metrics import Metric, OfFunction, get
 from .configuration.parameters import Parameters
 from .configuration.values import TextValue, mistake, refusal
-from .errors import PipelineError, ZondaError
+from .errors import InputError, PipelineError, ZondaError
 from .notebook import html_table
 from .signal import Signal
 from .storage.ecsv import Column, write_ecsv
@@ -168,10 +168,10 @@ class Choice(TextValue):
             return cls(value.own_name(), value)
         try:
             if isinstance(value, str):
-                return cls(value.partition("(")[0].strip(), get(value))
+                return cls(*_of_one_run(value.partition("(")[0].strip(), get(value)))
             if isinstance(value, Mapping) and len(value) == 1:
                 name, given = next(iter(value.items()))
-                return cls(str(name), get(str(name), given or {}))
+                return cls(*_of_one_run(str(name), get(str(name), given or {})))
         except ZondaError as err:
             raise refusal(err) from None
         raise mistake(f"cannot read {value!r:.60} as a metric; write its name, or {{name: {{parameter: value}}}}")
@@ -202,6 +202,14 @@ class Choice(TextValue):
         return Figure(self.name, float(found[0]), "", math.nan, (says or "").strip().split("\n")[0])
 
 
+def _of_one_run(name: str, metric: Metric) -> tuple[str, Metric]:
+    """Name and metric. Raises InputError for one that is an error between two runs."""
+    if metric.instead is not None:
+        message = f"{name} is an error of one run against another, not a figure of one"
+        raise InputError(message, place="metric", cure=metric.instead)
+    return name, metric
+
+
 def measure(data: Data, metric: str | FigureMetric, **parameters: Any) -> Figure:
     """A figure of a finished run: ``zonda.measure(data, "central_rms", radius="30 arcsec").value``.
 
@@ -209,7 +217,7 @@ def measure(data: Data, metric: str | FigureMetric, **parameters: Any) -> Figure
     """
     if isinstance(metric, FigureMetric):
         return Choice(metric.own_name(), metric).figure(data)
-    return Choice(metric.partition("(")[0], get(metric, parameters)).figure(data)
+    return Choice(*_of_one_run(metric.partition("(")[0].strip(), get(metric, parameters))).figure(data)
 
 
 class Figures:

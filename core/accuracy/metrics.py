@@ -33,10 +33,14 @@ class Metric:
         What the error is, half a line.
     needs_end
         True where `measure` reads products of an `Output` (plots, reports); these are left out otherwise.
+    instead
+        Of a metric that is no number of one run, only an error between two: what to measure of one run in its place. None: a
+        number of one run.
     """
 
     says: ClassVar[str] = "|m - m0| / |m0|"
     needs_end: ClassVar[bool] = False
+    instead: ClassVar[str | None] = None
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         """Raise `PipelineError` where a pipeline of these steps and signals cannot have this metric."""

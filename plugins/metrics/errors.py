@@ -75,6 +75,7 @@ class MapRms(OfPlanes):
     """Equation (1)."""
 
     says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
+    instead: ClassVar[str | None] = "measure central_rms, or name map_rms in zonda accuracy --metric"
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("map_rms", operators)
@@ -112,6 +113,7 @@ class Peak(OfPlanes):
     """Equation (2)."""
 
     says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
+    instead: ClassVar[str | None] = "measure peak_ratio or peak_snr, or name peak in zonda accuracy --metric"
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("peak", operators)
@@ -145,6 +147,7 @@ class Transfer(OfPlanes):
     """Equation (3)."""
 
     says: ClassVar[str] = "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is lost)"
+    instead: ClassVar[str | None] = "measure transfer_at, or name transfer in zonda accuracy --metric"
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("transfer", operators)
@@ -210,6 +213,7 @@ class Psd(_Binned):
     """Equation (4)."""
 
     says: ClassVar[str] = "rms over log-frequency bins of the relative error of the signal's power spectrum"
+    instead: ClassVar[str | None] = "measure psd_slope or crossing, or name psd in zonda accuracy --metric"
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         if not any("spectrum" in o.provides for o in operators):
@@ -234,6 +238,7 @@ class Structure(_Binned):
     """Equation (5). It keeps the atmosphere's stream, and the white noise, at some detectors by a step of its own."""
 
     says: ClassVar[str] = "rms relative error of the atmosphere's structure functions in time and across the field"
+    instead: ClassVar[str | None] = "name structure in zonda accuracy --metric"
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         if not any("atmosphere" in o.provides for o in operators) or not any("signal" in o.provides for o in operators):

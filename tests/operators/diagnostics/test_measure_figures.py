@@ -6,8 +6,11 @@ from astropy.table import Table
 
 import zonda
 from tests.scenes import camera, write_sky
-from zonda.core.errors import ZondaError
+from zonda.core.accuracy.metrics import OfFunction, get
+from zonda.core.errors import InputError, ZondaError
 from zonda.core.plan.structure import prune
+from zonda.core.registry import metrics
+from zonda.plugins.checks import scenes
 
 STEPS = """\
 operators:
@@ -89,3 +92,22 @@ def test_what_cannot_be_measured_is_said_before_the_run(tmp_path):
         loaded(tmp_path, named, "runs: {free: {without: [sky]}}\n")
     with pytest.raises(ZondaError, match="add it to runs"):
         loaded(tmp_path, named)
+
+
+@pytest.mark.parametrize("name", ["map_rms", "peak", "transfer", "psd", "structure"])
+def test_an_error_between_two_runs_is_no_figure(tmp_path, name):
+    """It is refused when the file is read, with a place and with what to measure instead."""
+    with pytest.raises(ZondaError) as caught:
+        loaded(tmp_path, f"  - MeasureFigures:\n      metrics: [central_rms, {name}]\n")
+    text = str(caught.value)
+    assert f"{name} is an error of one run against another, not a figure of one" in text
+    assert f"name {name} in zonda accuracy --metric" in text
+    assert "metrics: [central_rms, " in text  # the line of the file, marked
+    with pytest.raises(InputError, match="not a figure of one"):
+        zonda.measure(zonda.Data(scenes.scene()), name)
+
+
+def test_every_metric_is_a_figure_or_is_refused():
+    for name in metrics:
+        found = get(name)
+        assert isinstance(found, zonda.FigureMetric | OfFunction) == (found.instead is None), name
