@@ -59,9 +59,13 @@ def gaussian_taps(sigma: float) -> Floats:
     return np.asarray(kernel / kernel.sum())[reach:]
 
 
-def convolved(values: AnyFloats, taps: AnyFloats) -> AnyFloats:
-    """An image (ny, nx) convolved along both axes with a symmetric kernel; nothing lies outside. Both of one type."""
-    return np.ascontiguousarray(_along_columns(np.ascontiguousarray(_along_columns(values, taps).T), taps).T)
+def convolved(values: AnyFloats, taps: AnyFloats, along: AnyFloats | None = None) -> AnyFloats:
+    """An image (ny, nx) convolved along both axes with a symmetric kernel; nothing lies outside. All of one type.
+
+    ``along``: taps along x, where they are not those along y.
+    """
+    across = np.ascontiguousarray(_along_columns(values, taps).T)
+    return np.ascontiguousarray(_along_columns(across, taps if along is None else along).T)
 
 
 def convolved_rows(values: Floats, taps: Floats, rows: list[Floats]) -> Floats:

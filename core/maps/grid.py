@@ -1,0 +1,504 @@
+"""Grids of map pixels on the sphere: solid angles, steps on the sky, distances, duplicates, and smoothing.
+
+A pixel's size is not a constant: solid angles and steps are those of each pixel, in every projection that astropy
+reads. With d(x, y) the direction (a unit vector) of the 0-based pixel coordinates (x, y),
+
+    step along x = |d_x|,  along y = |d_y|,   solid angle = |d_x cross d_y|,   metric g_ij = d_i . d_j,           (1)
+
+derivatives over the middle half of the pixel; of gnomonic (TAN) and plate carree (CAR) images in closed form. A Gaussian of FWHM
+sqrt(8 ln 2) sigma on the sky, r the angle between two directions, is the kernel
+
+    K_pq = W_p / (2 pi sigma^2) exp(-r_pq^2 / 2 sigma^2),   W_p the solid angle of pixel p,                        (2)
+
+cut at 5 sigma: over pixels much smaller than the kernel it sums to 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..numerics import tangent
+from ..numerics.angles import FWHM_PER_SIGMA
+from ..numerics.projection import central, frame_rotation, wcs_frame_rotation
+from ..numerics.sphere import angles, separation, unit_vectors
+from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
+from ..types import AnyFloats, Floats
+
+Smoother = Callable[..., Floats]
+"""f(values, power=1.0): values, shape of the grid, convolved with the power-th power of equation (2). Nothing lies outside."""
+
+EVEN = 2e-3
+"""Relative differences of steps across an image, and skewness of its pixels, below which one kernel serves all pixels."""
+GENTLE = 1e-2
+"""sigma tan(latitude) of a CAR image up to which each row has its own kernel: the kernel's width varies by half of it within."""
+CUT = 5.0
+"""Standard deviations at which kernels end."""
+SMALL = 1 << 20
+"""Pixels of a grid whose solid angles and distances are kept."""
+CYLINDERS = ("CAR", "CEA", "MER", "CYP")
+ROWS = 256
+"""Of an image that are worked on at a time."""
+
+
+class MapGrid:
+    """Where the pixels of a map are on the sky: an image (`image_grid`) or a list of HEALPix pixels (`healpix_grid`).
+
+    Attributes
+    ----------
+    shape
+        Of the map's arrays: (ny, nx), or (n_pixel,).
+    """
+
+    shape: tuple[int, ...]
+
+    @property
+    def turn(self) -> Floats:
+        """(3, 3) from ICRS directions to those of the grid's frame. InputError for frames that are no rotation of it (FK4)."""
+        raise NotImplementedError
+
+    @property
+    def areas(self) -> Floats:
+        """Solid angles [sr], an array that broadcasts to `shape`; NaN for pixels that are not on the sky."""
+        raise NotImplementedError
+
+    @property
+    def once(self) -> NDArray[np.bool_]:
+        """Pixels that are on the sky and repeat no other one (as columns of CAR beyond 360 deg do); broadcasts to `shape`."""
+        raise NotImplementedError
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """Steps (y, x) on the sky [rad] of the middle pixel: what spectra and profiles of a small map need."""
+        raise NotImplementedError
+
+    def directions(self) -> Floats:
+        """(*shape, 3) unit vectors in the grid's frame; NaN for pixels that are not on the sky."""
+        raise NotImplementedError
+
+    def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
+        """Flat places (...) of the pixels that hold directions (..., 3) of the grid's frame, -1 where there is none."""
+        raise NotImplementedError
+
+    def smoother(self, fwhm: float) -> Smoother:
+        """The convolution with a Gaussian of ``fwhm`` [rad], equation (2)."""
+        raise NotImplementedError
+
+    @property
+    def pixel(self) -> float:
+        """Side of the square of the middle pixel's solid angle [rad]."""
+        return math.sqrt(math.prod(self.sides))
+
+    def distance(self, centre: tuple[float, float]) -> Floats:
+        """Angles [rad] of the pixels from ``centre`` (longitude, latitude) [rad] in the grid's frame, of `shape`."""
+        return separation(*angles(self.directions()), centre)
+
+    def solid_angle(self, where: NDArray[np.bool_]) -> float:
+        """Of the pixels ``where`` [sr], each piece of the sky counted once."""
+        areas = np.where(self.once, self.areas, 0.0)
+        return float(np.broadcast_to(areas, self.shape)[where].sum())
+
+    def smoothed(
+        self, values: Floats, fwhm: float, weights: Floats | None = None, noise: Floats | None = None
+    ) -> tuple[Floats, Floats | None]:
+        """(values, noise) of the mean under a Gaussian; NaN where ``values`` are, which count in no other pixel.
+
+            m'_p = sum_q K_pq w_q m_q / sum_q K_pq w_q,    n'_p = [sum_q (K_pq w_q n_q)^2]^(1/2) / sum_q K_pq w_q          (3)
+
+        ``weights``: default the solid angles, so that values are points of a brightness; noise is of pixels that are independent.
+        """
+        convolve = self.smoother(fwhm)
+        own = np.broadcast_to(np.nan_to_num(np.where(self.once, self.areas, 0.0)), self.shape)
+        own = own / own.max(initial=0.0) if weights is None else weights
+        known = np.isfinite(values)
+        weight = np.where(known, own, 0.0)
+        total = convolve(weight)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found = np.where(known, convolve(weight * np.where(known, values, 0.0)) / total, np.nan)
+            if noise is None:
+                return found, None
+            quiet = known & np.isfinite(noise)
+            variance = convolve((weight * np.where(quiet, noise, 0.0)) ** 2, 2.0)
+            return found, np.where(quiet & (variance >= 0), np.sqrt(np.maximum(variance, 0.0)) / total, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePixels(MapGrid):
+    """Pixels of an image.
+
+    Attributes
+    ----------
+    wcs
+        A `TangentWcs` or an `astropy.wcs.WCS` of two celestial axes.
+    nominal
+        Steps (y, x) [rad] where the header's degrees, which are rounded, are not to be taken; None: those.
+    """
+
+    wcs: Any
+    shape: tuple[int, int]
+    nominal: tuple[float, float] | None = None
+
+    @property
+    def turn(self) -> Floats:
+        return wcs_frame_rotation(self.wcs)
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """(2, 2) of the WCS: intermediate world coordinates (first axis, second axis) [rad] per pixel (x, y)."""
+        found = np.radians(np.asarray(self.wcs.pixel_scale_matrix, np.float64))
+        if self.nominal is not None:
+            found = found / np.sqrt((found**2).sum(axis=0)) * self.nominal[::-1]
+        return found
+
+    @cached_property
+    def kind(self) -> str:
+        """Three letters of the projection; empty where distortions or parameters make more of it."""
+        names = {str(name)[-3:] for name in self.wcs.wcs.ctype}
+        plain = len(names) == 1 and not self.wcs.has_distortion and not len(self.wcs.wcs.get_pv())
+        return names.pop() if plain else ""
+
+    @cached_property
+    def cylinder(self) -> bool:
+        """Whether rows are parallels of a cylindrical projection (of its own sphere, which may lie askew)."""
+        return self.kind in CYLINDERS and self.wcs.wcs.lng == 0 and not self.matrix[0, 1] and not self.matrix[1, 0]
+
+    @property
+    def around(self) -> int:
+        """Columns of a full turn; 0 where there is no such thing."""
+        return round(2 * math.pi / abs(float(self.matrix[0, 0]))) if self.cylinder else 0
+
+    @cached_property
+    def latitudes(self) -> Floats:
+        """(ny,) of the rows of a CAR image, on the sphere of its projection [rad]."""
+        rows = np.arange(self.shape[0]) + 1.0 - float(self.wcs.wcs.crpix[1])
+        return np.asarray(rows * float(self.matrix[1, 1]), np.float64)
+
+    def at(self, x: Any, y: Any) -> Floats:
+        """(..., 3) unit vectors, in the grid's frame, of 0-based pixel coordinates; NaN where they are not on the sky."""
+        x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        if self.kind == "TAN":
+            rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(central(self.wcs)).T
+            return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True), np.float64)
+        lon, lat = self.wcs.all_pix2world(x, y, 0)
+        if self.wcs.wcs.lng == 1:
+            lon, lat = lat, lon
+        known = np.isfinite(lon) & np.isfinite(lat)
+        if self.kind == "CAR":  # wcslib's own check is off: columns may go round more than once
+            native = (y + 1.0 - float(self.wcs.wcs.crpix[1])) if self.cylinder else np.zeros_like(y)
+            known &= abs(native * float(self.matrix[1, 1])) <= math.pi / 2 * (1 + 1e-12)
+        return np.where(known[..., None], unit_vectors(np.radians(lon), np.radians(lat)), np.nan)
+
+    def metric(self, x: Any, y: Any) -> tuple[Floats, Floats, Floats]:
+        """g_xx, g_xy, g_yy of equation (1) [rad^2] at 0-based pixel coordinates."""
+        h = 0.25
+        across = (self.at(np.asarray(x) + h, y) - self.at(np.asarray(x) - h, y)) / (2 * h)
+        along = (self.at(x, np.asarray(y) + h) - self.at(x, np.asarray(y) - h)) / (2 * h)
+        return tuple(np.asarray((a * b).sum(axis=-1)) for a, b in ((across, across), (across, along), (along, along)))  # type: ignore[return-value]
+
+    @cached_property
+    def middle(self) -> tuple[float, float, float]:
+        """Metric g_xx, g_xy, g_yy of the middle of the image; of the reference point where that is not on the sky."""
+        ny, nx = self.shape
+        found = self.metric((nx - 1) / 2, (ny - 1) / 2)
+        if not np.isfinite(found).all():
+            x, y = (float(v) - 1 for v in self.wcs.wcs.crpix[:2])
+            found = self.metric(x, y)
+        xx, xy, yy = (float(g) for g in found)
+        return xx, xy, yy
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        xx, _, yy = self.middle
+        return math.sqrt(yy), math.sqrt(xx)
+
+    @property
+    def pixel(self) -> float:
+        xx, xy, yy = self.middle
+        return math.sqrt(math.sqrt(xx * yy - xy**2))
+
+    @property
+    def areas(self) -> Floats:
+        return self._areas if math.prod(self.shape) <= SMALL else self._solid_angles()
+
+    @cached_property
+    def _areas(self) -> Floats:
+        found = self._solid_angles()
+        found.flags.writeable = False
+        return found
+
+    def _solid_angles(self) -> Floats:
+        ny, nx = self.shape
+        flat = abs(float(np.linalg.det(self.matrix)))
+        if self.kind == "TAN":  # r^2 on the plane: 1 + r^2 = 1 / cos^2
+            x, y = (np.arange(n) + 1.0 - float(c) for n, c in zip((nx, ny), self.wcs.wcs.crpix[:2], strict=True))
+            g = self.matrix.T @ self.matrix
+            secant = g[0, 0] * x**2 + (2 * g[0, 1] * x) * y[:, None] + (g[1, 1] * y**2)[:, None] + 1.0
+            return np.asarray(flat / (secant * np.sqrt(secant)))
+        if self.kind == "CAR" and self.cylinder:
+            step = abs(float(self.matrix[1, 1]))
+            edges = np.clip(self.latitudes[:, None] + [[-step / 2, step / 2]], -math.pi / 2, math.pi / 2)
+            found = abs(float(self.matrix[0, 0])) * 2 * np.sin(np.diff(edges) / 2) * np.cos(edges.mean(axis=1, keepdims=True))
+            return np.where(abs(self.latitudes[:, None]) <= math.pi / 2 * (1 + 1e-12), found, np.nan)
+        columns = np.arange(1 if self.cylinder else nx) + (float(self.wcs.wcs.crpix[0]) - 1.0 if self.cylinder else 0.0)
+        found = np.empty((ny, len(columns)))
+        for first in range(0, ny, ROWS):
+            rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
+            xx, xy, yy = self.metric(columns[None, :], rows[:, None])
+            found[first : first + ROWS] = np.sqrt(np.maximum(xx * yy - xy**2, 0.0))
+        return np.where(found > 0, found, np.nan)
+
+    @property
+    def once(self) -> NDArray[np.bool_]:
+        found = np.asarray(np.isfinite(self.areas))
+        if 0 < self.around < self.shape[1]:
+            found = found & (np.arange(self.shape[1]) < self.around)
+        return found
+
+    def directions(self) -> Floats:
+        ny, nx = self.shape
+        found = np.empty((ny, nx, 3))
+        for first in range(0, ny, ROWS):
+            rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
+            found[first : first + ROWS] = self.at(np.arange(nx, dtype=np.float64), rows[:, None])
+        return found
+
+    def distance(self, centre: tuple[float, float]) -> Floats:
+        kept = self.__dict__.setdefault("_distances", {})
+        if centre in kept:
+            return kept[centre]  # type: ignore[no-any-return]
+        if isinstance(self.wcs, tangent.TangentWcs):
+            y, x = np.indices(self.shape)
+            world = self.wcs.wcs_pix2world(x.ravel(), y.ravel(), 0)
+            longitude, latitude = np.radians(np.array(world)).reshape(2, *self.shape)
+        else:
+            longitude, latitude = angles(self.directions())
+        found = separation(longitude, latitude, centre)
+        found.flags.writeable = False
+        if found.size <= SMALL:
+            kept.clear()
+            kept[centre] = found
+        return found
+
+    def coordinates(self, directions: Floats) -> tuple[Floats, Floats]:
+        """0-based pixel coordinates (x, y) of directions (..., 3) of the grid's frame; NaN where the projection has none.
+
+        Of a cylindrical image from -1/2 to a full turn beyond; others may lie outside the image.
+        """
+        directions = np.asarray(directions, np.float64)
+        if self.kind == "TAN":
+            a, b, c = np.moveaxis(directions @ central(self.wcs).T, -1, 0)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                return np.where(c > 0, a / c, np.nan), np.where(c > 0, b / c, np.nan)
+        lon, lat = np.degrees(angles(directions))
+        known = np.isfinite(lon) & np.isfinite(lat)
+        pair = [np.where(known, lon % 360.0, 0.0), np.where(known, lat, 0.0)][:: -1 if self.wcs.wcs.lng == 1 else 1]
+        if self.wcs.has_distortion:
+            x, y = self.wcs.all_world2pix(*pair, 0, quiet=True)
+        else:
+            x, y = self.wcs.wcs_world2pix(*pair, 0)
+        x, y = np.where(known, x, np.nan), np.where(known, y, np.nan)
+        if self.cylinder:
+            turn = 2 * math.pi / abs(float(self.matrix[0, 0]))
+            x = x - turn * np.floor((x + 0.5) / turn)
+        return x, y
+
+    def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
+        x, y = self.coordinates(directions)
+        ny, nx = self.shape
+        with np.errstate(invalid="ignore"):
+            inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+        column, row = (np.rint(np.where(inside, v, 0.0)).astype(np.int64).clip(0, n - 1) for v, n in ((x, nx), (y, ny)))
+        return np.where(inside, row * nx + column, -1)
+
+    def window(self, rows: slice, columns: slice) -> ImagePixels:
+        """The grid of a part of the image."""
+        (y0, y1, _), (x0, x1, _) = (s.indices(n) for s, n in zip((rows, columns), self.shape, strict=True))
+        shape = max(y1 - y0, 0), max(x1 - x0, 0)
+        if isinstance(self.wcs, tangent.TangentWcs):
+            x, y = self.wcs.crpix
+            world: Any = tangent.TangentWcs(self.wcs.frame, self.wcs.crval, (x - x0, y - y0), self.wcs.cdelt)
+        else:
+            world = self.wcs.slice((slice(y0, None), slice(x0, None)))
+        return ImagePixels(world, shape, self.nominal)
+
+    # ------------------------------------------------------------------------------------------------------ smoothing
+
+    def smoother(self, fwhm: float) -> Smoother:
+        sigma = fwhm / FWHM_PER_SIGMA
+        if self.kind == "CAR" and self.cylinder and sigma * np.tan(abs(self.latitudes)).max(initial=0.0) < GENTLE:
+            return self._by_rows(sigma)
+        steps = self._even()
+        if steps is None:
+            return self._directly(sigma)
+        along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
+        return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
+
+    def _by_rows(self, sigma: float) -> Smoother:
+        """Of a CAR image: along each row with its own width, then along the columns; right to sigma tan(latitude) / 2."""
+        side, taps = abs(float(self.matrix[0, 0])), gaussian_taps(sigma / abs(float(self.matrix[1, 1])))
+        rows = [gaussian_taps(sigma / side / cosine) for cosine in np.cos(self.latitudes)]
+        around, nx = self.around, self.shape[1]
+        if not 0 < around <= nx:
+            return lambda values, power=1.0: convolved_rows(values, taps**power, [row**power for row in rows])
+        reach = min(max((len(row) for row in rows), default=0), (around - 1) // 2)
+        columns = np.arange(-reach, around + reach) % around
+
+        def found(values: AnyFloats, power: float = 1.0) -> Floats:
+            whole = convolved_rows(np.asarray(values, np.float64)[:, columns], taps**power, [row**power for row in rows])
+            return whole[:, reach + np.arange(nx) % around]
+
+        return found
+
+    def _even(self) -> tuple[float, float] | None:
+        """Steps (y, x) that hold for all pixels to `EVEN`, whose axes are at right angles; None: they differ."""
+        ny, nx = self.shape
+        if 0 < self.around <= nx:
+            return None
+        y, x = np.meshgrid(*(np.unique(np.linspace(0, n - 1, min(n, 33))) for n in (ny, nx)), indexing="ij")
+        xx, xy, yy = self.metric(x, y)
+        reference = tuple(float(v) for v in np.sqrt((self.matrix**2).sum(axis=0))[::-1])
+        for dy, dx in (reference, self.sides):
+            with np.errstate(invalid="ignore"):
+                same = (abs(np.sqrt(xx) / dx - 1) < EVEN) & (abs(np.sqrt(yy) / dy - 1) < EVEN) & (abs(xy) < EVEN * dx * dy)
+            if same.all():
+                return dy, dy if abs(dx / dy - 1) < 1e-9 else dx
+        return None
+
+    def _directly(self, sigma: float) -> Smoother:
+        """Equation (2) as it stands: each pixel with its own kernel."""
+        from .direct_smoothing import smooth_directly, table
+
+        ny, nx = self.shape
+        whole = 0 < self.around <= nx
+        columns = self.around if whole else nx
+        directions = np.ascontiguousarray(self.directions()[:, :columns])
+        areas = np.ascontiguousarray(np.nan_to_num(np.broadcast_to(self.areas, self.shape)[:, :columns]))
+        farthest = columns // 2 if whole else columns
+        reach = np.zeros((2, ny, columns), np.int32)
+        for first in range(0, ny, ROWS):
+            rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
+            xx, xy, yy = self.metric(np.arange(columns, dtype=np.float64), rows[:, None])
+            with np.errstate(invalid="ignore", divide="ignore"):
+                wide = 1.1 * CUT * sigma * np.sqrt(np.stack([yy, xx]) / (xx * yy - xy**2)) + 1
+                if self.cylinder:  # meridians meet: a circle about the pole has all columns
+                    side = abs(float(self.matrix[0, 0]))
+                    share = math.sin(min(CUT * sigma, math.pi / 2)) / (np.sqrt(xx) / side)
+                    wide[0] = np.where(share < 1, np.arcsin(np.minimum(share, 1.0)) / side + 1, np.inf)
+            wide = np.where(np.isnan(wide), 0.0, wide)
+            reach[:, first : first + ROWS] = np.minimum(wide, np.array([farthest, ny])[:, None, None])
+
+        def found(values: AnyFloats, power: float = 1.0) -> Floats:
+            own = np.ascontiguousarray(values[:, :columns], np.float64)
+            out = smooth_directly(own, directions, areas, reach, whole, sigma, power, table(power))
+            return np.asarray(out[:, np.arange(nx) % columns] if nx > columns else out, np.float64)
+
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class HealpixPixels(MapGrid):
+    """A list of HEALPix pixels, sorted."""
+
+    nside: int
+    nest: bool
+    pixels: NDArray[np.int64]
+    frame: str = "icrs"
+
+    @property
+    def shape(self) -> tuple[int, ...]:  # type: ignore[override]
+        return (len(self.pixels),)
+
+    @property
+    def turn(self) -> Floats:
+        return frame_rotation(self.frame)
+
+    @property
+    def areas(self) -> Floats:
+        return np.array([math.pi / (3 * self.nside**2)])
+
+    @property
+    def once(self) -> NDArray[np.bool_]:
+        return np.ones(1, np.bool_)
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        side = math.sqrt(4 * math.pi / (12 * self.nside**2))
+        return side, side
+
+    def directions(self) -> Floats:
+        import healpy
+
+        return np.stack(healpy.pix2vec(self.nside, self.pixels, nest=self.nest), axis=-1)
+
+    def distance(self, centre: tuple[float, float]) -> Floats:
+        import healpy
+
+        colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
+        return separation(phi, np.pi / 2 - colatitude, centre)
+
+    def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
+        import healpy
+
+        wanted = np.asarray(healpy.vec2pix(self.nside, *np.moveaxis(directions, -1, 0), nest=self.nest))
+        pixels = self.pixels if len(self.pixels) else np.array([-1])
+        place = np.clip(np.searchsorted(pixels, wanted), 0, len(pixels) - 1)
+        return np.where(pixels[place] == wanted, place, -1)
+
+    def smoother(self, fwhm: float) -> Smoother:
+        sigma = fwhm / FWHM_PER_SIGMA / self.sides[0]
+
+        def found(values: AnyFloats, power: float = 1.0) -> Floats:
+            import healpy
+
+            whole = np.zeros(healpy.nside2npix(self.nside))
+            whole[self.pixels] = values
+            if self.nest:
+                whole = healpy.reorder(whole, n2r=True)
+            whole = healpy.smoothing(whole, fwhm=fwhm / math.sqrt(power), iter=3)
+            if self.nest:
+                whole = healpy.reorder(whole, r2n=True)
+            kept: Floats = whole[self.pixels] * (4 * math.pi * sigma**2) ** (1 - power)
+            return kept
+
+        return found
+
+
+def image_grid(header: Any, shape: tuple[int, int], nominal: float | None = None) -> ImagePixels:
+    """The grid of an image by its FITS header (any mapping that astropy's `WCS` takes).
+
+    ``nominal``: side of a pixel at the reference point [rad], where it is known better than by the header's degrees.
+    """
+    known = ((key, header[key]) for key in header if key not in ("", "COMMENT", "HISTORY"))
+    cards = tuple((key, value) for key, value in known if isinstance(value, bool | int | float | str))
+    return _image(tangent.plain(header) or cards, (int(shape[0]), int(shape[1])), nominal)
+
+
+def wcs_grid(wcs: Any, shape: tuple[int, int]) -> ImagePixels:
+    """The grid of an image by its world coordinates, a `TangentWcs` or an `astropy.wcs.WCS`."""
+    if not isinstance(wcs, tangent.TangentWcs):
+        wcs = wcs.celestial
+        if str(wcs.wcs.ctype[0])[-3:] in CYLINDERS:
+            wcs = wcs.deepcopy()
+            wcs.wcs.bounds_check(False, False)
+    return ImagePixels(wcs, (int(shape[0]), int(shape[1])))
+
+
+def healpix_grid(nside: int, nest: bool, pixels: NDArray[np.int64], frame: str = "icrs") -> HealpixPixels:
+    """The grid of some HEALPix pixels (sorted)."""
+    return HealpixPixels(nside, nest, pixels, frame)
+
+
+@lru_cache(maxsize=4)  # the maps of all signals of a run share one, with its solid angles and distances
+def _image(world: Any, shape: tuple[int, int], nominal: float | None) -> ImagePixels:
+    if not isinstance(world, tangent.TangentWcs):
+        from astropy.wcs import WCS
+
+        world = WCS(dict(world), naxis=2)
+    found = wcs_grid(world, shape)
+    return found if nominal is None else ImagePixels(found.wcs, found.shape, (nominal, nominal))
