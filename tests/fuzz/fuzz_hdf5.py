@@ -12,7 +12,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import ROOT, fuzz, guided_by, scratch, told
 
-with guided_by("zonda.operators.io", "zonda.operators.atmosphere.weather.era5", "scipy.io._netcdf"):
+with guided_by("zonda.operators.io", "zonda.operators.atmosphere.weather", "scipy.io._netcdf"):
     import numpy as np
 
     from zonda.core.configuration.time import Instant

@@ -1,17 +1,15 @@
 """The atmosphere above a place from a file of ERA5 on pressure levels, as the Copernicus Climate Data Store delivers it.
 
-Both layouts are read: NetCDF-4 with ``valid_time`` and ``pressure_level`` (from 2024), and NetCDF-3 with packed values,
-``time`` and ``level`` (before). Only what surrounds the place and the time is read from the disk. Interpolation is bilinear in
-longitude and latitude and linear in time, of the temperature, the winds, the geopotential and the logarithm of humidity.
+NetCDF-4 with ``valid_time`` and ``pressure_level`` (from 2024), NetCDF-3 with packed values, ``time`` and ``level`` (before),
+and what others make of them (`netcdf`). Only what surrounds the place and the time is read from the disk. Interpolation is
+bilinear in longitude and latitude and linear in time, of the temperature, the winds, the geopotential and ln(humidity).
 Heights are geopotential heights z / g. `retrieve` downloads such a file through the store's own client ``cdsapi``.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from importlib import import_module
 from pathlib import Path
@@ -20,36 +18,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.errors import InputError, placed
-from zonda.core.storage import hdf5_files
-from zonda.core.storage.files import reading
 from zonda.core.types import Floats
 from zonda.core.weather import Column
 
 from .humidity import from_relative, from_specific, ozone_from_mass
+from .netcdf import GET, QUANTITIES, opened
 from .radiative_transfer import GRAVITY
+from .standard_atmosphere import misplaced
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
 
-
-VARIABLES = {
-    "t": "temperature",
-    "q": "specific_humidity",
-    "r": "relative_humidity",
-    "u": "u_component_of_wind",
-    "v": "v_component_of_wind",
-    "z": "geopotential",
-    "o3": "ozone_mass_mixing_ratio",
-}
-"""Short names in the file, and what the Climate Data Store calls them."""
-AXES = {
-    "time": ("valid_time", "time"),
-    "level": ("pressure_level", "level"),
-    "lat": ("latitude", "lat"),
-    "lon": ("longitude", "lon"),
-}
-"""Names of the axes."""
 
 SPACING_MAX = 1.0
 """deg between grid points, beyond which a mountain and its valley are one."""
@@ -62,10 +42,10 @@ HIGHEST = 20000.0
 HALF_CELL = 0.13
 """deg that the place may lie outside the grid: half a cell of ERA5's own."""
 
-DRIEST = 1e-9
-"""kg/kg, or % of relative humidity: less is taken as this, which is 1e-5 mm of water in the whole column."""
-
-GET = "`zonda weather fetch SITE --time TIME --output era5.nc` gets such a file, or the Climate Data Store's pages do"
+TEMPERATURES, WINDIEST, MOISTEST = (150.0, 340.0), 200.0, 0.1
+"""K, m/s and volume mixing ratio of any air below 50 km: what is beyond is in another unit than the file says, or none."""
+RELATIVE = 1.0, 300.0
+"""%: the moistest level of air is between these, in ice clouds too."""
 
 
 def read_era5(path: Path, site: Site, time: Instant) -> Column:
@@ -77,18 +57,20 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
         A file that is not NetCDF, lacks a variable or an axis, is too coarse, or does not cover the place or the time.
     """
     place = f"ERA5 file {path}"
-    with placed(place), _opened(path, place) as file:
-        lacking = [name for name in ("t", "u", "v", "z") if name not in file] + ([] if "q" in file or "r" in file else ["q"])
+    with placed(place), opened(path, place) as file:
+        either = [] if "q" in file or "r" in file else ["q"], [] if "z" in file or "gh" in file else ["z"]
+        lacking = [name for name in ("t", "u", "v") if name not in file] + either[0] + either[1]
         if lacking:
-            names = ", ".join(f"{name} ({VARIABLES[name]})" for name in lacking)
+            names = ", ".join(f"{name} ({QUANTITIES[name].what})" for name in lacking)
             raise InputError(f"lacks {names}", cure=f"download these too: {GET}")
-        axes = {kind: _axis(file, names) for kind, names in AXES.items()}
-        pressure = _pressure(file, axes["level"])
+        axes = file.axes()
+        pressure = axes["level"].values
+        _check_levels(pressure)
         latitude, longitude = np.degrees(site.latitude), np.degrees(site.longitude)
         weights = {
-            "time": _time_weights(file, axes["time"], time),
-            "lat": _latitude_weights(file.values(axes["lat"]), latitude),
-            "lon": _longitude_weights(file.values(axes["lon"]), longitude, abs(latitude)),
+            "time": _time_weights(axes["time"].values, time),
+            "lat": _latitude_weights(axes["lat"].values, latitude),
+            "lon": _longitude_weights(axes["lon"].values, longitude, abs(latitude)),
         }
         order = np.argsort(-pressure)
 
@@ -99,11 +81,15 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
         if "q" in file:
             h2o = from_specific(column("q", logarithm=True))
         else:
-            h2o = from_relative(column("r", logarithm=True) / 100, pressure, temperature)
+            relative = column("r", logarithm=True)
+            _check(not RELATIVE[0] <= relative.max() <= RELATIVE[1], f"its relative humidity is up to {relative.max():.3g} %")
+            h2o = from_relative(relative / 100, pressure, temperature)
         o3 = column("o3") if "o3" in file else None
+        height = column("z" if "z" in file else "gh") / GRAVITY
+        _check_air(pressure, height, temperature, h2o, column)
         return Column(
             pressure=pressure,
-            height=column("z") / GRAVITY,
+            height=height,
             temperature=temperature,
             h2o=h2o,
             wind_east=column("u"),
@@ -111,7 +97,7 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
             ozone_pressure=pressure if "o3" in file else None,
             ozone=ozone_from_mass(np.maximum(o3, 0.0)) if o3 is not None else None,
             stated=f"ERA5 from {path.name}, {time}"
-            + (f" ({'; '.join(remarks)})" if (remarks := _remarks(file.below_none, o3)) else ""),
+            + (f" ({'; '.join(remarks)})" if (remarks := [*file.remarks, *_remarks(file.below_none, o3)]) else ""),
         )
 
 
@@ -123,103 +109,7 @@ def _remarks(water_below_none: int, o3: Floats | None) -> list[str]:
     return found + ([f"{ozone_below_none} negative levels of ozone taken as none"] if ozone_below_none else [])
 
 
-class _File:
-    """What NetCDF-3 and NetCDF-4 have in common.
-
-    ``below_none``: how many values below 0 were raised to `DRIEST` before their logarithm was taken.
-    """
-
-    def __init__(self, variables: Any, dimensions: dict[str, list[str]], place: str) -> None:
-        self._variables, self._dimensions, self._place = variables, dimensions, place
-        self.below_none = 0
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._dimensions
-
-    def attribute(self, name: str, key: str, default: Any = None) -> Any:
-        variable = self._variables[name]
-        value = variable.attrs.get(key, default) if hasattr(variable, "attrs") else getattr(variable, key, default)
-        if isinstance(value, bytes):
-            return value.decode()
-        return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
-
-    def values(self, name: str, where: Any = ()) -> Floats:
-        """Unpacked values, NaN where they are missing."""
-        if hasattr(self._variables[name], "dims"):
-            hdf5_files.check_size(self._variables[name], self._place)
-        raw = np.asarray(self._variables[name][where])
-        missing = [self.attribute(name, key) for key in ("_FillValue", "missing_value")]
-        scale, offset = float(self.attribute(name, "scale_factor", 1.0)), float(self.attribute(name, "add_offset", 0))
-        out = raw.astype(np.float64) * scale + offset
-        for value in missing:
-            if value is not None:
-                out = np.where(raw == value, np.nan, out)
-        return np.atleast_1d(out)
-
-    def interpolated(self, name: str, axes: dict[str, str], weights: dict[str, dict[int, float]], log: bool) -> Floats:
-        """(n_level,) of a variable."""
-        total: Floats | float = 0.0
-        for i, a in weights["time"].items():
-            for j, b in weights["lat"].items():
-                for k, c in weights["lon"].items():
-                    column = self._column(name, axes, {"time": i, "lat": j, "lon": k})
-                    if log:
-                        self.below_none += int(np.count_nonzero(column < 0))
-                        column = np.log(np.maximum(column, DRIEST))
-                    total = total + a * b * c * column
-        return np.asarray(np.exp(total) if log else total)
-
-    def _column(self, name: str, axes: dict[str, str], at: dict[str, int]) -> Floats:
-        names = self._dimensions[name]
-        index = {axes[kind]: value for kind, value in at.items()} | {axes["level"]: slice(None)}
-        if any(axis not in names for axis in axes.values()):
-            message = f"the variable {name} lies on {', '.join(names)}"
-            raise InputError(message, cure=f"it needs time, level, latitude and longitude: {GET}")
-        values = self.values(name, tuple(index.get(n, slice(None)) for n in names))
-        extra = [n for n in names if n not in index]  # expver: ERA5, and its preliminary months; number: of an ensemble
-        if extra:
-            rest = [n for n in names if n in extra or n == axes["level"]]
-            values = np.moveaxis(values, rest.index(axes["level"]), 0).reshape(values.shape[rest.index(axes["level"])], -1)
-            whole = np.flatnonzero(np.isfinite(values).all(axis=0))
-            values = values[:, whole[0] if len(whole) else 0]
-        if not np.isfinite(values).all():
-            raise InputError(f"the variable {name} has no values at this place and time", cure="download the file again")
-        return values
-
-
-@contextmanager
-def _opened(path: Path, place: str) -> Iterator[_File]:
-    import h5py
-
-    kind, cure = "NetCDF", f"a GRIB file must be converted, a zip file unpacked; {GET}"
-    with reading(place, kind, cure):
-        of_hdf5 = path.is_file() and h5py.is_hdf5(path)
-    if of_hdf5:
-        with hdf5_files.opened(path, place, kind, cure) as file:
-            sets = {name: file[name] for name in file if isinstance(file.get(name), h5py.Dataset)}
-            yield _File(sets, {name: [_label(d) for d in item.dims] for name, item in sets.items()}, place)
-        return
-    from scipy.io import netcdf_file
-
-    with reading(place, kind, cure), netcdf_file(path, "r", mmap=False) as file:
-        yield _File(file.variables, {name: list(v.dimensions) for name, v in file.variables.items()}, place)
-
-
-def _label(dimension: Any) -> str:
-    return str(dimension[0].name).rpartition("/")[2] if len(dimension) else str(dimension.label)
-
-
-def _axis(file: _File, names: tuple[str, ...]) -> str:
-    found = next((name for name in names if name in file), None)
-    if found is None:
-        raise InputError(f"has no axis {' or '.join(names)}", cure=f"it must be on pressure levels: {GET}")
-    return found
-
-
-def _pressure(file: _File, name: str) -> Floats:
-    """(n_level,) Pa."""
-    unit = str(file.attribute(name, "units", "hPa"))
-    pressure = file.values(name) * (1.0 if unit == "Pa" else 100.0)
+def _check_levels(pressure: Floats) -> None:
     falling = np.sort(pressure)[::-1]
     low = falling[falling >= HIGHEST * (1 - 1e-9)]
     gap = float((low[:-1] / low[1:]).max()) if len(low) > 1 else np.inf
@@ -228,15 +118,27 @@ def _pressure(file: _File, name: str) -> Floats:
         fault = f"end at {falling[-1] / 100:g} hPa" if falling[-1] > HIGHEST else f"lie up to a factor {gap:.2g} apart"
         cure = f"download all levels up to {HIGHEST / 100:g} hPa or higher, none further apart than 700 and 500 hPa: {GET}"
         raise InputError(f"is too coarse: {levels} {fault}", cure=cure)
-    return pressure
 
 
-def _time_weights(file: _File, name: str, time: Instant) -> dict[int, float]:
-    match = re.match(r"(seconds|hours|days) since (\d+)-(\d+)-(\d+)", str(file.attribute(name, "units", "")))
-    if not match:
-        raise InputError(f"its {name} has the unit '{file.attribute(name, 'units')}'", cure="expected hours since a date")
-    start = datetime(int(match[2]), int(match[3]), int(match[4]), tzinfo=UTC).timestamp()
-    seconds = start + file.values(name) * {"seconds": 1.0, "hours": 3600.0, "days": 86400.0}[match[1]]
+def _check(bad: bool, message: str) -> None:
+    if bad:
+        raise InputError(f"{message}: no air has that", cure="check the variable's units in the file")
+
+
+def _check_air(pressure: Floats, height: Floats, temperature: Floats, h2o: Floats, column: Callable[[str], Floats]) -> None:
+    """Refuse what is in another unit than the file says, or than ERA5 has."""
+    low, high = TEMPERATURES
+    cold, warm = float(temperature.min()), float(temperature.max())
+    _check(not low < cold <= warm < high, f"its temperatures are {cold:.4g} to {warm:.4g} K")
+    _check(not h2o.max() < MOISTEST, f"its water vapour is up to {h2o.max():.3g} of the air")
+    for name in ("u", "v"):
+        fastest = float(np.abs(column(name)).max())
+        _check(not fastest < WINDIEST, f"its wind {name} is up to {fastest:.4g} m/s")
+    if (k := misplaced(pressure, height)) is not None:
+        _check(True, f"its level of {pressure[k] / 100:g} hPa lies at {height[k]:.4g} m")
+
+
+def _time_weights(seconds: Floats, time: Instant) -> dict[int, float]:
     order, wanted = np.argsort(seconds), time.posix
     first, last = seconds[order[0]], seconds[order[-1]]
     if not first - 1800 <= wanted <= last + 1800:
@@ -305,7 +207,7 @@ def request(site: Site, time: Instant, hours: int) -> dict[str, Any]:
     north, east = min(south + 0.25, 90.0), west + 0.25
     return {
         "product_type": ["reanalysis"],
-        "variable": [VARIABLES[name] for name in ("t", "q", "u", "v", "z", "o3")],
+        "variable": [QUANTITIES[name].what for name in ("t", "q", "u", "v", "z", "o3")],
         "year": sorted({f"{s:%Y}" for s in stamps}),
         "month": sorted({f"{s:%m}" for s in stamps}),
         "day": sorted({f"{s:%d}" for s in stamps}),

@@ -32,6 +32,8 @@ VAPOUR_SCALE_HEIGHT = 2e3
 """m: vapour density falls as exp(-height / this), a round value for clear days."""
 STRATOSPHERIC_WATER = 5e-6
 """Volume mixing ratio above the tropopause."""
+OFF = 2000.0, 0.1
+"""m, and share of its height, that a pressure may lie off its height in the standard atmosphere."""
 EXTEND_BELOW = 1500.0
 """Pa: a source whose highest level has more than this is continued upwards."""
 
@@ -48,6 +50,17 @@ def pressure(height: ArrayLike) -> Floats:
     logarithm = np.concatenate([[0.0], -np.cumsum(step)])
     at_sea_level = np.interp(0.0, fine, logarithm)
     return np.asarray(SEA_LEVEL_PRESSURE * np.exp(np.interp(np.asarray(height, np.float64), fine, logarithm) - at_sea_level))
+
+
+def misplaced(pressures: Floats, height: Floats) -> int | None:
+    """The first level whose pressure [Pa] no air has at its height [m above sea level]: a unit is wrong. None: there is none.
+
+    Off by more than `OFF`, where weather moves a level by less than half of that.
+    """
+    heights = np.linspace(-2000.0, 80e3, 4001)
+    usual = np.interp(-pressures, -pressure(heights), heights)
+    bad = np.abs(height - usual) > OFF[0] + OFF[1] * np.abs(usual)
+    return int(np.argmax(bad)) if bad.any() else None
 
 
 def wind_speed(above_ground: ArrayLike) -> Floats:

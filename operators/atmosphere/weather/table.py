@@ -16,7 +16,7 @@ from zonda.core.types import Floats
 from zonda.core.weather import Column
 
 from .humidity import from_density, from_relative, from_specific
-from .standard_atmosphere import wind_speed
+from .standard_atmosphere import misplaced, wind_speed
 
 if TYPE_CHECKING:
     from zonda.core.site import Site
@@ -41,6 +41,8 @@ UNITS = {
 }
 """Columns and the units each may have. Humidity is one of relative (mixed phase), density, specific, or mixing ratio (volume)."""
 HUMIDITY = ("relative humidity", "vapour density", "specific humidity", "mixing ratio")
+DRY_AIR = 0.011
+"""Relative humidity that some level of any air has: less is a share that was called a percentage."""
 PRESSURE_MIN = 1e-3
 """Pa: that of 95 km. Below, the share of water that a humidity gives is not a number one can work with."""
 
@@ -152,6 +154,9 @@ def _limits(values: dict[str, Floats], rows: list[int]) -> None:
     refuse(pressure < PRESSURE_MIN, f"the pressure is below {PRESSURE_MIN:g} Pa", "check its unit, or leave the row out: no air")
     falls = "the pressure does not fall with height"
     refuse(np.append(False, np.diff(pressure) >= 0), falls, "check pressures and their unit")
+    if (k := misplaced(pressure, height)) is not None:
+        message = f"a pressure of {pressure[k] / 100:.4g} hPa at {height[k]:g} m: no air has that"
+        raise InputError(f"line {rows[k]}: {message}", cure="check the units of height and pressure")
     low, high = TEMPERATURES
     refuse(
         ~((temperature > low) & (temperature < high)), f"the temperature is not between {low:g} and {high:g} K", "check its unit"
@@ -161,6 +166,9 @@ def _limits(values: dict[str, Floats], rows: list[int]) -> None:
             refuse(values[name] < 0, f"the {name} is negative", "a humidity is at least 0")
     if "relative humidity" in values:
         refuse(values["relative humidity"] > 1.2, "the relative humidity is above 120 %", "check its unit: [%] or [1]")
+        if 0 < values["relative humidity"].max() <= DRY_AIR:
+            message = f"the relative humidity is {values['relative humidity'].max():.2g} at most, which no air has"
+            raise InputError(message, cure="check its unit: [%] or [1]")
     for name in ("specific humidity", "mixing ratio"):
         if name in values:
             refuse(values[name] > 0.1, f"the {name} is above 0.1", "check its unit")

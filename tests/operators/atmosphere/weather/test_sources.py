@@ -359,6 +359,20 @@ def test_bad_era5_files(tmp_path, given, words):
     assert caught.value.cure
 
 
+def test_a_share_is_no_percentage(tmp_path):
+    path = tmp_path / "air.csv"
+    rows = [
+        f"{z}, {standard_atmosphere.pressure(z)[()] / 100:.5g}, {standard_atmosphere.temperature(z)[()]:.5g}, 0.5"
+        for z in (0, 2000, 4000, 6000, 9000)
+    ]
+    header = "height [m], pressure [hPa], temperature [K], relative humidity "
+    path.write_text("\n".join([header + "[%]", *rows]))
+    with pytest.raises(InputError, match=r"the relative humidity is 0[.]005 at most, which no air has"):
+        Table(table=path).column(here(), NIGHT)
+    path.write_text("\n".join([header + "[1]", *rows]))
+    assert Table(table=path).column(here(), NIGHT).h2o.max() > 1e-3
+
+
 def test_files_that_are_not_netcdf(tmp_path):
     path = tmp_path / "era5.nc"
     for content in (b"", b"GRIB....", b"CDF\x01", b"PK\x03\x04zip", b"\x89HDF\r\n\x1a\n" + 30 * b"x"):
@@ -433,6 +447,8 @@ def test_table_without_winds_and_with_density(tmp_path):
         ("3.0, 700", "1.2, 700", "line 5: the height does not increase"),
         ("3.0, 700", "3.0, 900", "line 5: the pressure does not fall with height"),
         ("3.0, 700", "3.0, 1e-320", "line 5: the pressure is below 0.001 Pa"),
+        ("pressure [hPa]", "pressure [Pa]", "line 3: a pressure of 9.55 hPa at 500 m: no air has that"),
+        ("height [km]", "height [m]", "line 5: a pressure of 700 hPa at 3 m: no air has that"),
         ("-18, 20", "-18, -20", "line 6: the relative humidity is negative"),
         ("-18, 20", "-18, 200", "line 6: the relative humidity is above 120 %"),
         ("10, 50", "283, 50", "line 3: the temperature is not between 150 and 340 K"),
