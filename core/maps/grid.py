@@ -177,7 +177,7 @@ class ImagePixels(MapGrid):
     def latitudes(self) -> Floats:
         """(ny,) of the rows of a CAR image, on the sphere of its projection [rad]."""
         rows = np.arange(self.shape[0]) + 1.0 - float(self.wcs.wcs.crpix[1])
-        return np.asarray(rows * float(self.matrix[1, 1]), np.float64)
+        return np.asarray(np.radians(rows * float(self.wcs.pixel_scale_matrix[1][1])), np.float64)
 
     def at(self, x: Any, y: Any) -> Floats:
         """(..., 3) unit vectors, in the grid's frame, of 0-based pixel coordinates; NaN where they are not on the sky."""
@@ -355,13 +355,26 @@ class ImagePixels(MapGrid):
 
         return found
 
+    def reach(self, angle: float) -> tuple[int, int]:
+        """Rows and columns that are at least ``angle`` [rad] wide everywhere in the image."""
+        xx, xy, yy = self._somewhere
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rows, columns = (np.sqrt(g / (xx * yy - xy**2)) for g in (xx, yy))
+        most = (float(np.nanmax(np.where(np.isfinite(v), v, np.nan))) for v in (rows, columns))
+        ny, nx = (min(math.ceil(angle * v), n) for v, n in zip(most, self.shape, strict=True))
+        return ny, nx
+
+    @cached_property
+    def _somewhere(self) -> tuple[Floats, Floats, Floats]:
+        """The metric at some pixels all over the image, its corners among them."""
+        y, x = np.meshgrid(*(np.unique(np.linspace(0, n - 1, min(n, 33))) for n in self.shape), indexing="ij")
+        return self.metric(x, y)
+
     def _even(self) -> tuple[float, float] | None:
         """Steps (y, x) that hold for all pixels to `EVEN`, whose axes are at right angles; None: they differ."""
-        ny, nx = self.shape
-        if 0 < self.around <= nx:
+        if 0 < self.around <= self.shape[1]:
             return None
-        y, x = np.meshgrid(*(np.unique(np.linspace(0, n - 1, min(n, 33))) for n in (ny, nx)), indexing="ij")
-        xx, xy, yy = self.metric(x, y)
+        xx, xy, yy = self._somewhere
         reference = tuple(float(v) for v in np.sqrt((self.matrix**2).sum(axis=0))[::-1])
         for dy, dx in (reference, self.sides):
             with np.errstate(invalid="ignore"):

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..numerics import tangent
-from ..numerics.sphere import separation
 from ..types import Floats
+from .grid import HealpixPixels, ImagePixels, healpix_grid, image_grid
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from ..instrument import Band
-    from ..numerics.tangent import TangentWcs
     from ..storage.fits_image import Cards
     from .polarized import Polarization
     from .scan_hits import ScanHits
-
-SMALL = 1 << 20
-"""Pixels of a map whose distances from the centre are kept."""
 
 
 @dataclass
@@ -50,7 +44,8 @@ class MapArrays:
     centre
         (lon, lat) [rad] of the map's centre in ``frame``.
     pixel
-        Side of a pixel [rad]; of CAR in latitude; for HEALPix the square root of its area.
+        Nominal side of a pixel [rad]: of TAN at the tangent point, of CAR in latitude (and in longitude on the equator); for
+        HEALPix the square root of its area. What a pixel covers on the sky is in `grid`.
     nside, nest, pixels
         HEALPix parameters and sorted pixel numbers, else 0, False, None.
     fwhm
@@ -125,25 +120,24 @@ class MapArrays:
         return "CAR" if str(self.header["CTYPE1"]).endswith("-CAR") else "TAN"
 
     @property
+    def grid(self) -> ImagePixels | HealpixPixels:
+        """Where its pixels are on the sky, and how large: `core.maps.grid`."""
+        if self.header is not None:
+            return image_grid(self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel)
+        assert self.pixels is not None  # of HEALPix
+        return healpix_grid(self.nside, self.nest, self.pixels, self.frame)
+
+    @property
     def latitudes(self) -> Floats:
         """(ny,) latitudes of the rows of a CAR map [rad]."""
-        header: Any = self.header
-        rows = np.arange(len(self.signal)) + 1.0 - float(header["CRPIX2"])
-        return np.asarray(np.radians(rows * float(header["CDELT2"])), np.float64)
+        return image_grid(self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel).latitudes
 
     def areas(self) -> Floats | float:
         """Solid angles of the pixels [sr]: one number (HEALPix), of rows (ny, 1) (CAR), or of all pixels (TAN).
 
-            TAN: side^2 cos^3(distance from the tangent point),   CAR: 2 side sin(side / 2) cos(latitude)
-
-        That of a TAN pixel is meant for maps about their tangent point.
+        TAN: side^2 cos^3(distance from the tangent point),   CAR: 2 side sin(side / 2) cos(latitude)
         """
-        if self.header is None:
-            return self.pixel**2
-        if self.projection == "CAR":
-            return 2 * self.pixel * math.sin(self.pixel / 2) * np.cos(self.latitudes)[:, None]
-        cosine = np.cos(self.distance())
-        return self.pixel**2 * cosine * cosine * cosine  # numpy's power takes four times as long
+        return self.pixel**2 if self.header is None else self.grid.areas
 
     @property
     def resolution(self) -> float:
@@ -152,14 +146,7 @@ class MapArrays:
 
     def distance(self) -> Floats:
         """Angle [rad] of every pixel from the centre, shape of ``signal``."""
-        if self.header is not None:
-            find = _tangent_distance if self.signal.size <= SMALL else _tangent_distance.__wrapped__
-            world = tangent.plain(self.header) or self.header.tostring()
-            return find(world, self.signal.shape, self.centre)
-        import healpy
-
-        colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
-        return separation(phi, np.pi / 2 - colatitude, self.centre)
+        return self.grid.distance(self.centre)
 
     def seconds_per_beam(self) -> Floats | float | None:
         """What one sample in a pixel adds to the integration time of all detectors per beam [s]: times ``hits``, that time.
@@ -175,18 +162,3 @@ class MapArrays:
         if areas.max() < 1.001 * areas.min():
             return beam / (float(areas.mean()) if self.projection == "CAR" else self.pixel**2)
         return np.asarray(np.broadcast_to(beam / areas, self.signal.shape), np.float64)
-
-
-@lru_cache(maxsize=1)  # the maps of all signals share it
-def _tangent_distance(world: TangentWcs | str, shape: tuple[int, int], centre: tuple[float, float]) -> Floats:
-    """``world``: what the header says, or the header itself."""
-    wcs: Any = world
-    if isinstance(world, str):
-        from astropy.wcs import WCS
-
-        wcs = WCS(world)
-    y, x = np.indices(shape)
-    phi, theta = np.radians(np.array(wcs.wcs_pix2world(x.ravel(), y.ravel(), 0))).reshape(2, *shape)
-    found = separation(phi, theta, centre)
-    found.flags.writeable = False
-    return found

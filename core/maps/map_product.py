@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..notebook import html_table
 from ..numerics.angles import FWHM_PER_SIGMA, angle_text
-from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
 from ..types import Floats
 from .central import central_diameter
+from .grid import CUT
 from .map_arrays import MapArrays
 
 if TYPE_CHECKING:
@@ -104,12 +104,11 @@ class MapProduct(MapArrays):
         if self.header is None or getattr(self, of) is None:
             return self.smoothed(fwhm).rms(radius, of)
         near = self.distance() <= radius
-        reach = math.ceil(5 * fwhm / FWHM_PER_SIGMA / self.pixel)
-        across = math.ceil(reach / float(np.cos(self.latitudes).min())) if self.projection == "CAR" else reach
-        window = tuple(_around(np.flatnonzero(near.any(axis=axis)), more) for axis, more in ((1, reach), (0, across)))
+        reach = self.grid.reach(CUT * fwhm / FWHM_PER_SIGMA)  # type: ignore[union-attr]
+        window = tuple(_around(np.flatnonzero(near.any(axis=axis)), more) for axis, more in zip((1, 0), reach, strict=True))
         names = ("signal", "hits", "weights", "noise", "half_difference")
         planes: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[window] for n in names}
-        cut = replace(self, header=_cut_below(self.header, window[0].start or 0), **planes)
+        cut = replace(self, header=_cut(self.header, window[0].start or 0, window[1].start or 0), **planes)
         return _rms(getattr(cut.smoothed(fwhm), of), cut.weights, near[window])
 
     def smoothed(self, fwhm: float) -> MapProduct:
@@ -129,7 +128,7 @@ class MapProduct(MapArrays):
 
             i, q, u = (self.stokes(which).smoothed(fwhm) for which in "IQU")
             return replace(i, polarization=smoothed_polarization(self.polarization, i, q, u))
-        convolve = self._convolver(fwhm)
+        convolve = self.grid.smoother(fwhm)
         known = self.hits > 0
         weights = np.where(known, self.weights, 0.0)
         total = convolve(weights, 1.0)
@@ -155,34 +154,6 @@ class MapProduct(MapArrays):
             half_difference=half,
             smoothed_by=math.hypot(self.smoothed_by, fwhm),
         )
-
-    def _convolver(self, fwhm: float) -> Any:
-        """f(values, power): values convolved with the power-th power of the Gaussian kernel, whose sum is 1.
-
-        Of a CAR map, along each row with its own width, then along the columns: right to FWHM tan(latitude).
-        """
-        sigma = fwhm / FWHM_PER_SIGMA / self.pixel
-        if self.header is not None:
-            taps = gaussian_taps(sigma)
-            if self.projection == "CAR":
-                rows = [gaussian_taps(sigma / cosine) for cosine in np.cos(self.latitudes)]
-                return lambda values, power: convolved_rows(values, taps**power, [row**power for row in rows])
-            return lambda values, power: convolved(values, taps**power)
-
-        def sphere(values: Floats, power: float) -> Floats:
-            import healpy
-
-            whole = np.zeros(healpy.nside2npix(self.nside))
-            whole[self.pixels] = values
-            if self.nest:
-                whole = healpy.reorder(whole, n2r=True)
-            whole = healpy.smoothing(whole, fwhm=fwhm / math.sqrt(power), iter=3)
-            if self.nest:
-                whole = healpy.reorder(whole, r2n=True)
-            kept: Floats = whole[self.pixels] * (4 * math.pi * sigma**2) ** (1 - power)
-            return kept
-
-        return sphere
 
     @property
     def healpix_full(self) -> Floats:
@@ -225,10 +196,10 @@ def _rms(values: Floats, weights: Floats, where: NDArray[np.bool_]) -> float:
     return float(np.sqrt((w * values[use] ** 2).sum() / w.sum())) if use.any() and w.sum() > 0 else math.nan
 
 
-def _cut_below(header: Any, rows: int) -> Any:
-    """The header of an image without its first ``rows`` rows."""
+def _cut(header: Any, rows: int, columns: int) -> Any:
+    """The header of an image without its first rows and columns."""
     found = header.copy()
-    found["CRPIX2"] = float(header["CRPIX2"]) - rows
+    found["CRPIX1"], found["CRPIX2"] = float(header["CRPIX1"]) - columns, float(header["CRPIX2"]) - rows
     return found
 
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..numerics.sphere import separation
+from ..numerics.sphere import separation, unit_vectors
 from ..types import AnyFloats, Floats
 from .map_arrays import MapArrays
 
@@ -26,30 +25,13 @@ def on_plane(product: MapArrays, planes: Mapping[str, AnyFloats], size: int = 40
     world = wcs.pixel_to_world_values(x, y)
     known = np.isfinite(world[0]) & np.isfinite(world[1])
     lon, lat = np.where(known, world, 0.0)
-    place, there = _pixels_at(product, lon, lat)
-    there &= known
+    place = product.grid.pixels_at(unit_vectors(np.radians(lon), np.radians(lat)))
+    there = known & (place >= 0)
     found = {}
     for name, values in planes.items():
         flat = values.ravel() if values.size else np.zeros(1)
         found[name] = np.where(there, flat[place], 0 if name == "hits" else np.nan)
     return found, wcs
-
-
-def _pixels_at(product: MapArrays, lon: Floats, lat: Floats) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Flat places in the map of the pixels at positions [deg], and whether they are there."""
-    if product.pixels is not None:
-        import healpy as hp
-
-        wanted = hp.ang2pix(product.nside, lon, lat, nest=product.nest, lonlat=True)
-        pixels = product.pixels if len(product.pixels) else np.array([-1])  # of a map without hits
-        place = np.clip(np.searchsorted(pixels, wanted), 0, len(pixels) - 1)
-        return place, pixels[place] == wanted
-    x, y = product.wcs.wcs_world2pix(lon, lat, 0)
-    ny, nx = product.signal.shape
-    around = 360.0 / abs(product.wcs.wcs.cdelt[0])
-    column, row = np.rint(x - around * np.floor((x + 0.5) / around)), np.rint(y)
-    there = (column < nx) & (row >= 0) & (row < ny)
-    return np.where(there, row * nx + column, 0).astype(np.int64), np.asarray(there, np.bool_)
 
 
 def _positions(product: MapArrays) -> Floats:
