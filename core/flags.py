@@ -3,6 +3,10 @@
 TOAST calls flags of samples *shared*. Its map-making leaves out samples with a bit of 15 and detectors with a bit of 7
 ("non-science"). zonda leaves out these and its own, `OPAQUE`, `NOT_RECORDED` and `DEAD`, which become *invalid* in a file. The
 bits of the Sun do not exclude a sample.
+
+What a file flags says nothing of the signal there: no filter uses it, turnarounds excepted. What a filter of this run trims has
+a signal (`TRIMMED`). TOAST knows one bit for both, *processing*; a file of zonda names what was trimmed by the intervals
+`TRIMMED_INTERVALS`.
 """
 
 from __future__ import annotations
@@ -15,15 +19,17 @@ from numpy.typing import NDArray
 Flags = NDArray[np.uint8]
 
 INVALID, PROCESSING = 1, 2
-"""Of samples and of detectors."""
+"""Of samples and of detectors, as a file or TOAST has them."""
 TURNAROUND, IRREGULAR, SUN_UP, SUN_CLOSE = 4, 8, 16, 32
 """Of samples."""
 SOLAR_SYSTEM_OBJECT = 4
 """Of detectors."""
 OPAQUE = 64
-"""Of samples and of detectors; zonda's own."""
-NOT_RECORDED = 128
-"""Of samples; zonda's own."""
+"""Of samples and of detectors; zonda's own: no signal comes through."""
+NOT_RECORDED = OPAQUE
+"""Of samples; zonda's own: there is no signal either, and the same bit says it."""
+TRIMMED = 128
+"""Of samples; zonda's own: a filter trims them. They have a signal."""
 DEAD = 128
 """Of detectors; zonda's own."""
 
@@ -44,13 +50,13 @@ class Flag:
 
 SAMPLE_FLAGS = (
     Flag(INVALID, "invalid", "do not use", True, INVALID),
-    Flag(PROCESSING, "processing", "left out by a step: ends that a filter trims", True, PROCESSING),
+    Flag(PROCESSING, "processing", "left out by a step of another run", True, PROCESSING),
     Flag(TURNAROUND, "unstable scan rate", "in a turnaround", True, TURNAROUND),
     Flag(IRREGULAR, "irregular", "no regular scan: an elevation nod", True, IRREGULAR),
     Flag(SUN_UP, "sun up", "the Sun is above the horizon", False, SUN_UP),
     Flag(SUN_CLOSE, "sun close", "the Sun is near", False, SUN_CLOSE),
-    Flag(OPAQUE, "opaque", "the atmosphere is opaque in the band of a detector", True, INVALID),
-    Flag(NOT_RECORDED, "not recorded", "in a gap of a recorded scan, or its row is not a number", True, INVALID),
+    Flag(OPAQUE, "no signal", "opaque air in the band of a detector; a gap of a recorded scan", True, INVALID),
+    Flag(TRIMMED, "trimmed", "left out by a filter of this run, which has used its signal", True, PROCESSING),
 )
 """Of samples (`Observation.flags`)."""
 DETECTOR_FLAGS = (
@@ -65,8 +71,10 @@ DETECTOR_FLAGS = (
 EXCLUDE_SAMPLE = sum(flag.bit for flag in SAMPLE_FLAGS if flag.excludes)
 EXCLUDE_DETECTOR = sum(flag.bit for flag in DETECTOR_FLAGS if flag.excludes)
 
-HAS_A_SIGNAL = PROCESSING | TURNAROUND
+HAS_A_SIGNAL = TRIMMED | TURNAROUND
 """Bits of samples that no map uses but whose signal is one: filters take it as it is, and bridge the other excluded samples."""
+TRIMMED_INTERVALS = "zonda_trimmed"
+"""Name of the intervals of a file in which *processing* means `TRIMMED`."""
 
 
 def good(flags: Flags, exclude: int) -> NDArray[np.bool_]:
@@ -82,16 +90,23 @@ def in_file(flags: Flags, table: tuple[Flag, ...]) -> Flags:
     return found
 
 
-def from_file(flags: Flags, mask: int) -> Flags:
+def has_a_signal(flags: Flags) -> NDArray[np.bool_]:
+    """Where filters take the signal as it is: samples that maps use, turnarounds, and what a filter of this run trims."""
+    return good(flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
+
+
+def from_file(flags: Flags, mask: int, trimmed: NDArray[np.bool_] | None = None) -> Flags:
     """Flags of samples as a file in TOAST's layout has them; only those with a bit of ``mask`` are excluded.
 
     Bits that do not exclude a sample (the Sun's) are kept. A bit of ``mask`` that is none of ours becomes *invalid*; other bits
-    that are not in ``mask`` are dropped.
+    that are not in ``mask`` are dropped. ``trimmed`` (n,): where *processing* means that a filter of zonda trimmed the sample.
     """
     passing = np.uint8(SUN_UP | SUN_CLOSE)
     other = np.uint8(mask & ~SAMPLE_MASK)
     found = flags & (np.uint8(mask & SAMPLE_MASK) | passing)
     found[(flags & other) != 0] |= np.uint8(INVALID)
+    if trimmed is not None:
+        found[trimmed & ((found & PROCESSING) != 0)] ^= np.uint8(PROCESSING | TRIMMED)
     return found
 
 

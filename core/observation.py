@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -100,6 +100,8 @@ class Observation:
         What was counted or approximated.
     hwp_angle
         (n_samp,) rad, of a half-wave plate in the focal plane (`core.polarization`); None: there is none.
+    recorded_azimuth
+        (n_samp,) rad, of the mount, as a file states it beside the boresight; None: it follows from ``boresight_azel``.
     shared
         What the bands of a camera share of the scan; None: there is one band.
     output
@@ -136,6 +138,7 @@ class Observation:
     windows: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     hwp_angle: NDArray[np.float64] | None = None
     pointed_radec: NDArray[np.float64] | None = None
+    recorded_azimuth: NDArray[np.float64] | None = None
     shared: SharedScan | None = None
 
     def __post_init__(self) -> None:
@@ -201,6 +204,14 @@ class Observation:
         """(n_samp, 4) as `boresight_radec`: where the telescope in fact looks on the sky."""
         return self.boresight_radec if self.pointed_radec is None else self.pointed_radec
 
+    def thinned(self, at: slice | NDArray[np.intp]) -> Observation:
+        """The scan at some of its samples alone."""
+        azimuth = None if self.recorded_azimuth is None else self.recorded_azimuth[at]
+        return replace(
+            self, seconds=self.seconds[at], boresight_azel=self.boresight_azel[at],
+            boresight_radec=self.boresight_radec[at], flags=self.flags[at], recorded_azimuth=azimuth,
+        )  # fmt: skip
+
     def key(self, *names: str | int) -> NDArray[np.uint32]:
         """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""
         return stream_key(self.seed, "observation", self.index, *names)
@@ -226,8 +237,10 @@ class Observation:
 
     @property
     def azimuth(self) -> AnyFloats:
-        """(n_samp,) rad, north through east, 0 to 2 pi."""
-        return (-self.derotate("boresight_azel")[0]) % (2 * np.pi)
+        """(n_samp,) rad, north through east, 0 to below 2 pi; as recorded, where it is."""
+        recorded = self.recorded_azimuth
+        found = (-self.derotate("boresight_azel")[0] if recorded is None else recorded) % (2 * np.pi)
+        return np.where(found < 2 * np.pi, found, 0.0)  # the remainder of what is a rounding below zero
 
     @property
     def elevation(self) -> AnyFloats:

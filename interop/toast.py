@@ -24,11 +24,11 @@ from zonda.operators.io.time_ordered_data import TimeOrderedData
 from zonda.operators.io.toast_hdf5 import (
     FLAGS_ARE,
     WEATHER,
-    azimuth_elevation,
     detectors_table,
     name_uid,
     nominal_noise,
     session_of,
+    tod_azimuth_elevation,
 )
 from zonda.operators.io.toast_reading import columns_of, offsets_of
 
@@ -113,7 +113,7 @@ def _fill_shared(ob: Any, tod: TimeOrderedData) -> None:
         if len(getattr(tod, name)):
             shared[name] = getattr(tod, name)
     if len(tod.boresight_azel):
-        shared["azimuth"], shared["elevation"] = azimuth_elevation(tod.boresight_azel)
+        shared["azimuth"], shared["elevation"] = tod_azimuth_elevation(tod)
     if tod.hwp_angle is not None:
         shared["hwp_angle"] = tod.hwp_angle
     for name, values in shared.items():
@@ -198,6 +198,7 @@ def from_toast(ob: Any, stream: str | None = "signal") -> TimeOrderedData:
         intervals={name: _spans(ob.intervals[name], times, seconds) for name in ob.intervals if name != ob.intervals.all_name},
         weather=_ground_weather(ob.telescope.site.weather),
         hwp_angle=np.array(ob.shared["hwp_angle"].data) if "hwp_angle" in ob.shared else None,
+        azimuth=np.array(ob.shared["azimuth"].data, np.float64) if "azimuth" in ob.shared else None,
         metadata=own,
         offsets=offsets_of(table, rows),
     )

@@ -44,9 +44,7 @@ class Slice(Operator):
 
 def _cut(o: Observation, seconds: float, every: int) -> Observation:
     n = min(o.n_samples, max(1, round(seconds * o.sample_rate)))
-    o = dataclasses.replace(
-        o, seconds=o.seconds[:n], boresight_azel=o.boresight_azel[:n], boresight_radec=o.boresight_radec[:n], flags=o.flags[:n]
-    )
+    o = o.thinned(slice(0, n))
     if every == 1:
         return o
     plane = o.focalplane

@@ -8,7 +8,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
+from zonda.core.flags import has_a_signal
 from zonda.core.operator import Operator
 
 from .baseline import Fit, splines
@@ -37,7 +37,7 @@ class Despline(Operator):
     def prepare(self, observation: Observation) -> Fit:
         """The fit to this observation's good samples. Raises PipelineError for more than `MOST` knots."""
         spacing = self.knots * observation.sample_rate
-        use = good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
+        use = has_a_signal(observation.flags)
         if observation.duration > MOST * self.knots:
             raise PipelineError(
                 f"knots every {self.knots:g} s are more than {MOST} in a scan of {observation.duration:g} s",

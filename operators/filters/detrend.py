@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from zonda.core.data import Block, Observation
-from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
+from zonda.core.flags import has_a_signal
 from zonda.core.operator import Operator
 
 from .baseline import Fit, polynomials
@@ -34,7 +34,7 @@ class Detrend(Operator):
 
     def prepare(self, observation: Observation) -> tuple[Fit, Inside | None]:
         """The fit to this observation's good samples."""
-        use = good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
+        use = has_a_signal(observation.flags)
         inside = self.mask.of(observation) if self.mask else None
         if inside is not None:
             check_mask(inside, observation, f"{self.label}, {observation.name}")

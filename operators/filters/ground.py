@@ -31,7 +31,7 @@ from zonda.core.compilation.jit import nb
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Observation
-from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, good
+from zonda.core.flags import has_a_signal
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
@@ -69,7 +69,7 @@ class GroundFilter(Operator):
             text = f"{observation.name} spans {reach:.3g} deg of azimuth, one bin of {np.degrees(self.bin):.3g} deg"
             warnings.warn(f"{self.label}: {text}: the template is a mean; choose a smaller bin", stacklevel=2)
         observation.tally.state(self.label, f"{observation.name}: bins of the template", f"{size}")
-        use = good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
+        use = has_a_signal(observation.flags)
         return Template.of(number, polynomials(observation.n_samples, self.trend).functions[1:], use)
 
     def exec(self, block: Block, state: Template) -> None:
@@ -79,8 +79,11 @@ class GroundFilter(Operator):
 
 def _bins(observation: Observation, width: float, split: bool) -> NDArray[np.int64]:
     """(n,) bin of each sample, from 0; bins that are nowhere are not counted."""
-    azimuth = observation.azimuth
-    number = np.floor(azimuth / width).astype(np.int64)
+    azimuth = observation.azimuth if observation.recorded_azimuth is None else observation.recorded_azimuth
+    around = round(2 * np.pi / width)
+    if abs(around * width - 2 * np.pi) > 1e-9:  # no whole number of bins
+        azimuth, around = azimuth % (2 * np.pi), 1 << 32
+    number = np.floor_divide(azimuth, width).astype(np.int64) % around  # as TOAST, at the edges of bins too
     if split and len(azimuth) > 1:
         number = 2 * number + (np.gradient(np.unwrap(azimuth)) > 0)
     return np.asarray(np.unique(number, return_inverse=True)[1], np.int64)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
+from zonda.core.flags import TRIMMED, has_a_signal
 from zonda.core.types import AnyFloats, Floats
 
 from .baseline import Fit, polynomials
@@ -57,7 +57,7 @@ class HighpassFilter(HighpassParameters):
 
     def prepare(self, observation: Observation) -> State:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
-        fine = good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
+        fine = has_a_signal(observation.flags)
         _trim(self, observation)
         observation.tally.count(self.label, "flagged samples bridged before filtering", int((~fine).sum()), fine.size)
         inside = self.mask.of(observation) if self.mask else None
@@ -112,8 +112,8 @@ def _trim(step: HighpassFilter, observation: Observation) -> None:
             place=f"{step.label}, {observation.name}",
             cure="shorten trim or lengthen the scan",
         )
-    observation.flags[:trimmed] |= PROCESSING
-    observation.flags[n - trimmed :] |= PROCESSING
+    observation.flags[:trimmed] |= TRIMMED
+    observation.flags[n - trimmed :] |= TRIMMED
     observation.tally.count(step.label, "samples trimmed", 2 * trimmed, n)
 
 

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.flags import EXCLUDE_SAMPLE, HAS_A_SIGNAL, PROCESSING, good
+from zonda.core.flags import TRIMMED, has_a_signal
 from zonda.core.intervals import ranges
 from zonda.core.numerics.smooth import product
 from zonda.core.operator import Operator
@@ -62,9 +62,9 @@ class PolynomialFilter(Operator):
         """The fits to this observation's good samples; flags what is in no interval."""
         n = observation.n_samples
         parts = [slice(0, n)] if self.interval == "whole" else self._parts(observation)
-        use = good(observation.flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
+        use = has_a_signal(observation.flags)
         pieces = Pieces.of(parts, self.order, use)
-        observation.flags[pieces.outside] |= PROCESSING
+        observation.flags[pieces.outside] |= TRIMMED
         observation.tally.count(self.label, "samples between intervals, flagged", int(pieces.outside.sum()), n)
         observation.tally.state(self.label, f"{observation.name}: polynomials of order {self.order}", f"{len(parts)}")
         inside = self.mask.of(observation) if self.mask else None

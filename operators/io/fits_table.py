@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.flags import of_before
-from zonda.core.intervals import Intervals
+from zonda.core.flags import PROCESSING, TRIMMED_INTERVALS, of_before
+from zonda.core.intervals import Intervals, runs
 from zonda.core.maps.map_file import ascii_text
 from zonda.core.storage.files import writing
 from zonda.core.storage.fits_files import COMPRESSED, check_size, opened
@@ -24,7 +24,7 @@ from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 
 from .time_ordered_data import TimeOrderedData
-from .toast_hdf5 import azimuth_elevation
+from .toast_hdf5 import tod_azimuth_elevation
 
 SUFFIX = ".fits"
 
@@ -133,7 +133,7 @@ def _primary_header(tod: TimeOrderedData) -> Any:
 def _samples_table(tod: TimeOrderedData) -> Any:
     from astropy.io import fits
 
-    azimuth, elevation = azimuth_elevation(tod.boresight_azel)
+    azimuth, elevation = tod_azimuth_elevation(tod)
     pointing = [
         ("AZ", "D", "rad", azimuth),
         ("EL", "D", "rad", elevation),
@@ -311,9 +311,10 @@ def _read(file: Any) -> TimeOrderedData:
     flags, detector_flags = _native(samples["FLAGS"]), _native(detectors["FLAGS"])
     if "FLAGBITS" in about and "INTERVALS" not in file:
         raise KeyError("there is no table INTERVALS")
+    intervals: Intervals = {}
     if "FLAGBITS" not in about:
         flags, detector_flags = of_before(flags, samples=True), of_before(detector_flags, samples=False)
-    intervals: Intervals = {}
+        intervals[TRIMMED_INTERVALS] = runs((flags & np.uint8(PROCESSING)) != 0, _native(samples["SECONDS"]))
     for row in file["INTERVALS"].data if "INTERVALS" in file else ():
         intervals.setdefault(str(row["NAME"]), []).append((float(row["START"]), float(row["STOP"])))
     weather = GroundWeather(**{name: float(about[key]) for key, name, _, _ in _WEATHER}) if "WEATHERT" in about else None
@@ -336,6 +337,7 @@ def _read(file: Any) -> TimeOrderedData:
         intervals=intervals,
         weather=weather,
         hwp_angle=_native(samples["HWP_ANGLE"]) if "HWP_ANGLE" in samples.names else None,
+        azimuth=_native(samples["AZ"]) if "AZ" in samples.names else None,
         metadata={str(key): json.loads(value) for key, value in zip(provenance["KEY"], provenance["VALUE"], strict=True)},
         offsets=np.stack([_native(detectors["XI"]), _native(detectors["ETA"])], axis=1),
     )

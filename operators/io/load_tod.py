@@ -14,6 +14,7 @@ from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.observation import Observation
 from zonda.core.signal import Component
+from zonda.core.types import Floats
 
 from .recorded_files import File, RecordedFiles, RecordedScan, Scan
 from .recorded_pointing import boresights, middle, state_celestial
@@ -38,6 +39,9 @@ MOMENT = 1.0
 
 SAME_DIRECTION = 1e-9
 """Largest difference of the boresights (quaternions) of files that are bands of one scan."""
+
+SAME_AZIMUTH = np.radians(1.0)
+"""Largest distance of the azimuth that a file states from that of its boresight: more than any pointing model."""
 
 SAME_NUMBER = 1e-6
 """Largest relative difference of the sites and sample rates of such files."""
@@ -230,7 +234,7 @@ def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
     fwhm = tod.columns.get("fwhm", plane.fwhm)  # of all bands of the file, whichever are used; these alone have been checked
     tolerance = step.interpolation_error * float(fwhm[fwhm > 0].min())
     found = boresights(tod, start, scene.site, step.celestial, tolerance, place)
-    good = flags.good(sample_flags := flags.from_file(tod.flags, step.flag_mask), flags.EXCLUDE_SAMPLE)
+    good = flags.good(sample_flags := tod.sample_flags(step.flag_mask), flags.EXCLUDE_SAMPLE)
     flagged = np.concatenate([b.part.tod.detector_flags[b.rows] for b in bands])
     dead = np.where(flagged & np.uint8(step.detector_mask), np.uint8(flags.INVALID), np.uint8(0))
     observation = Observation(
@@ -248,12 +252,28 @@ def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
         seed=scene.seed,
         flags=sample_flags,
         detector_flags=dead,
-        intervals=dict(tod.intervals),
+        intervals=tod.scan_intervals,
         weather=tod.weather,
         hwp_angle=tod.hwp_angle,
     )
+    observation.recorded_azimuth = _recorded_azimuth(step.label, observation, tod)
     state_celestial(step.label, observation, found, tod.sample_rate)
     return observation
+
+
+def _recorded_azimuth(label: str, observation: Observation, tod: TimeOrderedData) -> Floats | None:
+    """The azimuth that a file states (n_samp,) [rad], and that of the boresight where it is no number; None: it states none, or
+    one that is not the boresight's."""
+    if tod.azimuth is None:
+        return None
+    own = np.asarray(observation.azimuth, np.float64)
+    away = np.abs(np.angle(np.exp(1j * (tod.azimuth - own))))
+    known = np.isfinite(away)
+    if away[known].max(initial=0.0) > SAME_AZIMUTH:
+        what = f"{observation.name}: the column azimuth is not used; it is not the boresight's"
+        observation.tally.state(label, what, f"{np.degrees(away[known].max()):.3g} deg away")
+        return None
+    return np.where(known, tod.azimuth, own)
 
 
 def _centre(step: LoadTOD, tod: TimeOrderedData, scene: Any, radec: Any, good: Any) -> tuple[float, float]:

@@ -69,8 +69,8 @@ class File:
     def of(cls, part: RecordedScan, mask: int) -> File:
         """``mask``: bits of the flags that exclude a sample."""
         tod, rows = part.tod, np.concatenate(part.rows).tolist()
-        intervals = tod.intervals or {"scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)}
-        of_samples = flags.from_file(tod.flags, mask)
+        intervals = tod.scan_intervals or {"scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)}
+        of_samples = tod.sample_flags(mask)
         names = {tod.names[row]: row for row in rows}
         return cls(part.path, names, of_samples, intervals, tod.weather, tod.hwp_angle, part.noise)
 
@@ -170,8 +170,8 @@ class RecordedFiles(Operator):
         opened = reader(file.path)
         try:
             rows = np.array([file.rows[name] for name in observation.focalplane.names], np.intp)
-            good = flags.good(file.flags, flags.EXCLUDE_SAMPLE)
-            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask), good)
+            good, usable = flags.good(file.flags, flags.EXCLUDE_SAMPLE), flags.has_a_signal(file.flags)
+            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask), good, usable)
         except BaseException:
             opened.close()
             raise

@@ -42,8 +42,8 @@ class RecordedStream:
         (n_det,) rows of the file.
     mask
         Bits of the flags of a detector's samples that make one NaN.
-    good
-        (n_samp,) which instants the file's flags leave; None: all.
+    good, usable
+        (n_samp,) which instants the file's flags leave, and those at which there is a signal that filters use; None: all.
     level
         (n_det,) K, constant, that stands beside the stream; ``mean``: the same as a field, None where it is zero.
     """
@@ -53,6 +53,7 @@ class RecordedStream:
     rows: NDArray[np.intp]
     mask: np.uint8
     good: NDArray[np.bool_] | None = None
+    usable: NDArray[np.bool_] | None = None
     level: Floats = field(default_factory=lambda: np.zeros(0))
     mean: SmoothField | None = None
 
@@ -121,12 +122,16 @@ class RecordedStream:
 def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Floats, Floats]:
     """Median and standard deviation (n_detectors,) [K] of a few hundred finite samples of each detector, 0 where there is none.
 
-    They depend on the file alone. For the level any number would do: it is subtracted in float64 and added again.
+    They depend on the file alone, and not on samples that it flags. For the level any number would do: it is subtracted in
+    float64 and added again.
     """
     found = np.zeros((2, n_detectors))
-    begins = np.unique(np.linspace(0, max(n_samples - LENGTH, 0), STRETCHES).astype(int))
-    for rows in chunks(n_detectors, TILE_DETECTORS):
-        parts = np.hstack([stream.read(rows, slice(int(b), min(int(b) + LENGTH, n_samples)))[0] for b in begins])
+    usable = np.arange(n_samples) if stream.usable is None else np.flatnonzero(stream.usable)
+    begins = usable[np.unique(np.linspace(0, max(len(usable) - LENGTH, 0), STRETCHES).astype(int))] if len(usable) else usable
+    stretches = [slice(int(b), min(int(b) + LENGTH, n_samples)) for b in begins]
+    for rows in chunks(n_detectors, TILE_DETECTORS) if stretches else ():
+        known = [slice(None) if stream.usable is None else stream.usable[s] for s in stretches]
+        parts = np.hstack([stream.read(rows, s)[0][:, k] for s, k in zip(stretches, known, strict=True)])
         for number, values in enumerate(parts, rows.start):
             finite = values[np.isfinite(values)]
             found[:, number] = (np.median(finite), np.std(finite)) if finite.size else (0.0, 0.0)

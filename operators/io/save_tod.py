@@ -14,7 +14,6 @@ from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, OutputError
-from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
 from zonda.core.operator import Operator
 from zonda.core.output import output_folder
 from zonda.core.product import Record
@@ -69,8 +68,7 @@ class _State:
 
     def finish(self, observation: Observation, provenance: Mapping[str, str | int | float]) -> None:
         """Write what is known now that the scan is complete, and give the file its name."""
-        self.tod.flags = in_file(observation.flags, SAMPLE_FLAGS)
-        self.tod.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
+        self.tod.take_flags(observation)
         log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.tally)
         self.tod.metadata.update(provenance, tally=log)
         self.writer.finish()

@@ -10,8 +10,17 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
-from zonda.core.flags import DETECTOR_FLAGS, SAMPLE_FLAGS, in_file
-from zonda.core.intervals import Intervals
+from zonda.core.flags import (
+    DETECTOR_FLAGS,
+    PROCESSING,
+    SAMPLE_FLAGS,
+    TRIMMED,
+    TRIMMED_INTERVALS,
+    Flags,
+    from_file,
+    in_file,
+)
+from zonda.core.intervals import Intervals, runs, samples_in
 from zonda.core.numerics.quaternions import detector_quaternions
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
@@ -51,11 +60,14 @@ class TimeOrderedData:
     streams
         (n_det, n_samp) arrays; K_RJ, but for what is no temperature. NaN: a single sample that is not to be used.
     intervals
-        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`).
+        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`). In those called
+        `TRIMMED_INTERVALS` *processing* means that a filter of zonda trimmed the samples.
     weather
         At the telescope; None: not known.
     hwp_angle
         (n_samp,) rad, of a half-wave plate in the focal plane; None: there is none.
+    azimuth
+        (n_samp,) rad, of the mount, north through east, as recorded; None: it follows from ``boresight_azel``.
     metadata
         Text and numbers that say where the data come from.
     offsets
@@ -81,6 +93,7 @@ class TimeOrderedData:
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
     hwp_angle: NDArray[np.float64] | None = None
+    azimuth: NDArray[np.float64] | None = None
     metadata: dict[str, str | int | float] = field(default_factory=dict)
     offsets: NDArray[np.float64] | None = None
 
@@ -99,19 +112,36 @@ class TimeOrderedData:
         pointed = [name for name in ("boresight_azel", "boresight_radec") if len(getattr(self, name))]
         shapes |= dict.fromkeys(pointed or ("boresight_azel",), (*n, 4))
         shapes |= {} if self.offsets is None else {"offsets": (*d, 2)}
-        shapes |= {} if self.hwp_angle is None else {"hwp_angle": n}
+        shapes |= {name: n for name in ("hwp_angle", "azimuth") if getattr(self, name) is not None}
         wrong = [name for name, shape in shapes.items() if np.shape(getattr(self, name)) != shape]
         wrong += [name for name, column in self.columns.items() if np.shape(column) != d]
         wrong += [name for name, stream in self.streams.items() if stream.shape[:2] != (*d, *n) or stream.dtype.kind not in "fiu"]
         if wrong or not n or not d:
             message = f"does not fit together: {', '.join(wrong)} for {len(self.names)} detectors"
             raise InputError(message, place=place, cure="save it again")
+        shapes.pop("azimuth", None)  # where it is no number, that of the boresight is taken
         numbers = [name for name, shape in shapes.items() if not np.isfinite(getattr(self, name)).all()]
         if not np.isfinite([self.sample_rate, self.field_of_view, *self.site[1:]]).all() or not self.sample_rate > 0:
             numbers.append("sample rate, field of view or site")
         numbers += [f"intervals {name}" for name, spans in self.intervals.items() if not np.isfinite(spans).all()]
         if numbers:
             raise InputError(f"has NaN or impossible values in {', '.join(numbers)}", place=place, cure="save it again")
+
+    def take_flags(self, observation: Observation) -> None:
+        """Take the flags that a scan has now, and its intervals."""
+        self.flags = in_file(observation.flags, SAMPLE_FLAGS)
+        self.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
+        trimmed = runs((observation.flags & np.uint8(TRIMMED | PROCESSING)) == TRIMMED, observation.seconds)
+        self.intervals = {**observation.intervals, **({TRIMMED_INTERVALS: trimmed} if trimmed else {})}
+
+    def sample_flags(self, mask: int) -> Flags:
+        """(n_samp,) bits of `core.flags`; ``mask``: bits of the file that exclude a sample."""
+        return from_file(self.flags, mask, samples_in(self.intervals.get(TRIMMED_INTERVALS, []), self.seconds))
+
+    @property
+    def scan_intervals(self) -> Intervals:
+        """The intervals without those that say what was trimmed."""
+        return {name: spans for name, spans in self.intervals.items() if name != TRIMMED_INTERVALS}
 
     @property
     def xi(self) -> NDArray[np.float64]:
@@ -148,7 +178,7 @@ class TimeOrderedData:
         """Everything but the streams of an observation."""
         o, f, instrument = observation, observation.focalplane, observation.instrument
         n = len(f)
-        return cls(
+        found = cls(
             name=o.name,
             start=o.start.isoformat(),
             seconds=o.seconds,
@@ -159,8 +189,8 @@ class TimeOrderedData:
             site=(o.site.name, o.site.latitude, o.site.longitude, o.site.altitude),
             boresight_azel=o.boresight_azel,
             boresight_radec=o.boresight_radec,
-            flags=in_file(o.flags, SAMPLE_FLAGS),
-            detector_flags=in_file(o.detector_flags, DETECTOR_FLAGS),
+            flags=o.flags,
+            detector_flags=o.detector_flags,
             names=list(f.names),
             quats=detector_quaternions(f.xi, f.eta, f.polarization_angle),
             columns={
@@ -177,9 +207,9 @@ class TimeOrderedData:
                 "slope": f.slope,
                 "wafer": f.wafer.astype(np.float64),
             },
-            intervals=o.intervals,
             weather=o.weather,
             hwp_angle=o.hwp_angle,
+            azimuth=np.asarray(o.azimuth if o.recorded_azimuth is None else o.recorded_azimuth, np.float64),
             metadata={
                 "seed": o.seed,
                 "observation_index": o.index,
@@ -192,3 +222,5 @@ class TimeOrderedData:
             },
             offsets=np.stack([f.xi, f.eta], axis=1),
         )
+        found.take_flags(o)
+        return found

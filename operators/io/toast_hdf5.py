@@ -259,7 +259,7 @@ def _write_noise(group: Any, tod: TimeOrderedData, frequency: AnyFloats, psd: An
 
 
 def _write_shared(file: Any, tod: TimeOrderedData) -> None:
-    azimuth, elevation = azimuth_elevation(tod.boresight_azel)
+    azimuth, elevation = tod_azimuth_elevation(tod)
     shared = {
         "times": tod.times,
         "seconds": tod.seconds,
@@ -278,6 +278,12 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
     for name, spans in tod.intervals.items():
         at = np.searchsorted(tod.seconds, np.reshape(spans, (-1, 2)).T)
         intervals.create_dataset(name, data=tod.times[np.minimum(at, tod.n_samples - 1)])  # to the last bit those of samples
+
+
+def tod_azimuth_elevation(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats]:
+    """Azimuth, as recorded where it is, and elevation of a scan, rad."""
+    azimuth, elevation = azimuth_elevation(tod.boresight_azel)
+    return azimuth if tod.azimuth is None else tod.azimuth, elevation
 
 
 def azimuth_elevation(boresight_azel: AnyFloats) -> tuple[AnyFloats, AnyFloats]:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.flags import DETECTOR_MASK, Flags, of_before
-from zonda.core.intervals import Intervals
+from zonda.core.flags import DETECTOR_MASK, PROCESSING, TRIMMED_INTERVALS, Flags, of_before
+from zonda.core.intervals import Intervals, runs
 from zonda.core.storage.files import reading
 from zonda.core.storage.hdf5_files import check_size, checked
 from zonda.core.types import AnyFloats, Floats
@@ -205,7 +205,10 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         start = Instant(round(float(times[0]) * 1e9)).isoformat()
     kept = (k for k in other if k.startswith("zonda_") and k not in ("zonda_start_utc", FLAGS_ARE))
     own = {k.removeprefix("zonda_"): other[k] for k in kept}
-    flags, detector_flags = _flags(file, other, names)
+    flags, detector_flags, before = _flags(file, other, names)
+    intervals = _intervals(file, times, seconds)
+    if before:
+        intervals[TRIMMED_INTERVALS] = runs((flags & np.uint8(PROCESSING)) != 0, seconds)
     a = instrument.attrs
     return TimeOrderedData(
         name=str(file.attrs["observation_name"]),
@@ -228,9 +231,10 @@ def _read(file: Any, place: str) -> TimeOrderedData:
         names=names,
         quats=np.asarray(table["quat"][rows], np.float64),
         columns=columns_of(table, rows),
-        intervals=_intervals(file, times, seconds),
+        intervals=intervals,
         weather=_weather(a),
         hwp_angle=shared["hwp_angle"][:] if "hwp_angle" in shared else None,
+        azimuth=np.asarray(shared["azimuth"][:], np.float64) if "azimuth" in shared else None,
         metadata={k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()},
         offsets=offsets_of(table, rows),
     )
@@ -280,15 +284,15 @@ def _quaternions(shared: Any, name: str) -> Floats:
     return np.asarray(shared[name][:], np.float64) if name in shared else np.zeros((0, 4))
 
 
-def _flags(file: Any, other: Mapping[str, Any], names: list[str]) -> tuple[Flags, Flags]:
-    """Flags of samples and of detectors, in TOAST's bits."""
+def _flags(file: Any, other: Mapping[str, Any], names: list[str]) -> tuple[Flags, Flags, bool]:
+    """Flags of samples and of detectors, in TOAST's bits; whether an earlier zonda wrote them (its *processing*: trimmed)."""
     shared = file["shared"]
     found = json.loads(file.attrs["observation_detector_flags"])
     flags = shared["flags"][:] if "flags" in shared else np.zeros(len(shared["times"]), np.uint8)
     detector_flags = np.array([found[d] for d in names], np.uint8)
     if "zonda_start_utc" in other and FLAGS_ARE not in other:
-        return of_before(flags, samples=True), of_before(detector_flags, samples=False)
-    return np.asarray(flags, np.uint8), detector_flags
+        return of_before(flags, samples=True), of_before(detector_flags, samples=False), True
+    return np.asarray(flags, np.uint8), detector_flags, False
 
 
 def _intervals(file: Any, times: AnyFloats, seconds: AnyFloats) -> Intervals:

@@ -6,7 +6,6 @@ A shift delta of the beam changes a point source by at most 1.43 delta / FWHM of
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -133,9 +132,7 @@ def _bend(context: Context) -> float:
 def _thin(o: Observation) -> Observation:
     """At most `INSTANTS` of it, evenly taken: none of what is bounded changes between them by more than a part in 1000."""
     at = np.unique(np.linspace(0, o.n_samples - 1, min(INSTANTS, o.n_samples)).astype(int))
-    return replace(
-        o, seconds=o.seconds[at], boresight_azel=o.boresight_azel[at], boresight_radec=o.boresight_radec[at], flags=o.flags[at]
-    )
+    return o.thinned(at)
 
 
 def _rotation(o: Observation) -> float:

@@ -163,6 +163,8 @@ def _observation(step: PointingRecorded, data: Data, scan: Scan, recording: Reco
     parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
     samples = Samples(seconds, scan.rate, (azel, radec), scan.flags.copy(), parts)
     observation = observed(step.label, scene, len(data.observations), transform, centre, samples)
+    if recording.frame == "azel":
+        observation.recorded_azimuth = scan.longitude
     state_times(step.label, observation)
     if recording.frame == "azel":
         _state_celestial(step.label, observation, computed, good)

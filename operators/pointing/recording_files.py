@@ -134,6 +134,7 @@ def _fits(path: Path, place: str) -> RecordedTable:
                 found = RecordedTable(columns, Instant.parse(start) if start else None, in_seconds=True)
                 if names >= {"boresight_azel", "boresight_radec"}:  # SaveTOD's
                     found.bits = "toast" if "FLAGBITS" in table.header else "before"
+                    _check_rotation(table.data["BORESIGHT_AZEL"], place)
                     found.radec = np.asarray(table.data["BORESIGHT_RADEC"], np.float64)
                     found.intervals = _fits_intervals(file["INTERVALS"].data) if "INTERVALS" in file else {}
                 return found
@@ -184,15 +185,15 @@ def _fits_intervals(rows: Any) -> dict[str, Floats]:
 
 
 def _check_rotation(quaternions: Any, place: str) -> None:
-    """zonda's mount keeps the focal plane upright; a file whose boresight is rotated about itself would not be followed."""
+    """Raise InputError for a boresight that is rotated about itself: azimuth and elevation alone do not follow it."""
     x, y, z, w = np.asarray(quaternions[:], np.float64).T
     psi = np.arctan2(y * z + w * x, -(x * z - w * y))
     turned = float(np.abs(psi[np.isfinite(psi)]).max(initial=0.0))
     if turned > 1e-6:
         raise InputError(
-            f"the boresight is rotated by up to {np.degrees(turned):.3g} deg about itself, which is not simulated",
+            f"the boresight is rotated by up to {np.degrees(turned):.3g} deg about itself, which this step does not follow",
             place=place,
-            cure="give azimuth and elevation alone",
+            cure="use LoadTOD: {file: ..., signal: none} in its place: the pointing alone, with the rotation",
         )
 
 
@@ -211,13 +212,15 @@ def _recording(table: RecordedTable, clock: Clock, mask: int | None, place: str)
         seconds = _in_si(*found["seconds"], "s", "seconds", place)
     else:
         seconds, start = _times(*found["time" if "time" in found else "seconds"], clock, place)
-    bits = _flags(found["flags"][0], table.bits, mask) if "flags" in found else np.zeros(len(seconds), np.uint8)
     if table.radec is not None and table.radec.shape != (len(seconds), 4):
         shape = " x ".join(map(str, table.radec.shape))
         raise InputError(f"boresight_radec is {shape}, not {len(seconds)} x 4", place=place, cure="save the file again")
     radec = table.radec if frame == "azel" else None
     times = seconds if table.in_seconds or "time" not in found else np.asarray(found["time"][0], np.float64)
     parts = _intervals(table.intervals, times, seconds, place)
+    bits, trimmed = np.zeros(len(seconds), np.uint8), _within(parts.pop(flags.TRIMMED_INTERVALS, []), seconds)
+    if "flags" in found:
+        bits = _flags(found["flags"][0], table.bits, mask, trimmed)
     return Recording(start, seconds, longitude, latitude, frame, bits, radec, parts)
 
 
@@ -228,7 +231,16 @@ def _check_latitude(latitude: Floats, name: str, place: str) -> None:
         raise InputError(f"{name} is {np.degrees(worst):.6g} deg in row {row}", place=place, cure="check its unit")
 
 
-def _flags(values: Any, bits: Literal["toast", "before", "any"], mask: int | None) -> NDArray[np.uint8]:
+def _within(spans: list[tuple[float, float]], seconds: Floats) -> NDArray[np.bool_]:
+    """(n,) which rows lie in the intervals."""
+    last = np.nanmax(seconds, initial=-np.inf)
+    inside = [(seconds >= a) & ((seconds < b) | (b >= last)) for a, b in spans]
+    return np.any(inside, axis=0) if inside else np.zeros(len(seconds), np.bool_)
+
+
+def _flags(
+    values: Any, bits: Literal["toast", "before", "any"], mask: int | None, trimmed: NDArray[np.bool_] | None = None
+) -> NDArray[np.uint8]:
     """Flags in bits of `core.flags`. A value that is not a number excludes the sample."""
     number = np.asarray(values, np.float64)
     whole = np.where(np.isfinite(number), number, 255).astype(np.int64)
@@ -238,7 +250,8 @@ def _flags(values: Any, bits: Literal["toast", "before", "any"], mask: int | Non
     byte = (whole & 255).astype(np.uint8)
     if bits == "before":
         byte = flags.of_before(byte, samples=True)
-    return flags.from_file(byte, flags.SAMPLE_MASK if mask is None else mask)
+        trimmed = np.ones(len(byte), np.bool_)
+    return flags.from_file(byte, flags.SAMPLE_MASK if mask is None else mask, trimmed)
 
 
 def _intervals(given: Mapping[str, Floats], times: Floats, seconds: Floats, place: str) -> Intervals:

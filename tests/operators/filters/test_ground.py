@@ -104,3 +104,32 @@ def test_it_is_the_least_squares_fit(bench):
 def test_one_bin_is_warned_of(bench):
     with pytest.warns(UserWarning, match="spans 0 deg of azimuth, one bin of 0.5 deg"):
         bench.run([GroundFilter()], bench.observation(3, N), {"signal": np.ones((3, N))})
+
+
+def test_bins_are_of_the_recorded_azimuth(bench):
+    """A throw that begins on the edge of a bin, of which the azimuth of the quaternions is a rounding away; TOAST's bins."""
+    observation = scan(bench)
+    edge = np.radians(105.0)
+    azimuth = edge + np.radians(20) * np.abs(np.sin(2 * np.pi * observation.seconds / 12.3))
+    azimuth[::50] = edge
+    observation.boresight_azel = from_angles(-(azimuth - np.radians(5e-14)), np.full(N, 0.9))
+    observation.recorded_azimuth = azimuth
+    number = (azimuth // BIN).astype(int)
+    assert (number[::50] == 210).all()
+    assert (np.floor(observation.derotate("boresight_azel")[0] * -1 % (2 * np.pi) / BIN)[::50] == 209).any()
+    x = np.random.default_rng(2).standard_normal((3, 1000))[:, number]
+    found = bench.run([GroundFilter(trend=0)], observation, {"signal": x}, precision="float64").signal
+    assert np.abs(found).max() < 1e-12
+    observation.recorded_azimuth = azimuth + 2 * np.pi  # as TOAST counts beyond the north; of a whole number of bins
+    observation.recorded_azimuth[::2] = azimuth[::2]
+    where = (observation.recorded_azimuth // BIN).astype(int) % 720
+    x = np.random.default_rng(2).standard_normal((3, 1000))[:, where]
+    found = bench.run([GroundFilter(trend=0)], observation, {"signal": x}, precision="float64").signal
+    assert np.abs(found).max() < 1e-12
+
+
+def test_no_azimuth_is_a_whole_turn(bench):
+    """The remainder of what is a rounding below 0 is 2 pi: a bin of its own."""
+    observation = scan(bench)
+    observation.boresight_azel = from_angles(-np.linspace(-1e-17, 1e-17, N), np.full(N, 0.9))
+    assert observation.azimuth.max() < 2 * np.pi

@@ -12,7 +12,7 @@ from scipy.fft import dct, idct
 
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
-from zonda.core.flags import PROCESSING, SUN_CLOSE, SUN_UP, TURNAROUND
+from zonda.core.flags import SUN_CLOSE, SUN_UP, TRIMMED, TURNAROUND
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.highpass import ONLY_A_LINE, HighpassFilter
@@ -149,7 +149,7 @@ def test_short_scans(bench, n):
     assert any("shorter" in what for _, what in run.tally) == (n < 1250)
 
 
-@pytest.mark.parametrize("flag", [PROCESSING, TURNAROUND, SUN_UP, SUN_CLOSE])
+@pytest.mark.parametrize("flag", [TRIMMED, TURNAROUND, SUN_UP, SUN_CLOSE])
 def test_samples_with_a_signal_are_not_bridged(bench, flag):
     """Turnarounds that no map uses, ends that another filter trims, the Sun: the filter takes what they hold."""
     x = np.random.default_rng(7).standard_normal((3, 6000))

@@ -10,7 +10,7 @@ from scipy import signal as scipy_signal
 import zonda
 import zonda.testing
 from zonda.core.errors import PipelineError
-from zonda.core.flags import INVALID, PROCESSING
+from zonda.core.flags import INVALID, TRIMMED
 from zonda.core.intervals import ranges
 from zonda.operators.filters.detrend import Detrend
 from zonda.operators.filters.polynomial import Pieces, PolynomialFilter
@@ -87,7 +87,7 @@ def test_between_passes_goes_a_straight_line_and_the_samples_are_flagged(bench):
     assert np.abs(found.signal[:, 5500:]).max() == pytest.approx(
         0.05, rel=0.01
     )  # behind the last pass a constant goes: 5 s x 10 mK/s
-    np.testing.assert_array_equal(found.observations[0].flags == PROCESSING, ~inside)
+    np.testing.assert_array_equal(found.observations[0].flags == TRIMMED, ~inside)
     assert found.tally["PolynomialFilter", "samples between intervals, flagged"].startswith(str(np.count_nonzero(~inside)))
 
 
@@ -146,8 +146,8 @@ def test_on_an_azimuth_scan_turnarounds_are_in_no_map():
             np.arange(observation.n_samples),
             np.r_[tuple(np.arange(p.start, p.stop) for p in ranges(observation.intervals["turnaround"], observation.seconds))],
         )
-        left[interval] = (observation.flags == PROCESSING) & turning
+        left[interval] = (observation.flags == TRIMMED) & turning
         assert np.isfinite(observation.detdata["signal"]).all()
-        assert ((observation.flags == PROCESSING) == (turning if interval == "scanning" else False)).mean() > 0.99
+        assert ((observation.flags == TRIMMED) == (turning if interval == "scanning" else False)).mean() > 0.99
     assert left["scanning"].sum() > 100
     assert not left["throw"].any()

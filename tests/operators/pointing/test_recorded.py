@@ -11,6 +11,7 @@ from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import zonda
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PointingError, ZondaError
@@ -270,8 +271,32 @@ def test_a_rotated_boresight_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "turned.h5", "w") as file:
         for name, values in (("times", UNIX + t), ("azimuth", 1 + 0 * t), ("elevation", 0.8 + 0 * t), ("boresight_azel", turned)):
             file.create_dataset(f"shared/{name}", data=values)
-    with pytest.raises(InputError, match=r"rotated by up to 5\.73 deg about itself"):
+    text = r"rotated by up to 5\.73 deg about itself(.|\n)*LoadTOD: {file: \.\.\., signal: none}"
+    with pytest.raises(InputError, match=text):
         read_recording(tmp_path / "turned.h5", "unix")
+
+
+def test_the_step_that_a_rotated_boresight_needs(tmp_path: Path) -> None:
+    """A scheduled scan turned by 45 deg: refused from both formats, and followed by `LoadTOD` without a stream."""
+    schedule = tmp_path / "s.txt"
+    schedule.write_text(
+        "# Site | Telescope | Latitude [deg] | Longitude [deg] | Elevation [m]\nATACAMA | LAT | -22.958 | -67.786 | 5200.0\n"
+        "# Start time UTC | Stop time UTC | Rotation | Patch name | Az min. | Az max. | Elev. | Pass | Sub\n"
+        "2025-08-01 05:12:30 | 2025-08-01 05:12:50 | 45.0 | field | 73.0 | 82.0 | 50.00 | 0 | 0\n"
+    )
+    camera = {"like": "act_150ghz", "detectors": 3, "sample_rate": "20 Hz"}
+    scene = zonda.Scene(site="atacama", instrument=camera, time="2025-08-01T05:12", seed=1)
+    rest = [zonda.WhiteNoise(), zonda.Efficiency()]
+    saves = [zonda.SaveTOD(), zonda.SaveTOD(name="Fits", format="fits")]
+    scan = zonda.PointingSchedule(schedule=schedule, check_limits="warn")
+    first = zonda.Pipeline([scan, *rest, *saves]).run(scene, output=tmp_path)
+    for path in (next(tmp_path.glob("*.h5")), next(tmp_path.glob("*.fits"))):
+        with pytest.raises(InputError, match="rotated by up to 45 deg"):
+            zonda.Pipeline([zonda.PointingRecorded(file=path), *rest]).run(scene)
+        step = zonda.LoadTOD(file=path, signal=None)
+        second = zonda.Pipeline([step, *rest]).run(step.scene(seed=1))
+        one, other = second.observations[0], first.observations[0]
+        np.testing.assert_array_equal(one.boresight_azel, other.boresight_azel)
 
 
 def test_outside_the_telescopes_range_is_found_by_check(observe: Callable[..., Data], tmp_path: Path) -> None:
