@@ -93,25 +93,85 @@ def test_what_the_file_shows(here, capsys, command, change, words):
     [
         ({"BUNIT": "parsec"}, ["map.fits", "parsec", "Jy/pixel", "K_CMB"]),
         ({"BUNIT": None}, ["map.fits", "BUNIT", "unit"]),
+        ({"BUNIT": 3.0}, ["map.fits", "BUNIT = 3.0"]),
+        ({"BUNIT": "Jy/beam"}, ["map.fits", "BMAJ", "input_beam"]),
+        ({"BUNIT": "Jy/beam", "BMAJ": "20 arcsec"}, ["map.fits", "BMAJ = '20 arcsec'", "input_beam"]),
+        ({"BUNIT": "Jy/beam", "BMAJ": 20.0}, ["map.fits", "20 deg", "BMAJ", "input_beam"]),
+        ({"BUNIT": "Jy/beam", "BMAJ": 20 / 206265}, ["map.fits", "0.3491 arcsec", "BMAJ", "input_beam"]),
         ({"TEMPSCAL": None}, ["map.fits", "K_RJ", "K_CMB"]),
+        ({"TEMPSCAL": 2.0}, ["map.fits", "TEMPSCAL = 2.0"]),
         (dict.fromkeys(WORLD), ["CDELT", "pixel_size"]),
         ({"CDELT1": None, "CDELT2": None}, ["map.fits", "CDELT1"]),
+        ({"RADESYS": "MOON"}, ["map.fits", "RADESYS = 'MOON'", "ICRS"]),
+        ({"RADESYS": 2000.0}, ["map.fits", "RADESYS = 2000.0"]),
+        ({"RADESYS": "GAPPT"}, ["map.fits", "RADESYS = 'GAPPT'", "ICRS"]),
+        ({"RADESYS": "FK5", "EQUINOX": "J2000"}, ["map.fits", "EQUINOX = 'J2000'"]),
     ],
 )  # fmt: skip
-def test_what_the_map_lacks(here, capsys, cards, words):
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_what_the_map_lacks(here, capsys, command, cards, words):
     (here / "map.fits").unlink()
     write_map(here / "map.fits", **cards)
-    message = refused(capsys)
+    message = refused(capsys, command)
     assert all(w in message for w in words), message
 
 
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_what_a_cube_and_a_polarized_map_lack(here, capsys, command):
+    (here / "map.fits").unlink()
+    write_map(here / "map.fits", np.ones((3, 11, 11)))
+    assert "set the operator's parameter plane" in refused(capsys, command)
+    (here / "map.fits").unlink()
+    write_map(here / "map.fits", np.ones((3, 11, 11)), CTYPE3="STOKES", CRPIX3=1.0, CRVAL3=1.0, CDELT3=1.0)
+    (here / "my.yaml").write_text(PIPELINE.replace("mustang2", "{like: mustang2, detectors: 8, polarization: pairs}"))
+    assert "polarization_convention" in refused(capsys, command)
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_unit_without_its_temperature_scale(here, capsys, command):
+    (here / "map.fits").unlink()
+    write_map(here / "map.fits", TEMPSCAL=None)
+    (here / "my.yaml").write_text(PIPELINE.replace("map.fits}", "map.fits, unit: mK}"))
+    message = refused(capsys, command)
+    assert all(w in message for w in ("my.yaml:8", "'mK'", "TEMPSCAL")), message
+
+
+@pytest.mark.parametrize("system", ["J2000", "j2000", "fk5", "FK5 (J2000)"])
+def test_frames_by_other_names(here, capsys, system):
+    """What CASA and others call FK5 is that, to the last bit; `check` says so."""
+    from astropy.io import fits
+
+    made = []
+    for name, written in (("fk5", "FK5"), ("other", system)):
+        (here / "map.fits").unlink()
+        values = np.random.default_rng(0).normal(size=(11, 11))
+        write_map(here / "map.fits", values, RADESYS=written)
+        assert cli.main(["run", "my.yaml", "--output", name, "--set", "instrument.sample_rate=20 Hz"]) == 0
+        made.append(fits.getdata(here / name / "map.fits"))
+    assert np.isfinite(made[0]).any()
+    assert np.array_equal(made[0], made[1], equal_nan=True)
+    capsys.readouterr()
+    assert cli.main(["check", "my.yaml"]) == 0
+    assert f"coordinates: FK5: RADESYS = '{system}'" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("scale", [1 / 60 * 206265, 1 / 60 / 206265])
+def test_pixels_far_too_large_or_too_small_are_doubted(here, capsys, warned, scale):
+    """A side in arcsec, or in radians, where degrees are due."""
+    (here / "map.fits").unlink()
+    write_map(here / "map.fits", CDELT1=-scale, CDELT2=scale)
+    cli.main(["check", "my.yaml"])
+    assert "CDELT1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_nan_in_the_map(here, capsys, bad):
+def test_nan_in_the_map(here, capsys, bad, command):
     (here / "map.fits").unlink()
     values = np.ones((11, 11))
     values[3, 4] = values[7, 7] = bad
     write_map(here / "map.fits", values)
-    message = refused(capsys)
+    message = refused(capsys, command)
     assert all(w in message for w in ("map.fits", "2 ", "missing: zero")), message
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zonda.core.configuration.target import Target
 from zonda.core.hooks import manager
+from zonda.core.numerics.angles import ARCSEC
 from zonda.core.types import Floats
 
 from .beam import REACH, SIGMA, convolve, distinct
@@ -18,18 +19,26 @@ from .brightness import Brightness, conversion, interpolated, on_own_pixels, too
 from .geometry import placed, turned
 from .grid import Grid, own_pixels, tangent_grid
 from .inputs import HealpixMap, WcsMap
+from .limits import check_brightness
 from .parameters import SkyParameters
 from .read import read_array, read_map
 from .resample import Progress, no_progress
 from .state import Beam
 from .stokes import STOKES
+from .units import DOUBT
 
 if TYPE_CHECKING:
-    from zonda.core.data import Observation
+    from zonda.core.data import Data, Observation
     from zonda.core.instrument import Band
 
 LARGE = 1 << 26
 """Bytes of a file above which the progress bar shows that it is read."""
+LOOKED_WHOLE = 1 << 28
+"""Bytes of a file up to which `zonda check` reads its values."""
+COARSE = 100.0
+"""Beams in a pixel beyond which an image's scale is doubted."""
+SCANS_LOOKED_AT = 8
+"""Scans of which `zonda check` lays out the grid."""
 
 
 def beam_widths(step: SkyParameters, observation: Observation) -> tuple[Floats, NDArray[np.int64]]:
@@ -42,9 +51,7 @@ def grid_of(step: SkyParameters, observation: Observation) -> Grid:
     """The grid on which the map will be convolved; nothing is convolved or interpolated yet."""
     widths, _ = beam_widths(step, observation)
     beam = REACH * SIGMA * float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)) / step.pixels_per_fwhm
-    polarized = observation.focalplane.polarized
-    identity = (*_identity(step), *(["polarized"] if polarized else []))
-    source: WcsMap | HealpixMap = step._cache.get(identity, lambda: read_of(step, polarized))
+    source, identity = source_of(step, observation.focalplane.polarized)
     band = observation.instrument.band
     key = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
     if isinstance(source, WcsMap):
@@ -59,6 +66,49 @@ def grid_of(step: SkyParameters, observation: Observation) -> Grid:
         if centre is not None:
             return tangent_grid(turned(source, centre, step.place), observation, beam, (*key, centre), step.place)
     return tangent_grid(source, observation, beam, key, step.place)
+
+
+def source_of(step: SkyParameters, polarized: bool) -> tuple[WcsMap | HealpixMap, tuple[Hashable, ...]]:
+    """`read_of`, once for all observations, and what tells it from others."""
+    identity = (*_identity(step), *(["polarized"] if polarized else []))
+    return cast("WcsMap | HealpixMap", step._cache.get(identity, lambda: read_of(step, polarized))), identity
+
+
+def looked_at(step: SkyParameters, data: Data) -> list[str]:
+    """What was chosen of the map, as `zonda check` tells it: read by the code with which a run reads it.
+
+    Raises InputError as `SkyMap.prepare`, but for what convolution alone finds; of a file of more than `LOOKED_WHOLE` bytes as
+    far as its header tells.
+    """
+    instrument = data.scene.instrument
+    polarized = any(o.focalplane.polarized for o in data.observations) or instrument.focalplane().polarized
+    large = step.map is None and step.file is not None and step.file.exists() and step.file.stat().st_size > LOOKED_WHOLE
+    source = read_of(step, polarized, header_alone=True) if large else source_of(step, polarized)[0]
+    if isinstance(source, WcsMap) and step.beam != "none":
+        beam = instrument.beam_fwhm if step.fwhm is None else step.fwhm
+        if text := odd_pixels(source, beam):
+            warnings.warn(f"{step.label}: {step.file or step.source}: {text}", stacklevel=2)
+    lines = [f"{what}: {text}" for what, text in source.notes.items() if what != DOUBT]
+    if large:
+        return [*lines, f"the values of {step.source} are looked at by the run alone: more than {LOOKED_WHOLE >> 20} MB"]
+    for observation in data.observations[:SCANS_LOOKED_AT]:
+        grid = grid_of(step, observation)
+        for camera in instrument.cameras.values():
+            found = conversion(grid, camera.band, step.spectral_index)
+            check_brightness(np.array([np.abs(source.values).max(initial=0.0)]) * found.typical * step.scale, step.place)
+    return [*lines, *([f"pixels taken as zero: {source.zeroed}"] if source.zeroed else [])]
+
+
+def odd_pixels(source: WcsMap, beam: float) -> str:
+    """The warning about pixels that are far too large or too small for a beam of FWHM ``beam`` [rad]; empty where none is due."""
+    sides = np.radians(np.asarray(source.wcs.pixel_scale_matrix)) if source.scale is None else source.scale
+    x, y = (float(side) / ARCSEC for side in np.linalg.norm(sides, axis=0))
+    across, fwhm = max(x * source.values.shape[1], y * source.values.shape[0]), beam / ARCSEC
+    text = f"its pixels are {x:.4g} x {y:.4g} arcsec"
+    cure = "are CDELT1 and CDELT2 in degrees?"
+    if across < fwhm:
+        return f"{text} and all of it {across:.4g} arcsec, less than the beam of {fwhm:.4g} arcsec; {cure}"
+    return f"{text}, and the beam {fwhm:.4g} arcsec; {cure}" if min(x, y) > COARSE * fwhm else ""
 
 
 def brightness_on(grid: Grid, step: SkyParameters, band: Band) -> Brightness:
@@ -99,22 +149,23 @@ def _identity(step: SkyParameters) -> tuple[Hashable, ...]:
     return ("file", stamp and (stamp.st_mtime_ns, stamp.st_size))
 
 
-def read_of(step: SkyParameters, polarized: bool = False) -> WcsMap | HealpixMap:
+def read_of(step: SkyParameters, polarized: bool = False, header_alone: bool = False) -> WcsMap | HealpixMap:
     """The map as its file, or the array, has it; with Q and U where the camera is ``polarized``."""
-    given = {name: getattr(step, name) for name in ("unit", "pixel_size", "missing", "input_beam", "coordsys")}
+    given = {name: getattr(step, name) for name in ("unit", "pixel_size", "missing", "input_beam", "coordsys", "column")}
     given |= {"plane": (step.plane,) if isinstance(step.plane, int) else step.plane, "centred": step.centre is not None}
     given |= {"polarized": polarized, "convention": step.polarization_convention}
     if (array := step.array()) is not None:
         source = read_array(array, step.place, **given)
     else:
         assert step.file is not None
-        large = step.file.exists() and step.file.stat().st_size > LARGE
+        large = step.file.exists() and step.file.stat().st_size > LARGE and not header_alone
         progress = _progress(step, f"reading {step.file.name}") if large else no_progress
         progress(0, 1)
-        source = read_map(step.file, hdu=step.hdu, **given)
+        source = read_map(step.file, hdu=step.hdu, header_alone=header_alone, **given)
         progress(0, 0)
-    if STOKES in source.notes:
-        warnings.warn(f"{step.label}: {step.file or step.source}: {source.notes[STOKES]}", stacklevel=2)
+    for what in (STOKES, DOUBT):
+        if what in source.notes:
+            warnings.warn(f"{step.label}: {step.file or step.source}: {source.notes[what]}", stacklevel=2)
     return source
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.header import number, with_known_frame
 from zonda.core.numerics import tangent
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.numerics.sphere import local_axes
@@ -53,7 +54,9 @@ def geometry(
             raise _no_position(place, "CTYPE1, CTYPE2, CRVAL1, CRVAL2, CRPIX1, CRPIX2")
         notes["position"] = "the file has no WCS: its centre is put on the target, its first axis runs west, its second north"
         return None, _plain_scale(place, header, scaled, pixel_size)
-    _check_frame(header, place)
+    header, note = _with_frame(header, place)
+    if note:
+        notes["coordinates"] = note
     absent = [k for k in ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2") if k not in header]
     if absent and not centred:
         raise _no_position(place, ", ".join(absent))
@@ -84,19 +87,16 @@ def _with_known_units(header: Any, place: str) -> Any:
     return header
 
 
-def _check_frame(header: Any, place: str) -> None:
-    """Refuse axes that are neither equatorial nor Galactic; of Galactic ones what belongs to equatorial axes is removed."""
+def _with_frame(header: Any, place: str) -> tuple[Any, str]:
+    """`with_known_frame`; axes that are neither equatorial nor Galactic are refused."""
     kinds = {str(header[f"CTYPE{axis}"]).upper()[:4] for axis in "12"}
-    if kinds == {"GLON", "GLAT"}:
-        for key in ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH"):  # they are for equatorial axes; astropy would take ICRS
-            if key in header:
-                del header[key]
-    elif kinds != {"RA--", "DEC-"}:
+    if kinds not in ({"GLON", "GLAT"}, {"RA--", "DEC-"}):
         raise InputError(
             f"the axes {header['CTYPE1']}, {header['CTYPE2']} are neither equatorial nor Galactic",
             place=place,
             cure="give a map in ICRS, FK5, FK4 or Galactic coordinates",
         )
+    return with_known_frame(header, place)
 
 
 def _wcs(header: Any, place: str) -> tuple[Any, Floats]:
@@ -161,11 +161,13 @@ def _plain_scale(place: str, header: Any, scaled: bool, pixel_size: float | None
         return np.diag([-pixel_size, pixel_size])
     sizes = []
     for k in (1, 2):
-        unit = _IN_RADIANS[str(header.get(f"CUNIT{k}") or header.get("CUNIT1"))]
-        step = header.get(f"CDELT{k}")
+        written = str(header.get(f"CUNIT{k}") or header.get("CUNIT1")).strip()
+        if written not in _IN_RADIANS:
+            raise InputError(f"CUNIT{k} = '{written}' is no angle", place=place, cure=f"set CUNIT{k} to 'deg' or 'rad'")
+        step = number(header, f"CDELT{k}", place)
         if step is None:
-            step = np.hypot(header.get(f"CD1_{k}", 0.0), header.get(f"CD2_{k}", 0.0))
-        sizes.append(abs(float(step)) * unit)
+            step = float(np.hypot(*(number(header, f"CD{i}_{k}", place) or 0.0 for i in (1, 2))))
+        sizes.append(abs(step) * _IN_RADIANS[written])
     if not all(np.isfinite(s) and s > 0 for s in sizes):
         raise InputError("the pixel size is zero or not finite", place=place, cure="check CDELT1 and CDELT2")
     check_sides(np.degrees(sizes), place, "check CDELT1 and CDELT2")

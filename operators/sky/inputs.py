@@ -28,6 +28,10 @@ class Wanted:
         True where Q and U are read, too.
     convention
         Of them: `SkyMap.polarization_convention`.
+    column
+        Of a HEALPix table, by name or counted from 1: the column of I.
+    header_alone
+        True for a look at a large file: everything but its values is read and checked; they are zeros.
     """
 
     unit: str | None = None
@@ -40,6 +44,8 @@ class Wanted:
     hdu: int | str | None = None
     polarized: bool = False
     convention: Literal["cosmo", "iau"] | None = None
+    column: int | str | None = None
+    header_alone: bool = False
 
 
 @dataclass

@@ -44,6 +44,8 @@ class SkyParameters(Operator):
     """Full width at half maximum of the beam that a map in Jy/beam was made with. Default: its header's BMAJ and BMIN."""
     coordsys: Literal["icrs", "galactic", "ecliptic"] | None = None
     """Coordinates of a HEALPix map. Default: its header's COORDSYS."""
+    column: int | str | None = None
+    """Column of a HEALPix table, by name or counted from 1. Default: that of I (I_STOKES, TEMPERATURE, SIGNAL ...)."""
     plane: int | tuple[int, ...] | None = None
     """Plane of a cube, counted from 1; of several further axes a list: [12, 1]. Default: the only one, or Stokes I."""
     polarization_convention: Literal["cosmo", "iau"] | None = None

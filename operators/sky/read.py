@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.header import text
 from zonda.core.maps.stokes_names import columns_of_q_and_u
 from zonda.core.numerics import tangent
 from zonda.core.storage.files import check_memory, reading
@@ -25,7 +26,7 @@ from .geometry import geometry
 from .healpix import is_healpix, read_healpix
 from .inputs import HealpixMap, Wanted, WcsMap
 from .planes import chosen, plane_of_cube
-from .units import beam_solid_angle, filled, unit_of
+from .units import beam_solid_angle, check_beam, filled, unit_of
 
 T = TypeVar("T", WcsMap, HealpixMap, WcsMap | HealpixMap)
 
@@ -47,22 +48,22 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
     wanted = Wanted(**options)
     place = f"sky map {path}"
     cure = "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
-    plain = read_image(path) if wanted.hdu in (None, 0) else None
+    plain = read_image(path) if wanted.hdu in (None, 0) and not wanted.header_alone else None
     if plain is not None and plain[1].ndim > 1 and tangent.plain(plain[0]) is not None:  # nothing that astropy need be asked
         with reading(place, "FITS", cure):
             check_memory(8 * plain[1].size, "the array or table", place)
             return _told(_image(place, plain[1].astype(np.float64), plain[0], wanted), plain[0].get(GIVEN))
     with opened(path, place, cure) as hdus:
         hdu, notes = chosen(hdus, wanted.hdu, place)
-        check_size(path, hdu, place)
+        check_size(path, hdu, place, whole=not wanted.header_alone)
         if is_healpix(hdu):
             found: WcsMap | HealpixMap = read_healpix(hdu, place, wanted)
         else:
             q_and_u = None
             if wanted.hdu is None:
                 notes |= stokes.of_extensions(hdu.name, [other.name for other in hdus if other.is_image], place)
-                q_and_u = _extensions(path, hdus, hdu, place) if wanted.polarized else None
-            found = _image(place, np.asarray(hdu.data), hdu.header, wanted, q_and_u)
+                q_and_u = _extensions(path, hdus, hdu, wanted, place) if wanted.polarized else None
+            found = _image(place, _pixels(hdu, wanted), hdu.header, wanted, q_and_u)
         found.notes = notes | found.notes
         if found.polarization is not None:
             found.notes.pop(stokes.STOKES, None)
@@ -78,45 +79,69 @@ def read_array(array: ArrayMap, place: str, **options: Any) -> WcsMap | HealpixM
     return _told(_image(place, array.values, array.header, wanted), array.text)
 
 
-def _told(found: T, text: object) -> T:
+def _told(found: T, given: object) -> T:
     """The map, with a note of the array that it was in Python."""
-    if text:
-        found.notes["input"] = f"{text}, in {found.unit}, given in Python"
+    if given:
+        found.notes["input"] = f"{given}, in {found.unit}, given in Python"
     return found
 
 
-def _extensions(path: Path, hdus: Any, first: Any, place: str) -> Floats | None:
+def _pixels(hdu: Any, wanted: Wanted) -> Floats:
+    """The array of an image; of the header alone one of zeros that takes no memory."""
+    return np.broadcast_to(np.float64(0.0), hdu.shape) if wanted.header_alone else np.asarray(hdu.data)
+
+
+def _extensions(path: Path, hdus: Any, first: Any, wanted: Wanted, place: str) -> Floats | None:
     """(2, ny, nx) Q and U of a file that has them as extensions beside its ``first`` image; None where it has none."""
     images = [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2]
     found = columns_of_q_and_u([hdu.name for hdu in images])
     if found is None:
         return None
-    for k in found:
-        check_size(path, images[k], place)
-    planes = [np.asarray(images[k].data, np.float64) for k in found]
-    if any(plane.shape != first.data.shape for plane in planes):
+    if any(images[k].shape != first.shape for k in found):
         raise InputError("its images of I, Q and U differ in size", place=place, cure="give three images of one grid")
-    return np.stack(planes)
+    for k in found:
+        check_size(path, images[k], place, whole=not wanted.header_alone)
+        _check_extension(images[k], first, wanted, place)
+    return np.stack([np.asarray(_pixels(images[k], wanted), np.float64) for k in found])
+
+
+def _check_extension(hdu: Any, first: Any, wanted: Wanted, place: str) -> None:
+    """Refuse an image of Q or U in another unit than that of I."""
+    units = [text(h.header, "BUNIT", place) for h in (first, hdu)]
+    if wanted.unit is None and units[1] not in ("", units[0]):
+        cure = "write all three in one unit, or set the operator's parameter unit, which then holds for all"
+        raise InputError(f"its image {hdu.name} is in {units[1]}, and I in {units[0] or '(none)'}", place=place, cure=cure)
 
 
 def _image(place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Floats | None = None) -> WcsMap:
     if values.ndim < 2 or values.size == 0:
         raise InputError("the image has no pixels", place=place, cure="give a two-dimensional image")
-    if wanted.coordsys is not None:
-        raise InputError("coordsys is for HEALPix maps", place=place, cure="remove coordsys: CTYPE says what an image's are")
+    if values.dtype.kind not in "iuf":
+        raise InputError(f"its pixels are {values.dtype}, not numbers", place=place, cure="give an image of numbers")
+    for name, is_given in (("coordsys", wanted.coordsys is not None), ("column", wanted.column is not None)):
+        if is_given:
+            cure = f"remove {name}" + (": CTYPE says what an image's are" if name == "coordsys" else "")
+            raise InputError(f"{name} is for HEALPix maps", place=place, cure=cure)
     plane, notes = plane_of_cube(header, values.shape, wanted.plane, place)
     planes = stokes.planes_of_q_and_u(header, values.shape, plane) if wanted.polarized else None
-    if planes is not None:
-        q_and_u = np.stack([np.array(values[k], np.float64) for k in planes])
-    values = np.array(values[plane], np.float64)
     unit, factor = unit_of(place, header, "BUNIT", wanted.unit, notes)
     beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
+    wcs, scale = geometry(place, header, wanted.pixel_size, wanted.centred, notes)
+    sides = np.radians(np.asarray(wcs.pixel_scale_matrix)) if scale is None else scale
+    x, y = np.linalg.norm(sides, axis=0)
+    check_beam(place, beam, (float(x), float(y)), values.shape[-2:], wanted.input_beam is not None, notes)
+    if planes is not None and not wanted.header_alone:
+        q_and_u = np.stack([np.array(values[k], np.float64) for k in planes])
+    if planes is not None or q_and_u is not None:
+        notes.pop(stokes.STOKES, None)
+        sign = stokes.sign_of_u(header, wanted.convention, True, place, notes)
+    if wanted.header_alone:
+        return WcsMap(values[plane], unit, wcs, scale, beam, notes)
+    values = np.array(values[plane], np.float64)
     zeroed = filled(place, values, wanted.missing, "row {}, column {} (counted from 1)")
     values *= factor
     if q_and_u is not None:
-        notes.pop(stokes.STOKES, None)
-        q_and_u = stokes.in_cosmo(q_and_u, header, wanted.convention, True, place, notes)
         zeroed += filled(place, q_and_u, wanted.missing, "plane {} of Q and U, row {}, column {} (counted from 1)")
         q_and_u *= factor
-    wcs, scale = geometry(place, header, wanted.pixel_size, wanted.centred, notes)
+        q_and_u[1] *= sign
     return WcsMap(values, unit, wcs, scale, beam, notes, zeroed, polarization=q_and_u)

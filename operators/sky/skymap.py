@@ -14,7 +14,8 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.core.product import Product
 from zonda.core.storage.fits_image import Cards
 
-from .convolved import beam_widths, brightness_on, grid_of, with_beam
+from .convolved import beam_widths, brightness_on, grid_of, looked_at, with_beam
+from .inputs import HealpixMap
 from .parameters import SkyParameters
 from .state import SkyState
 
@@ -57,6 +58,10 @@ class SkyMap(SkyParameters):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
 
+    def check(self, data: Data) -> list[str]:
+        """As `SkyParameters.check`, and what reading the map tells or refuses (`convolved.looked_at`)."""
+        return [*super().check(data), *looked_at(self, data)]
+
     def prepare(self, observation: Observation) -> SkyState:
         grid, (widths, index) = grid_of(self, observation), beam_widths(self, observation)
         sky = brightness_on(grid, self, observation.instrument.band)
@@ -95,9 +100,10 @@ def _count(step: SkyMap, observation: Observation, state: SkyState) -> None:
     observation.tally.count(step.label, "samples outside the input map", beyond, total)
     if beyond == total:
         ra, dec = np.degrees(observation.centre)
+        cure = "" if isinstance(state.grid.source, HealpixMap) else "; `centre: target` moves the map there"
         warnings.warn(
             f"{step.label}: no sample of {observation.name} around RA {ra:.4f} deg, Dec {dec:.4f} deg falls on the input map "
-            f"{step.source}; `centre: target` moves the map there",
+            f"{step.source}{cure}",
             stacklevel=3,
         )
     if behind:

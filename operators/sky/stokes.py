@@ -5,34 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import numpy as np
-
 from zonda.core.errors import InputError
+from zonda.core.maps.header import text
 from zonda.core.maps.stokes_names import along_axis, is_polarized
-from zonda.core.types import Floats
 
 STOKES = "Stokes parameters"
 """Key of the note about them."""
 
 
-def of_columns(names: Sequence[str], read: int, place: str) -> dict[str, str]:
-    """The note about a table's columns of which number ``read`` is read as I.
-
-    Raises
-    ------
-    InputError
-        That column is named as Q, U or V.
-    """
-    if is_polarized(names[read]):
-        raise InputError(
-            f"its first map, the column {names[read]}, is no intensity", place=place, cure="put the column of I first"
-        )
-    unused = [name for name in names[read + 1 :] if is_polarized(name)]
+def of_columns(names: Sequence[str], read: int) -> dict[str, str]:
+    """The note about a table's columns of which number ``read`` is read as I."""
+    unused = [name for k, name in enumerate(names) if k != read and is_polarized(name)]
     return {STOKES: f"column {names[read]} is read as I; {_not_used(unused)}"} if unused else {}
 
 
 def of_extensions(read: str, names: Sequence[str], place: str) -> dict[str, str]:
-    """The note about a file's image ``read``, beside which there are others called ``names``. Raises as `of_columns`."""
+    """The note about a file's image ``read``, beside which there are others called ``names``.
+
+    Raises InputError where it is Q, U or V.
+    """
     if is_polarized(read):
         raise InputError(
             f"its first image, {read}, is no intensity",
@@ -77,17 +68,15 @@ def planes_of_q_and_u(header: Any, shape: Sequence[int], plane: tuple[int, ...])
     return None
 
 
-def in_cosmo(
-    values: Floats, header: Any, given: Literal["cosmo", "iau"] | None, image: bool, place: str, notes: dict[str, str]
-) -> Floats:
-    """Q and U (2, ...), which are changed, in COSMO's convention: that of IAU has U of the other sign.
+def sign_of_u(header: Any, given: Literal["cosmo", "iau"] | None, image: bool, place: str, notes: dict[str, str]) -> float:
+    """Factor on U that brings it to COSMO's convention: that of IAU has the other sign.
 
     Raises
     ------
     InputError
         The header has an unknown POLCCONV; an image has none, and none is ``given``.
     """
-    written = str(header.get("POLCCONV", "") or "").strip().upper()
+    written = text(header, "POLCCONV", place).upper()
     if given is None and written not in ("COSMO", "IAU", ""):
         raise InputError(
             f"POLCCONV = '{written}' is neither COSMO nor IAU",
@@ -106,9 +95,7 @@ def in_cosmo(
     notes["polarization"] = f"Q and U are read, convention {found} ({why})"
     if given and written and written != found:
         notes["polarization"] += f"; POLCCONV = '{written}' is overridden"
-    if found == "IAU":
-        np.negative(values[1], out=values[1])
-    return values
+    return -1.0 if found == "IAU" else 1.0
 
 
 def _not_used(names: Sequence[str]) -> str:

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.header import number, text
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
+from zonda.core.numerics.angles import ARCSEC
 from zonda.core.types import Floats
 
 from .limits import LARGEST, check_sides, check_values
 
+WIDER, MANY = 3.0, 60.0
+"""Widths of a map in which its beam cannot be; pixels per FWHM of its beam beyond which that is doubted."""
+DOUBT = "doubtful"
+"""Key of the note about what is possible and not likely."""
+
 
 def unit_of(place: str, header: Any, key: str, given: str | None, notes: dict[str, str]) -> tuple[str, float]:
     """`parse_unit` of the unit ``given``, or of the header's ``key``."""
-    written = str(header.get(key, "") or "").strip()
-    text = given if given is not None else written
-    if not text:
+    written = text(header, key, place)
+    wanted = given if given is not None else written
+    if not wanted:
         raise InputError(
             "the unit of the map is missing",
             place=place,
@@ -25,7 +33,7 @@ def unit_of(place: str, header: Any, key: str, given: str | None, notes: dict[st
         )
     if given is not None and written and given != written:
         notes["unit"] = f"{given} as given; {key} = '{written}' is overridden"
-    return parse_unit(text, place=place, temperature_scale=header.get("TEMPSCAL"))
+    return parse_unit(wanted, place=place, temperature_scale=text(header, "TEMPSCAL", place))
 
 
 def beam_solid_angle(place: str, header: Any, unit: str, given: float | None, notes: dict[str, str]) -> float | None:
@@ -37,21 +45,67 @@ def beam_solid_angle(place: str, header: Any, unit: str, given: float | None, no
             )
         return None
     notes["resolution"] = "the map is in Jy/beam, so convolved already; it is convolved with the detector's beam once more"
-    major, minor = header.get("BMAJ"), header.get("BMIN", header.get("BMAJ"))
-    written = all(isinstance(b, int | float) and np.isfinite(b) and b > 0 for b in (major, minor))
+    degrees = "set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam"
     if given is not None:
-        if written:
+        if "BMAJ" in header:
             notes["input beam"] = f"{np.degrees(given) * 3600:g} arcsec as given; BMAJ and BMIN are overridden"
         return float(np.pi / (4 * np.log(2)) * given**2)
-    if not written:
+    major = number(header, "BMAJ", place, degrees)
+    minor = number(header, "BMIN", place, degrees) if major is not None else None
+    minor = major if minor is None else minor
+    if major is None or minor is None:
         raise InputError(
             "a map in Jy/beam needs the beam it was made with, and its header has no BMAJ",
             place=place,
             cure="set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam: 18 arcsec, the "
             "FWHM of the map's beam (not fwhm, which is that of the telescope simulated)",
         )
-    check_sides((major, minor), place, "set the header keys BMAJ and BMIN (FWHM in degrees)")
+    if min(major, minor) <= 0:
+        raise InputError(f"BMAJ = {major:g} and BMIN = {minor:g} are no widths", place=place, cure=degrees)
+    check_sides((major, minor), place, degrees)
     return float(np.pi / (4 * np.log(2)) * np.radians(major) * np.radians(minor))
+
+
+def check_beam(
+    place: str,
+    area: float | None,
+    pixels: tuple[float, float],
+    shape: tuple[int, ...],
+    given: bool,
+    notes: dict[str, str],
+) -> None:
+    """Refuse a beam of ``area`` [sr] that the map cannot have: wider than all of it, or far smaller than its pixels.
+
+    Parameters
+    ----------
+    pixels
+        rad, sides of a pixel along (x, y).
+    shape
+        (ny, nx), () of a HEALPix map.
+    given
+        True where the user states the beam: then what is not likely is doubted alone.
+
+    Raises
+    ------
+    InputError
+        The header's beam is `WIDER` than the map, or narrower than a fifth of a pixel.
+    """
+    if area is None:
+        return
+    fwhm, side = math.sqrt(area * 4 * math.log(2) / math.pi), math.sqrt(pixels[0] * pixels[1])
+    text = f"the beam of the map is {_angle(fwhm)} wide"
+    cure = "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them, or set the operator's parameter input_beam: 18 arcsec"
+    across = max(shape[0] * pixels[1], shape[1] * pixels[0]) if len(shape) == 2 else math.pi
+    if not given and fwhm > WIDER * across:
+        raise InputError(f"{text}, and the whole map {_angle(across)}", place=place, cure=cure)
+    if not given and fwhm < side / 5:
+        raise InputError(f"{text}, and its pixels {_angle(side)}", place=place, cure=cure)
+    if not side / 2 <= fwhm <= min(across, MANY * side):
+        notes[DOUBT] = f"{text}, its pixels {_angle(side)} and all of it {_angle(across)}: is that right? {cure}"
+
+
+def _angle(value: float) -> str:
+    return f"{np.degrees(value):.4g} deg" if value >= np.radians(0.1) else f"{value / ARCSEC:.4g} arcsec"
 
 
 def filled(place: str, values: Floats, missing: str, first: str) -> int:

@@ -45,10 +45,12 @@ def test_healpix_of_i_alone_has_no_note(tmp_path):
     assert STOKES not in read_map(tmp_path / "i.fits").notes
 
 
-def test_healpix_that_begins_with_q(tmp_path):
+def test_healpix_that_begins_with_q_is_read_by_its_names(tmp_path):
     healpix_file(tmp_path / "q.fits", column_names=["Q_STOKES", "U_STOKES", "I_STOKES"])
-    with pytest.raises(InputError, match="the column Q_STOKES, is no intensity"):
-        read_map(tmp_path / "q.fits")
+    found = read_map(tmp_path / "q.fits")
+    assert found.notes["column"] == "I_STOKES (3 of 3: Q_STOKES, U_STOKES, I_STOKES)"
+    assert np.array_equal(found.values, read_map(tmp_path / "q.fits", column=3).values)
+    assert not np.array_equal(found.values, read_map(tmp_path / "q.fits", column="q_stokes").values)
 
 
 @pytest.mark.parametrize(("first", "step", "plane"), [(1, 1, 0), (3, -1, 2)])

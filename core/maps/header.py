@@ -1,0 +1,104 @@
+"""Cards of FITS headers from elsewhere, checked for their type where they are read, for maps, masks and comparisons alike."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..types import AnyFloats
+
+FRAMES = ("ICRS", "FK5", "FK4", "FK4-NO-E")
+"""Values of RADESYS that are read (FITS 4.0, table 24, without GAPPT: apparent places, which depend on an instant)."""
+_SAME = {
+    **dict.fromkeys(("J2000", "J2000.0", "FK5J2000", "EQUATORIALJ2000"), ("FK5", 2000.0)),
+    **dict.fromkeys(("B1950", "B1950.0", "FK4B1950"), ("FK4", 1950.0)),
+    **dict.fromkeys(("ICRF", "ICRF2", "ICRF3", "GCRS"), ("ICRS", None)),
+}  # fmt: skip
+"""What CASA, AIPS and others write: RADESYS and equinox."""
+_EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
+
+
+def number(header: Any, key: str, place: str, cure: str = "") -> float | None:
+    """The finite number of a card; None where there is no such card, or it has no value. Raises InputError for anything else."""
+    value = header.get(key)
+    if value is None or _is_blank(value):
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{key} = {value!r} is no number", place=place, cure=cure or f"write {key} as a number, or remove it")
+    return float(value)
+
+
+def text(header: Any, key: str, place: str, cure: str = "") -> str:
+    """The text of a card, empty where there is none. Raises InputError for a number or a logical value."""
+    value = header.get(key)
+    if value is None or _is_blank(value):
+        return ""
+    if not isinstance(value, str):
+        raise InputError(f"{key} = {value!r} is no text", place=place, cure=cure or f"write {key} in quotes")
+    return value.strip()
+
+
+UNSEEN = -1.6375e30
+"""Value of pixels that HEALPix's tools did not see."""
+
+
+def marked_bad(values: AnyFloats, header: Any, place: str) -> NDArray[np.bool_]:
+    """Which values a map's file marks as not observed: `UNSEEN`, and the value of the card BAD_DATA. NaN is not among them.
+
+    Raises InputError where BAD_DATA is no number.
+    """
+    stated, found = number(header, "BAD_DATA", place), np.zeros(values.shape, bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for bad in {UNSEEN} | (set() if stated is None else {stated}):
+            found |= np.abs(values - bad) <= 1e-5 * abs(bad)
+    return found
+
+
+def _is_blank(value: Any) -> bool:
+    """Whether a card is there without a value: astropy has an object of its own for it."""
+    return type(value).__name__ == "Undefined" or (isinstance(value, str) and not value.strip())
+
+
+def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
+    """A copy of an image's header whose RADESYS is one of `FRAMES`, or absent, and a note where another one was read as that.
+
+    Of Galactic axes what belongs to equatorial ones is removed: astropy would take ICRS.
+
+    Raises
+    ------
+    InputError
+        RADESYS is none that is known, or no text; EQUINOX is no number.
+    """
+    made = header.copy()
+    kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}
+    if kinds == {"GLON", "GLAT"}:
+        for key in _EQUATORIAL:
+            if key in made:
+                del made[key]
+        return made, ""
+    for key in ("EQUINOX", "EPOCH"):
+        if key in made and number(made, key, place) is None:
+            del made[key]
+    key = "RADESYS" if "RADESYS" in made else "RADECSYS"
+    written = text(made, key, place)
+    if key in made and not written:
+        del made[key]
+    if not written or written in FRAMES:
+        return made, ""
+    plain = written.upper().replace(" ", "").replace("(", "").replace(")", "").replace("_", "").replace("/", "")
+    frame, equinox = _SAME.get(plain, (written.upper(), None))
+    if frame not in FRAMES:
+        raise InputError(
+            f"{key} = '{written}' is no frame of coordinates that is read",
+            place=place,
+            cure=f"set {key} to {', '.join(FRAMES[:-1])} or {FRAMES[-1]}, or convert the map to ICRS",
+        )
+    made[key] = frame
+    stated = number(made, "EQUINOX", place)
+    if equinox is not None and stated is None:
+        made["EQUINOX"] = equinox
+    return made, f"{frame}: {key} = '{written}'"
