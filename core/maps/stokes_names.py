@@ -13,7 +13,7 @@ _NAMES = {1: "I", 2: "Q", 3: "U", 4: "V"}
 _POLARIZED = re.compile(r"(STOKES[ _-]?)?[QUV]([ _-].*)?", re.IGNORECASE)
 """Names of columns and extensions: Q_POLARISATION (healpy), Q_STOKES (Planck), STOKES_Q, Q."""
 _INTENSITY = re.compile(
-    r"(STOKES[ _-]?)?[IT]|[IT][ _-]?STOKES|I[ _-].*|TEMP(ERATURE)?|INTENSITY|SIGNAL|BRIGHTNESS|T[ _-]?B", re.IGNORECASE
+    r"(STOKES[ _-]?)?[IT]|[IT][ _-]?STOKES|I[ _-]POL[A-Z]*|TEMP(ERATURE)?|INTENSITY|SIGNAL|BRIGHTNESS|T[ _-]?B", re.IGNORECASE
 )
 """Names of columns of a brightness: I_STOKES (Planck), TEMPERATURE (healpy), SIGNAL (zonda, HEALPix's own tools)."""
 _PIXEL = re.compile(
@@ -60,6 +60,7 @@ def intensity_column(names: Sequence[str], wanted: int | str | None, place: str)
         return same[0] - 1
     may_be = [k for k, name in enumerate(names) if k != pixel and not is_polarized(name) and not _OTHER.fullmatch(name.strip())]
     known = [k for k in may_be if _INTENSITY.fullmatch(names[k].strip())]
+    known = known or [k for k in may_be if re.match(r"I[ _-]|STOKES[ _-]?I", names[k].strip(), re.IGNORECASE)]
     if not may_be:
         raise InputError(
             f"none of its columns is an intensity: {there}",

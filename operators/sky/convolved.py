@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -91,9 +92,10 @@ def looked_at(step: SkyParameters, data: Data) -> list[str]:
     lines = [f"{what}: {text}" for what, text in source.notes.items() if what != DOUBT]
     if large:
         return [*lines, f"the values of {step.source} are looked at by the run alone: more than {LOOKED_WHOLE >> 20} MB"]
-    for observation in data.observations[:SCANS_LOOKED_AT]:
-        grid = grid_of(step, observation)
-        for camera in instrument.cameras.values():
+    for whole in data.observations[:SCANS_LOOKED_AT]:
+        for number, camera in enumerate(instrument.cameras.values()):
+            plane = whole.focalplane.of_band(number) if instrument.bands else whole.focalplane
+            grid = grid_of(step, replace(whole, instrument=camera, focalplane=plane))
             found = conversion(grid, camera.band, step.spectral_index)
             check_brightness(np.array([np.abs(source.values).max(initial=0.0)]) * found.typical * step.scale, step.place)
     return [*lines, *([f"pixels taken as zero: {source.zeroed}"] if source.zeroed else [])]

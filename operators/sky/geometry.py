@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from typing import Any
@@ -166,7 +167,7 @@ def _plain_scale(place: str, header: Any, scaled: bool, pixel_size: float | None
             raise InputError(f"CUNIT{k} = '{written}' is no angle", place=place, cure=f"set CUNIT{k} to 'deg' or 'rad'")
         step = number(header, f"CDELT{k}", place)
         if step is None:
-            step = float(np.hypot(*(number(header, f"CD{i}_{k}", place) or 0.0 for i in (1, 2))))
+            step = math.hypot(*(number(header, f"CD{i}_{k}", place) or 0.0 for i in (1, 2)))
         sizes.append(abs(step) * _IN_RADIANS[written])
     if not all(np.isfinite(s) and s > 0 for s in sizes):
         raise InputError("the pixel size is zero or not finite", place=place, cure="check CDELT1 and CDELT2")

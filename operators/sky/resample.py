@@ -236,7 +236,8 @@ def resample_healpix(
 
     Each value comes from the polynomial of third degree that best fits the `NEIGHBOURS` nearest covered pixel centres in the
     tangent plane, with weights 1 / distance^4 (moving least squares): it passes through the pixel values, whatever the
-    orientation of the pixels. Where the neighbours do not determine it, it is their weighted mean: ``poor`` counts those.
+    orientation of the pixels. Where the neighbours do not determine it, it is their weighted mean: ``poor`` counts those. Of a
+    map with fewer pixels all are neighbours.
     ``tiles`` and ``axis`` as of `resample_image`.
     """
     import healpy
@@ -246,13 +247,13 @@ def resample_healpix(
     nx, ny = target.pixel_shape
     planes, covered, poor = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool), 0
     values = planes if axis is not None else planes[0]
-    if len(sky.values) < NEIGHBOURS:
+    if not len(sky.values):
         return values, covered, poor
     for block in _blocks(target, tiles, progress):
         own = healpy.vec2pix(sky.nside, *(block.d @ to_frame.T).T, nest=sky.nest)
         seen = _slots(sky, own)[1]
         near = _near(sky, block.d[seen] @ to_frame.T) if seen.any() else np.zeros(0, np.int64)
-        if len(near) < NEIGHBOURS:
+        if not len(near):
             continue
         numbers = near if sky.pixels is None else sky.pixels[near]
         d = np.stack(healpy.pix2vec(sky.nside, numbers, nest=sky.nest), axis=1)
@@ -300,10 +301,12 @@ def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Flo
 
     The values (k, n), and at how many points they are weighted means because the fit is not determined.
     """
-    distance, index = tree.query(at, NEIGHBOURS)
-    scale = distance[:, -1:]
+    distance, index = tree.query(at, np.arange(1, min(NEIGHBOURS, tree.n) + 1))
+    scale = np.maximum(distance[:, -1:], 1e-300)
     u, v = np.moveaxis((points[index] - at[:, None, :]) / scale[:, :, None], 2, 0)
     weight = 1.0 / ((distance / scale) ** 2 + 1e-6)
+    if tree.n < 10:  # fewer than the coefficients
+        return np.sum(weight**2 * data[:, index], axis=2) / np.sum(weight**2, axis=1), len(at)
     cubic = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=2)
     q, r = np.linalg.qr(cubic * weight[:, :, None])
     pivots = np.abs(np.diagonal(r, axis1=1, axis2=2))

@@ -219,6 +219,52 @@ def test_grid_points_without_a_fit_are_counted(made, tmp_path):
     assert scan.tally.get("SkyMap", "grid points whose neighbours determine no third-order fit, taken as their mean") > 0
 
 
+@pytest.mark.parametrize("number", [1, 4, 9, 18, 23])
+def test_partial_maps_of_a_few_pixels(made, tmp_path, number):
+    """A constant over so few pixels is that constant on each of them."""
+    centre = unit(np.radians(60.0), np.radians(25.0))
+    d = np.stack(healpy.pix2vec(256, np.arange(12 * 256**2)), axis=1)
+    seen = np.sort(np.argsort(-(d @ centre))[:number])
+    values = np.full(12 * 256**2, healpy.UNSEEN)
+    values[seen] = 2.0
+    path = tmp_path / "few.fits"
+    healpy.write_map(path, values, coord="C", column_units="K_RJ", dtype=np.float64, partial=True)
+    lon, lat = np.arctan2(d[seen, 1], d[seen, 0]), np.arcsin(d[seen, 2])
+    scan = made.observation(lon, lat, centre=(np.radians(60.0), np.radians(25.0)))
+    np.testing.assert_allclose(made.look(SkyMap(file=path, beam="none", outside="2 K"), scan), 2.0, rtol=1e-6)
+    assert scan.tally.get("SkyMap", "samples outside the input map") == 0
+
+
+def test_a_full_map_of_twelve_pixels(made, tmp_path):
+    healpy.write_map(tmp_path / "h.fits", np.full(12, 3.0), coord="C", column_units="K_RJ", dtype=np.float64)
+    scan, _ = scan_about(made, 60.0, 25.0)
+    np.testing.assert_allclose(made.look(SkyMap(file=tmp_path / "h.fits", beam="none"), scan), 3.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [-9999.0, -1.0e10, 0.0])
+def test_pixels_that_the_file_marks_as_bad_are_no_sky(made, tmp_path, bad):
+    """BAD_DATA (HEALPix's FITS conventions) is what UNSEEN is, to the last bit."""
+    near = healpy.query_disc(64, unit(np.radians(60.0), np.radians(25.5)), np.radians(0.3))
+    scan, got = scan_about(made, 60.0, 25.0, reach=60 * ARCMIN)[0], []
+    for name, value in (("unseen", healpy.UNSEEN), ("bad", bad)):
+        values = np.full(12 * 64**2, 1.5)
+        values[near] = value
+        extra = [("BAD_DATA", bad)] if name == "bad" else []
+        path = tmp_path / f"{name}.fits"
+        healpy.write_map(path, values, coord="C", column_units="K_RJ", dtype=np.float64, extra_header=extra)
+        assert len(read_map(path).values) == 12 * 64**2 - len(near)
+        got.append(made.look(SkyMap(file=path, fwhm="30 arcmin"), scan))
+    np.testing.assert_array_equal(*got)
+    assert got[0].min() > 0.0
+
+
+def test_bad_data_is_a_number(tmp_path):
+    extra = [("BAD_DATA", "none")]
+    healpy.write_map(tmp_path / "m.fits", np.ones(192), coord="C", column_units="K_RJ", dtype=np.float64, extra_header=extra)
+    with pytest.raises(InputError, match="BAD_DATA"):
+        read_map(tmp_path / "m.fits")
+
+
 def test_healpix_units(made, tmp_path):
     healpy.write_map(tmp_path / "c.fits", np.full(12 * 64**2, 3.0), coord="C", column_units="Jy/pixel", dtype=np.float64)
     scan = made.observation(np.full(4, 1.0), 0.3)

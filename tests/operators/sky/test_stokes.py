@@ -53,6 +53,73 @@ def test_healpix_that_begins_with_q_is_read_by_its_names(tmp_path):
     assert not np.array_equal(found.values, read_map(tmp_path / "q.fits", column="q_stokes").values)
 
 
+def table(path, names, unit="K_RJ"):
+    """Column k holds k; a column PIXEL numbers the pixels."""
+    columns = [
+        fits.Column(n, "J", array=np.arange(192)) if n == "PIXEL" else fits.Column(n, "D", unit=unit, array=np.full(192, k))
+        for k, n in enumerate(names)
+    ]
+    hdu = fits.BinTableHDU.from_columns(columns)
+    hdu.header.update(PIXTYPE="HEALPIX", ORDERING="RING", NSIDE=4, COORDSYS="C")
+    hdu.writeto(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("names", "read"),
+    [
+        (["HITS", "I_STOKES"], 1),
+        (["N_OBS", "TEMPERATURE"], 1),
+        (["PIXEL", "HITS", "SIGNAL", "WEIGHTS"], 2),
+        (["TEMPERATURE", "N_OBS"], 0),
+        (["II_COV", "I_STOKES", "Q_STOKES", "U_STOKES"], 1),
+        (["TMASK", "I_STOKES_INP", "I_STOKES"], 2),
+        (["HITS", "I_143GHZ"], 1),
+        (["MY_MAP", "HITS"], 0),
+        (["SIGNAL", "PIXEL"], 0),
+        (["COMPTON", "STDDEV"], 0),
+    ],
+)
+def test_the_column_of_a_table_is_found_by_its_name(tmp_path, names, read):
+    found = read_map(table(tmp_path / "t.fits", names))
+    assert set(found.values) == {float(read)}
+    several = len([name for name in names if name != "PIXEL"]) > 1
+    assert found.notes.get("column", "").startswith(f"{names[read]} ({read + 1} of {len(names)}" if several else "")
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["HITS"], "none of its columns is an intensity: HITS"),
+        (["PIXEL", "HITS", "WEIGHTS"], "none of its columns is an intensity"),
+        (["Q_STOKES", "U_STOKES"], "none of its columns is an intensity"),
+        (["FULL", "FIRST", "LAST"], "several of its columns may be the map: FULL, FIRST, LAST"),
+    ],
+)
+def test_a_table_without_a_known_column_is_refused(tmp_path, names, words):
+    with pytest.raises(InputError, match=words):
+        read_map(table(tmp_path / "t.fits", names))
+    assert set(read_map(tmp_path / "t.fits", column=names[-1]).values) == {len(names) - 1.0}
+    with pytest.raises(InputError, match="there is no map in a column NONE"):
+        read_map(tmp_path / "t.fits", column="NONE")
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({"NSIDE": 8}, "NSIDE = 8"),
+        ({"NSIDE": "four"}, "NSIDE = 'four'"),
+        ({"INDXSCHM": "EXPLICIT"}, "no column numbers the pixels"),
+    ],
+)
+def test_a_table_that_contradicts_itself(tmp_path, cards, words):
+    table(tmp_path / "t.fits", ["SIGNAL"])
+    with fits.open(tmp_path / "t.fits", mode="update") as hdus:
+        hdus[1].header.update(cards)
+    with pytest.raises(InputError, match=words):
+        read_map(tmp_path / "t.fits")
+
+
 @pytest.mark.parametrize(("first", "step", "plane"), [(1, 1, 0), (3, -1, 2)])
 def test_cube_of_i_q_u(made, save, first, step, plane):
     values = np.random.default_rng(2).normal(size=(3, 5, 6))
