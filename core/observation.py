@@ -163,6 +163,11 @@ class Observation:
         return np.asarray(reduce(np.hypot, levels) if levels else self.focalplane.net, np.float64)
 
     @property
+    def origin(self) -> tuple[str, str, str]:
+        """Names of the telescope, the instrument and the site."""
+        return self.instrument.telescope.name, self.instrument.name, self.site.name
+
+    @property
     def good_samples(self) -> NDArray[np.bool_]:
         """(n_samp,) True where no flag excludes the sample."""
         return good(self.flags, EXCLUDE_SAMPLE)

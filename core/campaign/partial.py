@@ -117,6 +117,7 @@ class Thinned(Observation):
     samples: int = 0
     detectors: int = 0
     emission: dict[str, float] = field(default_factory=dict)
+    names: tuple[str, str, str] = ("", "", "")
 
     def __post_init__(self) -> None:
         """No flags are made for the samples that are not here."""
@@ -130,6 +131,10 @@ class Thinned(Observation):
         return self.detectors
 
     @property
+    def origin(self) -> tuple[str, str, str]:
+        return self.names
+
+    @property
     def mean_emission(self) -> dict[str, float]:
         return self.emission
 
@@ -137,10 +142,11 @@ class Thinned(Observation):
     def made(cls, scan: dict[str, Any], index: int, scene: Scene, plane: Focalplane) -> Thinned:
         """Restore a scan from what `_thinned` kept."""
         samples, detectors = (np.ones(number, np.uint8) for number in scan["flagged"])
-        own = {k: v for k, v in scan.items() if k not in ("start", "centre", "focal_plane", "flagged")}
+        own = {k: v for k, v in scan.items() if k not in ("start", "centre", "origin", "focal_plane", "flagged")}
         return cls(
             index=index, site=scene.site, instrument=scene.instrument, focalplane=plane, start=Instant(scan["start"]),
-            centre=(scan["centre"][0], scan["centre"][1]), seed=scene.seed, flags=samples, detector_flags=detectors, **own,
+            centre=(scan["centre"][0], scan["centre"][1]), seed=scene.seed, flags=samples, detector_flags=detectors,
+            names=tuple(scan["origin"]), **own,
         )  # fmt: skip
 
 
@@ -177,6 +183,7 @@ def _thinned(observation: Observation, number: int) -> dict[str, Any]:
         "boresight_azel": observation.boresight_azel[kept],
         "boresight_radec": observation.boresight_radec[kept],
         "centre": list(observation.centre),
+        "origin": list(observation.origin),
         "emission": observation.mean_emission,
         "focal_plane": {name: getattr(observation.focalplane, name) for name in LEVELS} if number == 0 else {},
         "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],

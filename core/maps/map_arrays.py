@@ -49,7 +49,8 @@ class MapArrays:
     nside, nest, pixels
         HEALPix parameters and sorted pixel numbers, else 0, False, None.
     fwhm
-        Main-beam FWHM of the instrument [rad]. ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
+        FWHM of the beam [rad]; of detectors with several beams that of the map, `core.maps.beams`; 0: not known.
+        ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
     scans
         Names of the observations in it.
     sample_rate
@@ -87,6 +88,8 @@ class MapArrays:
     """Hits of each scan (`BinMap: {scan_hits: true}`)."""
     band: Band | None = None
     """Band of the run, with which `to` converts units; None: not known."""
+    beams: tuple[float, float] = (0.0, 0.0)
+    """FWHM [rad] of the narrowest and the widest beam in the map; zeros: not known."""
 
     @property
     def wcs(self) -> Any:

@@ -38,6 +38,8 @@ CROSSING = ("crosslinking", "mean_cos_2psi", "mean_sin_2psi")
 """Planes that tell in which directions the scans go."""
 COUNTS = ("hits", "condition", *CROSSING)
 """Planes without unit."""
+LONGEST = 66
+"""Letters of a text in a card."""
 _SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
 _COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
 
@@ -120,7 +122,12 @@ class MapFile:
         product = self.product
         degrees = float(np.degrees(product.resolution))
         what = "[deg] FWHM: beam, smoothing in quadrature" if product.smoothed_by else "[deg] FWHM of the beam"
-        return Cards([("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")] if degrees else ())
+        cards = Cards([("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")] if degrees else ())
+        narrow, wide = (float(np.degrees(fwhm)) for fwhm in product.beams)
+        if degrees and narrow < wide:
+            cards["BEAMLOW"] = narrow, "[deg] narrowest FWHM of the beams in BMAJ"
+            cards["BEAMHIGH"] = wide, "[deg] widest; BMAJ: peak x beam is the flux"
+        return cards
 
     @property
     def convention(self) -> Cards:
@@ -241,17 +248,26 @@ def _origin(data: Data) -> Cards:
             ("CREATOR", f"zonda {provenance.get('versions', {}).get('zonda', zonda.__version__)}", "software"),
             ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
             ("SEED", int(scene.seed), "root of all random numbers"),
-            ("TELESCOP", ascii_text(scene.instrument.telescope.name)),
-            ("INSTRUME", ascii_text(scene.instrument.name)),
-            ("SITE", ascii_text(scene.site.name)),
             ("DATE-OBS", str(min((o.start for o in data.scans), default=scene.time)), "start of the first scan, UTC"),
             ("NSCANS", len(data.scans), "scans"),
         ]
     )
+    names = (scene.instrument.telescope.name, scene.instrument.name, scene.site.name)
+    found = zip(*(o.origin for o in data.scans), strict=True) if data.scans else ((name,) for name in names)
+    for key, every in zip(("TELESCOP", "INSTRUME", "SITE"), found, strict=True):
+        cards[key], more = _names(every)
+        cards.history += [f"{key}: {name}" for name in more]
     if command := str(provenance.get("command", "")):
         cards.history.append(ascii_text(command))
     cards.history += map(ascii_text, str(provenance.get("resolved_yaml", "")).splitlines())
     return cards
+
+
+def _names(every: Iterable[str]) -> tuple[str, list[str]]:
+    """The different names, and those that HISTORY tells where a card does not hold them."""
+    names = sorted({ascii_text(name) for name in every})
+    text = ", ".join(names)
+    return (text, []) if len(text) <= LONGEST else (f"{len(names)} of them, see HISTORY", names)
 
 
 def ascii_text(text: str) -> str:

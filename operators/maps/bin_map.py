@@ -261,6 +261,14 @@ def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], where: tuple
             dropped[FLAGGED] += (stop - start) * which.size
 
 
+def note_beams(step: BinMap, observation: Observation, sums: MapSums | StokesSums, binned: int) -> None:
+    """Note the beams of an observation's detectors, with what they weigh in the map: ``binned`` samples, as many of each."""
+    good = observation.good_detectors
+    if count := int(np.count_nonzero(good)):
+        weight, _ = weights_of(step, observation, step._layout["variance"])
+        sums.beams.add(observation.focalplane.fwhm[good], weight[good], -(-binned // count))
+
+
 def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared) -> None:
     """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples that are too large."""
     if step.label not in data.partial:
@@ -277,6 +285,7 @@ def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared
         sums.coverage.add_directions(state.directions)
     if before is not None:
         sums.coverage.add_hits(sums.hits.sum(axis=0) - before, f"{step.label}, {observation.name}")
+    note_beams(step, observation, sums, binned)
     used = observation.focalplane.net[observation.good_detectors]
     sums.unknown_variance |= step.weights == "inverse_variance" and not (used > 0).all()
     every, tally = observation.n_detectors * observation.n_samples, observation.tally

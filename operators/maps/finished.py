@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
+from zonda.core.maps.beams import SPREAD
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.scan_hits import ScanHits
+from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.chunks import empty
 from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
@@ -45,8 +48,9 @@ def finish(step: MapParameters, data: Data, grid: Grid, layout: Mapping[str, Any
             _with_coverage(product, grid, sums)
             state_choices(step, product, sums, data.tally)
             warn_after(step, product, data.band)
+            tell_beams(step, product, data)
         if step.smooth is not None:
-            product = product.smoothed(layout["fwhm"] if step.smooth == "beam" else float(step.smooth))
+            product = product.smoothed(product.fwhm if step.smooth == "beam" else float(step.smooth))
         data.products[key] = product
 
 
@@ -74,8 +78,9 @@ def map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: Map
     planes: list[NDArray[Any]] = [signal, hits, weight, noise] + ([half] if half is not None else [])
     planes = [plane[keep].reshape(-1 if isinstance(grid, HealpixGrid) else grid.shape) for plane in planes]
     common: dict[str, Any] = {
-        "frame": step.frame, "weighting": step.weights, "noise_from": step.noise, "fwhm": layout["fwhm"], "scans":
-        list(sums.scans), "centre": tuple(layout["middle"]), "half_difference": planes[4] if half is not None else None,
+        "frame": step.frame, "weighting": step.weights, "noise_from": step.noise,
+        "fwhm": sums.beams.fwhm or layout["fwhm"], "beams": sums.beams.extremes,
+        "scans": list(sums.scans), "centre": tuple(layout["middle"]), "half_difference": planes[4] if half is not None else None,
         "difference": DIFFERENCES[step.split],
         "contents": step.contents, "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
     }  # fmt: skip
@@ -101,6 +106,19 @@ def _with_coverage(product: MapProduct, grid: Grid, sums: MapSums | StokesSums) 
         product.directions = planes.reshape(2, *product.hits.shape)
     if pixels is not None:
         product.scan_hits = ScanHits(list(sums.scans), pixels, coverage.hits)
+
+
+def tell_beams(step: MapParameters, product: MapProduct, data: Data) -> None:
+    """Tell which beam a map has whose detectors have several; warn where these differ much."""
+    narrow, wide = product.beams
+    if narrow < wide:
+        beams = f"{angle_text(narrow)} to {angle_text(wide)}"
+        text = f"{angle_text(product.fwhm)}: peak times its area is the flux density; detectors have {beams}"
+        data.tally.state(step.label, "beam of the map (FWHM)", text)
+        if wide > SPREAD * narrow:
+            more = "fluxes are right by it, shapes are not: map detectors of one beam by themselves for these"
+            bmaj = angle_text(product.fwhm)
+            warnings.warn(f"{step.label}: beams of {beams} are in one map, BMAJ is {bmaj}: {more}", stacklevel=4)
 
 
 def state_choices(step: MapParameters, product: MapProduct, sums: MapSums | StokesSums, tally: Tally) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
+from zonda.core.maps.beams import Beams
 from zonda.core.numerics.chunks import empty
 from zonda.core.product import Product
 
@@ -36,6 +37,8 @@ class PixelSums(Product):
         A scan's weights are uniform because every NET is zero.
     coverage
         Directions of motion, and the hits of each observation.
+    beams
+        The detectors' beams, and what each weighs in the map.
     """
 
     def __init__(self, signals: Sequence[str], of_scans: bool) -> None:
@@ -45,6 +48,7 @@ class PixelSums(Product):
         self.rates: set[float] = set()
         self.unknown_variance = False
         self.coverage = Coverage()
+        self.beams = Beams()
 
     @property
     @abstractmethod
@@ -69,6 +73,7 @@ class PixelSums(Product):
         self.rates |= other.rates
         self.unknown_variance |= other.unknown_variance
         self.coverage += other.coverage
+        self.beams += other.beams
         self.coverage.check("the sum of the maps of all tasks")
 
     def _about(self) -> dict[str, Any]:
@@ -76,12 +81,14 @@ class PixelSums(Product):
         return {
             "signals": list(self.signals), "of_scans": self.of_scans, "scans": list(self.scans), "rates": sorted(self.rates),
             "unknown_variance": self.unknown_variance, "n_pixels": self.hits.shape[1], "coverage": self.coverage.arrays(),
+            "beams": [list(pair) for pair in sorted(self.beams.weights.items())],
         }  # fmt: skip
 
     def _with_about(self, arrays: Mapping[str, Any]) -> Self:
         self.scans, self.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
         self.unknown_variance = bool(arrays["unknown_variance"])
         self.coverage = Coverage.of(arrays["coverage"], int(arrays["n_pixels"]))
+        self.beams = Beams({float(fwhm): int(weight) for fwhm, weight in arrays["beams"]})
         return self
 
     def _refuse_overflow(self, largest: float, highest: float, place: str) -> None:

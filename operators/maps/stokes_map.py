@@ -154,7 +154,8 @@ def stokes_map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], su
 def _common(step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: StokesSums, keep: Any) -> dict[str, Any]:
     """What is said of the map beside its planes."""
     found: dict[str, Any] = {
-        "frame": step.frame, "weighting": step.weights, "noise_from": step.noise, "fwhm": layout["fwhm"],
+        "frame": step.frame, "weighting": step.weights, "noise_from": step.noise,
+        "fwhm": sums.beams.fwhm or layout["fwhm"], "beams": sums.beams.extremes,
         "scans": list(sums.scans), "centre": tuple(layout["middle"]), "difference": DIFFERENCES[step.split],
         "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
     }  # fmt: skip

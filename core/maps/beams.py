@@ -1,0 +1,65 @@
+"""The beam of a map to which detectors of different beams contribute.
+
+A point source of flux density S is seen by a detector of Gaussian beam O_d with the peak S / O_d, and the map's peak is the
+mean of these by the weights W_d that the detectors have in it. The beam of the map is the Gaussian of the solid angle O with
+
+    1 / O = sum W_d / O_d / sum W_d,   that is   FWHM^-2 = sum W_d FWHM_d^-2 / sum W_d:                           (1)
+
+peak times O is S, as is the integral over the map (which is S for any beams). No single Gaussian has the shape of a sum of
+several: what lies between, such as a fit of the width, is as near as the beams are to each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..types import Floats
+
+UNIT = 1 << 10
+"""Of weights, which are added up as whole numbers: their sums do not depend on the order."""
+SPREAD = 1.1
+"""Widest over narrowest beam above which the shape of the map's beam is worth a warning."""
+
+
+def effective_fwhm(weights: Mapping[float, float]) -> float:
+    """Equation (1) [rad] of weights by FWHM; of one FWHM that itself; 0 where one of them is not known (0) or there is none."""
+    used = sorted((fwhm, weight) for fwhm, weight in weights.items() if weight > 0)
+    if not used or not used[0][0] > 0:
+        return 0.0
+    if len(used) == 1:
+        return used[0][0]
+    total = math.fsum(weight for _, weight in used)
+    return math.sqrt(total / math.fsum(weight / fwhm**2 for fwhm, weight in used))
+
+
+@dataclass
+class Beams:
+    """Weights in a map by the detectors' FWHM [rad], in whole numbers of `UNIT` times a sample of weight 1."""
+
+    weights: dict[float, int] = field(default_factory=dict)
+
+    def add(self, fwhm: Floats, weight: Floats, samples: int) -> None:
+        """Detectors of ``fwhm`` (n_det,) whose samples weigh ``weight`` (n_det,), with about ``samples`` each."""
+        for width in np.unique(fwhm):
+            share = round(float(weight[fwhm == width].sum()) * UNIT) * samples
+            if share > 0:
+                self.weights[float(width)] = self.weights.get(float(width), 0) + share
+
+    def __iadd__(self, other: Beams) -> Beams:
+        for width, share in other.weights.items():
+            self.weights[width] = self.weights.get(width, 0) + share
+        return self
+
+    @property
+    def fwhm(self) -> float:
+        """Of the map, equation (1)."""
+        return effective_fwhm(self.weights)
+
+    @property
+    def extremes(self) -> tuple[float, float]:
+        """Narrowest and widest FWHM; zeros where there is none."""
+        return (min(self.weights), max(self.weights)) if self.weights else (0.0, 0.0)
