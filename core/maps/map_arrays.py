@@ -29,7 +29,7 @@ class MapArrays:
     Attributes
     ----------
     signal
-        Weighted mean of the samples, `unit`; NaN where hits == 0.
+        Weighted mean of the samples, `unit`; NaN where there is no value (`known`).
     hits
         Number of samples, int64.
     weights
@@ -38,7 +38,7 @@ class MapArrays:
         Standard deviation of ``signal`` (after smoothing, where it is smoothed), `unit`; NaN where unknown.
     half_difference
         Noise map from the difference of two halves of the samples (``difference``: which, ``even - odd scans``),
-        (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2): its variance is that of ``signal`` where both have hits; NaN elsewhere.
+        (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2): its variance is that of ``signal`` where both have a value; NaN elsewhere.
     header
         Keywords of the WCS (images), else None; a dict that `astropy.io.fits.Header` takes.
     centre
@@ -80,7 +80,7 @@ class MapArrays:
     """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
     difference: str = "even - odd scans"
     polarization: Polarization | None = None
-    """Q and U; ``signal`` and the others are of I then, and ``hits`` and ``weights`` 0 where I, Q and U are not determined."""
+    """Q and U; ``signal`` and the others are of I then, and ``weights`` 0 where I, Q and U are not determined."""
     directions: Floats | None = None
     """(2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors moved through each pixel; NaN
     where none did. None: not kept (`BinMap: {crosslinking: true}`)."""
@@ -108,6 +108,17 @@ class MapArrays:
         TOAST's `CrossLinking`. NaN where no detector moved; None where it was not kept.
         """
         return None if self.directions is None else np.hypot(*self.directions)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Where the map has a value: where there are samples and, of a polarized map, enough of their angles."""
+        hit = self.hits > 0
+        return hit if self.contents == "hits" else hit & np.isfinite(self.signal)
+
+    @property
+    def known_hits(self) -> NDArray[np.int64]:
+        """``hits`` where the map has a value, else 0."""
+        return np.where(self.known, self.hits, 0)
 
     def hits_of(self, scan: str | int) -> NDArray[np.int32]:
         """Hits of one scan, by name or number, shape of ``signal``. Raises InputError where they were not kept."""

@@ -112,7 +112,7 @@ class MapProduct(MapArrays):
         return _rms(getattr(cut.smoothed(fwhm), of), cut.weights, near[window])
 
     def smoothed(self, fwhm: float) -> MapProduct:
-        """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w over pixels with hits.
+        """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w over pixels with a value.
 
         Empty pixels neither contribute nor are filled. Noise: pixels are independent before, so its variance becomes
         sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel itself. I, Q and U are smoothed one by one.
@@ -129,7 +129,7 @@ class MapProduct(MapArrays):
             i, q, u = (self.stokes(which).smoothed(fwhm) for which in "IQU")
             return replace(i, polarization=smoothed_polarization(self.polarization, i, q, u))
         convolve = self.grid.smoother(fwhm)
-        known = self.hits > 0
+        known = self.known
         weights = np.where(known, self.weights, 0.0)
         total = convolve(weights, 1.0)
 
@@ -163,7 +163,7 @@ class MapProduct(MapArrays):
         if self.pixels is None:
             raise InputError("not a HEALPix map", place="map", cure="set nside of the map maker")
         whole = np.full(healpy.nside2npix(self.nside), healpy.UNSEEN)
-        known = self.hits > 0
+        known = self.known
         whole[self.pixels[known]] = self.signal[known]
         return whole
 

@@ -30,7 +30,7 @@ class Polarization:
         Condition number of the samples' angles in each pixel, largest over smallest eigenvalue: 2 at best, infinite where they
         do not determine I, Q and U; NaN where there are no samples.
     hits
-        Samples in each pixel, also in those that are not solved (where `MapArrays.hits` is 0).
+        `MapArrays.hits`: the samples in each pixel, also in those that are not solved.
     half_difference
         (2, ...) of Q and U, as `MapArrays.half_difference`, each with the variance of the map there; None: not made.
     """

@@ -277,7 +277,7 @@ def _flat(
     per_beam: AnyFloats | float | None = None,
 ) -> FlatMap:
     """What pictures need of a map; a HEALPix or CAR map on a plane about its centre."""
-    found = {plane: getattr(product, plane) for plane in ("hits", "weights", *planes)}
+    found = {"hits": product.known_hits} | {plane: getattr(product, plane) for plane in ("weights", *planes)}
     header, is_flat = product.header, product.projection == "TAN"
     rms: dict[str, float] = {}
     if not is_flat:

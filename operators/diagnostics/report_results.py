@@ -71,9 +71,9 @@ def results(data: Data, given: float | None) -> str:
 
 def _unsolved(name: str, product: MapProduct) -> list[Card]:
     """In how many pixels with samples a map has no I, Q and U: a card, or none where there are all."""
-    if (found := product.polarization) is None:
+    if product.polarization is None:
         return []
-    hit, solved = int(np.count_nonzero(found.hits)), int(np.count_nonzero(product.hits))
+    hit, solved = int(np.count_nonzero(product.hits)), int(np.count_nonzero(product.known))
     label = "" if name == "map" else f", {name}"
     text = f"pixels with samples are NaN: too few angles of polarization for I, Q and U{label}"
     return [(f"{hit - solved} of {hit}", text)] if solved < hit else []

@@ -56,7 +56,7 @@ def sphere_spectra(name: str, product: MapProduct, bins: int, least: float, plac
         raise PipelineError(f"the spectrum of a map of nside {product.nside} would take gigabytes", place=place, cure=cure)
     planes = [product] if product.polarization is None else [product.stokes(which) for which in IQU]
     number = healpy.nside2npix(product.nside)
-    seen = product.hits[product.hits > 0]
+    seen = product.hits[product.known]
     share = product.hits / (float(np.percentile(seen, 99)) if seen.size else 1.0)
     known = np.logical_and.reduce([np.isfinite(plane.signal) for plane in planes])
     window = np.where(known & (share >= least), np.minimum(share, 1.0), 0.0)

@@ -225,8 +225,8 @@ def window_of(product: MapProduct, radius: float | None = None, taper: float | N
     """
     from scipy.ndimage import binary_fill_holes, gaussian_filter
 
-    hits = gaussian_filter(product.hits.astype(np.float64), product.fwhm / FWHM_PER_SIGMA / product.pixel, mode="constant")
-    seen = hits[product.hits > 0]
+    hits = gaussian_filter(product.known_hits.astype(np.float64), product.fwhm / FWHM_PER_SIGMA / product.pixel, mode="constant")
+    seen = hits[product.known]
     inside = hits >= max(least * float(np.percentile(seen, 99)), 1e-9) if seen.size else np.zeros(hits.shape, bool)
     inside = binary_fill_holes(inside)
     if radius is not None:

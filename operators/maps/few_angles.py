@@ -45,9 +45,9 @@ def warn_before(step: MapParameters, observations: Sequence[Observation]) -> Non
 
 def warn_after(step: MapParameters, product: MapProduct, band: str) -> None:
     """Warn where I, Q and U of most pixels with samples are NaN."""
-    if (found := product.polarization) is None:
+    if product.polarization is None:
         return
-    hit, solved = int(np.count_nonzero(found.hits)), int(np.count_nonzero(product.hits))
+    hit, solved = int(np.count_nonzero(product.hits)), int(np.count_nonzero(product.known))
     if 2 * solved < hit:
         number = f"{hit - solved} of {hit} pixels with samples have no I, Q and U" if solved else "the whole map is NaN"
         text = f"{number}: the samples in a pixel see too few angles of polarization"

@@ -123,9 +123,9 @@ def tell_beams(step: MapParameters, product: MapProduct, data: Data) -> None:
 
 def state_choices(step: MapParameters, product: MapProduct, sums: MapSums | StokesSums, tally: Tally) -> None:
     """Tell how the map was made, and what is approximate about it."""
-    if (found := product.polarization) is not None:
-        hit = int(np.count_nonzero(found.hits))
-        tally.count(step.label, UNSOLVED, hit - int(np.count_nonzero(product.hits)), hit)
+    if product.polarization is not None:
+        hit = int(np.count_nonzero(product.hits))
+        tally.count(step.label, UNSOLVED, hit - int(np.count_nonzero(product.known)), hit)
     if step.noise == "scatter":
         alone = int(np.count_nonzero(product.hits == 1))
         tally.count(step.label, "pixels with one sample, whose scatter is unknown: noise NaN", alone)

@@ -140,13 +140,12 @@ def stokes_map_of(step: MapParameters, grid: Grid, layout: Mapping[str, Any], su
         rest = (-1,) if isinstance(grid, HealpixGrid) else grid.shape
         return plane[..., keep].reshape(*plane.shape[:-1], *rest)
 
-    solved = np.isfinite(values[0])
     polarization = Polarization(
         shaped(values[1]), shaped(values[2]), shaped(covariance), shaped(weights[1:]), shaped(condition), shaped(hits),
         shaped(half[1:]) if halves else None,
     )  # fmt: skip
     return MapProduct(
-        shaped(values[0]), shaped(np.where(solved, hits, 0)), shaped(weights[0]), shaped(np.sqrt(covariance[0])),
+        shaped(values[0]), shaped(hits), shaped(weights[0]), shaped(np.sqrt(covariance[0])),
         shaped(half[0]) if halves else None, polarization=polarization, **_common(step, grid, layout, sums, keep),
     )  # fmt: skip
 

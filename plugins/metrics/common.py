@@ -43,7 +43,7 @@ def at_beam(product: MapProduct, fwhm: float | None = None) -> MapProduct:
 
 def covered(product: MapProduct) -> NDArray[np.bool_]:
     """Where a map has a value and at least `COVERED` of the usual samples."""
-    seen = product.hits[product.hits > 0]
+    seen = product.hits[product.known]
     least = COVERED * float(np.percentile(seen, 99)) if seen.size else 1.0
     return np.asarray(np.isfinite(product.signal) & (product.hits >= max(least, 1e-9)))
 

@@ -166,7 +166,7 @@ class Transfer(OfPlanes):
                 "the metric transfer needs a TAN map", place="transfer", cure="leave BinMap.nside and projection out"
             )
         image = input_of(data, "transfer")
-        window = sky.hits / np.percentile(sky.hits[sky.hits > 0], 99)
+        window = sky.known_hits / np.percentile(sky.hits[sky.known], 99)
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
         side = np.array(window.shape) * sky.pixel
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)

@@ -197,7 +197,7 @@ def plane_of(product: MapProduct | Image, name: str) -> Plane:
     if isinstance(product, Image):
         return Plane(name, np.asarray(product.values, np.float64), product.header, product.unit, 0.0)
     fwhm = math.hypot(product.fwhm, product.smoothed_by) or None
-    planes = {"signal": np.where(product.hits > 0, product.signal, np.nan), "noise": product.noise}
+    planes = {"signal": np.where(product.known, product.signal, np.nan), "noise": product.noise}
     if product.projection == "TAN":
         return Plane(name, planes["signal"], product.header, product.unit, fwhm, planes["noise"])
     if product.pixels is not None:

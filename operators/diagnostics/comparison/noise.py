@@ -25,12 +25,12 @@ def with_noise(plane: Plane, product: MapProduct, fwhm: float) -> Plane:
         return plane.smoothed(fwhm)
     known = bool(np.isfinite(product.noise).any())
     with np.errstate(divide="ignore"):
-        shape = product.noise if known else np.where(product.hits > 0, 1 / np.sqrt(product.hits), np.nan)
+        shape = product.noise if known else np.where(product.known, 1 / np.sqrt(product.hits), np.nan)
     half = product.half_difference
     if half is None:
         return replace(plane, noise=product.noise if known else None).smoothed(fwhm)
     both = replace(plane, values=half, noise=np.where(np.isfinite(half), shape, np.nan)).smoothed(fwhm)
-    well = (product.hits >= LEAST * np.percentile(product.hits[product.hits > 0], 99)) & np.isfinite(both.values)
+    well = (product.hits >= LEAST * np.percentile(product.hits[product.known], 99)) & np.isfinite(both.values)
     assert both.noise is not None
     factor = float(np.sqrt(np.mean((both.values[well] / both.noise[well]) ** 2))) if well.any() else np.nan
     made = replace(plane, noise=shape).smoothed(fwhm)

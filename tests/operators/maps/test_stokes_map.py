@@ -17,11 +17,13 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.map_file import MapFile, Provenance
 from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
+from zonda.operators.diagnostics.plot_operators import _flat
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import TangentGrid
 from zonda.operators.maps.stokes_product import StokesSums
 from zonda.plugins.checks import scenes
 from zonda.plugins.checks.scenes import run, scan
+from zonda.plugins.metrics.common import covered
 
 STOKES_I, Q, U = 1.0, 0.3, -0.2
 PAIRS = np.radians([0.0, 90.0, 45.0, 135.0])
@@ -65,7 +67,7 @@ def test_noiseless_recovery_to_rounding(how, frame, plate):
     if plate:
         o.hwp_angle = 11.0 * o.seconds
     product = mapped(o, signal_of(o, frame=frame), frame=frame, **how)
-    found, solved = planes(product), product.hits > 0
+    found, solved = planes(product), product.known
     assert solved.sum() > 40
     # terms of the matrix and cosines are rounded to 2^-31: as much of I + |Q| + |U|, times the condition number (pixels hit from
     # all angles have about 2)
@@ -118,7 +120,7 @@ def test_noise_of_the_map_is_what_it_states():
     rng = np.random.default_rng(6)
     sigma = o.focalplane.net[:, None] * np.sqrt(o.sample_rate)
     product = mapped(o, signal_of(o) + sigma * rng.normal(size=(o.n_detectors, o.n_samples)))
-    solved = product.hits > 0
+    solved = product.known
     rest = (planes(product) - np.array([STOKES_I, Q, U])[:, None, None])[:, solved]
     rows, columns = np.triu_indices(3)
     matrix = np.empty((solved.sum(), 3, 3))
@@ -193,7 +195,7 @@ def test_pixels_that_are_not_determined_are_nan_and_counted():
     assert np.isnan(product.polarization.condition[~hit]).all()
     count = {what: value for who, what, value in data.tally if who == "BinMap"}
     assert count["pixels whose samples do not determine I, Q and U: NaN"].startswith(str(int(hit.sum())))
-    assert not product.hits.any()
+    assert not product.known.any()
     assert not product.weights.any()
 
 
@@ -251,16 +253,22 @@ def test_a_map_of_nan_is_told():
             product = mapped(o, np.ones((o.n_detectors, o.n_samples)), pixel="60 arcsec")
         told = [str(w.message) for w in caught if "angles of polarization" in str(w.message)]
         assert [text.startswith(words) for text in told] == [True] * bool(words)
-        assert bool(product.hits.any()) == (not words)
+        assert bool(product.known.any()) == (not words)
 
 
 def test_a_lower_limit_of_the_condition_number_leaves_pixels_out():
     o = observation()
     product = mapped(o, signal_of(o))
-    condition = product.polarization.condition[product.hits > 0]
+    condition = product.polarization.condition[product.known]
     limit = float(np.median(condition))
     fewer = mapped(o, signal_of(o), condition_limit=limit)
-    np.testing.assert_array_equal(fewer.hits > 0, (product.hits > 0) & (product.polarization.condition <= limit))
+    np.testing.assert_array_equal(fewer.known, product.known & (product.polarization.condition <= limit))
+    np.testing.assert_array_equal(fewer.hits, product.hits)  # the samples are there
+    smooth = fewer.smoothed(np.radians(1 / 60))  # what is not known neither contributes nor is filled
+    np.testing.assert_array_equal(np.isfinite(planes(smooth)).all(axis=0), fewer.known)
+    assert np.array_equal(np.isfinite(smooth.noise), fewer.known)
+    assert not (_flat(fewer, "signal").hits[~fewer.known]).any()
+    assert np.array_equal(covered(fewer) & ~fewer.known, np.zeros(fewer.hits.shape, bool))
 
 
 def test_half_differences_have_the_noise_of_the_map():
@@ -295,7 +303,7 @@ def test_files(tmp_path, how):
             for name, plane in zip("IQU", planes(product), strict=True):
                 np.testing.assert_array_equal(file[name].data, plane)
             assert file["COV_QU"].header["BUNIT"] == "K2"
-            np.testing.assert_array_equal(file["HITS"].data, product.polarization.hits)
+            np.testing.assert_array_equal(file["HITS"].data, product.hits)
             header = file["Q"].header
     assert header["POLCCONV"] == "COSMO"
 
@@ -314,7 +322,7 @@ def test_smoothing_units_and_planes():
     o = observation()
     product = mapped(o, signal_of(o))
     product.band = o.instrument.band
-    solved = product.hits > 0
+    solved = product.known
     smooth = product.smooth("30 arcsec")
     for name, value in (("I", STOKES_I), ("Q", Q), ("U", U)):
         np.testing.assert_allclose(smooth.stokes(name).signal[solved], value, rtol=0, atol=1e-5)
@@ -379,8 +387,8 @@ def test_flagged_and_not_finite_samples_are_dropped_and_counted():
     assert count["samples dropped: not finite"] == 11
     assert sum(count.values()) == o.n_detectors * o.n_samples
     product = data.products["map"]
-    assert count["samples binned"] == product.polarization.hits.sum()
-    solved = product.hits > 0
+    assert count["samples binned"] == product.hits.sum()
+    solved = product.known
     np.testing.assert_allclose(product.polarization.q[solved], Q, rtol=0, atol=1e-5)
 
 
