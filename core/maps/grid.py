@@ -42,6 +42,10 @@ CUT = 5.0
 """Standard deviations at which kernels end."""
 SMALL = 1 << 20
 """Pixels of a grid whose solid angles and distances are kept."""
+MOST_PAIRS = 3e6
+"""Pairs of HEALPix pixels under a kernel up to which each is looked at: harmonics of a whole sphere take as long."""
+LARGEST_NSIDE = 2048
+"""Of HEALPix maps that are smoothed by harmonics: beyond, a whole sphere takes gigabytes."""
 CYLINDERS = ("CAR", "CEA", "MER", "CYP")
 ROWS = 256
 """Of an image that are worked on at a time."""
@@ -465,6 +469,8 @@ class HealpixPixels(MapGrid):
 
     def smoother(self, fwhm: float) -> Smoother:
         sigma = fwhm / FWHM_PER_SIGMA / self.sides[0]
+        if len(self.pixels) * math.pi * (CUT * sigma) ** 2 < MOST_PAIRS or self.nside > LARGEST_NSIDE:
+            return self._directly(fwhm / FWHM_PER_SIGMA)
 
         def found(values: AnyFloats, power: float = 1.0) -> Floats:
             import healpy
@@ -478,6 +484,26 @@ class HealpixPixels(MapGrid):
                 whole = healpy.reorder(whole, r2n=True)
             kept: Floats = whole[self.pixels] * (4 * math.pi * sigma**2) ** (1 - power)
             return kept
+
+        return found
+
+    def _directly(self, sigma: float) -> Smoother:
+        """Equation (2) as it stands: of few pixels, or of a part of a sphere that is too fine for harmonics of the whole."""
+        from scipy.spatial import cKDTree
+
+        directions = self.directions()
+        tree, scale = cKDTree(directions), float(self.areas[0]) / (2 * math.pi * sigma**2)
+
+        def found(values: AnyFloats, power: float = 1.0) -> Floats:
+            out = np.zeros(len(directions))
+            rows = max(1, round(1e6 / max(1.0, math.pi * (CUT * sigma / self.sides[0]) ** 2)))
+            for first in range(0, len(directions), rows):
+                part = cKDTree(directions[first : first + rows])
+                near = part.sparse_distance_matrix(tree, CUT * sigma, output_type="ndarray")
+                chord = near["v"] ** 2
+                kernel = np.exp(-power * chord * (1 + chord / 12) / (2 * sigma**2))
+                out[first : first + rows] = np.bincount(near["i"], kernel * values[near["j"]], part.n)
+            return np.asarray(out * scale**power, np.float64)
 
         return found
 

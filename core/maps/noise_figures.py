@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
+from ..types import Floats
 from .central import central_diameter
 from .map_product import MapProduct
 from .stokes import planes_of
@@ -56,6 +59,41 @@ def noise_figures(maps: Mapping[str, MapProduct], given: float | None = None) ->
             smoothed = product.smoothed_rms(product.fwhm, diameter / 2, of=plane) if again else math.nan
             found.append(NoiseFigure(name, of, rms, smoothed, diameter))
     return found
+
+
+LEAST = 0.1
+"""Share of the 99th percentile of the weight (1 / noise^2) that a pixel needs for its noise to be measured."""
+FREE = "the map of all but the sky"
+"""How the source-free map is called."""
+
+
+def noise_alone(
+    maps: Mapping[str, MapProduct], name: str, wanted: Sequence[Noise] = ("source_free", "half_difference")
+) -> tuple[Floats, str] | None:
+    """A map of the noise alone of the map ``name``, and what it is in words: all but the sky, else half the difference of two
+    halves of
+    the samples (``wanted``: which, in this order). None where there is none."""
+    sources = noise_sources(maps, name)
+    for of in wanted:
+        if of in sources:
+            product, plane = sources[of]
+            values = np.where(product.known, getattr(product, plane), np.nan)
+            return values, FREE if of == "source_free" else f"half the difference, {product.difference}"
+    return None
+
+
+def noise_factor(noise: Floats, alone: Floats) -> float | None:
+    """The rms of ``alone`` / ``noise`` over pixels with at least `LEAST` of the usual weight: what white
+    noise is to be multiplied by, so that noise that is correlated between pixels (1/f noise, the atmosphere)
+    counts in full. None where it cannot be measured."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weight, ratio = noise**-2.0, alone / noise
+    known = np.isfinite(ratio) & np.isfinite(weight)
+    if not known.any():
+        return None
+    well = known & (weight >= LEAST * np.percentile(weight[known], 99))
+    factor = float(np.sqrt(np.mean(ratio[well] ** 2)))
+    return factor if factor > 0 else None
 
 
 def noise_sources(

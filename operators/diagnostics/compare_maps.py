@@ -15,12 +15,12 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.noise_figures import maps_of, noise_alone
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
 
 from .comparison.files import plane_of, read_planes, write_comparison
-from .comparison.noise import with_noise
 from .comparison.planes import Plane
 from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
 from .comparison.stokes import on_meridians_of, planes_of, products_of
@@ -58,8 +58,9 @@ class CompareMaps(Output):
     """Map pixels with fewer (beam-smoothed) samples than this share of their 99th percentile are left out."""
     threshold: float = Field(THRESHOLD, gt=0, le=100)
     """Least difference that the fidelity divides by, in units of the rms of the difference."""
-    noise: Literal["half_difference", "map"] = "half_difference"
-    """Noise of the SNR: that of the map, brought to the rms of half the difference of the scans, or as it is."""
+    noise: Literal["measured", "half_difference", "map"] = "measured"
+    """Noise of the SNR: that of the map, brought to the rms, at the resolution of the comparison, of the map of all but the sky
+    (signal ``source_free``) or else of half the difference of the scans; of the latter alone; or as it is (`map`)."""
     bins: int = Field(24, ge=2, le=500)
     """Number of rings of the spectra, of equal width in the logarithm of the scale."""
 
@@ -78,13 +79,8 @@ class CompareMaps(Output):
 def _compare(step: CompareMaps, data: Data, which: str, reference: Plane, product: tuple[str, Any]) -> None:
     """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and the map."""
     name, found = product
-    plane = covered(plane_of(found, name), found, step.least_coverage)
+    plane = covered(_with_noise(step, data, which, plane_of(found, name)), found, step.least_coverage)
     fwhm = step.beam or resolution(plane, reference, found)
-    if step.noise == "half_difference":
-        noisy = data.products.get(step.map.rpartition("/")[2])  # of a signal without noise: the noise of the complete map
-        noisy = noisy if isinstance(noisy, MapProduct) else found
-        noisy = noisy.stokes(which) if noisy.polarization is not None else noisy
-        plane = with_noise(plane, noisy, fwhm) if isinstance(noisy, MapProduct) else plane
     made = compare(reference, plane, Settings(fwhm or None, step.threshold, step.bins), step.label)
     of = "" if which == "I" else f"{which}: "
     for note in made.notes:
@@ -95,6 +91,21 @@ def _compare(step: CompareMaps, data: Data, which: str, reference: Plane, produc
     data.products[key] = made
     if data.output is not None:
         write_comparison(made, product_path(data.output, data.named(key)), about(data))
+
+
+def _with_noise(step: CompareMaps, data: Data, which: str, plane: Plane) -> Plane:
+    """With the noise of the complete map, also of a signal without noise, and what is known of the noise alone."""
+    complete = step.map.rpartition("/")[2]
+    whole = data.products.get(complete)
+    if step.noise == "map" or not isinstance(whole, MapProduct) or whole.contents != "all":
+        return plane
+    name = plane_key(complete, which) if whole.polarization is not None else complete
+    maps = maps_of(data.products)
+    alone = noise_alone(maps, name) if step.noise == "measured" else noise_alone(maps, name, ["half_difference"])
+    noisy = plane_of(maps[name], name, alone)
+    if noisy.values.shape != plane.values.shape:
+        return plane
+    return replace(plane, noise=noisy.noise, blurred=noisy.blurred, alone=noisy.alone, alone_of=noisy.alone_of)
 
 
 def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
@@ -110,23 +121,33 @@ def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
 def _in_kelvin(plane: Plane, data: Data) -> Plane:
     if plane.unit in ("K_RJ", ""):
         return replace(plane, unit="K_RJ")
-    pixel, beam = plane.pixel**2, math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2
-    return plane.scaled(to_kelvin_rj(plane.unit, data.scene.instrument.band, pixel, 0.0, beam), "K_RJ")
+    beam = math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2
+    factor: Any = to_kelvin_rj(plane.unit, data.scene.instrument.band, 1.0, 0.0, beam)
+    if plane.unit == "Jy/pixel":
+        factor = factor / np.broadcast_to(plane.grid.areas, plane.values.shape)
+    return plane.scaled(factor, "K_RJ")
 
 
 def resolution(plane: Plane, reference: Plane, product: Any) -> float:
     """FWHM [rad] of the map with the wider beam; sqrt(2) times that of a map which is not smoothed yet. 0: not known."""
     own = plane.fwhm or 0.0
-    if isinstance(product, MapProduct) and product.projection == "TAN" and not product.smoothed_by:
+    if isinstance(product, MapProduct) and not product.smoothed_by:
         own *= math.sqrt(2)
     return max(own, reference.fwhm or 0.0)
 
 
 def covered(plane: Plane, product: Any, least: float) -> Plane:
     """The plane without the pixels that `window_of` leaves out."""
-    if not isinstance(product, MapProduct) or product.projection != "TAN":
+    if not isinstance(product, MapProduct):
         return plane
-    return replace(plane, values=np.where(window_of(product, least=least) > 0, plane.values, np.nan))
+    if product.projection == "TAN":
+        return replace(plane, values=np.where(window_of(product, least=least) > 0, plane.values, np.nan))
+    areas, seen = np.broadcast_to(plane.grid.areas, product.hits.shape), product.known
+    depth = product.known_hits / areas  # samples per solid angle, under the beam
+    if product.fwhm > 0:
+        depth = plane.grid.smoother(product.fwhm)(np.nan_to_num(depth))
+    enough = depth >= least * np.percentile(depth[seen], 99) if seen.any() else seen
+    return replace(plane, values=np.where(enough, plane.values, np.nan))
 
 
 def _product(data: Data, name: str, place: str) -> Any:

@@ -20,14 +20,13 @@ from zonda.core.drawable import Drawable, Sketch
 from zonda.core.early import take
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import Noise, maps_of, noise_sources
+from zonda.core.maps.noise_figures import Noise, maps_of, noise_alone, noise_sources
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, atomic_path, product_path
-from zonda.core.types import AnyFloats
+from zonda.core.types import AnyFloats, Floats
 
 from .comparison.files import plane_of
-from .comparison.noise import with_noise
 from .comparison.statistics import Comparison
 from .drawing.artist import Artist
 from .drawing.canvas import DPI
@@ -205,10 +204,10 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
                 yield Drawing(f"input {name}_{plane}", draw_input, partial(_input, name, image, plane), True)
     for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
         if not name.startswith("source_free/") and maps[name].contents == "all":
-            yield Drawing(f"map {name}", draw_map, partial(_map, name, maps[name], style))
+            yield Drawing(f"map {name}", draw_map, partial(_map, name, maps[name], style, maps))
     for name, product in data.products.items():
         if isinstance(product, MapProduct) and product.polarization is not None and not name.startswith(("source_free/", "_")):
-            yield Drawing(f"map {name}_P", draw_map, partial(_map, f"{name}_P", product.stokes("P"), style))
+            yield Drawing(f"map {name}_P", draw_map, partial(_map, f"{name}_P", product.stokes("P"), style, maps))
     for name, product in maps.items():
         if "/" not in name and name in data.products:  # Q and U have the hits of I
             yield Drawing(f"coverage {name}", draw_coverage, partial(_coverage, name, product))
@@ -297,19 +296,32 @@ def _flat(
     )  # fmt: skip
 
 
-def _map(name: str, product: MapProduct, style: Style) -> tuple[Any, ...]:
+def _map(name: str, product: MapProduct, style: Style, maps: Mapping[str, MapProduct]) -> tuple[Any, ...]:
     run, _, key = name.rpartition("/")
     flat = _flat(product, "signal")
-    return product_path("", name).name, run, key, flat, style, None if run else _snr(product, style)
+    snr = None
+    if style.contours and not run:
+        snr = _snr(product, style, noise_alone(maps, name) if name in maps else _of_q_and_u(maps, name.removesuffix("_P")))
+    return product_path("", name).name, run, key, flat, style, snr
 
 
-def _snr(product: MapProduct, style: Style) -> AnyFloats | None:
-    """The SNR of a map as it is shown, where contours of it are wanted and its noise is known."""
-    if not style.contours or product.projection != "TAN":
+def _of_q_and_u(maps: Mapping[str, MapProduct], name: str) -> tuple[Floats, str] | None:
+    """As `noise_alone`, of the P of a map: the rms of that of its Q and U."""
+    q, u = (noise_alone(maps, f"{name}_{which}") for which in "QU")
+    return None if q is None or u is None else (np.hypot(q[0], u[0]) / math.sqrt(2), q[1])
+
+
+def _snr(product: MapProduct, style: Style, alone: tuple[Floats, str] | None) -> tuple[AnyFloats, str] | None:
+    """The SNR of a map as it is shown, and what its noise is, in words; None where it is not known. ``alone``: `noise_alone`."""
+    flat = product.projection == "TAN"
+    smoothing = product.fwhm if style.smooth is None else style.smooth
+    plane = replace(plane_of(product, "map", alone), fwhm=0.0)
+    plane = plane.smoothed(smoothing if flat and not product.smoothed_by else 0.0).measured()
+    if plane.noise is None or not np.isfinite(plane.noise).any():
         return None
-    smoothing = 0.0 if product.smoothed_by else product.fwhm if style.smooth is None else style.smooth
-    plane = with_noise(plane_of(product, "map"), product, math.hypot(product.fwhm, product.smoothed_by, smoothing))
-    return None if plane.noise is None else np.asarray(plane.values / plane.noise, np.float32)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        snr = np.asarray(plane.values / plane.noise, np.float32)
+    return snr if flat else on_plane(product, {"signal": snr})[0]["signal"], plane.noise_in_words
 
 
 def _noise(name: str, sources: dict[Noise, tuple[MapProduct, Any]], style: Style) -> tuple[Any, ...]:

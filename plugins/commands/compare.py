@@ -120,6 +120,7 @@ def _compare(
     from zonda.core.storage.files import atomic_path
     from zonda.operators.diagnostics.comparison import statistics
     from zonda.operators.diagnostics.comparison.files import read_planes, write_comparison
+    from zonda.operators.diagnostics.comparison.planes import common_beam
     from zonda.operators.diagnostics.comparison.stokes import on_meridians_of
     from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
     from zonda.operators.diagnostics.drawing.pictures import Style, printed
@@ -135,8 +136,11 @@ def _compare(
     levels, formats = look
     style = Style(0.0, 0.0, 0.0, levels, formats)
     for plane in both:
-        reference = replace(references[plane], fwhm=0.0) if given[2] else references[plane]
-        one, other = _in_one_unit(reference, maps[plane], given[0], given[1] or read[0].frequency or read[1].frequency)
+        sky = replace(references[plane], fwhm=0.0) if given[2] else references[plane]
+        beam = settings.fwhm or common_beam(sky, maps[plane])
+        hertz = given[1] or read[0].frequency or read[1].frequency
+        one, other = _in_one_unit(references[plane], maps[plane], given[0], hertz, beam)
+        one = replace(one, fwhm=sky.fwhm)
         found = statistics.compare(one, other, settings)
         click.echo("\n".join([*([f"Stokes {plane}"] if len(both) > 1 else []), *lines(found), *([""] if len(both) > 1 else [])]))
         name = plane_key("comparison", plane)
@@ -164,21 +168,24 @@ def _name(path: Path, paths: tuple[Path, Path]) -> str:
     return path.name if paths[0].name != paths[1].name else f"{path.parent.name or '.'}/{path.name}"
 
 
-def _in_one_unit(reference: Plane, other: Plane, unit: str | None, frequency: float | None) -> tuple[Plane, Plane]:
+def _in_one_unit(reference: Plane, other: Plane, unit: str | None, frequency: float | None, beam: float) -> tuple[Plane, Plane]:
+    """Both in ``unit``, or in that of the reference: as brightness where that is per pixel, per common
+    ``beam`` [rad] where it is per beam."""
     from zonda.core.errors import InputError
     from zonda.operators.diagnostics.comparison.files import in_unit
 
-    if unit is not None:
-        return in_unit(reference, unit, frequency), in_unit(other, unit, frequency)
-    if reference.unit == other.unit:
-        return reference, other
-    if not (reference.unit and other.unit):
+    if unit is None and not (reference.unit and other.unit) and reference.unit != other.unit:
         bare = other if reference.unit else reference
         known = reference.unit or other.unit
         raise InputError(
             f"has no unit, and the other map is in {known}", place=bare.name, cure="set its header key BUNIT to what it is in"
         )
-    return reference, in_unit(other, reference.unit, frequency)
+    wanted = unit or ("MJy/sr" if reference.unit == "Jy/pixel" else reference.unit)
+    if wanted == "Jy/beam" and unit is None and reference.unit == other.unit and not (reference.fwhm and other.fwhm):
+        return reference, other  # nothing is known of the beams, so that nothing is smoothed
+    return (
+        (in_unit(reference, wanted, frequency, beam), in_unit(other, wanted, frequency, beam)) if wanted else (reference, other)
+    )
 
 
 def lines(found: Comparison) -> list[str]:
@@ -195,7 +202,10 @@ def lines(found: Comparison) -> list[str]:
         value = f"{f[key] * scale:.5g}" + (f" +- {f[error] * scale:.2g}" if error and math.isfinite(f[error]) else "")
         rows.append((text, value + (f" {unit}" if has_unit and unit else "")))
     if "chi2" in f:
-        rows.append(("chi2 of the difference / pixels", f"{f['chi2']:.5g} / {f['chi2 pixels']:.0f} = {_ratio(f):.4g}"))
+        scatter = math.sqrt(2 / f["chi2 values"]) if f["chi2 values"] else math.nan
+        rows.append(
+            ("chi2 of the difference / pixels", f"{f['chi2']:.5g} / {f['chi2 pixels']:.0f} = {_ratio(f):.4g} +- {scatter:.2g}")
+        )
     width = max(len(text) for text, _ in rows)
     made = [f"{text:<{width}}  {value}" for text, value in rows]
     return [*made, "", *found.notes]

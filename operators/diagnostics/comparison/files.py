@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.grid import HealpixPixels, healpix_grid
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.on_plane import on_plane
+from zonda.core.maps.noise_figures import FREE
 from zonda.core.maps.stokes import IQU
 from zonda.core.maps.stokes_names import along_axis, columns_of_q_and_u
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
-from zonda.core.numerics.sphere import angles
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path
 from zonda.core.storage.fits_files import check_size, opened
@@ -29,13 +29,20 @@ from zonda.core.types import Floats
 from .planes import Plane
 from .statistics import Comparison
 
-MOST = 2000
-"""Points along each side of the plane onto which a HEALPix map is brought."""
 SAME_BAND = 1e-3
 """Relative difference of frequencies of one band."""
 FRAMES = {"C": "icrs", "Q": "icrs", "ICRS": "icrs", "G": "galactic"}
-NOISES = {"NOISE": "noise I", "COV_II": "noise I", "COV_QQ": "noise Q", "COV_UU": "noise U"}
-"""Of a file's extensions and columns: standard errors, or variances."""
+NOISES = {
+    "NOISE": "noise I",
+    "COV_II": "noise I",
+    "COV_QQ": "noise Q",
+    "COV_UU": "noise U",
+    "HALF_DIFFERENCE": "half I",
+    "HALF_DIFFERENCE_Q": "half Q",
+    "HALF_DIFFERENCE_U": "half U",
+}
+"""Of a file's extensions and columns: standard errors, or variances; and noise alone."""
+FLUXES = ("Jy/pixel", "Jy/beam", "MJy/sr")
 CURE = "give a FITS file with a two-dimensional image that has a celestial WCS, or with a HEALPix table"
 
 
@@ -53,12 +60,15 @@ class ReadMap:
         BAND, its name; empty: not stated.
     notes
         Why Q and U that are in the file are not taken.
+    own
+        Whether zonda wrote it.
     """
 
     planes: dict[str, Plane]
     frequency: float | None
     band: str
     notes: list[str]
+    own: bool = False
 
     def is_of_the_band_of(self, other: ReadMap) -> bool:
         """False where the frequencies that both state differ, or the names where one of them states no frequency."""
@@ -79,26 +89,60 @@ def read_planes(path: Path, name: str = "") -> ReadMap:
     POLCCONV; of a HEALPix table without it as COSMO, of an image without it not at all. Axes of length one are dropped. A file
     without BUNIT has no unit (an empty text), one without BMAJ no known beam.
 
+    What holds noise alone is taken from the map of all but the sky that a run wrote beside it (``source_free_NAME.fits``), else
+    from HALF_DIFFERENCE; where neither is there, the factor on the noise that the header states (NOISEFAC).
+
     Raises
     ------
     InputError
         Unreadable; no image of the sky in it; a cube of something else; an unknown unit; a HEALPix table without NSIDE, ORDERING
         or COORDSYS.
     """
+    read = _read(path, name)
+    beside = path.with_name(f"source_free_{path.name}")
+    if not (read.own and any(plane.noise is not None for plane in read.planes.values()) and beside.is_file()):
+        return read
+    free = _read(beside, name)
+    made = {}
+    for key, plane in read.planes.items():
+        found = free.planes.get(key)
+        alike = found is not None and free.own and found.unit == plane.unit and _on_one_grid(found, plane)
+        made[key] = replace(plane, alone=found.values, alone_of=FREE, factor=None) if alike and found is not None else plane
+    return replace(read, planes=made)
+
+
+def _on_one_grid(a: Plane, b: Plane) -> bool:
+    if a.values.shape != b.values.shape or (a.pixels is None) != (b.pixels is None):
+        return False
+    if a.pixels is None or b.pixels is None:
+        return dict(a.header) == dict(b.header)
+    one, two = a.pixels, b.pixels
+    alike = (one.nside, one.nest, one.frame) == (two.nside, two.nest, two.frame)
+    return alike and np.array_equal(one.pixels, two.pixels)
+
+
+def _read(path: Path, name: str) -> ReadMap:
     place = str(path)
     with opened(path, place, "check the file, e.g. with fitsverify, or copy it again") as hdus:
         for hdu in hdus:
             image = hdu.is_image and hdu.header.get("NAXIS", 0) >= 2
             if image or ("NSIDE" in hdu.header and "ORDERING" in hdu.header):
                 check_size(path, hdu, place)
-                header, values, unit = _images(hdus, hdu, place) if image else _healpix(hdu, place)
-                return _read(name or path.name, (header, values), (hdu.header, unit), bool(image), place)
+                where, values, unit, stated = _images(hdus, hdu, place) if image else _healpix(hdu, place)
+                return _told(name or path.name, where, values, (hdu.header, unit, stated), bool(image), place)
     raise InputError("is not a map: it holds no image of two axes and no HEALPix table", place=place, cure=CURE)
 
 
-def _read(name: str, found: tuple[Any, dict[str, Floats]], told: tuple[Any, Any], image: bool, place: str) -> ReadMap:
-    """``found``: celestial header and planes; ``told``: header of the file and unit."""
-    (header, values), (about, unit) = found, told
+def _told(
+    name: str,
+    where: Any,
+    values: dict[str, Floats],
+    told: tuple[Any, Any, dict[str, tuple[float, str]]],
+    image: bool,
+    place: str,
+) -> ReadMap:
+    """``where``: celestial header or HEALPix pixels; ``told``: header of the file, unit, factors on the noise by plane."""
+    about, unit, stated = told
     text = str(unit or "").strip()
     label, factor = parse_unit(text, place=place, temperature_scale=about.get("TEMPSCAL")) if text else ("", 1.0)
     axes = [about.get("BMAJ"), about.get("BMIN", about.get("BMAJ"))]
@@ -114,14 +158,24 @@ def _read(name: str, found: tuple[Any, dict[str, Floats]], told: tuple[Any, Any]
     for key in IQU:
         if key in values:
             sign = -1.0 if key == "U" and convention == "IAU" else 1.0
-            noise = values.get(f"noise {key}")
-            plane = Plane(name if key == "I" else f"{name} {key}", sign * values[key], header, "", fwhm, noise)
+            noise, alone = values.get(f"noise {key}"), values.get(f"half {key}")
+            own, words = stated.get(key, (None, ""))
+            if alone is not None:
+                own, words = None, f"half the difference, {about.get('JACKKNIF', 'of two halves')}"
+            elif own is not None and noise is not None:
+                noise = noise * own
+            plane = Plane(
+                name if key == "I" else f"{name} {key}", sign * values[key], where if image else None, "", fwhm, noise,
+                None if image else where, 0.0, alone, words, own,
+            )  # fmt: skip
             planes[key] = plane.scaled(factor, label)
-    return ReadMap(planes, hertz, str(about.get("BAND", "")).strip(), notes)
+    origin = str(about.get("ORIGIN", "")).strip().lower() == "zonda"
+    return ReadMap(planes, hertz, str(about.get("BAND", "")).strip(), notes, origin)
 
 
-def _images(hdus: Any, hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any]:
-    """Header of the celestial axes, planes and their noise, unit: of a plane or a cube of Stokes parameters, or of extensions."""
+def _images(hdus: Any, hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any, dict[str, tuple[float, str]]]:
+    """Header of the celestial axes; planes, their noise and what holds noise alone; unit; factors on the
+    noise: of a plane or a cube of Stokes parameters, or of extensions."""
     from astropy.wcs import WCS
 
     header, values = hdu.header, np.asarray(hdu.data, np.float64)
@@ -143,16 +197,28 @@ def _images(hdus: Any, hdu: Any, place: str) -> tuple[Any, dict[str, Floats], An
     letters = columns_of_q_and_u([str(other.name) for other in alike])
     for key, number in zip(("Q", "U"), letters or (), strict=False):
         found.setdefault(key, np.asarray(alike[number].data, np.float64).reshape(ny, nx))
+    stated: dict[str, tuple[float, str]] = {}
     for other in alike if not long else ():
         if (of := NOISES.get(str(other.name).upper())) is not None:
             noise = np.asarray(other.data, np.float64).reshape(ny, nx)
-            found[of] = noise if other.name.upper() == "NOISE" else np.sqrt(noise)
+            found[of] = np.sqrt(noise) if other.name.upper().startswith("COV") else noise
+            stated |= _stated(other.header, of)
     both = found.keys() >= {"Q", "U"}
-    return wcs.celestial.to_header(relax=True), {k: v for k, v in found.items() if both or k[-1] == "I"}, header.get("BUNIT")
+    kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
+    return wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated
 
 
-def _healpix(hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any]:
-    """A HEALPix table on a plane about its middle: header, planes and perhaps their noise, unit."""
+def _stated(header: Any, of: str) -> dict[str, tuple[float, str]]:
+    """The factor on white noise that the header of a plane of noise states (`core.maps.map_file`), and what
+    it was measured in."""
+    factor = header.get("NOISEFAC")
+    good = of.startswith("noise") and isinstance(factor, int | float) and math.isfinite(factor) and factor > 0
+    return {of[-1]: (float(factor), str(header.get("NOISEOF", "its file")))} if good else {}
+
+
+def _healpix(hdu: Any, place: str) -> tuple[HealpixPixels, dict[str, Floats], Any, dict[str, tuple[float, str]]]:
+    """Pixels of a HEALPix table with a value; planes, perhaps their noise and what holds noise alone; unit;
+    factors on the noise."""
     import healpy
 
     header, names = hdu.header, [str(n).upper() for n in hdu.columns.names]
@@ -170,63 +236,58 @@ def _healpix(hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any]:
     if not seen.any():
         raise InputError("no pixel has a value", place=place, cure="give a map that is not NaN everywhere")
     order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
-    found = _on_plane(int(header["NSIDE"]), nest, pixels[order], {key: values[order] for key, values in planes.items()}, frame)
-    return *found, header.get(f"TUNIT{1 + int(explicit)}")
+    where = healpix_grid(int(header["NSIDE"]), nest, pixels[order], frame)
+    kept = {key: np.where(healpy.mask_bad(values[order]), np.nan, values[order]) for key, values in planes.items()}
+    return where, kept, header.get(f"TUNIT{1 + int(explicit)}"), {}
 
 
-def _on_plane(nside: int, nest: bool, pixels: Any, planes: Mapping[str, Floats], frame: str) -> tuple[Any, dict[str, Floats]]:
-    """Planes of HEALPix pixels on a plane with points as far apart as the pixels are, each with the pixel's value."""
-    import healpy
+def plane_of(product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None) -> Plane:
+    """A product of a run, with its noise. The input image has a resolution of 0: no beam.
 
-    directions = np.stack(healpy.pix2vec(nside, pixels, nest=nest), axis=1)
-    middle = directions.mean(axis=0)
-    centre = tuple(float(a) for a in angles(middle))
-    side = healpy.nside2resol(nside)
-    reach = float(np.arccos(np.clip((directions @ middle).min() / np.linalg.norm(middle), -1, 1)))
-    ones = np.ones(len(pixels))
-    product = MapProduct(
-        next(iter(planes.values())), ones.astype(np.int64), ones, ones, None, None, (centre[0], centre[1]), side, frame,
-        nside=nside, nest=nest, pixels=pixels,
-    )  # fmt: skip
-    made, wcs = on_plane(product, dict(planes), size=int(min(MOST, max(8.0, 2 * reach / side + 2))))
-    return wcs.to_header(relax=True), {key: np.asarray(values, np.float64) for key, values in made.items()}
-
-
-def plane_of(product: MapProduct | Image, name: str) -> Plane:
-    """A product of a run, with its noise. The input image has a resolution of 0: no beam."""
+    ``alone``: a map of the noise alone, and what it is in words.
+    Where the noise is not known and there is a map of it, it has the shape of 1 / sqrt(samples).
+    """
     if isinstance(product, Image):
         return Plane(name, np.asarray(product.values, np.float64), product.header, product.unit, 0.0)
-    fwhm = math.hypot(product.fwhm, product.smoothed_by) or None
-    planes = {"signal": np.where(product.known, product.signal, np.nan), "noise": product.noise}
-    if product.projection == "TAN":
-        return Plane(name, planes["signal"], product.header, product.unit, fwhm, planes["noise"])
+    noise: Floats | None = product.noise
+    if not np.isfinite(product.noise).any():
+        with np.errstate(divide="ignore"):
+            noise = None if alone is None else np.where(product.known, 1 / np.sqrt(product.hits), np.nan)
+    pixels = None
     if product.pixels is not None:
-        header, found = _on_plane(product.nside, product.nest, product.pixels, planes, product.frame)
-    else:
-        made, wcs = on_plane(product, planes, size=min(MOST, max(product.signal.shape)))
-        header, found = wcs.to_header(relax=True), {key: np.asarray(values, np.float64) for key, values in made.items()}
-    return Plane(name, found["signal"], header, product.unit, fwhm, found["noise"])
+        pixels = healpix_grid(product.nside, product.nest, product.pixels, product.frame)
+    return Plane(
+        name, np.where(product.known, product.signal, np.nan), product.header, product.unit, product.resolution or None, noise,
+        pixels, product.smoothed_by / FWHM_PER_SIGMA, *(alone or ()),
+    )  # fmt: skip
 
 
-def in_unit(plane: Plane, unit: str, frequency: float | None) -> Plane:
+def in_unit(plane: Plane, unit: str, frequency: float | None, beam: float = 0.0) -> Plane:
     """The plane in ``unit``, a name of `parse_unit` with a prefix (``mK_RJ``), at one frequency [Hz].
 
-    Raises InputError where that needs a frequency or a beam that are not known, or the plane has no unit.
+    Jy/beam are converted by the beam of the plane; what becomes Jy/beam is that of a Gaussian of FWHM ``beam`` [rad], to which
+    it will be smoothed. Raises InputError where that needs a frequency or a beam that are not known, or the plane has no unit;
+    for Jy/pixel, which is no brightness.
     """
     try:
         wanted, factor = parse_unit(unit, place="unit")
     except InputError as error:
         raise InputError(error.message, place="unit", cure=f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ") from error
-    if plane.unit == wanted:
+    if wanted == "Jy/pixel":
+        cure = "use MJy/sr; smoothed and interpolated maps have no flux of their own pixels"
+        raise InputError("Jy/pixel depends on the pixel, and maps are compared as brightness", place="unit", cure=cure)
+    if plane.unit == wanted != "Jy/beam":
         return plane.scaled(1 / factor, unit)
     if not plane.unit:
         raise InputError(f"has no unit, and {unit} is wanted", place=plane.name, cure="set the header key BUNIT")
-    ratio = _kelvin(plane, plane.unit, frequency) / _kelvin(plane, wanted, frequency)
+    known = plane.unit in FLUXES and wanted in FLUXES  # their ratio depends on no frequency
+    per = 1.0 if known else frequency
+    ratio = _kelvin(plane, plane.unit, per, plane.fwhm or 0.0) / _kelvin(plane, wanted, per, beam)
     return plane.scaled(ratio / factor, unit)
 
 
-def _kelvin(plane: Plane, unit: str, frequency: float | None) -> float:
-    """Rayleigh-Jeans kelvin of one ``unit``."""
+def _kelvin(plane: Plane, unit: str, frequency: float | None, beam: float) -> float | Floats:
+    """Rayleigh-Jeans kelvin of one ``unit``: a number, of Jy/pixel one for each pixel. ``beam``: FWHM of a Jy/beam."""
     if unit == "K_RJ":
         return 1.0
     if frequency is None:
@@ -234,10 +295,14 @@ def _kelvin(plane: Plane, unit: str, frequency: float | None) -> float:
         raise InputError(f"units differ ({plane.unit}), and their ratio depends on the frequency", place=plane.name, cure=cure)
     if unit in ("K_CMB", "y"):
         return float((cmb_slope if unit == "K_CMB" else thermal_sz)(frequency))
-    area = {"Jy/pixel": math.prod(plane.sides), "Jy/beam": math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2}.get(unit)
-    if area == 0:
+    scale = float(intensity_to_kelvin(frequency))
+    if unit == "MJy/sr":
+        return scale * 1e-20
+    if unit == "Jy/pixel":
+        return np.asarray(scale * 1e-26 / np.broadcast_to(plane.grid.areas, plane.values.shape), np.float64)
+    if not beam > 0:
         raise InputError("is in Jy/beam, and its beam is not known", place=plane.name, cure="set the header keys BMAJ and BMIN")
-    return float(intensity_to_kelvin(frequency)) * (1e-20 if area is None else 1e-26 / area)
+    return scale * 1e-26 / (math.pi / math.log(16) * beam**2)
 
 
 def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> list[Path]:
@@ -253,6 +318,11 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
             if found.fwhm:
                 for key in ("BMAJ", "BMIN"):
                     header[key] = math.degrees(found.fwhm), "[deg] FWHM"
+            if name in found.noise:
+                words, factor = found.noise[name]
+                if factor is not None:
+                    header["NOISEFAC"] = factor, "noise of the SNR / white noise"
+                header["NOISEOF"] = _ascii(words), "noise of the SNR"
             if k == 0:
                 header["REFERENC"], header["COMPARED"] = (_ascii(name) for name in found.names)
                 header["ORIGIN"] = "zonda", "comparison of two maps"

@@ -1,55 +1,82 @@
 """Maps that are compared, and how they are brought to one beam and one grid.
 
-One beam: each map is convolved, on its own pixels, with a Gaussian of FWHM sqrt(target^2 - own^2). Pixels without a value count
-neither in the sum nor in its weight, and stay without one:
+One beam: each map is convolved, on its own pixels, with a Gaussian of FWHM sqrt(target^2 - own^2) on the sky (`core.maps.grid`).
+Pixels count with their solid angles W; those without a value count neither in the sum nor in its weight, and stay without one:
 
-    m'_p = sum_q K_(p-q) m_q / sum_q K_(p-q),    q with a value                                              (1)
-    n'_p = [sum_q K_(p-q)^2 n_q^2]^(1/2) / sum_q K_(p-q)      (pixels independent before)                    (2)
+    m'_p = sum_q K_pq W_q m_q / sum_q K_pq W_q,    q with a value                                            (1)
+    n'_p = [sum_q (K_pq W_q n_q)^2]^(1/2) / sum_q K_pq W_q      (pixels independent before)                  (2)
 
-One grid: that of the map with the smaller pixels, so that nothing is aliased. The other is interpolated by cubic B-splines; a
-pixel has a value where the pixel of the other map that it lies in has one. Where the grids differ by whole pixels values are
-copied, bit by bit.
+One grid: that of the map with the smaller pixels, so that nothing is aliased; of a HEALPix map its pixels,
+whatever those of the other. The other is interpolated by cubic B-splines (HEALPix by the four neighbours); a
+pixel has a value where the pixel of the other map that it lies in has one. Where the grids differ by whole
+pixels values are copied, bit by bit. With the weights w_i of an interpolation and the correlation rho_ij =
+exp(-r_ij^2 / 4 sigma^2) that a smoothing by sigma has left between pixels, noise becomes
+
+    n'^2 = n^2 sum_ij w_i w_j rho_ij                                                                         (3)
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.noise_figures import noise_factor
+from zonda.core.maps.on_plane import on_plane
 from zonda.core.numerics import tangent
 from zonda.core.numerics.angles import FWHM_PER_SIGMA, angle_text
 from zonda.core.numerics.projection import pixel_matrix
-from zonda.core.numerics.transforms import gaussian_taps
+from zonda.core.numerics.sphere import angles, local_axes
 from zonda.core.types import Floats
 
 SAME = 1e-4
 """Pixels: offsets of grids that differ from whole ones by less count as whole."""
 EQUAL_BEAMS = 1e-3
 """Relative difference of beams that count as one."""
+WHITE = "white noise only"
+"""Said of noise that is the standard error of independent pixels, where no map of the noise alone is known."""
+MOST = 2000
+"""Points along each side of the plane onto which a HEALPix map is brought."""
+NEIGHBOURS = 12
+"""Pixels on either side that a cubic spline through values looks at: beyond, its weights are below 2e-7."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A map on an image grid.
+    """A map on an image grid, or of HEALPix pixels.
 
     Attributes
     ----------
     name
         Its name in messages and pictures.
     values
-        (ny, nx), NaN where nothing is known.
+        (ny, nx), or (n_pixel,) of HEALPix; NaN where nothing is known.
     header
-        FITS keywords of a two-dimensional celestial WCS.
+        FITS keywords of a two-dimensional celestial WCS; None of HEALPix.
     unit
         Of the values.
     fwhm
         Resolution, rad; 0 for a sky before any beam; None: unknown.
     noise
-        (ny, nx) standard error, same unit; None: unknown.
+        Standard error, of the same shape and unit; None: unknown.
+    pixels
+        Of HEALPix, else None.
+    blurred
+        Standard deviation [rad] of the Gaussian that the noise was smoothed with: 0 where pixels are independent.
+    spread
+        Solid angle [sr] of the pixels on which it was before it was brought to these; 0: these are its own.
+    alone, alone_of
+        A map of the noise alone, of the same shape and unit (all but the sky; half the difference of two halves of the samples),
+        and what it is in words; None, empty: there is none.
+    factor
+        What `measured` has multiplied the noise by; None: it is white noise alone.
     """
 
     name: str
@@ -58,10 +85,28 @@ class Plane:
     unit: str = "K_RJ"
     fwhm: float | None = None
     noise: Floats | None = None
+    pixels: HealpixPixels | None = None
+    blurred: float = 0.0
+    alone: Floats | None = None
+    alone_of: str = ""
+    factor: float | None = None
+    spread: float = 0.0
+
+    @property
+    def noise_in_words(self) -> str:
+        """What stands behind its noise; empty where none is known."""
+        if self.noise is None:
+            return ""
+        return WHITE if self.factor is None else f"{self.factor:.3g} x white noise, as in {self.alone_of}"
+
+    @property
+    def grid(self) -> MapGrid:
+        """Where its pixels are."""
+        return image_grid(self.header, self.values.shape) if self.pixels is None else self.pixels
 
     @property
     def wcs(self) -> Any:
-        """A `TangentWcs` or an `astropy.wcs.WCS`."""
+        """A `TangentWcs` or an `astropy.wcs.WCS`, of an image."""
         found = tangent.plain(self.header)
         if found is not None:
             return found
@@ -70,69 +115,90 @@ class Plane:
         return WCS(self.header, naxis=2).celestial
 
     @property
-    def sides(self) -> tuple[float, float]:
-        """Of a pixel along y and x, rad."""
-        x, y = np.radians(np.sqrt((np.asarray(self.wcs.pixel_scale_matrix) ** 2).sum(axis=0)))
-        return float(y), float(x)
-
-    @property
     def pixel(self) -> float:
-        """Side of the square of a pixel's area, rad."""
-        return math.sqrt(math.prod(self.sides))
+        """Side of the square of the median solid angle of the pixels with a value, rad."""
+        areas = np.broadcast_to(self.grid.areas, self.values.shape)
+        known = areas[np.isfinite(self.values) & np.isfinite(areas)]
+        return math.sqrt(float(np.median(known))) if known.size else self.grid.pixel
 
-    def scaled(self, factor: float, unit: str) -> Plane:
+    def scaled(self, factor: float | Floats, unit: str) -> Plane:
         """In another unit."""
-        return replace(self, values=self.values * factor, unit=unit, noise=None if self.noise is None else self.noise * factor)
+        noise, alone = (None if found is None else found * factor for found in (self.noise, self.alone))
+        return replace(self, values=self.values * factor, unit=unit, noise=noise, alone=alone)
 
     def smoothed(self, fwhm: float) -> Plane:
         """With a resolution of ``fwhm`` [rad], equations (1) and (2); as it is where its own is unknown or equal."""
         if self.fwhm is None or self.fwhm >= fwhm * (1 - EQUAL_BEAMS):
             return self
-        sigmas = [math.sqrt(fwhm**2 - self.fwhm**2) / FWHM_PER_SIGMA / side for side in self.sides]
-        known = np.isfinite(self.values)
-        share = _convolved(known.astype(np.float64), sigmas)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            values = np.where(known, _convolved(np.where(known, self.values, 0.0), sigmas) / share, np.nan)
-            noise = None
-            if self.noise is not None:
-                variance = _convolved(np.where(np.isfinite(self.noise), self.noise, 0.0) ** 2, sigmas, squared=True)
-                noise = np.where(np.isfinite(self.noise), np.sqrt(variance) / share, np.nan)
-        return replace(self, values=values, noise=noise, fwhm=fwhm)
+        more = math.sqrt(fwhm**2 - self.fwhm**2)
+        noise = None if self.noise is None else np.where(np.isfinite(self.values), self.noise, np.nan)
+        values, noise = self.grid.smoothed(self.values, more, noise=noise)
+        if noise is not None and self.blurred:  # pixels were not independent before
+            noise = noise * _left(self.blurred, more / FWHM_PER_SIGMA, self.pixel)
+        alone = None if self.alone is None else self.grid.smoothed(self.alone, more)[0]
+        blurred = math.hypot(self.blurred, more / FWHM_PER_SIGMA)
+        return replace(self, values=values, noise=noise, fwhm=fwhm, blurred=blurred, alone=alone)
+
+    def measured(self) -> Plane:
+        """With the noise times what ``alone`` is of it (`noise_factor`); as it is where there is no ``alone``."""
+        if self.alone is None or self.noise is None:
+            return self
+        factor = noise_factor(self.noise, self.alone)
+        return self if factor is None else replace(self, noise=self.noise * factor, factor=factor)
 
     def onto(self, other: Plane) -> Plane:
         """On the grid of another; NaN where it does not reach."""
-        shape = other.values.shape
-        x, y = positions(other.wcs, shape, self.wcs)
-        noise = None if self.noise is None else _sampled(self.noise, x, y, 1)
-        return replace(self, values=_sampled(self.values, x, y, 3), noise=noise, header=other.header)
+        there = {"header": other.header, "pixels": other.pixels, "alone": None, "spread": self.pixel**2}
+        if self.pixels is not None:
+            values, noise = _of_neighbours(self, other.grid)
+            return replace(self, values=values, noise=noise, **there)
+        x, y = positions(other.grid, self.grid)
+        values = _sampled(self.values, x, y, 3)
+        noise = None
+        if self.noise is not None:
+            noise = np.sqrt(_sampled(self.noise**2, x, y, 1)) * _kept(x, y, self.blurred, self.grid.sides)
+        return replace(self, values=values, noise=noise, **there)
+
+    def independent(self, where: NDArray[np.bool_]) -> float:
+        """How many independent values the noise of the pixels ``where`` has: their solid angle / (2 pi
+        blurred^2), or over that of its own pixels, at most their number. 2 pi sigma^2 is the integral of the
+        square of the correlation."""
+        count = float(np.count_nonzero(where))
+        each = max(2 * math.pi * self.blurred**2, self.spread)
+        return min(count, max(self.grid.solid_angle(where) / each, 1.0)) if each else count
 
 
-def _convolved(values: Floats, sigmas: list[float], squared: bool = False) -> Floats:
-    """With a Gaussian of ``sigmas`` pixels along y and x, zeros beyond the edges; or with the square of the kernel."""
-    from scipy.ndimage import correlate1d
+def _left(before: float, more: float, pixel: float) -> float:
+    """Factor on equation (2) for white noise that a Gaussian of ``before`` [rad] has smoothed, of ``more`` after it.
 
-    for axis, sigma in enumerate(sigmas):
-        side = gaussian_taps(sigma)
-        taps = np.concatenate([side[:0:-1], side])
-        values = correlate1d(values, taps**2 if squared else taps, axis, mode="constant")
-    return np.asarray(values, np.float64)
+    The rms goes from 1 / (sqrt(4 pi) before) to 1 / (sqrt(4 pi) hypot(before, more)); equation (2) divides by sqrt(4 pi) more /
+    pixel.
+    """
+    return max(1.0, before / math.hypot(before, more) * math.sqrt(4 * math.pi) * more / pixel)
 
 
-def positions(target: Any, shape: tuple[int, int], source: Any) -> tuple[Floats, Floats]:
-    """0-based pixels (x, y) of ``source`` at the pixels of a grid (ny, nx); NaN where the projection has none."""
-    y, x = np.indices(shape, np.float64)
+def positions(target: MapGrid, source: MapGrid) -> tuple[Floats, Floats]:
+    """0-based pixels (x, y) of the image ``source`` at the pixels of a grid, of its shape; NaN where the projection has none."""
+    assert isinstance(source, ImagePixels)  # HEALPix has no such coordinates
+    if isinstance(target, ImagePixels) and target.kind == source.kind == "TAN":
+        y, x = np.indices(target.shape, np.float64)
+        matrix: Floats = pixel_matrix(source.wcs) @ np.linalg.inv(pixel_matrix(target.wcs))
+        a, b, c = np.tensordot(matrix, np.stack([x, y, np.ones_like(x)]), 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(c > 0, a / c, np.nan), np.where(c > 0, b / c, np.nan)
     try:
-        matrix = pixel_matrix(source) @ np.linalg.inv(pixel_matrix(target))
-    except InputError:
-        return _by_astropy(target, source, x, y)
-    a, b, c = np.tensordot(matrix, np.stack([x, y, np.ones_like(x)]), 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(c > 0, a / c, np.nan), np.where(c > 0, b / c, np.nan)
+        turn = source.turn @ target.turn.T
+    except InputError:  # FK4 is no rotation of ICRS
+        if isinstance(target, ImagePixels):
+            return _by_astropy(target.wcs, source.wcs, target.shape)
+        raise
+    return source.coordinates(target.directions() @ turn.T)
 
 
-def _by_astropy(target: Any, source: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+def _by_astropy(target: Any, source: Any, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
     from astropy.wcs.utils import pixel_to_pixel
 
+    y, x = np.indices(shape, np.float64)
     whole = [wcs.astropy() if isinstance(wcs, tangent.TangentWcs) else wcs for wcs in (target, source)]
     try:
         return pixel_to_pixel(*whole, x, y)  # type: ignore[no-any-return]
@@ -151,8 +217,7 @@ def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
         inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
     column, row = (np.rint(np.where(inside, at, 0)).astype(np.int64).clip(0, n - 1) for at, n in ((x, nx), (y, ny)))
     near = np.where(inside, values[row, column], np.nan)
-    off = max(float(np.abs(np.where(inside, at - whole, 0)).max(initial=0.0)) for at, whole in ((x, column), (y, row)))
-    if off < SAME or not inside.any():
+    if _off(x, y, inside) < SAME or not inside.any():
         return near
     missing = ~np.isfinite(values)
     if missing.any() and not missing.all():
@@ -163,6 +228,69 @@ def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
     else:
         found = map_coordinates(values, at, order=3, mode="mirror")
     return np.where(np.isfinite(near), found, np.nan)
+
+
+def _off(x: Floats, y: Floats, inside: NDArray[np.bool_]) -> float:
+    """How far pixels ``inside`` are from whole ones, at most."""
+    return max(float(np.abs(np.where(inside, at - np.rint(at), 0)).max(initial=0.0)) for at in (x, y))
+
+
+def _kept(x: Floats, y: Floats, blurred: float, sides: tuple[float, float]) -> Floats:
+    """Equation (3) of a cubic spline: n' / n at pixels (x, y) of an image with pixels of these sides (y, x)."""
+    with np.errstate(invalid="ignore"):
+        if _off(x, y, np.isfinite(x) & np.isfinite(y)) < SAME:
+            return np.ones_like(x)
+    offsets = np.linspace(0.0, 1.0, 33)
+    found = np.ones_like(x)
+    for at, side in ((y, sides[0]), (x, sides[1])):
+        share = np.nan_to_num(at - np.floor(at))
+        found *= np.interp(share, offsets, _variances(offsets, blurred / side))
+    return np.sqrt(found)
+
+
+def _variances(offsets: Floats, sigma: float) -> Floats:
+    """sum_ij w_i w_j rho_ij of the cubic spline along one axis at ``offsets`` (n,) from a pixel; ``sigma`` in pixels."""
+    from zonda.core.numerics.smooth import interpolating, spline_basis
+
+    count = 2 * NEIGHBOURS
+    coefficients = interpolating(np.eye(count))  # (pixel, coefficient): the splines through a one at each pixel
+    middle = NEIGHBOURS - 1  # offsets lie between it and the next
+    weights = coefficients[:, middle - 1 : middle + 3] @ spline_basis(offsets)  # (pixel, n)
+    apart = np.subtract.outer(np.arange(count), np.arange(count))
+    rho = np.exp(-(apart**2) / (4 * sigma**2)) if sigma > 0 else np.eye(count)
+    return np.asarray(np.einsum("in,ij,jn->n", weights, rho, weights), np.float64)
+
+
+def _of_neighbours(plane: Plane, target: MapGrid) -> tuple[Floats, Floats | None]:
+    """Values and noise of a HEALPix map at the pixels of a grid: its own where the two are alike, else from four neighbours."""
+    import healpy
+
+    source = plane.pixels
+    assert source is not None  # asked for of HEALPix maps alone
+    directions = target.directions() @ target.turn @ source.turn.T
+    same = isinstance(target, HealpixPixels) and (target.nside, target.frame) == (source.nside, source.frame)
+    own = source.pixels_at(directions)
+    there = (own >= 0) & np.isfinite(plane.values[own])
+    if same:
+        values = np.where(there, plane.values[own], np.nan)
+        return values, None if plane.noise is None else np.where(there, plane.noise[own], np.nan)
+    lon, lat = np.arctan2(directions[..., 1], directions[..., 0]), np.arcsin(np.clip(directions[..., 2], -1, 1))
+    near, weights = healpy.get_interp_weights(source.nside, np.pi / 2 - lat.ravel(), lon.ravel(), nest=source.nest)
+    place = np.clip(np.searchsorted(source.pixels, near), 0, len(source.pixels) - 1)
+    known = (source.pixels[place] == near) & np.isfinite(plane.values[place])
+    weights = np.where(known, weights, 0.0).reshape(4, *target.shape)
+    place = place.reshape(4, *target.shape)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weights = weights / weights.sum(axis=0)
+        values = np.where(there, (weights * np.nan_to_num(plane.values[place])).sum(axis=0), np.nan)
+        if plane.noise is None:
+            return values, None
+        noise = np.nan_to_num(plane.noise[place])
+        apart = np.array(healpy.pix2vec(source.nside, source.pixels[place], nest=source.nest))
+        apart = ((apart[:, :, None] - apart[:, None]) ** 2).sum(axis=0)
+        rho = np.exp(-apart / (4 * plane.blurred**2)) if plane.blurred else (apart == 0).astype(np.float64)
+        variance = np.einsum("i...,ij...,j...->...", weights * noise, rho, weights * noise)
+        return values, np.where(there, np.sqrt(variance), np.nan)
 
 
 def common(reference: Plane, other: Plane, fwhm: float | None = None) -> tuple[Plane, Plane, list[str]]:
@@ -178,8 +306,7 @@ def common(reference: Plane, other: Plane, fwhm: float | None = None) -> tuple[P
     InputError
         ``fwhm`` is less than one of the two; the maps have no pixel with a value in common.
     """
-    known = [plane.fwhm for plane in (reference, other) if plane.fwhm is not None]
-    target, notes = max(known, default=0.0) if fwhm is None else fwhm, []
+    target, notes = common_beam(reference, other) if fwhm is None else fwhm, []
     for plane in (reference, other):
         if not np.isfinite(plane.values).any():
             raise InputError("no pixel has a value", place=plane.name, cure="give a map that is not NaN everywhere")
@@ -190,12 +317,12 @@ def common(reference: Plane, other: Plane, fwhm: float | None = None) -> tuple[P
             raise InputError(beams, place=plane.name, cure="choose a larger one")
     made = []
     for plane in (reference, other):
-        made.append(plane.smoothed(target))
-        if made[-1] is not plane:
+        made.append(plane.smoothed(target).measured())
+        if plane.fwhm is not None and made[-1].fwhm != plane.fwhm:
             before = f"from {angle_text(plane.fwhm)} " if plane.fwhm else ""
             notes.append(f"{plane.name}: smoothed {before}to {angle_text(target)}")
     first, second = made
-    if second.pixel < first.pixel * (1 - EQUAL_BEAMS):
+    if _is_the_grid(second, first):
         moved, grid = first.onto(second), second
         first = moved
     else:
@@ -210,8 +337,53 @@ def common(reference: Plane, other: Plane, fwhm: float | None = None) -> tuple[P
     return first, second, notes
 
 
+def on_a_plane(pixels: HealpixPixels, planes: Mapping[str, Floats]) -> tuple[Any, dict[str, Floats]]:
+    """Planes of HEALPix pixels as images about their middle, with points as far apart as the pixels are and
+    the value of the pixel that each lies in: header, and planes. For pictures and spectra."""
+    middle = pixels.directions().mean(axis=0)
+    centre = tuple(float(a) for a in angles(middle))
+    reach = float(np.arccos(np.clip((pixels.directions() @ middle).min() / np.linalg.norm(middle), -1, 1)))
+    size = int(min(MOST, max(8.0, 2 * reach / pixels.pixel + 2)))
+    ones = np.ones(len(pixels.pixels))
+    product = MapProduct(
+        ones, ones.astype(np.int64), ones, ones, None, None, (centre[0], centre[1]), pixels.pixel, pixels.frame,
+        nside=pixels.nside, nest=pixels.nest, pixels=pixels.pixels,
+    )  # fmt: skip
+    made, wcs = on_plane(product, dict(planes), size=size)
+    return wcs.to_header(relax=True), {key: np.asarray(values, np.float64) for key, values in made.items()}
+
+
+def cell_of(grid: ImagePixels) -> Floats:
+    """(2, 2): steps east and north [rad] of the middle pixel, by one in x (first column) and in y."""
+    y, x = ((n - 1) / 2 for n in grid.shape)
+    if not np.isfinite(grid.at(x, y)).all():
+        x, y = (float(v) - 1 for v in grid.wcs.wcs.crpix[:2])
+    h = 0.25
+    longitude, latitude = angles(grid.at(x, y))
+    east, north = local_axes(float(longitude), float(latitude))[1:]
+    steps = [(grid.at(x + h * i, y + h * j) - grid.at(x - h * i, y - h * j)) / (2 * h) for i, j in ((1, 0), (0, 1))]
+    return np.array([[axis @ step for step in steps] for axis in (east, north)])
+
+
+def common_beam(reference: Plane, other: Plane) -> float:
+    """The wider of two resolutions, rad; 0 where none is known."""
+    return max((plane.fwhm for plane in (reference, other) if plane.fwhm is not None), default=0.0)
+
+
+def _is_the_grid(second: Plane, first: Plane) -> bool:
+    """Whether two maps are compared on the pixels of the second: those of HEALPix, of two such maps the
+    larger ones; else the smaller ones."""
+    if first.pixels is not None and second.pixels is not None:
+        return second.pixels.nside < first.pixels.nside
+    if first.pixels is not None or second.pixels is not None:
+        return second.pixels is not None
+    return second.pixel < first.pixel * (1 - EQUAL_BEAMS)
+
+
 def _how(grid: Plane, moved: Plane, *given: Plane) -> str:
     own = next(plane for plane in given if plane.name == moved.name)
-    x, y = positions(grid.wcs, grid.values.shape, own.wcs)
-    whole = np.nanmax(np.abs([x - np.rint(x), y - np.rint(y)])) < SAME
-    return "is on the same pixels" if whole else "is interpolated by cubic splines"
+    if own.pixels is not None:
+        same = grid.pixels is not None and (grid.pixels.nside, grid.pixels.frame) == (own.pixels.nside, own.pixels.frame)
+        return "is on the same pixels" if same else "is interpolated between four neighbours"
+    x, y = positions(grid.grid, own.grid)
+    return "is on the same pixels" if _off(x, y, np.isfinite(x) & np.isfinite(y)) < SAME else "is interpolated by cubic splines"

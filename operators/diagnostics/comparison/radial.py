@@ -13,6 +13,11 @@ Of Q and U on parallel axes, those of the plane, with phi the angle of k from so
     E_k = Q_k cos 2 phi + U_k sin 2 phi,    B_k = -Q_k sin 2 phi + U_k cos 2 phi;                            (2)
 
 cross spectra are A / sum w^2 mean_i Re a_k b_k*. The window mixes some of E into B on scales near its own.
+
+Pixels may be oblong, turned or skew: a cell J (2, 2) [rad] holds the steps east and north by one pixel in x
+(first column) and in y, A = |det J|, and the wave of f_x, f_y cycles per pixel has the wavenumbers (k_east,
+k_north) = J^-T (f_x, f_y). A number in its place is the side of a square pixel with x to the west and y to
+the north.
 """
 
 from __future__ import annotations
@@ -27,16 +32,40 @@ from numpy.typing import NDArray
 from zonda.core.types import Floats
 
 
-def tapered(inside: NDArray[np.bool_], pixel: float, taper: float | None = None) -> Floats:
+def cell(steps: float | Floats) -> Floats:
+    """(2, 2) J of a cell, or of the side of a square pixel."""
+    return np.array([[-steps, 0.0], [0.0, steps]]) if np.ndim(steps) == 0 else np.asarray(steps, np.float64)
+
+
+def lengths(steps: float | Floats) -> tuple[float, float]:
+    """Of a pixel along y and x, rad."""
+    x, y = np.hypot(*cell(steps))
+    return float(y), float(x)
+
+
+def waves(shape: tuple[int, int], steps: float | Floats) -> tuple[Floats, Floats]:
+    """(k_north, k_west) [rad^-1] of the modes of `numpy.fft.fft2`, (ny, nx) each. ``steps``: a cell or a side."""
+    j = cell(steps)
+    if not j[0, 1] and not j[1, 0]:
+        north, west = np.meshgrid(np.fft.fftfreq(shape[0], j[1, 1]), np.fft.fftfreq(shape[1], -j[0, 0]), indexing="ij")
+        return north, west
+    f_y, f_x = np.meshgrid(*(np.fft.fftfreq(n) for n in shape), indexing="ij")
+    east, north = np.tensordot(np.linalg.inv(j).T, np.stack([f_x, f_y]), 1)
+    return north, -east
+
+
+def tapered(inside: NDArray[np.bool_], steps: float | Floats, taper: float | None = None) -> Floats:
     """sin^2(pi/2 min(d / taper, 1)), d [rad] the distance of a pixel to the nearest one that is not ``inside``, (ny, nx).
 
-    ``taper`` None: the largest d, so that a disc has cos^2(pi/2 r / R).
+    ``steps``: a cell or a side. ``taper`` None: the largest d, so that a disc has cos^2(pi/2 r / R).
     """
     from scipy.ndimage import distance_transform_edt
 
-    depth = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * pixel
+    sides = lengths(steps)
+    even = sides[0] == sides[1]
+    depth = distance_transform_edt(np.pad(inside, 1), sampling=None if even else sides)[1:-1, 1:-1] * (sides[0] if even else 1.0)
     width = depth.max(initial=0.0) if taper is None else taper
-    return np.asarray(np.sin(np.pi / 2 * np.minimum(depth / max(width, pixel), 1)) ** 2, np.float64)
+    return np.asarray(np.sin(np.pi / 2 * np.minimum(depth / max(width, *sides), 1)) ** 2, np.float64)
 
 
 @dataclass(frozen=True)
@@ -76,12 +105,14 @@ class RadialSpectra:
         return np.asarray(1 / np.where(np.isfinite(self.wavenumber), self.wavenumber, middle), np.float64)
 
 
-def ring_edges(shape: tuple[int, int], pixel: float, bins: int) -> Floats:
-    """At most (bins + 1,) wavenumbers, from one wave across the map to two pixels per wave, rad^-1.
+def ring_edges(shape: tuple[int, int], steps: float | Floats, bins: int) -> Floats:
+    """At most (bins + 1,) wavenumbers, from one wave across the map to two of the longer sides of a pixel per wave, rad^-1.
 
-    Their ratio is constant, but rings are at least as wide as the modes of the longer side are apart.
+    ``steps``: a cell or a side. Their ratio is constant, but rings are at least as wide as the modes of the
+    longer side of the map are apart.
     """
-    step, highest = 1 / (max(shape) * pixel), 0.5 / pixel
+    sides = lengths(steps)
+    step, highest = 1 / max(n * side for n, side in zip(shape, sides, strict=True)), 0.5 / max(sides)
     edges = [0.75 * step]
     ratio = (highest / edges[0]) ** (1 / bins)
     while edges[-1] < highest * (1 - 1e-9) and len(edges) <= bins:
@@ -92,7 +123,7 @@ def ring_edges(shape: tuple[int, int], pixel: float, bins: int) -> Floats:
 def radial_spectra(
     maps: Mapping[str, Floats],
     window: Floats,
-    pixel: float,
+    steps: float | Floats,
     edges: Floats,
     noise: Mapping[str, Floats] | None = None,
     smoothing: float = 0.0,
@@ -104,8 +135,8 @@ def radial_spectra(
     ----------
     window
         (ny, nx).
-    pixel
-        Side, rad.
+    steps
+        Cell of a pixel, or its side, rad.
     edges
         Between the rings, rad^-1.
     noise
@@ -119,13 +150,13 @@ def radial_spectra(
     known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
     window = np.where(known, window, 0.0)
     square = float((window**2).sum())
-    area = pixel**2 / square if square else math.nan
+    area = abs(float(np.linalg.det(cell(steps)))) / square if square else math.nan
     transforms = {}
     for name, values in maps.items():
         kept = np.where(known, values, 0.0)
         mean = float((kept * window).sum() / window.sum()) if square else 0.0
         transforms[name] = np.fft.fft2((kept - mean) * window)
-    north, west = np.meshgrid(*(np.fft.fftfreq(n, pixel) for n in window.shape), indexing="ij")
+    north, west = waves((window.shape[0], window.shape[1]), steps)
     k = np.hypot(north, west)
     pairs: dict[str, tuple[str, str]] = {}
     for name, (q, u) in (polarized or {}).items():
@@ -161,7 +192,7 @@ def radial_spectra(
 
 @dataclass(frozen=True)
 class Profiles:
-    """Means in rings about a pixel.
+    """Means in rings about a point.
 
     Attributes
     ----------
@@ -177,21 +208,21 @@ class Profiles:
     error: dict[str, Floats]
 
 
-def profiles(maps: Mapping[str, Floats], centre: tuple[float, float], pixel: float, width: float, beam_area: float) -> Profiles:
-    """Mean of each map (ny, nx) in rings of ``width`` [rad] about the pixel ``centre`` (x, y).
+def profiles(maps: Mapping[str, Floats], distance: Floats, areas: Floats, width: float, beam_area: float) -> Profiles:
+    """Mean of each map in rings of ``width`` [rad], over the solid angle: pixels count with their ``areas`` [sr].
 
-    ``beam_area`` [sr]: area in which pixels are not independent.
+    ``distance``: of the pixels from the middle of the rings [rad]; all of one shape. ``beam_area`` [sr]: area in which pixels are
+    not independent.
     """
-    known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
-    y, x = np.indices(known.shape)
-    ring = (np.hypot(x - centre[0], y - centre[1]) * pixel / width).astype(np.int64)[known]
-    number = np.bincount(ring)
-    independent = np.maximum(number * min(1.0, pixel**2 / beam_area if beam_area else 1.0), 1.0)
+    known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()]) & np.isfinite(distance) & (areas > 0)
+    ring, weight = (distance[known] / width).astype(np.int64), areas[known]
+    number, covered = np.bincount(ring), np.bincount(ring, weight)
+    independent = np.maximum(np.minimum(number, covered / beam_area if beam_area else np.inf), 1.0)
     mean, error = {}, {}
     for name, values in maps.items():
         with np.errstate(invalid="ignore", divide="ignore"):
-            first = np.bincount(ring, values[known]) / number
-            second = np.bincount(ring, (values[known] - first[ring]) ** 2) / number
+            first = np.bincount(ring, weight * values[known]) / covered
+            second = np.bincount(ring, weight * (values[known] - first[ring]) ** 2) / covered
             error[name] = np.where(independent > 1, np.sqrt(second / np.maximum(independent - 1, 1e-9)), np.nan)
         mean[name] = first
     return Profiles(np.asarray((np.arange(len(number)) + 0.5) * width, np.float64), mean, error)

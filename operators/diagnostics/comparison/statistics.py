@@ -4,30 +4,40 @@
     fidelity F = |A| / max(|B - A|, t rms(B - A))                                                            (2)
     chi^2 = sum (B - A)^2 / (n_A^2 + n_B^2)                                                                  (3)
 
-A is the reference, B the map. (2) with t = 0.7 is the fidelity of ALMA's memo 398 (Pety, Gueth & Guilloteau 2001): the threshold
-keeps it from being large by chance. The standard error of g and o is that of a jackknife: the fit is repeated without each of
-`BLOCKS`^2 parts of the field, so that neighbouring pixels need not be independent.
+A is the reference, B the map. In means, fits and rms, pixels of different size count with their solid angles,
+and those that repeat another (columns of a CAR image beyond a full turn) not at all. (2) with t = 0.7 is the
+fidelity of ALMA's memo 398 (Pety, Gueth & Guilloteau 2001): the threshold keeps it from being large by
+chance. The standard error of g and o is that of a jackknife: the fit is repeated without each of `BLOCKS`^2
+parts of the field, so that neighbouring pixels need not be independent.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.maps.grid import ImagePixels, MapGrid, image_grid
+from zonda.core.numerics.sphere import angles
 from zonda.core.types import Floats
 
-from .planes import Plane, common
+from .planes import Plane, cell_of, common, on_a_plane
 from .radial import Profiles, RadialSpectra, profiles, radial_spectra, ring_edges, tapered
 
 BLOCKS = 6
 """Parts of the field along each side that the jackknife leaves out in turn."""
 THRESHOLD = 0.7
 """t of equation (2)."""
+EVEN = 1e-3
+"""Relative difference of solid angles of pixels that count as equal."""
+UNEVEN = 0.1
+"""Relative difference of solid angles that the notes tell of."""
+ZENITHAL = ("TAN", "SIN", "ARC", "STG", "ZEA", "ZPN", "NCP")
+"""Projections about a point, which is the middle of a map that holds it."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +62,12 @@ class Comparison:
     notes
         How the maps were brought together.
     centre
-        Pixel (x, y) of the profiles' centre.
+        (longitude, latitude) [rad] of the profiles' centre, in the frame of the map.
     label
         Of the step that made it.
+    noise
+        Of ``snr`` and ``reference_snr``: what stands behind the noise, in words, and the measured factor on it (None: there is no
+        map of the noise alone).
     """
 
     names: tuple[str, str]
@@ -69,6 +82,7 @@ class Comparison:
     notes: list[str]
     centre: tuple[float, float]
     label: str = "compare"
+    noise: dict[str, tuple[str, float | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -84,12 +98,13 @@ def compare(reference: Plane, other: Plane, settings: Settings | None = None, la
     """Compare a map with a reference. Raises InputError where they cannot be: `planes.common`."""
     settings = settings or Settings()
     a, b, notes = common(reference, other, settings.fwhm)
-    centre = _centre(a)
-    a, b, corner = _cropped(a, b)
-    both = np.isfinite(a.values) & np.isfinite(b.values)
+    centre, names = _centre(a), (reference.name, other.name)
+    a, b = _cropped(a, b)
+    grid, both = a.grid, np.isfinite(a.values) & np.isfinite(b.values)
     planes = {"reference": np.where(both, a.values, np.nan), "map": np.where(both, b.values, np.nan)}
     difference = planes["difference"] = planes["map"] - planes["reference"]
-    floor = settings.threshold * rms(difference)
+    areas, weights = _weights(grid, both)
+    floor = settings.threshold * rms(difference, weights)
     with np.errstate(invalid="ignore", divide="ignore"):
         planes["fidelity"] = np.abs(planes["reference"]) / np.maximum(np.abs(difference), floor)
         for name, plane in (("snr", b), ("reference_snr", a)):
@@ -97,36 +112,87 @@ def compare(reference: Plane, other: Plane, settings: Settings | None = None, la
                 planes[name] = np.where(both & (plane.noise > 0), plane.values / plane.noise, np.nan)
     pixel, fwhm = a.pixel, max(a.fwhm or 0.0, b.fwhm or 0.0)
     maps = {name: planes[name] for name in ("reference", "map", "difference")}
-    edges = ring_edges(both.shape, pixel, settings.bins)
-    spectra = radial_spectra(maps, tapered(both, pixel), pixel, edges)
-    centre = centre[0] - corner[0], centre[1] - corner[1]
     area = math.pi / math.log(16) * fwhm**2
-    found = profiles(maps, centre, pixel, max(pixel, fwhm / 2), area)
-    figures = figures_of(planes["reference"], planes["map"], (a.noise, b.noise))
-    figures["pixels"] = float(np.count_nonzero(both))
+    found = profiles(maps, grid.distance(centre), areas, max(pixel, fwhm / 2), area)
+    figures = figures_of(planes["reference"], planes["map"], (a.noise, b.noise), weights, _places(a, centre))
+    figures["pixels"] = float(np.count_nonzero(both & (weights > 0)))
     figures["median fidelity where the reference is above 10 % of its peak"] = _median_fidelity(planes)
-    names = (reference.name, other.name)
-    return Comparison(names, planes, a.header, a.unit, fwhm, pixel, figures, spectra, found, notes, centre, label)
+    if "chi2" in figures:
+        noisy = [plane for plane in (a, b) if plane.noise is not None]
+        figures["chi2 values"] = min(figures["chi2 pixels"], *(plane.independent(both) for plane in noisy))
+    noise = {name: plane for name, plane in (("snr", b), ("reference_snr", a)) if name in planes}
+    for name, plane in noise.items():
+        of = "the map" if name == "snr" else "the reference"
+        notes.append(f"noise of {of}: {plane.noise_in_words}")
+    header = a.header
+    if a.pixels is not None:
+        header, planes = on_a_plane(a.pixels, planes)
+        maps = {name: planes[name] for name in maps}
+    flat = image_grid(header, planes["map"].shape)
+    cell, known = cell_of(flat), np.isfinite(planes["map"])
+    spectra = radial_spectra(maps, tapered(known, cell), cell, ring_edges(known.shape, cell, settings.bins))
+    if (uneven := _unevenness(flat, known)) > UNEVEN:
+        notes.append(f"solid angles of the pixels differ by {100 * uneven:.2g} %: scales of the spectra are those of the middle")
+    return Comparison(
+        names, planes, header, a.unit, fwhm, pixel, figures, spectra, found, notes, centre, label,
+        {name: (plane.noise_in_words, plane.factor) for name, plane in noise.items()},
+    )  # fmt: skip
 
 
-def _cropped(a: Plane, b: Plane) -> tuple[Plane, Plane, tuple[int, int]]:
-    """The part of both in which both have values, and the pixel (x, y) at which it begins."""
+def _cropped(a: Plane, b: Plane) -> tuple[Plane, Plane]:
+    """The part of both in which both have values."""
     both = np.isfinite(a.values) & np.isfinite(b.values)
+    if a.pixels is not None:
+        pixels = replace(a.pixels, pixels=a.pixels.pixels[both])
+        first, second = (
+            replace(p, values=p.values[both], noise=None if p.noise is None else p.noise[both], pixels=pixels, alone=None)
+            for p in (a, b)
+        )
+        return first, second
     y, x = (np.flatnonzero(both.any(axis=axis)) for axis in (1, 0))
     window = slice(int(y[0]), int(y[-1]) + 1), slice(int(x[0]), int(x[-1]) + 1)
     header = {key: a.header[key] for key in a.header if key and isinstance(a.header[key], bool | int | float | str)}
     for key, cut in (("CRPIX1", window[1]), ("CRPIX2", window[0])):
         header[key] = float(header.get(key, 0.0)) - cut.start
     first, second = (
-        replace(p, values=p.values[window], noise=None if p.noise is None else p.noise[window], header=header) for p in (a, b)
+        replace(p, values=p.values[window], noise=None if p.noise is None else p.noise[window], header=header, alone=None)
+        for p in (a, b)
     )
-    return first, second, (window[1].start, window[0].start)
+    return first, second
 
 
-def rms(values: Floats) -> float:
+def _weights(grid: MapGrid, known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Solid angles of the pixels [sr], 0 for those that repeat another; and what pixels count: equal ones 1 each."""
+    areas = np.broadcast_to(np.nan_to_num(np.where(grid.once, grid.areas, 0.0)), known.shape)
+    used = areas[known & (areas > 0)]
+    if used.size and used.max() < (1 + EVEN) * used.min():
+        return areas, (areas > 0).astype(np.float64)
+    return areas, areas
+
+
+def _unevenness(grid: ImagePixels, known: NDArray[np.bool_]) -> float:
+    """Largest over smallest solid angle of the pixels ``known``, less one."""
+    areas = np.broadcast_to(grid.areas, grid.shape)[known]
+    areas = areas[np.isfinite(areas)]
+    return float(areas.max() / areas.min()) - 1 if areas.size else 0.0
+
+
+def _places(plane: Plane, centre: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Where pixels are, up and across: numbers of rows and columns; of HEALPix offsets in latitude and longitude."""
+    if plane.pixels is None:
+        row, column = np.indices(plane.values.shape, np.float64)
+        return np.asarray(row), np.asarray(column)
+    longitude, latitude = angles(plane.pixels.directions())
+    around = np.mod(longitude - centre[0] + np.pi, 2 * np.pi) - np.pi
+    return np.asarray(latitude - centre[1]), np.asarray(around)
+
+
+def rms(values: Floats, weights: Floats | None = None) -> float:
     """Root mean square of what is known; NaN where nothing is."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+    known = np.isfinite(values) if weights is None else np.isfinite(values) & (weights > 0)
+    if not known.any():
+        return math.nan
+    return float(np.sqrt(np.average(values[known] ** 2, weights=None if weights is None else weights[known])))
 
 
 def _median_fidelity(planes: Mapping[str, Floats]) -> float:
@@ -136,28 +202,50 @@ def _median_fidelity(planes: Mapping[str, Floats]) -> float:
 
 
 def _centre(plane: Plane) -> tuple[float, float]:
-    """The reference point of the projection where it is in the image, else the middle."""
-    ny, nx = plane.values.shape
+    """(longitude, latitude) [rad], in the frame of the grid, of the reference point of the projection where it is in the image,
+    else of its middle; of HEALPix of the mean of the pixels."""
+    grid = plane.grid
+    if not isinstance(grid, ImagePixels):
+        longitude, latitude = angles(grid.directions()[np.isfinite(plane.values)].mean(axis=0))
+        return float(longitude), float(latitude)
+    ny, nx = grid.shape
     x, y = (float(plane.header.get(key, 0.0)) - 1 for key in ("CRPIX1", "CRPIX2"))
-    zenithal = str(plane.header.get("CTYPE1", "")).endswith(("TAN", "SIN", "ARC", "STG", "ZEA", "ZPN", "NCP"))
-    return (x, y) if zenithal and 0 <= x < nx and 0 <= y < ny else ((nx - 1) / 2, (ny - 1) / 2)
+    if not (grid.kind in ZENITHAL and 0 <= x < nx and 0 <= y < ny):
+        x, y = (nx - 1) / 2, (ny - 1) / 2
+    middle = grid.at(x, y)
+    if not np.isfinite(middle).all():  # a corner of the projection that is not on the sky
+        middle = np.nanmean(grid.directions()[np.isfinite(plane.values)], axis=0)
+    longitude, latitude = angles(middle)
+    return float(longitude), float(latitude)
 
 
-def figures_of(a: Floats, b: Floats, noise: Sequence[Floats | None] = (None, None)) -> dict[str, float]:
-    """Figures of a map b against a reference a, both (ny, nx), NaN where either has no value.
+def figures_of(
+    a: Floats,
+    b: Floats,
+    noise: Sequence[Floats | None] = (None, None),
+    weights: Floats | None = None,
+    places: tuple[Floats, Floats] | None = None,
+) -> dict[str, float]:
+    """Figures of a map b against a reference a, both of one shape, NaN where either has no value.
 
     ``rms reference``, ``rms map``, ``rms difference`` and ``mean ...`` (about zero, over pixels with both); ``correlation``
     (Pearson); ``gain``, ``offset`` and their errors, equation (1); ``peak ratio``: b over a where \\|a\\| is largest; ``chi2``
     and its number of pixels, equation (3), where a noise is known.
+
+    ``weights``: of the pixels, 0 for those that repeat another; default 1. ``places``: where they are (row, column), for the
+    parts of the jackknife; default those of an image.
     """
-    both = np.isfinite(a) & np.isfinite(b)
-    x, y = a[both], b[both]
+    weight = np.ones(a.shape) if weights is None else weights
+    both = np.isfinite(a) & np.isfinite(b) & (weight > 0)
+    x, y, w = a[both], b[both], weight[both] / weight[both].sum()
     found: dict[str, float] = {}
     for name, values in (("reference", x), ("map", y), ("difference", y - x)):
-        found[f"mean {name}"], found[f"rms {name}"] = float(values.mean()), rms(values)
-    scatter = x.std() * y.std()
-    found["correlation"] = float(((x - x.mean()) * (y - y.mean())).mean() / scatter) if scatter > 0 else math.nan
-    fit, error = _line(a, b, both)
+        found[f"mean {name}"], found[f"rms {name}"] = float((w * values).sum()), rms(values, w)
+    u, v = x - found["mean reference"], y - found["mean map"]
+    scatter = rms(u, w) * rms(v, w)
+    found["correlation"] = float((w * u * v).sum() / scatter) if scatter > 0 else math.nan
+    where: Any = np.indices(a.shape, np.float64) if places is None else places
+    fit, error = _line(x, y, w, [place[both] for place in where])
     found["gain"], found["gain error"], found["offset"], found["offset error"] = fit[0], error[0], fit[1], error[1]
     peak = int(np.abs(x).argmax())
     found["peak reference"], found["peak ratio"] = float(x[peak]), float(y[peak] / x[peak]) if x[peak] else math.nan
@@ -169,13 +257,12 @@ def figures_of(a: Floats, b: Floats, noise: Sequence[Floats | None] = (None, Non
     return found
 
 
-def _line(a: Floats, b: Floats, both: NDArray[np.bool_]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """(gain, offset) and their standard errors."""
-    row, column = np.nonzero(both)
-    x, y = a[both], b[both]
-    x0 = float(x.mean())
-    part = (row - row.min()) * BLOCKS // (np.ptp(row) + 1) * BLOCKS + (column - column.min()) * BLOCKS // (np.ptp(column) + 1)
-    terms = (np.ones_like(x), x - x0, y, (x - x0) ** 2, (x - x0) * y)
+def _line(x: Floats, y: Floats, w: Floats, places: Sequence[Floats]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(gain, offset) and their standard errors, of values with weights at places (up, across)."""
+    x0 = float((w * x).sum() / w.sum())
+    up, across = (np.minimum((p - p.min()) / (np.ptp(p) * (1 + 1e-9) + 1e-300) * BLOCKS, BLOCKS - 1) for p in places)
+    part = up.astype(np.int64) * BLOCKS + across.astype(np.int64)
+    terms = (w, w * (x - x0), w * y, w * (x - x0) ** 2, w * (x - x0) * y)
     sums = np.array([np.bincount(part, t, BLOCKS**2) for t in terms])
     whole = sums.sum(axis=1)
     used = np.flatnonzero(sums[0])

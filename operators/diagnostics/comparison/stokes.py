@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.stokes import IQU
-from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
 
@@ -49,16 +49,18 @@ def on_meridians_of(other: Plane, planes: Mapping[str, Plane]) -> dict[str, Plan
     if "Q" not in planes:
         return dict(planes)
     q, u = planes["Q"], planes["U"]
-    pole = wcs_frame_rotation(q.wcs) @ wcs_frame_rotation(other.wcs)[2]
+    pole = q.grid.turn @ other.grid.turn[2]
     if 1 - float(pole @ NORTH) < SAME:
         return dict(planes)
-    y, x = np.indices(q.values.shape, np.float64)
-    lon, lat = np.radians(q.wcs.pixel_to_world_values(x, y))
-    directions = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
-    turn = between_meridians(directions, NORTH, pole)
-    values = turned_by(np.stack([q.values, u.values]), turn)
+    turn = between_meridians(q.grid.directions(), NORTH, pole)
+    values, alone = (_turned(turn, a, b) for a, b in ((q.values, u.values), (q.alone, u.alone)))
     noise: list[Floats | None] = [None, None]
     if q.noise is not None and u.noise is not None:
         noise = [np.hypot(turn.real * a, turn.imag * b) for a, b in ((q.noise, u.noise), (u.noise, q.noise))]
-    turned = {"Q": replace(q, values=values[0], noise=noise[0]), "U": replace(u, values=values[1], noise=noise[1])}
-    return {**planes, **turned}
+    q = replace(q, values=values[0], noise=noise[0], alone=alone[0])
+    u = replace(u, values=values[1], noise=noise[1], alone=alone[1])
+    return {**planes, "Q": q, "U": u}
+
+
+def _turned(turn: Any, q: Floats | None, u: Floats | None) -> Any:
+    return (None, None) if q is None or u is None else turned_by(np.stack([q, u]), turn)

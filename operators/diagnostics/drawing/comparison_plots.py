@@ -14,7 +14,7 @@ from zonda.core.types import Floats
 
 from .canvas import SEQUENCE, log_labels, new_figure, unit_of, write_title
 from .map_layout import map_axes
-from .map_plots import contour_text, plot_contours, plot_map, plot_plain
+from .map_plots import contour_text, noise_text, plot_contours, plot_map, plot_plain
 from .sky_axes import SkyAxes
 
 if TYPE_CHECKING:
@@ -69,11 +69,11 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
     if snr is not None:
         reached = [abs(level) for level in levels if (snr * np.sign(level) >= abs(level)).any()]
         top = float(math.ceil(max(float(np.nanpercentile(np.abs(snr), 99.9)), *reached, 1.0)))
-        plot_plain(
-            snr, where, (-top, top), "RdBu_r", "signal-to-noise ratio", ax=axes[1], title="Signal-to-noise ratio of the map"
-        )
+        words = noise_text(found.noise["snr"][0])
+        title = f"Signal-to-noise ratio of the map\nnoise: {words}"
+        plot_plain(snr, where, (-top, top), "RdBu_r", "signal-to-noise ratio", ax=axes[1], title=title)
         plot_contours(axes[1], snr, levels)
-        caption += f" Contours of the SNR: {contour_text(levels)} (negative ones dashed)."
+        caption += f" Contours of the SNR: {contour_text(levels)} (negative ones dashed). Its noise: {words}."
     return Sketch(f"{file}_quality", "Fidelity and SNR", caption, axes[0])
 
 

@@ -116,6 +116,11 @@ def contour_text(levels: Sequence[float]) -> str:
     return ", ".join(f"{level:g}".replace("-", "−") for level in sorted(levels)) + " σ"
 
 
+def noise_text(words: str) -> str:
+    """What the noise of an SNR is, as pictures write it: ``1.44 × white noise, as in ...``."""
+    return words.replace(" x ", " × ").replace(" - ", " − ")
+
+
 def plot_coverage(
     hits: NDArray[np.integer] | AnyFloats, wcs: Any, *, ax: Any = None, title: str = "", per_beam: AnyFloats | float | None = None
 ) -> Axes:

@@ -18,7 +18,17 @@ from ..series import Modes, Spectrum, TimeStream, unit_of_stream
 from .canvas import DPI, unit_of
 from .flat_map import FlatMap
 from .map_layout import map_axes
-from .map_plots import SHOWN, contour_text, plot_circle, plot_contours, plot_coverage, plot_crosslinking, plot_map, plot_plain
+from .map_plots import (
+    SHOWN,
+    contour_text,
+    noise_text,
+    plot_circle,
+    plot_contours,
+    plot_coverage,
+    plot_crosslinking,
+    plot_map,
+    plot_plain,
+)
 from .plot_modes import plot_modes
 from .plots import ScanTrack, plot_scan, plot_spectra, plot_tod, plot_transfer
 from .png import png_of
@@ -73,8 +83,10 @@ def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, A
     return [Sketch(file, what, "The input map, before beam, opacity and filters.", ax)]
 
 
-def draw_map(file: str, signal: str, key: str, product: FlatMap, style: Style, snr: AnyFloats | None = None) -> list[Sketch]:
-    """Plane ``signal`` of a map of a signal, called ``key``; ``snr`` (ny, nx): contours of it."""
+def draw_map(
+    file: str, signal: str, key: str, product: FlatMap, style: Style, snr: tuple[AnyFloats, str] | None = None
+) -> list[Sketch]:
+    """Plane ``signal`` of a map of a signal, called ``key``; ``snr``: (ny, nx), contours of it, and what its noise is."""
     window = product.window()
     shown, how = _shown(product.cropped(window), style)
     title = {"": "Map", "noiseless": "Noiseless map"}.get(signal, f"Map of signal {signal}")
@@ -84,11 +96,15 @@ def draw_map(file: str, signal: str, key: str, product: FlatMap, style: Style, s
         "noiseless": "The sky alone through the same pointing, filters and binning: what the processing leaves of it.",
     }.get(signal, "A part of the components, filtered and binned.")
     limit = shown.limit("signal", shown.hits, SHOWN if signal == "noiseless" else 99.7)
-    ax = _panels([(shown, _titled(title, shown))], style, limit)
+    head = _titled(title, shown)
+    if snr is not None:
+        head += f"\ncontours of S/N, noise: {noise_text(snr[1])}"
+    ax = _panels([(shown, head)], style, limit)
     text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
     if snr is not None:
-        plot_contours(ax, np.where(shown.covered(style.least_coverage), snr[window], np.nan), style.contours)
-        text += f" Contours: {contour_text(style.contours)} (negative ones dashed)."
+        plot_contours(ax, np.where(shown.covered(style.least_coverage), snr[0][window], np.nan), style.contours)
+        text += f" Contours of the signal-to-noise ratio: {contour_text(style.contours)} (negative ones dashed)."
+        text += f" Its noise: {noise_text(snr[1])}."
     return [Sketch(file, title, text, ax)]
 
 

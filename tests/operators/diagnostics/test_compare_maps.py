@@ -20,7 +20,6 @@ from zonda.core.numerics.angles import ARCSEC
 from zonda.core.run.first_look import first_look
 from zonda.operators.diagnostics.compare_maps import CompareMaps
 from zonda.operators.diagnostics.comparison.files import plane_of
-from zonda.operators.diagnostics.comparison.noise import with_noise
 from zonda.operators.diagnostics.comparison.radial import radial_spectra
 from zonda.operators.diagnostics.drawing.comparison_plots import plot_radial_spectra
 from zonda.operators.diagnostics.map_spectra import MapSpectrum
@@ -103,14 +102,14 @@ def test_the_input_with_the_beam_is_the_reference(tmp_path, products):
 
 def test_noise_of_the_half_difference(products):
     """Half-difference and noise of the same rms: a factor of 1 within its error; three times the noise: three."""
-    whole = products["map"]
-    plane = with_noise(plane_of(whole, "map"), whole, BEAM * ARCSEC)
+    whole, half = products["map"], (products["map"].half_difference, "half the difference")
+    plane = plane_of(whole, "map", half).measured()
     # 4096 pixels: the rms is known to 1 / sqrt(8192) = 1.1 %
     assert plane.noise[20, 20] == pytest.approx(1e-5, rel=0.05)
-    loud = product(whole.signal, 3 * whole.half_difference)
-    assert with_noise(plane, loud, BEAM * ARCSEC).noise[20, 20] == pytest.approx(3 * plane.noise[20, 20], rel=1e-9)
-    unknown = product(whole.signal, whole.half_difference, noise=np.nan)
-    assert with_noise(plane, unknown, BEAM * ARCSEC).noise[20, 20] == pytest.approx(plane.noise[20, 20], rel=1e-9)
+    loud = plane_of(whole, "map", (3 * half[0], "half the difference")).measured()
+    assert loud.noise[20, 20] == pytest.approx(3 * plane.noise[20, 20], rel=1e-9)
+    unknown = plane_of(product(whole.signal, noise=np.nan), "map", half).measured()
+    assert unknown.noise[20, 20] == pytest.approx(plane.noise[20, 20], rel=1e-9)
 
 
 def test_a_file_as_reference(tmp_path, products):

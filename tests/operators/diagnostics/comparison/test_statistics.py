@@ -127,7 +127,7 @@ def test_rings_cover_all_scales_and_have_modes():
 def test_profiles_are_means_in_rings():
     pixel = 2 * ARCSEC
     r = np.hypot(*(np.indices((41, 41)) - 20.0)) * pixel
-    found = profiles({"r": r}, (20.0, 20.0), pixel, 8 * ARCSEC, 0.0)
+    found = profiles({"r": r}, r, np.full(r.shape, pixel**2), 8 * ARCSEC, 0.0)
     inner = found.radius < 40 * ARCSEC
     assert np.abs(found.mean["r"] - found.radius)[inner].max() < 1.5 * ARCSEC  # the ring's mean radius is beyond its middle
     ring = (r >= 16 * ARCSEC) & (r < 24 * ARCSEC)

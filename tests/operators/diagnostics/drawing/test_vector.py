@@ -8,6 +8,7 @@ import numpy as np
 
 import zonda
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.noise_figures import noise_alone
 from zonda.core.numerics.angles import ARCSEC
 from zonda.operators.diagnostics.drawing.canvas import new_axes
 from zonda.operators.diagnostics.drawing.map_plots import plot_contours
@@ -62,7 +63,8 @@ def test_plots_in_all_formats(tmp_path):
     written = sorted(path.name for path in tmp_path.iterdir())
     assert written == [f"{name}.{kind}" for name in ("coverage", "map", "noise_map") for kind in ("pdf", "svg")]
     captions = {p.name: p.caption for p in run.products["pictures"]}
-    assert "Contours: −4, 4, 8 σ (negative ones dashed)." in captions["map"]
+    assert "Contours of the signal-to-noise ratio: −4, 4, 8 σ (negative ones dashed)." in captions["map"]
+    assert "× white noise, as in half the difference, even − odd scans." in captions["map"]
     assert all(p.png.startswith(b"\x89PNG") for p in run.products["pictures"])  # for the report
 
 
@@ -81,12 +83,14 @@ def test_contours_are_of_the_smoothed_map():
     """White noise smoothed with a beam of 4.5 pixels has an SNR of unit rms (some 80 independent patches: 8 %), the source about
     3 (4 pi sigma^2 / A)^(1/2) 20^2 / (20^2 + 9^2) = 17."""
     style = Plots(contours=[4.0]).style()
-    snr = _snr(product(), style)
+    found = product()
+    snr, words = _snr(found, style, noise_alone({"map": found}, "map"))
     edge = np.ones((48, 48), bool)
     edge[8:40, 8:40] = False
     assert 0.75 < snr[edge].std() < 1.3
     assert 12 < snr.max() < 22
-    assert _snr(product(), Plots().style()) is None
+    assert words.endswith("x white noise, as in half the difference, even - odd scans")
+    assert _snr(found, style, None)[1] == "white noise only"
 
 
 def test_no_contours_where_no_level_is_reached():
