@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +40,24 @@ FARTHEST = math.tan(0.5)
 """Largest distance of a detector from the boresight, tan(rad): half the largest field of view of an `Instrument`."""
 DEAD = {"true": 1, "yes": 1, "1": 1, "false": 0, "no": 0, "0": 0, "": 0}
 """What stands in the column `dead`."""
+ALIASES = {
+    **dict.fromkeys(("gamma", "pol_angle", "pol_ang", "polangle", "psi_pol", "polarization"), "polarization_angle"),
+    **dict.fromkeys(("pol_eff", "pol_efficiency", "poleff"), "polarization_efficiency"),
+    **dict.fromkeys(("psd_fknee", "fknee", "f_knee"), "knee"), **dict.fromkeys(("psd_alpha", "alpha"), "slope"),
+    **dict.fromkeys(("psd_fmin", "fmin", "f_min"), "pink_minimum_frequency"), "beam_fwhm": "fwhm",
+    **dict.fromkeys(("det", "detector", "det_id", "det_name", "detector_name"), "name"),
+}  # fmt: skip
+"""What sotodlib, so3g and TOAST call columns: their gamma runs from eta towards xi, as `Focalplane.polarization_angle` does."""
+LEAKAGE = "pol_leakage"
+"""TOAST's cross-polar leakage e, in place of the efficiency (1 - e) / (1 + e)."""
+NOT_READ = {
+    "psd_net": "write net: on the sky, after calibration, in K_RJ s(1/2) (TOAST's is of the CMB's temperature)",
+    "psi": "write polarization_angle, from eta towards xi", "theta": "write xi and eta", "phi": "write xi and eta",
+    "quat": "write xi, eta and polarization_angle", "pol": "write polarization_angle, from eta towards xi",
+    "pol_x": "write polarization_angle, from eta towards xi", "pol_y": "write polarization_angle, from eta towards xi",
+    "x": "write xi", "y": "write eta", "nep": "write net", "tau": "give TimeConstant a value",
+}  # fmt: skip
+"""Columns that say where detectors look, or how well, in ways that are not read, with the cure."""
 OF_INSTRUMENT = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope", "pink_minimum_frequency")
 """Columns of what an instrument or a band states for all of its detectors."""
 
@@ -58,6 +76,8 @@ class ArrayTable:
         By name, (n,) SI: `QUANTITIES`, and ``wafer`` and ``dead`` as whole numbers.
     lines
         Line of the file of each; of the heading last.
+    notes
+        Which columns were read under another name, and which are not used.
     """
 
     place: str
@@ -65,6 +85,7 @@ class ArrayTable:
     bands: list[str]
     columns: Mapping[str, NDArray[Any]]
     lines: Sequence[int]
+    notes: Sequence[str] = ()
 
     @property
     def reach(self) -> float:
@@ -133,6 +154,7 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
 
     table = read_table(path)
     mistakes = Mistakes(table.place)
+    table, notes = _by_known_names(table, mistakes)
     _check_columns(table, mistakes)
     names = table.texts("name") if "name" in table.columns else [""] * len(table)
     seen: dict[str, int] = {}
@@ -147,6 +169,10 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
             with mistakes.noted():
                 columns[key] = table.numbers(key, unit)
             _check_limits(table, key, mistakes)
+    if "polarization_angle" in columns:
+        _check_angles(table, mistakes)
+    if LEAKAGE in table.columns:
+        _add_efficiency(table, columns, mistakes)
     if {"xi", "eta"} <= columns.keys():
         _check_distances(table, names, np.hypot(columns["xi"], columns["eta"]), mistakes)
     if "polarization_angle" in columns:
@@ -157,12 +183,60 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
         columns["dead"] = _dead(table, mistakes)
     mistakes.tell()
     bands = table.texts("band") if "band" in table.columns else []
-    return ArrayTable(table.place, names, bands, columns, table.lines)
+    known = (*TEXTS, *QUANTITIES, LEAKAGE)
+    if unused := [name for name in table.columns if name not in known]:
+        notes.append(f"not used: {', '.join(unused)}")
+    return ArrayTable(table.place, names, bands, columns, table.lines, notes)
+
+
+def _by_known_names(table: Table, mistakes: Mistakes) -> tuple[Table, list[str]]:
+    """The table with our names for columns that others call otherwise (`ALIASES`), and notes of them."""
+    columns, notes = dict[str, tuple[list[str], str]](), list[str]()
+    for written, column in table.columns.items():
+        own = written if written in (*TEXTS, *QUANTITIES) else ALIASES.get(written.lower(), written)
+        if own != written and (own in table.columns or own in columns):
+            if own == "name":
+                own = written  # of several names, one is enough
+            else:
+                mistakes.add(table.lines[-1], f"has {written!r} beside {own!r}", "remove one of the two columns")
+                continue
+        if own != written:
+            notes.append(f"{written} is read as {own}")
+        if own.lower() in NOT_READ:
+            mistakes.add(table.lines[-1], f"has a column {written!r}, which is not read", NOT_READ[own.lower()])
+        columns[own] = column
+    return replace(table, columns=columns), notes
+
+
+def _check_angles(table: Table, mistakes: Mistakes) -> None:
+    """Angles of polarization that are in another unit than written: turns and turns of rad, or degrees that are parts of pi."""
+    values, unit = table.values("polarization_angle"), table.columns["polarization_angle"][1]
+    size = np.abs(values[np.isfinite(values) & (values != 0)])
+    cure = "see that the unit of the angles is right"
+    if unit in ("rad", "radian") and size.size and size.max() > 4 * np.pi:
+        mistakes.add(table.lines[-1], f"polarization_angle goes to {size.max():g} rad, more than two turns", cure)
+    parts = size / (np.pi / 24)
+    if unit in ("deg", "degree") and 0 < size.max(initial=0) < 6.3 and (np.abs(parts - np.round(parts)) < 0.02).all():
+        text = f"polarization_angle has {', '.join(f'{v:g}' for v in np.unique(size)[:3])} deg: parts of pi, as in rad"
+        mistakes.add(table.lines[-1], text, cure)
+
+
+def _add_efficiency(table: Table, columns: dict[str, NDArray[Any]], mistakes: Mistakes) -> None:
+    """The efficiency that follows from TOAST's leakage, for detectors with an angle."""
+    if "polarization_efficiency" in table.columns:
+        mistakes.add(table.lines[-1], f"has {LEAKAGE!r} beside 'polarization_efficiency'", "remove one of the two columns")
+        return
+    with mistakes.noted():
+        leakage = table.numbers(LEAKAGE)
+        for row in np.flatnonzero((leakage < 0) | (leakage > 1)).tolist():
+            mistakes.add(table.lines[row], f"{LEAKAGE} is {table.texts(LEAKAGE)[row]}", "give 0 to 1")
+        if "polarization_angle" in columns:
+            columns["polarization_efficiency"] = (1 - leakage) / (1 + leakage)
 
 
 def _check_columns(table: Table, mistakes: Mistakes) -> None:
     """Those that a table must have are there, and none is misspelt."""
-    known = (*TEXTS, *QUANTITIES)
+    known = (*TEXTS, *QUANTITIES, LEAKAGE)
     misspelt = {
         c: hint for c in table.columns if c not in known and (hint := nearest(c, [k for k in known if k not in table.columns]))
     }

@@ -344,6 +344,12 @@ class Instrument(Parameters):
             **{key: np.full(n, value) for key, value in stated.items()},
         )
 
+    @property
+    def notes(self) -> dict[str, str]:
+        """What was chosen in reading the files that describe it, for the log and `zonda check`."""
+        told = read_array(self.focalplane_table).notes if self.focalplane_table is not None else ()
+        return {"focal plane": "; ".join(told)} if told else {}
+
     def _pixels(self, number: int) -> Layout:
         """Places and wafers of pixels."""
         if self.layout == "wafers":

@@ -275,6 +275,8 @@ class Pipeline:
         threads, memory, ceiling = arguments.check_run(scene, output, numbers, keep, self.name)
         data = Data(scene=scene, output=None if output is None else Path(output))
         data.provenance = {**self.provenance(scene), **(provenance or {})}
+        for what, text in scene.instrument.notes.items():
+            data.tally.state(scene.instrument.name, what, text)
         hooks = manager().hook
         settings = Settings(
             threads=threads or available_threads(),

@@ -25,6 +25,8 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
         click.echo(f"warning: {note}", err=True)
     found = file.look()
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
+    for what, text in file.scene().instrument.notes.items():
+        click.echo(f"  {what}: {text}")
     for step, lines in zip(file.steps, found, strict=True):
         click.echo(f"  {step.key}")
         for line in lines:

@@ -16,19 +16,14 @@ from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.files import InputPath
 from zonda.core.data import Data
-from zonda.core.errors import InputError
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.observation import Observation
-from zonda.core.storage.files import reading
 from zonda.core.types import Floats
 
 from .full_sky import FullSky, Nside
 from .skymap import SkyMap
+from .spectrum_file import Scaling, Spectrum, Unit, read
 from .state import SkyState
-
-HIGHEST = 30_000
-"""Multipole above which a spectrum is not read."""
-CURE = "give columns of text: ell, TT or ell, TT, EE, BB, TE, as ell (ell + 1) C_l / (2 pi) in uK^2 (what CAMB and CLASS write)"
 
 
 class CMBSky(FullSky):
@@ -38,7 +33,15 @@ class CMBSky(FullSky):
     """
 
     spectrum: InputPath
-    """Text: columns l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2; # begins a remark."""
+    """Text: columns l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2; # begins a remark. A remark that names
+    columns (CAMB's, CLASS's, Planck's) or their unit is heeded."""
+    columns: str | None = None
+    """Columns behind l, e.g. `TT, EE, TE, BB`. Default: those of the file's heading, else by their number."""
+    unit: Unit | None = None
+    """Unit of the columns: `uK^2`, `K^2` or `dimensionless` (CLASS's default). Default: the file's, else uK^2; refused where the
+    sky is then no CMB."""
+    scaling: Scaling | None = None
+    """Factor on C_l in the columns, or `none`. Default: l (l + 1) / (2 pi), and refused where the shape is that of C_l."""
     nside: Nside = 2048
     """Of the HEALPix map that is drawn; a pixel should be smaller than half of the beam."""
     realization: int | None = Field(None, ge=0)
@@ -48,11 +51,21 @@ class CMBSky(FullSky):
 
     def check(self, data: Data) -> list[str]:
         """Up to which multipole the spectrum reaches; raises InputError where it is wrong."""
-        return [f"{self.spectrum} reaches multipole {read_spectrum(str(self.spectrum)).shape[1] - 1}"]
+        found = self.read()
+        return [
+            f"{self.spectrum} reaches multipole {found.values.shape[1] - 1}, rms {1e6 * found.rms:.4g} uK_CMB before the beam",
+            f"its columns: {found.text}",
+        ]
+
+    def read(self) -> Spectrum:
+        """The spectra of the file. Raises InputError as `spectrum_file.read`."""
+        columns = [name for name in (self.columns or "").replace(",", " ").split() if name]
+        return read(str(self.spectrum), self.unit, self.scaling, columns)
 
     def prepare(self, observation: Observation) -> tuple[SkyMap, SkyState]:
         """The step that samples the map, and what that one knows of the scan."""
         sky, rms = self.sky(observation.seed, observation.focalplane.polarized)
+        observation.tally.state(self.label, "spectrum", self.read().text)
         observation.tally.state(self.label, "rms of the sky before the beam", f"{1e6 * rms:.4g} uK_CMB, nside {self.nside}")
         return sky, sky.prepare(observation)
 
@@ -60,41 +73,11 @@ class CMBSky(FullSky):
         """The step that samples the map of a seed, and the map's rms, K_CMB; I alone where detectors are not ``polarized``."""
         number = seed if self.realization is None else self.realization
         if (number, polarized) not in self._skies:
-            spectra = read_spectrum(str(self.spectrum))
+            spectra = self.read().values
             maps = draw(spectra if polarized else spectra[:1], self.nside, stream_key(number, "CMBSky", self.label))
             self._skies.clear()
             self._skies[number, polarized] = self.sampler(maps, "K_CMB", "C"), float(np.std(maps[0]))
         return self._skies[number, polarized]
-
-
-def read_spectrum(place: str) -> Floats:
-    """C_l [K^2], (4, lmax + 1): TT, EE, BB, TE from l = 0; zero where the file has none. Raises InputError."""
-    with reading(place, "a power spectrum", CURE):
-        try:
-            table = np.loadtxt(place, ndmin=2)
-        except ValueError as error:  # numpy's own cures are for those who call it
-            raise ValueError(str(error).partition("; use `")[0]) from None
-    if table.shape[1] not in (2, 5):
-        raise InputError(f"has {table.shape[1]} columns, not 2 or 5", place=place, cure=CURE)
-    ell = table[:, 0]
-    if (
-        not np.isfinite(table).all()
-        or (ell != np.round(ell)).any()
-        or (np.diff(ell) <= 0).any()
-        or ell[0] < 0
-        or ell[-1] > HIGHEST
-    ):
-        raise InputError(f"the first column is no rising series of multipoles up to {HIGHEST}", place=place, cure=CURE)
-    if (ell[-1] - max(ell[0], 2)) + 1 != np.count_nonzero(ell >= 2):
-        raise InputError("multipoles are missing between the first and the last", place=place, cure="give every l")
-    spectra, at = np.zeros((4, int(ell[-1]) + 1)), ell.astype(int)
-    flat = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0.0) * 1e-12
-    for k, column in enumerate(table.T[1:]):
-        spectra[k, at] = column * flat
-    tt, ee, bb, te = spectra
-    if min(tt.min(), ee.min(), bb.min()) < 0 or (te**2 > tt * ee * (1 + 1e-6)).any():
-        raise InputError("no sky has this spectrum: TT, EE or BB is negative, or TE^2 exceeds TT EE", place=place, cure=CURE)
-    return spectra
 
 
 def draw(spectra: Floats, nside: int, key: Any) -> Floats:

@@ -193,9 +193,7 @@ class CMBPlanning(Planning[Any]):
 
     def traits(self, observation: Observation) -> Traits:
         """Four and a half standard deviations of the sky, which is larger than 1 K_RJ per K_CMB nowhere."""
-        from .cmb import read_spectrum
-
-        spectra = read_spectrum(str(self.operator.spectrum))
+        spectra = self.operator.read().values
         ell = np.arange(spectra.shape[1])
         return Traits(peak=4.5 * math.sqrt(float(((2 * ell + 1) * spectra[0]).sum()) / (4 * math.pi)))
 
@@ -205,10 +203,8 @@ class CMBPlanning(Planning[Any]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost: maps from multipoles, of each ring and each pair (l, m); and what `SkyMap` does with them."""
-        from .cmb import read_spectrum
-
         nside, polarized = self.operator.nside, self._polarized(context.first)
-        highest = min(read_spectrum(str(self.operator.spectrum)).shape[1] - 1, 3 * nside - 1)
+        highest = min(self.operator.read().values.shape[1] - 1, 3 * nside - 1)
         drawn = (POLARIZED if polarized else INTENSITY) * highest**2 * nside
         once = drawn + (4.5e-7 if polarized else 3e-7) * 12 * nside**2 + 2.0
         peak = self.traits(context.first).peak or 0.0
@@ -220,9 +216,7 @@ class CMBPlanning(Planning[Any]):
 
     def _polarized(self, observation: Observation) -> bool:
         """Whether I, Q and U are drawn."""
-        from .cmb import read_spectrum
-
-        return observation.focalplane.polarized and bool(read_spectrum(str(self.operator.spectrum))[1:].any())
+        return observation.focalplane.polarized and bool(self.operator.read().values[1:].any())
 
 
 class PySMPlanning(Planning[Any]):

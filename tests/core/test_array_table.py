@@ -164,7 +164,39 @@ def test_a_variant_with_a_table(tmp_path: Path) -> None:
     assert str(tmp_path) not in made.name + made.description
 
 
+def test_the_names_of_sotodlib_and_toast(tmp_path: Path) -> None:
+    """gamma runs from eta towards xi, as `polarization_angle`; TOAST's leakage e is an efficiency of (1 - e) / (1 + e)."""
+    own = of(tmp_path, f"{HEAD}, polarization_angle [deg], polarization_efficiency", "a, 0, 0, 30, 0.8", "b, 0, 0, 120, 1")
+    for head, rows in (
+        ("det_id, xi [deg], eta [deg], gamma [deg], pol_eff", ["a, 0, 0, 30, 0.8", "b, 0, 0, 120, 1"]),
+        (f"{HEAD}, pol_angle [deg], pol_leakage", [f"a, 0, 0, 30, {1 / 9}", "b, 0, 0, 120, 0"]),
+        (f"{HEAD}, psi_pol [deg], pol_efficiency", ["a, 0, 0, 30, 0.8", "b, 0, 0, 120, 1"]),
+    ):
+        plane = of(tmp_path, head, *rows)
+        np.testing.assert_allclose(plane.polarization_angle, own.polarization_angle, rtol=1e-15)
+        np.testing.assert_allclose(plane.polarization_efficiency, own.polarization_efficiency, rtol=1e-12)
+        assert plane.names == ["a", "b"]
+    assert of(tmp_path, f"{HEAD}, gamma [deg]", "a, 0, 0, 0").polarized
+    noisy = of(tmp_path, f"{HEAD}, psd_fknee [Hz], psd_alpha, psd_fmin [Hz]", "a, 0, 0, 0.3, 1.5, 0.001")
+    assert (noisy.knee[0], noisy.slope[0], noisy.minimum_frequency[0]) == (0.3, 1.5, 0.001)
+
+
+def test_what_was_read_under_another_name_and_what_was_not_is_told(tmp_path: Path) -> None:
+    table = written(tmp_path / "a.csv", f"{HEAD}, gamma [deg], pixel, ufm", ["a, 0, 0, 10, 1, Mv6"])
+    camera = zonda.Instrument(**CAMERA, focalplane=str(table))
+    told = "gamma is read as polarization_angle; not used: pixel, ufm"
+    assert camera.notes == {"focal plane": told}
+    assert ("camera", "focal plane", told) in list(mapped(CAMERA | {"focalplane": str(table)}).tally)
+
+
 FAULTS = [
+    (f"{HEAD}, gamma", ["a, 0, 0, 0"], "polarization_angle has no unit", "deg"),
+    (f"{HEAD}, gamma [deg], polarization_angle [deg]", ["a, 0, 0, 0, 0"], "has 'gamma' beside", "remove one"),
+    (f"{HEAD}, gamma [rad]", ["a, 0, 0, 0", "b, 0, 0, 90"], "goes to 90 rad", "unit of the angles"),
+    (f"{HEAD}, gamma [deg]", ["a, 0, 0, 0", "b, 0, 0, 1.5708", "c, 0, 0, 0.7854"], "0.7854, 1.5708 deg: parts of pi", "unit"),
+    (f"{HEAD}, psd_net [K s(1/2)]", ["a, 0, 0, 1"], "has a column 'psd_net', which is not read", "write net"),
+    ("name, xi [deg], eta [deg], psi [deg]", ["a, 0, 0, 1"], "has a column 'psi', which is not read", "polarization_angle"),
+    (f"{HEAD}, gamma [deg], pol_leakage", ["a, 0, 0, 1, -0.1"], "pol_leakage is -0.1", "give 0 to 1"),
     ("name, xi [deg]", ["a, 0"], "has no column 'eta'", "a table of detectors has name, xi and eta"),
     (HEAD, ["a, 0, 0", "a, 1, 0"], "line 3: name 'a' is that of line 2 too", "name of its own"),
     (HEAD, ["a, 0, 0", ", 1, 0"], "line 3: has no name", "name of its own"),

@@ -9,14 +9,15 @@ import pytest
 import zonda
 from zonda.core.block import Block
 from zonda.core.errors import InputError, ZondaError
-from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.numerics.radiation import T_CMB, to_kelvin_rj
 from zonda.core.numerics.random import stream_key
 from zonda.core.plan.look import look
 from zonda.core.plan.planning import planning_of
 from zonda.core.plan.structure import Structure
 from zonda.core.registry import instruments
 from zonda.operators.sky import cmb
-from zonda.operators.sky.cmb import CMBSky, draw, read_spectrum
+from zonda.operators.sky.cmb import CMBSky, draw
+from zonda.operators.sky.spectrum_file import read
 from zonda.plugins.checks import scenes
 
 LMAX, NSIDE = 95, 64
@@ -32,7 +33,7 @@ def theory(path, polarized=True):
 
 def test_the_spectra_within_cosmic_variance(tmp_path):
     """Over l and skies: sum (2 l + 1) C^ / C is chi^2 with sum (2 l + 1) degrees. anafast of a band-limited map errs by 1e-3."""
-    spectra = read_spectrum(str(theory(tmp_path / "t.txt")))
+    spectra = read(str(theory(tmp_path / "t.txt"))).values
     number, found = 12, np.zeros((4, LMAX + 1))
     for k in range(number):
         maps = draw(spectra, NSIDE, stream_key(k, "test"))
@@ -48,7 +49,7 @@ def test_the_spectra_within_cosmic_variance(tmp_path):
 
 
 def test_another_nside_is_the_same_sky(tmp_path):
-    spectra = read_spectrum(str(theory(tmp_path / "t.txt", polarized=False)))
+    spectra = read(str(theory(tmp_path / "t.txt", polarized=False))).values
     fine, coarse = (healpy.map2alm(draw(spectra[:, :60], n, stream_key(1, "test"))[0], lmax=40, iter=5) for n in (64, 32))
     assert np.abs(fine - coarse).max() < 1e-3 * np.abs(fine).max()
 
@@ -142,7 +143,12 @@ def test_without_a_spectrum_it_is_refused():
     [
         ("2 1000\n3 x\n", "cannot be read as a power spectrum"),
         ("2 1000 5\n3 1000\n", "the number of columns changed"),
-        ("2 1000 1\n3 1000 1\n", "has 3 columns, not 2 or 5"),
+        ("2 1000 1\n3 1000 1\n", "has 3 columns, and no heading names them"),
+        ("2 1e-10\n3 1e-10\n", r"dimensionless \(rms 22.9 uK\)"),
+        ("2 1e-9\n3 1e-9\n", "unit: K\\^2"),
+        ("2 1e9\n3 1e9\n", "rms of 2.*e\\+04 uK"),
+        ("# dimensionless\n2 1000\n3 1000\n", "unit: uK\\^2"),
+        ("# L EE BB\n2 30 1\n3 30 1\n", "no heading names them"),
         ("2 1000\n4 1000\n", "multipoles are missing"),
         ("3 1000\n2 1000\n", "no rising series"),
         ("2 -5\n3 1000\n", "no sky has this spectrum"),
@@ -153,8 +159,67 @@ def test_files_that_are_no_spectrum(tmp_path, text, match):
     path = tmp_path / "bad.txt"
     path.write_text(text)
     with pytest.raises(InputError, match=match) as caught:
-        read_spectrum(str(path))
+        read(str(path))
     assert "bad.txt" in str(caught.value)
     assert "usecols" not in str(caught.value)
     with pytest.raises(InputError, match=match):  # before a run
         zonda.CMBSky(spectrum=path).check(None)
+
+
+def spectra():
+    """l, and l (l + 1) C_l / (2 pi) in uK^2 by name: with a peak at l = 220, as the CMB's."""
+    ell = np.arange(2, 901.0)
+    tt = 1000 + 4500 * np.exp(-(((ell - 220) / 120) ** 2))
+    return ell, {"TT": tt, "EE": 0.01 * tt, "BB": 1e-4 * tt, "TE": 0.05 * tt, "PP": 1e-7 / ell}
+
+
+@pytest.mark.parametrize(
+    ("heading", "order", "unit"),
+    [
+        ("L TT EE BB TE", ["TT", "EE", "BB", "TE"], "uK^2"),  # CAMB
+        ("", ["TT", "EE", "BB", "TE"], "uK^2"),
+        ("L    TT     TE     EE     BB     PP", ["TT", "TE", "EE", "BB", "PP"], "uK^2"),  # Planck
+        (
+            "dimensionless total lensed [l(l+1)/2pi] C_l's\n1:l 2:TT 3:EE 4:TE 5:BB 6:phiphi",
+            ["TT", "EE", "TE", "BB", "PP"],
+            "dimensionless",
+        ),  # CLASS
+        ("ell dl_tt dl_ee dl_te", ["TT", "EE", "TE"], "uK^2"),
+    ],
+)
+def test_files_of_several_codes_are_one_spectrum(tmp_path, heading, order, unit):
+    """Their units, orders and factors differ, not what is read: to rounding, 1e-12."""
+    ell, powers = spectra()
+    size = 1.0 if unit == "uK^2" else 1e-12 / T_CMB**2
+    path = tmp_path / "cl.txt"
+    np.savetxt(path, np.stack([ell, *(powers[name] * size for name in order)], axis=1), header=heading)
+    found = read(str(path))
+    for k, name in enumerate(("TT", "EE", "BB", "TE")):
+        expected = powers[name] * 2 * np.pi / (ell * (ell + 1)) * 1e-12 if name in order else 0 * ell
+        np.testing.assert_allclose(found.values[k, 2:], expected, rtol=1e-12)
+    assert unit in found.text
+
+
+def test_what_is_stated_stands_above_the_file(tmp_path):
+    ell, powers = spectra()
+    path = tmp_path / "cl.txt"
+    np.savetxt(path, np.stack([ell, powers["TT"], powers["EE"], powers["TE"], powers["BB"]], axis=1))  # CLASS's order, no heading
+    stated = CMBSky(spectrum=path, columns="TT, EE, TE, BB").read().values
+    np.testing.assert_allclose(stated[3, 2:], powers["TE"] * 2 * np.pi / (ell * (ell + 1)) * 1e-12, rtol=1e-12)
+    c_l = powers["TT"] * 2 * np.pi / (ell * (ell + 1))
+    np.savetxt(path, np.stack([ell, c_l], axis=1))
+    with pytest.raises(InputError, match="scaling: none"):
+        read(str(path))
+    np.testing.assert_allclose(CMBSky(spectrum=path, scaling="none").read().values[0, 2:], c_l * 1e-12, rtol=1e-12)
+    np.savetxt(path, np.stack([ell, powers["TT"] * 1e-12], axis=1))
+    np.testing.assert_allclose(CMBSky(spectrum=path, unit="K^2").read().values[0, 2:], c_l * 1e-12, rtol=1e-12)
+
+
+def test_the_rms_of_the_sky_is_told(tmp_path):
+    """sum (2 l + 1) C_l / (4 pi), as the map drawn has it: its own multipoles' scatter, 0.5 % for l up to 900."""
+    path = tmp_path / "cl.txt"
+    ell, powers = spectra()
+    np.savetxt(path, np.stack([ell, powers["TT"]], axis=1))
+    step = CMBSky(spectrum=path, nside=512)
+    assert step.sky(1, False)[1] == pytest.approx(step.read().rms, rel=0.05)
+    assert f"rms {1e6 * step.read().rms:.4g} uK_CMB" in step.check(None)[0]
