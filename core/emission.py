@@ -1,14 +1,43 @@
-"""Mean emission of the atmosphere in a scan, from the levels that its steps resolved."""
+"""Emission of the atmosphere in a scan: its mean, from the levels that steps resolved, and its spectrum over the passband."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .focalplane import Focalplane
 from .numerics.smooth import SmoothField
+from .types import Floats
+
+
+@dataclass(frozen=True)
+class LoadSpectra:
+    """The atmosphere over a passband, in cells of frequency, at elevations that the scan sees.
+
+    Attributes
+    ----------
+    frequency
+        (n,) Hz, of the cells, those at the passband's edges in part; each the mean of what the passband lets through of it.
+    width, square
+        (n,) Hz, integrals of the transmission t and of its square over each cell.
+    brightness, transmission
+        (k, n) Rayleigh-Jeans brightness [K] and e^-tau at k elevations.
+    """
+
+    frequency: Floats
+    width: Floats
+    square: Floats
+    brightness: Floats
+    transmission: Floats
+
+    @property
+    def emission(self) -> Floats:
+        """(k,) mean brightness over the passband, K_RJ."""
+        return np.asarray(self.brightness @ self.width / self.width.sum())
+
 
 INSTANTS = 64
 """Instants, evenly over a scan, that the mean is taken of: the emission follows the elevation."""

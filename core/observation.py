@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .emission import mean_emission
+from .emission import LoadSpectra, mean_emission
 from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
 from .intervals import Intervals, runs
@@ -81,6 +81,8 @@ class Observation:
     expected_load
         Tells the atmosphere's mean emission [K_RJ] and transmission in the middle of the scan, before ``smooth`` is known; None:
         there is no atmosphere.
+    load_spectra
+        Tells the atmosphere over the passband; None: it is not known, and taken to be flat.
     noise_levels
         Levels of the white noise by step, in their order. Pink noise refers to the last.
     closed_forms
@@ -132,6 +134,7 @@ class Observation:
     tally: Tally = field(default_factory=Tally)
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None
+    load_spectra: Callable[[], LoadSpectra] | None = None
     components: frozenset[str] = frozenset()
     signals: tuple[str, ...] = ("signal",)
     unfiltered: frozenset[str] = frozenset()

@@ -140,5 +140,6 @@ def _of_band(scan: Observation, number: int, own: Data, shared: SharedScan) -> O
     return replace(
         scan, name=f"{scan.name}-{band}", instrument=own.scene.instrument, focalplane=plane, flags=scan.flags.copy(),
         detector_flags=scan.detector_flags[scan.focalplane.band == number], intervals=dict(scan.intervals), smooth={}, detdata={},
-        noise_levels={}, closed_forms={}, windows={}, quoted_net=None, expected_load=None, tally=Tally(), shared=shared,
+        noise_levels={}, closed_forms={}, windows={}, quoted_net=None, expected_load=None, load_spectra=None, tally=Tally(),
+        shared=shared,
     )  # fmt: skip

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.data import Data
+from zonda.core.emission import LoadSpectra
 from zonda.core.errors import InputError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
 
 EDGE_TAPER = 10.0
 """dB: power at the rim of a tapered aperture below that at its centre, where none is given."""
+
+AIRMASS_STEP = 0.05
+"""Of ln(airmass), between which the load's integrals over the passband are interpolated."""
 
 MODELS_KEPT = 2
 """Observations whose models are kept: one is prepared while the one before is worked on."""
@@ -195,9 +199,19 @@ class ExpectedLoad:
 
     def announce(self) -> None:
         """Let other steps know, and the other bands of the camera (`core.shared`)."""
-        self.observation.expected_load = self
+        self.observation.expected_load, self.observation.load_spectra = self, self.spectra
         if self.observation.shared is not None:
             self.observation.shared.announce(self.parameters.label, self.observation.name, self)
+
+    def spectra(self) -> LoadSpectra:
+        """The atmosphere over the passband at elevations that the scan sees, before its model is built."""
+        profile, band = self.models.weather(self.parameters, self.observation)
+        elevation, reach = self.observation.elevation, math.atan(self.observation.focalplane.radius)
+        ends = np.clip([float(elevation.min()) - reach, float(elevation.max()) + reach], ELEVATION_MIN, ELEVATION_MAX)
+        low, high = np.log(np.sin(ends))
+        number = 2 + math.ceil((high - low) / AIRMASS_STEP)
+        elevations = np.arcsin(np.minimum(np.exp(np.linspace(low, high, number)), 1.0))
+        return band.spectra(self.parameters.pwv or profile.pwv, elevations.tolist())
 
     def model(self) -> AtmosphereModel:
         """The model that the observation was, or will be, drawn from."""

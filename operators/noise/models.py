@@ -15,6 +15,7 @@ from zonda.core.registry import noise_models
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
+    from zonda.core.focalplane import Focalplane
     from zonda.core.observation import Observation
 
 
@@ -25,6 +26,9 @@ class NoiseModel(Parameters):
     """Name under which the model is registered (filled in by the pipeline)."""
     reference: Literal["sky", "detector"] = "sky"
     """Where the temperature applies: on the sky, after division by zeta e^-tau, or at the detector."""
+
+    def check(self, focalplane: Focalplane) -> None:
+        """Refuse parameters that contradict the detectors (`InputError`)."""
 
     def net(self, observation: Observation) -> Floats:
         """Noise-equivalent temperature (n_det,) K_RJ sqrt(s), referred to `reference`.

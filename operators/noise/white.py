@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, mod
 
 from zonda.core.compilation.jit import nb
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
+from zonda.core.errors import placed
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
     from zonda.core.block import Block
     from zonda.core.data import Data
+    from zonda.core.focalplane import Focalplane
     from zonda.core.observation import Observation
 
 _SCHEMA = {
@@ -61,8 +63,20 @@ class WhiteNoise(Operator):
     def observe(self, data: Data) -> None:
         """Announce the level to `PinkNoise`, and to map makers, which lay out their sums for it."""
         for observation in data.observations:
+            self._check(observation.focalplane)
             model = self.model or FixedNet.of(self.net, self.reference)
             observation.noise_levels[self.label] = NoiseLevel(model, self.scatter, self.label)
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse a noise model that contradicts the detectors."""
+        for observation in data.observations:
+            self._check(observation.focalplane)
+        return []
+
+    def _check(self, focalplane: Focalplane) -> None:
+        if self.model is not None:
+            with placed(self.label):
+                self.model.check(focalplane)
 
     def prepare(self, observation: Observation) -> _State:
         """Resolve the level."""

@@ -12,12 +12,14 @@ are then polynomials in u and v. The transmission is averaged over the band, nev
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from zonda.core.emission import LoadSpectra
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import T_CMB, rayleigh_jeans
@@ -92,6 +94,10 @@ class BandAtmosphere:
     def direct(self, pwv: float, elevation: float) -> tuple[float, float, float]:
         """Equations (1) to (3) by radiative transfer, without interpolation: K_RJ, neper, ln K_RJ."""
         return self._transfer(pwv, [elevation])[0]
+
+    def spectra(self, pwv: float, elevations: Sequence[float]) -> LoadSpectra:
+        """Brightness and transmission over the passband by radiative transfer. PWV in m, elevations in rad."""
+        return self._transfer.spectra(pwv, elevations)
 
     def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """Equation (1): the atmosphere alone, background 0 K. PWV in m, elevation in rad -> K_RJ."""
@@ -200,6 +206,11 @@ class BandTransfer:
         self._cross_sections, cell, share = layers.in_parts(_at_frequencies(layers, frequency, cells))
         frequency = frequency[cell]
         self._weight = weight[cell] * share / weight.sum()
+        self._frequency, self._width, self._square = (
+            frequency,
+            weight[cell] * share,
+            _cell_squares(band, layers.table)[cell] * share,
+        )
         self._source = rayleigh_jeans(frequency, layers.temperature[:, None])
         self._cmb = rayleigh_jeans(frequency, T_CMB)
 
@@ -207,6 +218,15 @@ class BandTransfer:
         layers = self._layers.scaled(pwv)
         vertical = layers.opacity(self._cross_sections)
         return [self._at(vertical * layers.airmass(elevation)[:, None]) for elevation in elevations]
+
+    def spectra(self, pwv: float, elevations: Sequence[float]) -> LoadSpectra:
+        """Brightness and transmission in each of the cells."""
+        layers = self._layers.scaled(pwv)
+        vertical = layers.opacity(self._cross_sections)
+        slant = [vertical * layers.airmass(elevation)[:, None] for elevation in elevations]
+        brightness = np.array([emission(one, self._source) for one in slant])
+        transmission = np.exp(-np.array([one.sum(axis=0) for one in slant]))
+        return LoadSpectra(self._frequency, self._width, self._square, brightness, transmission)
 
     def _at(self, slant: Floats) -> tuple[float, float, float]:
         emitted = float(np.sum(self._weight * emission(slant, self._source)))
@@ -220,14 +240,8 @@ def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, s
     """Integral of the (piecewise linear) transmission over each cell of the absorption table that it touches, and the mean
     frequency of that integral: not the cell's centre where the band ends inside the cell.
     """
-    open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
-    support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
-    nu, transmission = band.frequency[support], band.transmission[support]
-    cells = table.cells(float(nu[0]), float(nu[-1]), place=f"band '{band.name}'")
-    edges = table.edges[cells.start : cells.stop + 1]
-    points = np.union1d(np.clip(edges, nu[0], nu[-1]), nu)
-    values, step = np.interp(points, nu, transmission), np.diff(points)
-    cell = np.clip(np.searchsorted(edges, (points[1:] + points[:-1]) / 2) - 1, 0, len(edges) - 2)
+    points, values, cell, cells = _divided(band, table)
+    edges, step = table.edges[cells.start : cells.stop + 1], np.diff(points)
     offset = points - table.frequency[cells][np.append(cell, cell[-1])]  # from the centre of the cell that begins there
     end = offset[:-1] + step
     integral = np.bincount(cell, step * (values[1:] + values[:-1]) / 2, len(edges) - 1).astype(np.float64)
@@ -235,6 +249,26 @@ def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, s
     moment = np.bincount(cell, first, len(edges) - 1)
     shift = np.divide(moment, integral, out=np.zeros_like(moment), where=integral > 0)
     return integral, table.frequency[cells] + shift, cells
+
+
+def _cell_squares(band: Band, table: AbsorptionTable) -> Floats:
+    """Integral of the square of the transmission over each of the cells of `_cell_weights`."""
+    points, values, cell, cells = _divided(band, table)
+    square = values[:-1] ** 2 + values[:-1] * values[1:] + values[1:] ** 2
+    return np.bincount(cell, np.diff(points) * square / 3, cells.stop - cells.start).astype(np.float64)
+
+
+def _divided(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, NDArray[np.intp], slice]:
+    """Frequencies at which the passband bends or a cell of the table begins, its transmission there, and between each and the
+    next the cell, of a slice of them."""
+    open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
+    support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
+    nu, transmission = band.frequency[support], band.transmission[support]
+    cells = table.cells(float(nu[0]), float(nu[-1]), place=f"band '{band.name}'")
+    edges = table.edges[cells.start : cells.stop + 1]
+    points = np.union1d(np.clip(edges, nu[0], nu[-1]), nu)
+    cell = np.clip(np.searchsorted(edges, (points[1:] + points[:-1]) / 2) - 1, 0, len(edges) - 2)
+    return points, np.interp(points, nu, transmission), cell, cells
 
 
 def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSections:
