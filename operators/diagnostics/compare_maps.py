@@ -20,7 +20,7 @@ from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
 
-from .comparison.files import plane_of, read_planes, write_comparison
+from .comparison.files import Wanted, plane_of, read_planes, write_comparison
 from .comparison.planes import Plane
 from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
 from .comparison.stokes import on_meridians_of, planes_of, products_of
@@ -52,6 +52,12 @@ class CompareMaps(Output):
     """What it is compared with, by its name among the products: the input of `SkyMap`, or another map."""
     file: InputPath | None = None
     """FITS image or HEALPix map to compare with, instead of a product. A relative path starts at the pipeline file's folder."""
+    hdu: int | str | None = None
+    """Which extension of the `file`, by name or number. Default: its first image or HEALPix table."""
+    plane: int | list[int] | None = None
+    """Plane of a cube in the `file`, counted from 1; of one with several axes of planes a list, in FITS's order."""
+    coordsys: str | None = None
+    """Coordinate system of a HEALPix `file` whose header has no COORDSYS: C (ICRS), G (galactic) or E (ecliptic)."""
     beam: Angle | None = Field(None, gt=0)
     """Common resolution (FWHM). Default: that of the map with the wider beam, once more smoothed with it if it was not yet."""
     least_coverage: float = Field(0.1, ge=0, lt=1)
@@ -112,9 +118,10 @@ def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
     """The planes of the reference, K_RJ."""
     if step.file is None:
         return planes_of(_product(data, step.reference, step.label), step.reference)
-    read = read_planes(step.file)
-    for note in read.notes:
-        data.tally.state(step.label, "Q and U", note)
+    plane = (step.plane,) if isinstance(step.plane, int) else None if step.plane is None else tuple(step.plane)
+    read = read_planes(step.file, wanted=Wanted(step.hdu, plane, step.coordsys))
+    for what, _, note in (note.partition(": ") for note in read.notes):
+        data.tally.state(step.label, what, note)
     return {which: _in_kelvin(plane, data) for which, plane in read.planes.items()}
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from zonda.operators.diagnostics.comparison.files import Wanted
     from zonda.operators.diagnostics.comparison.planes import Plane
     from zonda.operators.diagnostics.comparison.statistics import Comparison, Settings
 
@@ -37,6 +38,12 @@ ROWS = (
 @click.option("--frequency", metavar="FREQUENCY", help="For conversions, e.g. '93 GHz'.  [default: RESTFRQ of the files]")
 @click.option("--beam", metavar="ANGLE", help="Common resolution (FWHM), e.g. '20 arcsec'.  [default: the wider of the two]")
 @click.option("--sky", is_flag=True, help="REFERENCE is a sky before any beam: it gets the whole common beam.")
+@click.option("--hdu", "hdus", multiple=True, metavar="HDU",
+              help="Extension, by name or number; given twice: of REFERENCE and of MAP.  [default: the first map]")  # fmt: skip
+@click.option("--plane", "planes", multiple=True, metavar="N[,N]",
+              help="Plane of a cube, counted from 1; given twice: of REFERENCE and of MAP.")  # fmt: skip
+@click.option("--coordsys", "systems", multiple=True, metavar="C|G|E",
+              help="Of a HEALPix map without COORDSYS; given twice: of REFERENCE and of MAP.")  # fmt: skip
 @click.option("--threshold", type=click.FloatRange(0, 100, min_open=True), default=0.7, show_default=True,
               help="Least difference that the fidelity divides by, in units of the rms of the difference.")  # fmt: skip
 @click.option("--contours", default="-8,-4,-2,2,4", show_default=True, metavar="LEVELS", help="Of the signal-to-noise ratio.")
@@ -49,6 +56,9 @@ def compare(
     frequency: str | None,
     beam: str | None,
     sky: bool,
+    hdus: tuple[str, ...],
+    planes: tuple[str, ...],
+    systems: tuple[str, ...],
     threshold: float,
     contours: str,
     formats: tuple[str, ...],
@@ -68,10 +78,10 @@ def compare(
 
     fwhm = None if beam is None else checked("--beam", lambda: Unit("rad").parse(beam))
     hertz = None if frequency is None else checked("--frequency", lambda: Unit("Hz").parse(frequency))
-    levels = _levels(contours)
+    levels, choices = _levels(contours), _choices(hdus, planes, systems)
     for name, one, other in pairs(first, second):
         folder = output / name if name else output
-        _compare((one, other), folder, Settings(fwhm, threshold), (unit, hertz, sky), (levels, formats))
+        _compare((one, other), folder, Settings(fwhm, threshold), (unit, hertz, sky), (levels, formats), choices)
 
 
 def pairs(first: Path, second: Path) -> list[tuple[str, Path, Path]]:
@@ -115,8 +125,12 @@ def _compare(
     settings: Settings,
     given: tuple[str | None, float | None, bool],
     look: tuple[tuple[float, ...], tuple[str, ...]],
+    choices: tuple[Wanted, Wanted],
 ) -> None:
-    """One comparison, printed and written to ``folder``. ``given``: unit, frequency [Hz], whether the reference is a sky."""
+    """One comparison, printed and written to ``folder``. ``given``: unit, frequency [Hz], whether the reference is a sky.
+
+    ``choices``: what to read of the two files.
+    """
     from zonda.core.storage.files import atomic_path
     from zonda.operators.diagnostics.comparison import statistics
     from zonda.operators.diagnostics.comparison.files import read_planes, write_comparison
@@ -126,7 +140,7 @@ def _compare(
     from zonda.operators.diagnostics.drawing.pictures import Style, printed
     from zonda.operators.diagnostics.series import plane_key
 
-    read = [read_planes(path, _name(path, paths)) for path in paths]
+    read = [read_planes(path, _name(path, paths), wanted) for path, wanted in zip(paths, choices, strict=True)]
     if not read[0].is_of_the_band_of(read[1]):
         both_bands = " and ".join(f"{_name(path, paths)} of {one.band_in_words}" for path, one in zip(paths, read, strict=True))
         click.echo(f"warning: the maps are of different bands, {both_bands}: the sky itself differs between them", err=True)
@@ -151,8 +165,9 @@ def _compare(
                 with atomic_path(path) as temporary:
                     temporary.write_bytes(content)
                 written.append(path)
-    for note in [*read[0].notes, *read[1].notes] or _without(references, maps, paths):
-        click.echo(f"Q and U: {note}")
+    told = [f"{path}: {note}" for path, one in zip(paths, read, strict=True) for note in one.notes]
+    for note in [*told, *(_without(references, maps, paths) if not any("Q and U" in note for note in told) else [])]:
+        click.echo(note)
     click.echo("\n" + "\n".join(map(str, written)))
 
 
@@ -160,7 +175,29 @@ def _without(references: Mapping[str, Plane], maps: Mapping[str, Plane], paths: 
     """Says that one of two files has no Q and U, where the other has."""
     if references.keys() == maps.keys():
         return []
-    return [f"not compared: {_name(paths['Q' in references], paths)} has none"]
+    return [f"Q and U: not compared: {_name(paths['Q' in references], paths)} has none"]
+
+
+def _choices(hdus: tuple[str, ...], planes: tuple[str, ...], systems: tuple[str, ...]) -> tuple[Wanted, Wanted]:
+    """What to read of the reference and of the map. Raises BadParameter for what is given more than twice, or is no plane."""
+    from zonda.operators.diagnostics.comparison.files import Wanted
+
+    pairs = []
+    for name, given in (("--hdu", hdus), ("--plane", planes), ("--coordsys", systems)):
+        if len(given) > 2:
+            raise click.BadParameter("is given more than twice: there are two maps", param_hint=f"'{name}'")
+        pairs.append((given * 2)[:2] if given else (None, None))
+    numbers = []
+    for text in pairs[1]:
+        try:
+            numbers.append(None if text is None else tuple(int(n) for n in text.split(",")))
+        except ValueError:
+            raise click.BadParameter(
+                f"'{text}' is not a number, or numbers with commas: 2 or 1,3", param_hint="'--plane'"
+            ) from None
+    once = max(len(planes), len(systems)) < 2
+    first, second = (Wanted(pairs[0][k], numbers[k], pairs[2][k], once) for k in (0, 1))
+    return first, second
 
 
 def _name(path: Path, paths: tuple[Path, Path]) -> str:

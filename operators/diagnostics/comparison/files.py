@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from zonda.core.errors import InputError
-from zonda.core.maps.grid import HealpixPixels, healpix_grid
+from zonda.core.maps.grid import healpix_grid
+from zonda.core.maps.header import marked_bad, number, text, with_known_frame
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import FREE
 from zonda.core.maps.stokes import IQU
-from zonda.core.maps.stokes_names import along_axis, columns_of_q_and_u
+from zonda.core.maps.stokes_names import along_axis, columns_of_q_and_u, intensity_column, pixel_column
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
@@ -31,7 +32,12 @@ from .statistics import Comparison
 
 SAME_BAND = 1e-3
 """Relative difference of frequencies of one band."""
-FRAMES = {"C": "icrs", "Q": "icrs", "ICRS": "icrs", "G": "galactic"}
+FRAMES = {
+    **dict.fromkeys(("C", "Q", "EQ", "ICRS", "CELESTIAL", "EQUATORIAL"), "icrs"),
+    **dict.fromkeys(("G", "GALACTIC"), "galactic"),
+    **dict.fromkeys(("E", "ECLIPTIC"), "barycentricmeanecliptic"),
+}
+"""Of COORDSYS."""
 NOISES = {
     "NOISE": "noise I",
     "COV_II": "noise I",
@@ -59,7 +65,7 @@ class ReadMap:
     band
         BAND, its name; empty: not stated.
     notes
-        Why Q and U that are in the file are not taken.
+        What was chosen, and why Q and U that are in the file are not taken: ``what: text``.
     own
         Whether zonda wrote it.
     """
@@ -82,8 +88,31 @@ class ReadMap:
         return " ".join([*([self.band] if self.band else []), *([f"{self.frequency / 1e9:.4g} GHz"] if self.frequency else [])])
 
 
-def read_planes(path: Path, name: str = "") -> ReadMap:
-    """The first image or HEALPix table of a FITS file with its noise (extension or column NOISE, or COV_II); Q and U beside it.
+@dataclass(frozen=True)
+class Wanted:
+    """Which map of a file.
+
+    Attributes
+    ----------
+    hdu
+        Extension by name or number; None: the first image or HEALPix table.
+    plane
+        Of a cube, counted from 1, in FITS's order of the axes behind the first two; None: it has to be the only one,
+        or I of Stokes parameters.
+    coordsys
+        Of a HEALPix table: C, G or E; None: that of its header.
+    shared
+        Plane and system are those of another file, too: where they do not apply to this one, they are left out.
+    """
+
+    hdu: int | str | None = None
+    plane: tuple[int, ...] | None = None
+    coordsys: str | None = None
+    shared: bool = False
+
+
+def read_planes(path: Path, name: str = "", wanted: Wanted | None = None) -> ReadMap:
+    """An image or HEALPix table of a FITS file with its noise (extension or column NOISE, or COV_II); Q and U beside it.
 
     Q and U are further planes along an axis STOKES, extensions or columns with their names. They are taken as COSMO or IAU by
     POLCCONV; of a HEALPix table without it as COSMO, of an image without it not at all. Axes of length one are dropped. A file
@@ -95,14 +124,14 @@ def read_planes(path: Path, name: str = "") -> ReadMap:
     Raises
     ------
     InputError
-        Unreadable; no image of the sky in it; a cube of something else; an unknown unit; a HEALPix table without NSIDE, ORDERING
-        or COORDSYS.
+        Unreadable; no image of the sky in it; a cube of which no plane is wanted; an unknown unit or frame; a HEALPix table
+        without NSIDE, ORDERING or COORDSYS, or of which no column is I; cards that are no numbers.
     """
-    read = _read(path, name)
+    read = _read(path, name, wanted or Wanted())
     beside = path.with_name(f"source_free_{path.name}")
     if not (read.own and any(plane.noise is not None for plane in read.planes.values()) and beside.is_file()):
         return read
-    free = _read(beside, name)
+    free = _read(beside, name, wanted or Wanted())
     made = {}
     for key, plane in read.planes.items():
         found = free.planes.get(key)
@@ -121,124 +150,186 @@ def _on_one_grid(a: Plane, b: Plane) -> bool:
     return alike and np.array_equal(one.pixels, two.pixels)
 
 
-def _read(path: Path, name: str) -> ReadMap:
+def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
     place = str(path)
     with opened(path, place, "check the file, e.g. with fitsverify, or copy it again") as hdus:
-        for hdu in hdus:
-            image = hdu.is_image and hdu.header.get("NAXIS", 0) >= 2
-            if image or ("NSIDE" in hdu.header and "ORDERING" in hdu.header):
-                check_size(path, hdu, place)
-                where, values, unit, stated = _images(hdus, hdu, place) if image else _healpix(hdu, place)
-                return _told(name or path.name, where, values, (hdu.header, unit, stated), bool(image), place)
-    raise InputError("is not a map: it holds no image of two axes and no HEALPix table", place=place, cure=CURE)
+        hdu = _chosen(hdus, wanted.hdu, place)
+        check_size(path, hdu, place)
+        if not _is_healpix(hdu):
+            if wanted.coordsys is not None and not wanted.shared:
+                raise InputError("coordsys is for HEALPix maps", place=place, cure="remove it: CTYPE says what an image's are")
+            return _told(name or path.name, hdu.header, True, _images(hdus, hdu, wanted, place), place)
+        if wanted.plane is not None and not wanted.shared:
+            raise InputError("plane is for images, and this is a HEALPix table", place=place, cure="remove it")
+        return _told(name or path.name, hdu.header, False, _healpix(hdu, wanted, place), place)
 
 
-def _told(
-    name: str,
-    where: Any,
-    values: dict[str, Floats],
-    told: tuple[Any, Any, dict[str, tuple[float, str]]],
-    image: bool,
-    place: str,
-) -> ReadMap:
-    """``where``: celestial header or HEALPix pixels; ``told``: header of the file, unit, factors on the noise by plane."""
-    about, unit, stated = told
-    text = str(unit or "").strip()
-    label, factor = parse_unit(text, place=place, temperature_scale=about.get("TEMPSCAL")) if text else ("", 1.0)
-    axes = [about.get("BMAJ"), about.get("BMIN", about.get("BMAJ"))]
-    good = all(isinstance(b, int | float) and math.isfinite(b) and b > 0 for b in axes)
-    fwhm = math.radians(math.sqrt(axes[0] * axes[1])) if good else None
-    frequency = about.get("RESTFRQ", about.get("RESTFREQ"))
-    hertz = float(frequency) if isinstance(frequency, int | float) and frequency > 0 else None
-    convention, notes = str(about.get("POLCCONV", "" if image else "COSMO")).strip().upper(), []
+def _is_healpix(hdu: Any) -> bool:
+    return not hdu.is_image and "NSIDE" in hdu.header and "ORDERING" in hdu.header
+
+
+def _chosen(hdus: Any, wanted: int | str | None, place: str) -> Any:
+    """The extension that is ``wanted``, or the first that is a map."""
+    maps = [hdu for hdu in hdus if _is_healpix(hdu) or (hdu.is_image and hdu.header.get("NAXIS", 0) >= 2)]
+    if wanted is None:
+        if not maps:
+            raise InputError("is not a map: it holds no image of two axes and no HEALPix table", place=place, cure=CURE)
+        return maps[0]
+    found = [hdu for k, hdu in enumerate(hdus) if str(wanted).strip().upper() in (str(k), str(hdu.name).upper())]
+    if not found or not any(found[0] is one for one in maps):
+        there = ", ".join(f"{k}{f' {hdu.name}' if hdu.name else ''}" for k, hdu in enumerate(hdus) if any(hdu is m for m in maps))
+        what = "is neither an image of two axes nor a HEALPix table" if found else "is not there"
+        raise InputError(f"the extension {wanted} {what}", place=place, cure=f"set hdu to one of these: {there or 'none'}")
+    return found[0]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Planes of a file as they are: ``where`` they are (celestial header, or HEALPix pixels), their ``unit``, and factors on the
+    noise that headers state, by plane."""
+
+    where: Any
+    values: dict[str, Floats]
+    unit: Any
+    stated: dict[str, tuple[float, str]]
+    notes: list[str] = field(default_factory=list)
+
+
+def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadMap:
+    """With what the header ``about`` says of the planes."""
+    label, factor = "", 1.0
+    if unit := str(found.unit or "").strip():
+        label, factor = parse_unit(unit, place=place, temperature_scale=text(about, "TEMPSCAL", place) or None)
+    major = number(about, "BMAJ", place)
+    minor = number(about, "BMIN", place) or major
+    fwhm = math.radians(math.sqrt(major * minor)) if major and minor and major > 0 and minor > 0 else None
+    hertz = number(about, "RESTFRQ", place) or number(about, "RESTFREQ", place)
+    convention = (text(about, "POLCCONV", place) or ("" if image else "COSMO")).upper()
+    values, notes = found.values, list(found.notes)
     if "Q" in values and convention not in ("COSMO", "IAU"):
-        notes.append(f"not compared: {name} has them and no POLCCONV; set that header key to COSMO or IAU")
+        notes.append(f"Q and U: not compared: {name} has them and no POLCCONV; set that header key to COSMO or IAU")
         values = {key: plane for key, plane in values.items() if key not in ("Q", "U")}
     planes: dict[str, Plane] = {}
     for key in IQU:
         if key in values:
             sign = -1.0 if key == "U" and convention == "IAU" else 1.0
             noise, alone = values.get(f"noise {key}"), values.get(f"half {key}")
-            own, words = stated.get(key, (None, ""))
+            own, words = found.stated.get(key, (None, ""))
             if alone is not None:
                 own, words = None, f"half the difference, {about.get('JACKKNIF', 'of two halves')}"
             elif own is not None and noise is not None:
                 noise = noise * own
             plane = Plane(
-                name if key == "I" else f"{name} {key}", sign * values[key], where if image else None, "", fwhm, noise,
-                None if image else where, 0.0, alone, words, own,
+                name if key == "I" else f"{name} {key}", sign * values[key], found.where if image else None, "", fwhm, noise,
+                None if image else found.where, 0.0, alone, words, own,
             )  # fmt: skip
             planes[key] = plane.scaled(factor, label)
-    origin = str(about.get("ORIGIN", "")).strip().lower() == "zonda"
-    return ReadMap(planes, hertz, str(about.get("BAND", "")).strip(), notes, origin)
+    origin = text(about, "ORIGIN", place).lower() == "zonda"
+    return ReadMap(planes, hertz if hertz and hertz > 0 else None, text(about, "BAND", place), notes, origin)
 
 
-def _images(hdus: Any, hdu: Any, place: str) -> tuple[Any, dict[str, Floats], Any, dict[str, tuple[float, str]]]:
-    """Header of the celestial axes; planes, their noise and what holds noise alone; unit; factors on the
-    noise: of a plane or a cube of Stokes parameters, or of extensions."""
+def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
+    """A plane or a cube of Stokes parameters, or extensions: with their noise and what holds noise alone."""
     from astropy.wcs import WCS
 
-    header, values = hdu.header, np.asarray(hdu.data, np.float64)
-    ny, nx = values.shape[-2:]
-    long = [k for k, n in enumerate(values.shape[:-2]) if n > 1]
-    axis = values.ndim - long[0] if long else 0
-    if long and (len(long) > 1 or str(header.get(f"CTYPE{axis}", "")).strip().upper() != "STOKES"):
-        sides = " x ".join(str(n) for n in reversed(values.shape))
-        raise InputError(f"is a cube of {sides} pixels, not a map", place=place, cure="cut one plane out of it")
+    header, frame = with_known_frame(hdu.header, place)
+    shape = tuple(int(n) for n in hdu.shape)
     wcs = WCS(header)
     if not wcs.has_celestial:
         kinds = ", ".join(str(header.get(f"CTYPE{k}", "none")) for k in (1, 2))
         raise InputError(f"is not a map: it has no celestial coordinates (CTYPE: {kinds})", place=place, cure=CURE)
-    names = along_axis(header, axis, values.shape[long[0]]) if long else ["I"]
-    found = {key: plane for key, plane in zip(names, values.reshape(-1, ny, nx), strict=True) if key in ("I", "Q", "U")}
+    stokes, index, note = _plane_of(header, shape, wanted, place)
+    values = np.asarray(hdu.data[index], np.float64)
+    names = along_axis(header, stokes, shape[len(shape) - stokes]) if stokes else ["I"]
+    found = {key: plane for key, plane in zip(names, values.reshape(-1, *shape[-2:]), strict=True) if key in ("I", "Q", "U")}
     if "I" not in found:
         raise InputError(f"its axis STOKES has {', '.join(names)} and no I", place=place, cure="give a map of I, Q and U")
-    alike = [other for other in hdus if other.is_image and other.shape == hdu.shape]
-    letters = columns_of_q_and_u([str(other.name) for other in alike])
-    for key, number in zip(("Q", "U"), letters or (), strict=False):
-        found.setdefault(key, np.asarray(alike[number].data, np.float64).reshape(ny, nx))
     stated: dict[str, tuple[float, str]] = {}
-    for other in alike if not long else ():
+    first = wanted.hdu is None and len(names) == 1  # the extensions beside it are of it
+    alike = [other for other in hdus if other.is_image and other.shape == shape] if first else []
+    letters = columns_of_q_and_u([str(other.name) for other in alike])
+    for key, k in zip(("Q", "U"), letters or (), strict=False):
+        found[key] = np.asarray(alike[k].data[index], np.float64).reshape(shape[-2:])
+    for other in alike:
         if (of := NOISES.get(str(other.name).upper())) is not None:
-            noise = np.asarray(other.data, np.float64).reshape(ny, nx)
+            noise = np.asarray(other.data[index], np.float64).reshape(shape[-2:])
             found[of] = np.sqrt(noise) if other.name.upper().startswith("COV") else noise
-            stated |= _stated(other.header, of)
+            stated |= _stated(other.header, of, place)
     both = found.keys() >= {"Q", "U"}
     kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
-    return wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated
+    notes = [f"{what}: {text}" for what, text in (("plane", note), ("frame", frame)) if text]
+    return Found(wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated, notes)
 
 
-def _stated(header: Any, of: str) -> dict[str, tuple[float, str]]:
-    """The factor on white noise that the header of a plane of noise states (`core.maps.map_file`), and what
-    it was measured in."""
-    factor = header.get("NOISEFAC")
-    good = of.startswith("noise") and isinstance(factor, int | float) and math.isfinite(factor) and factor > 0
-    return {of[-1]: (float(factor), str(header.get("NOISEOF", "its file")))} if good else {}
+def _plane_of(header: Any, shape: Sequence[int], choice: Wanted, place: str) -> tuple[int, tuple[int | slice, ...], str]:
+    """(FITS number of the axis STOKES whose planes are all read, or 0; index of what is read; a note of the plane of a cube)."""
+    axes = {len(shape) - k: n for k, n in enumerate(shape[:-2])}  # FITS counts from the fastest
+    kinds = {axis: str(header.get(f"CTYPE{axis}", "")).strip().upper() for axis in axes}
+    if any(kind[:4] in ("RA--", "DEC-", "GLON", "GLAT") for kind in kinds.values()):
+        cure = "transpose it, so that axes 1 and 2 are longitude and latitude"
+        raise InputError("the axes of the sky are not the first two of the cube", place=place, cure=cure)
+    stokes = next((axis for axis, n in axes.items() if n > 1 and kinds[axis] == "STOKES"), 0)
+    asked = [axis for axis in sorted(axes) if axes[axis] > 1 and axis != stokes]
+    wanted = choice.plane if asked or not choice.shared else None
+    if wanted is not None and stokes and len(wanted) == len(asked) + 1:
+        asked, stokes = sorted([*asked, stokes]), 0
+    if asked and wanted is None:
+        ranges = ", ".join(f"1 to {axes[axis]} along {kinds[axis] or f'axis {axis}'}" for axis in asked)
+        sides = " x ".join(str(n) for n in reversed(shape))
+        example = ",".join("1" for _ in asked)
+        cure = f"choose its plane ({ranges}): --plane {example}, or plane: {example if len(asked) == 1 else f'[{example}]'}"
+        raise InputError(f"is a cube of {sides} pixels, not a map", place=place, cure=cure)
+    if len(wanted or ()) != len(asked):
+        cure = f"give {len(asked)} of them" if asked else "leave plane out: it is no cube"
+        raise InputError(
+            f"plane has {len(wanted or ())} numbers, and the image {len(asked)} axes of planes", place=place, cure=cure
+        )
+    numbers = dict(zip(asked, wanted or (), strict=True))
+    for axis, chosen in numbers.items():
+        if not 1 <= chosen <= axes[axis]:
+            raise InputError(f"there is no plane {chosen} of {axes[axis]}", place=place, cure="planes are counted from 1")
+    note = ", ".join(f"{n} of {axes[axis]}{f' along {kinds[axis]}' if kinds[axis] else ''}" for axis, n in numbers.items())
+    return stokes, tuple(slice(None) if axis == stokes else numbers.get(axis, 1) - 1 for axis in axes), note
 
 
-def _healpix(hdu: Any, place: str) -> tuple[HealpixPixels, dict[str, Floats], Any, dict[str, tuple[float, str]]]:
-    """Pixels of a HEALPix table with a value; planes, perhaps their noise and what holds noise alone; unit;
-    factors on the noise."""
-    import healpy
+def _stated(header: Any, of: str, place: str) -> dict[str, tuple[float, str]]:
+    """The factor on white noise that the header of a plane of noise states, and what it was measured in."""
+    factor = number(header, "NOISEFAC", place) if of.startswith("noise") else None
+    return {of[-1]: (factor, text(header, "NOISEOF", place) or "its file")} if factor and factor > 0 else {}
 
+
+def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
+    """Pixels of a HEALPix table with a value, with their noise and what holds noise alone."""
     header, names = hdu.header, [str(n).upper() for n in hdu.columns.names]
-    frame, nest = FRAMES.get(str(header.get("COORDSYS", "")).strip().upper()), str(header["ORDERING"]).upper().startswith("NEST")
+    stated_there = text(header, "COORDSYS", place)
+    written = ((stated_there or wanted.coordsys if wanted.shared else wanted.coordsys or stated_there) or "").upper()
+    frame = FRAMES.get(written)
     if frame is None:
-        cure = "set the header key COORDSYS to C (ICRS) or G (galactic)"
-        raise InputError("the coordinate system of the HEALPix map is missing or unknown", place=place, cure=cure)
-    explicit = names[0] in ("PIXEL", "PIXELS", "PIX", "INDEX")
-    columns = {"I": int(explicit), **dict(zip(("Q", "U"), columns_of_q_and_u(names) or (), strict=False))}
+        what = f"unknown: COORDSYS = {written!r}" if written else "missing"
+        cure = "give it: --coordsys C (ICRS), G (galactic) or E (ecliptic), or coordsys: C; or set the header key COORDSYS"
+        raise InputError(f"the coordinate system of the HEALPix map is {what}", place=place, cure=cure)
+    nest = str(header["ORDERING"]).upper().startswith("NEST")
+    place_of, first = pixel_column(names), intensity_column(names, None, place)
+    columns = {"I": first, **dict(zip(("Q", "U"), columns_of_q_and_u(names) or (), strict=False))}
     columns |= {key: names.index(name) for name, key in NOISES.items() if name in names and key[-1] in columns}
     planes = {key: np.asarray(hdu.data.field(k), np.float64).ravel() for key, k in columns.items()}
+    planes = {key: np.where(marked_bad(plane, header, place), np.nan, plane) for key, plane in planes.items()}
     planes = {key: np.sqrt(plane) if names[columns[key]].startswith("COV") else plane for key, plane in planes.items()}
-    pixels = np.asarray(hdu.data.field(0), np.int64).ravel() if explicit else np.arange(planes["I"].size)
-    seen = np.isfinite(planes["I"]) & ~healpy.mask_bad(planes["I"])
+    pixels = np.arange(planes["I"].size) if place_of is None else np.asarray(hdu.data.field(place_of), np.int64).ravel()
+    seen = np.isfinite(planes["I"])
     if not seen.any():
         raise InputError("no pixel has a value", place=place, cure="give a map that is not NaN everywhere")
+    nside = number(header, "NSIDE", place)
     order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
-    where = healpix_grid(int(header["NSIDE"]), nest, pixels[order], frame)
-    kept = {key: np.where(healpy.mask_bad(values[order]), np.nan, values[order]) for key, values in planes.items()}
-    return where, kept, header.get(f"TUNIT{1 + int(explicit)}"), {}
+    bad = not nside or nside != int(nside) or pixels[order[0]] < 0 or pixels[order[-1]] >= 12 * nside**2
+    if bad or (np.diff(pixels[order]) == 0).any() or (place_of is None and pixels.size != 12 * (nside or 0) ** 2):
+        cure = "check NSIDE and the column of the pixel numbers"
+        raise InputError("the pixel numbers are out of range or twice there", place=place, cure=cure)
+    where = healpix_grid(int(nside or 0), nest, pixels[order], frame)
+    stated: dict[str, tuple[float, str]] = {}
+    for of in ("I", *(("Q", "U") if "Q" in columns else ())):
+        stated |= _stated({"NOISEFAC": header.get(f"NOISFAC{of}"), "NOISEOF": header.get("NOISEOF")}, f"noise {of}", place)
+    return Found(where, {key: v[order] for key, v in planes.items()}, header.get(f"TUNIT{1 + first}"), stated)
 
 
 def plane_of(product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None) -> Plane:

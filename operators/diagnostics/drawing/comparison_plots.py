@@ -70,7 +70,7 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
         reached = [abs(level) for level in levels if (snr * np.sign(level) >= abs(level)).any()]
         top = float(math.ceil(max(float(np.nanpercentile(np.abs(snr), 99.9)), *reached, 1.0)))
         words = noise_text(found.noise["snr"][0])
-        title = f"Signal-to-noise ratio of the map\nnoise: {words}"
+        title = f"Signal-to-noise ratio, {noise_text(found.noise['snr'][0], short=True)}"
         plot_plain(snr, where, (-top, top), "RdBu_r", "signal-to-noise ratio", ax=axes[1], title=title)
         plot_contours(axes[1], snr, levels)
         caption += f" Contours of the SNR: {contour_text(levels)} (negative ones dashed). Its noise: {words}."

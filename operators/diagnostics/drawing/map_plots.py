@@ -116,9 +116,12 @@ def contour_text(levels: Sequence[float]) -> str:
     return ", ".join(f"{level:g}".replace("-", "−") for level in sorted(levels)) + " σ"
 
 
-def noise_text(words: str) -> str:
-    """What the noise of an SNR is, as pictures write it: ``1.44 × white noise, as in ...``."""
-    return words.replace(" x ", " × ").replace(" - ", " − ")
+def noise_text(words: str, short: bool = False) -> str:
+    """What the noise of an SNR is, as pictures write it: ``1.44 × white noise, as in ...``.
+
+    ``short``: without where it was measured.
+    """
+    return (words.partition(", as in ")[0] if short else words).replace(" x ", " × ").replace(" - ", " − ")
 
 
 def plot_coverage(

@@ -98,7 +98,7 @@ def draw_map(
     limit = shown.limit("signal", shown.hits, SHOWN if signal == "noiseless" else 99.7)
     head = _titled(title, shown)
     if snr is not None:
-        head += f"\ncontours of S/N, noise: {noise_text(snr[1])}"
+        head += f"; contours: S/N, {noise_text(snr[1], short=True)}"
     ax = _panels([(shown, head)], style, limit)
     text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
     if snr is not None:

@@ -203,3 +203,77 @@ def test_bad_options(tmp_path, values, capsys):
     assert "not a list of numbers" in capsys.readouterr().err
     assert compare(a, a, "--beam", "5 km") == 2
     assert "--beam" in capsys.readouterr().err
+
+
+def test_a_plane_of_a_cube(tmp_path, values, capsys):
+    """Planes of frequency have to be chosen; one that is chosen once is that of the cube, whichever file it is."""
+    cube = write(
+        tmp_path / "cube.fits", np.stack([3 * values, values, 2 * values]), CTYPE3="FREQ", CRPIX3=1, CRVAL3=9e10, CDELT3=1e9
+    )
+    a = write(tmp_path / "a.fits", values)
+    assert compare(a, cube, "--output", tmp_path / "o") == 2
+    error = capsys.readouterr().err
+    assert "is a cube of 48 x 48 x 3 pixels, not a map" in error
+    assert "choose its plane (1 to 3 along FREQ): --plane 1" in error
+    for given, gain in ((["2"], 1.0), (["3"], 2.0)):
+        arguments = [x for n in given for x in ("--plane", n)]
+        assert compare(a, cube, "--output", tmp_path / "o", *arguments) == 0
+        text = capsys.readouterr().out
+        assert float(rows(text)["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(gain, abs=1e-6)
+        assert f"cube.fits: plane: {given[0]} of 3 along FREQ" in text
+    assert compare(cube, cube, "--output", tmp_path / "o", "--plane", "1", "--plane", "2") == 0
+    assert float(rows(capsys.readouterr().out)["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(
+        1 / 3, abs=1e-4
+    )
+    for wrong, words in (("4", "there is no plane 4 of 3"), ("1,2", "plane has 2 numbers"), ("x", "'x' is not a number")):
+        assert compare(a, cube, "--output", tmp_path / "o", "--plane", wrong) == 2
+        assert words in capsys.readouterr().err
+    bad = write(tmp_path / "bad.fits", values, unit="furlong")
+    assert compare(cube, bad, "--output", tmp_path / "o", "--plane", "1") == 2
+    assert "unknown unit 'furlong'" in capsys.readouterr().err  # not that it is no cube
+
+
+def test_an_extension_and_a_coordinate_system(tmp_path, values, capsys):
+    a = write(tmp_path / "a.fits", values)
+    header = fits.getheader(a)
+    hdus = [fits.PrimaryHDU(values, header), fits.ImageHDU(0.5 * values, header, name="OTHER")]
+    fits.HDUList(hdus).writeto(tmp_path / "two.fits")
+    for hdu, gain in (("0", 1.0), ("other", 0.5), ("1", 0.5)):
+        assert compare(a, tmp_path / "two.fits", "--output", tmp_path / "o", "--hdu", "0", "--hdu", hdu) == 0
+        assert float(rows(capsys.readouterr().out)["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(gain)
+    assert compare(a, tmp_path / "two.fits", "--output", tmp_path / "o", "--hdu", "0", "--hdu", "5") == 2
+    assert "set hdu to one of these: 0 PRIMARY, 1 OTHER" in capsys.readouterr().err
+    pixels = healpy.query_disc(16384, healpy.ang2vec(75.0, 20.0, lonlat=True), np.radians(40 / 3600))
+    columns = [fits.Column("PIXEL", "K", array=pixels), fits.Column("HITS", "J", array=np.full(pixels.size, 7))]
+    columns += [fits.Column("TEMPERATURE", "D", unit="K", array=np.linspace(1, 2, pixels.size))]
+    table = fits.BinTableHDU.from_columns(columns)
+    table.header.update({"PIXTYPE": "HEALPIX", "NSIDE": 16384, "ORDERING": "RING", "TEMPSCAL": "K_RJ", "BAD_DATA": 1.0})
+    table.writeto(tmp_path / "h.fits")
+    assert compare(tmp_path / "h.fits", tmp_path / "h.fits", "--output", tmp_path / "o") == 2
+    assert "--coordsys C (ICRS)" in capsys.readouterr().err
+    assert compare(tmp_path / "h.fits", tmp_path / "h.fits", "--output", tmp_path / "o", "--coordsys", "C") == 0
+    found = rows(capsys.readouterr().out)
+    assert found["pixels with both"].startswith(f"{pixels.size - 1} of")  # the first is BAD_DATA
+    assert 1 < float(found["rms of the reference"].split()[0]) < 2  # not the hits
+
+
+def test_jansky_per_pixel_and_per_beam_are_brightness(tmp_path, values, capsys):
+    """A point source of 1 Jy: its flux is in both files, whatever their pixels and beams are."""
+    y, x = (np.indices((SIDE, SIDE)) - 23.5) * 2.0
+
+    def source(fwhm):
+        return np.exp(-4 * np.log(2) * (x**2 + y**2) / fwhm**2)
+
+    area = np.pi / (4 * np.log(2))
+    a = write(tmp_path / "a.fits", source(12.0), unit="Jy/beam", beam=12.0)
+    b = write(tmp_path / "b.fits", source(20.0), unit="Jy/beam", beam=20.0)
+    c = write(tmp_path / "c.fits", source(20.0) * 4 / (area * 20.0**2), unit="Jy/pixel", beam=20.0)
+    for one, other in ((a, b), (b, a), (a, c), (c, b)):
+        assert compare(one, other, "--output", tmp_path / "o") == 0
+        found = rows(capsys.readouterr().out)
+        assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(1.0, abs=2e-3)
+        if one != c:
+            peak, unit = found["peak of the reference"].split()
+            assert (float(peak), unit) == (pytest.approx(1.0, abs=0.02), "Jy/beam")  # of the pixel nearest to the source
+    assert compare(a, c, "--output", tmp_path / "o", "--unit", "Jy/pixel") == 2
+    assert "Jy/pixel depends on the pixel" in capsys.readouterr().err
