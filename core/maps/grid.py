@@ -374,6 +374,11 @@ class ImagePixels(MapGrid):
         y, x = np.meshgrid(*(np.unique(np.linspace(0, n - 1, min(n, 33))) for n in self.shape), indexing="ij")
         return self.metric(x, y)
 
+    @property
+    def even(self) -> bool:
+        """Whether all pixels have the same steps along its axes, to `EVEN`: one kernel serves all."""
+        return self._even() is not None
+
     def _even(self) -> tuple[float, float] | None:
         """Steps (y, x) that hold for all pixels to `EVEN`, whose axes are at right angles; None: they differ."""
         if 0 < self.around <= self.shape[1]:

@@ -146,6 +146,11 @@ class MapArrays:
         """(ny,) latitudes of the rows of a CAR map [rad]."""
         return image_grid(self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel).latitudes
 
+    @property
+    def sides(self) -> tuple[float, float]:
+        """Steps (y, x) from pixel to pixel on the sky [rad], in the middle of the map."""
+        return self.grid.sides if self.projection == "CAR" else (self.pixel, self.pixel)
+
     def areas(self) -> Floats | float:
         """Solid angles of the pixels [sr]: one number (HEALPix), of rows (ny, 1) (CAR), or of all pixels (TAN).
 

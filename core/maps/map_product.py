@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..notebook import html_table
-from ..numerics.angles import FWHM_PER_SIGMA, angle_text
+from ..numerics.angles import FWHM_PER_SIGMA, angle_text, sides_text
 from ..types import Floats
 from .central import central_diameter
 from .grid import CUT
@@ -179,7 +179,7 @@ class MapProduct(MapArrays):
         hit = self.hits > 0
         rows: list[tuple[Any, Any]] = [
             ("size", repr(self)),
-            ("pixel", f"{math.degrees(self.pixel) * 3600:.3g} arcsec"),
+            ("pixel", sides_text(*self.sides)),
             ("pixels hit", int(hit.sum())),
             ("smoothed by", f"{math.degrees(self.smoothed_by) * 3600:.3g} arcsec" if self.smoothed_by else "nothing"),
             ("resolution (FWHM)", f"{math.degrees(self.resolution) * 3600:.3g} arcsec"),

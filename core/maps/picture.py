@@ -11,6 +11,7 @@ import numpy as np
 from ..configuration.diagnostics import nearest
 from ..errors import InputError
 from ..types import AnyFloats
+from .grid import wcs_grid
 from .map_arrays import MapArrays
 from .stokes import stokes_plane
 
@@ -79,7 +80,7 @@ def draw(shown: Shown, ax: Any, limit: float | None) -> Any:
         for axis, name in zip(ax.coords, wcs.wcs.ctype, strict=True):
             axis.set_axislabel({"RA--": "right ascension", "DEC-": "declination", "GLON": "l", "GLAT": "b"}.get(name[:4], name))
     if shown.fwhm > 0:
-        _beam(ax, math.degrees(shown.fwhm) / abs(float(np.linalg.det(wcs.pixel_scale_matrix))) ** 0.5)
+        _beam(ax, shown)
     ax.set_title(shown.title)
     return ax
 
@@ -96,10 +97,20 @@ def _range(known: AnyFloats, limit: float | None, around_zero: bool) -> tuple[fl
     return (low, top, False) if low < top else (low, low + (abs(low) or 1.0), False)
 
 
-def _beam(ax: Any, across: float) -> None:
-    """A circle ``across`` pixels wide in the lower left corner."""
-    from matplotlib.patches import Circle
+def _beam(ax: Any, shown: Shown) -> None:
+    """The beam in the lower left corner: a circle on the sky there, in the picture's pixels an ellipse."""
+    from matplotlib.patches import Ellipse
 
-    left, bottom = ax.get_xlim()[0], ax.get_ylim()[0]
-    circle = Circle((left + 1.2 * across, bottom + 1.2 * across), across / 2, facecolor="white", edgecolor="black")
-    ax.add_patch(circle)
+    grid = wcs_grid(shown.wcs, (shown.values.shape[0], shown.values.shape[1]))
+    corner, place = np.array([ax.get_xlim()[0], ax.get_ylim()[0]]), np.zeros(2)
+    for _ in range(2):  # its own size says where it lies
+        xx, xy, yy = (float(g) for g in grid.metric(*place))
+        if not math.isfinite(xx * yy):
+            xx, xy, yy = grid.middle
+        half = shown.fwhm / 2 * np.sqrt(np.array([yy, xx]) / (xx * yy - xy**2))
+        place = corner + 2.4 * half
+    sizes, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
+    width, height = (float(v) for v in shown.fwhm / np.sqrt(sizes))
+    angle = math.degrees(math.atan2(float(axes[1, 0]), float(axes[0, 0])))
+    at = float(place[0]), float(place[1])
+    ax.add_patch(Ellipse(at, width, height, angle=angle, facecolor="white", edgecolor="black"))

@@ -14,7 +14,7 @@ from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.maps.central import central_diameter, in_beams
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
-from zonda.core.numerics.angles import angle_text
+from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.operator import Operator
 
@@ -86,7 +86,7 @@ def _noise(figure: NoiseFigure, product: MapProduct) -> list[Card]:
     label = "" if figure.product == "map" else f", {figure.product}"
     if math.isfinite(figure.smoothed):
         how = _smoothed(figure.smoothed, product)
-        before = f"the same before smoothing, per {angle_text(product.pixel)} pixel"
+        before = f"the same before smoothing, per {sides_text(*product.sides)} pixel"
         return [(brightness(figure.smoothed), f"{where}, {how}{label}"), (brightness(figure.rms), before)]
     if math.isfinite(figure.rms):
         return [(brightness(figure.rms), f"{where}{label}")]
@@ -106,16 +106,19 @@ def has_white_noise(data: Data) -> bool:
 def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
     """What the NET and the samples promise for the centre of a map: a card, or none where nothing is known.
 
-    Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 / A.
+    Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 / A: the weight of the pixels
+    1 / noise^2 is added up per solid angle.
     """
-    noise = product.noise[product.distance() <= diameter / 2]
+    near = product.distance() <= diameter / 2
+    noise, areas = product.noise[near], np.broadcast_to(product.areas(), product.hits.shape)[near]
     known = np.isfinite(noise) & (noise > 0)
     if not known.any() or product.noise_from != "net" or product.contents != "all":
         return []
     rms = float(1 / np.sqrt(np.sum(noise[known] ** -2.0) / noise.size))  # of the mean weight
     label = "" if name == "map" else f", {name}"
     where = _central(diameter, product)
-    factor = product.pixel / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
+    side = math.sqrt(float(areas.mean()))
+    factor = side / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
     if product.smoothed_by or factor > 0.5:  # pixels that are not small beside the beam
         return [(brightness(rms), f"white noise by NET and samples, {where}{label}")]
     how = _smoothed(rms * factor, product)
@@ -139,7 +142,7 @@ def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:
     seconds = float(np.median(samples * each))
     time = f"{seconds:.3g}\u00a0s" if seconds < 6000 else f"{seconds / 3600:.3g}\u00a0h"
     where = _central(diameter, product) + ("" if name == "map" else f", {name}")
-    counted = f"{np.median(samples):.4g} samples per {angle_text(product.pixel)} pixel"
+    counted = f"{np.median(samples):.4g} samples per {sides_text(*product.sides)} pixel"
     return [(time, f"of all detectors per {angle_text(product.fwhm)} beam, {where}; {counted}")]
 
 

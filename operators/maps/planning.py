@@ -10,7 +10,7 @@ from zonda.core.plan.estimate import Cost, Estimate, Traits
 from zonda.core.plan.planning import Planning
 
 from .bin_map import BinMap
-from .grid import TangentGrid
+from .grid import TangentGrid, in_frame
 
 
 class BinMapPlanning(Planning[BinMap]):
@@ -20,9 +20,12 @@ class BinMapPlanning(Planning[BinMap]):
     smaller = "choose a larger pixel or a smaller width"
 
     def traits(self, observation: Observation) -> Traits:
-        """Size of the pixels, and the weights."""
+        """Size of the pixels (the root of their solid angle in the middle of the map), and the weights."""
         step = self.operator
         side = math.sqrt(4 * math.pi / (12 * step.nside**2)) if step.nside else step.pixel
+        if step.projection == "CAR" and not step.nside:
+            _, latitude = in_frame(step.centre.icrs() if step.centre else observation.centre, step.frame)
+            side *= math.sqrt(max(math.cos(latitude), side))
         return Traits(pixel=side, weighs=step.weights == "inverse_variance" and step.contents == "all")
 
     def estimate(self, context: Context) -> Estimate:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.maps.grid import ImagePixels, wcs_grid
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
-from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.types import Floats
 
@@ -49,19 +49,15 @@ def covered(product: MapProduct) -> NDArray[np.bool_]:
 
 
 def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Floats:
-    """The input map, smoothed with a Gaussian (``fwhm`` [rad]; the beam), at the centres of the map's pixels."""
-    from scipy.ndimage import gaussian_filter, map_coordinates
+    """The input map, the mean under a Gaussian (``fwhm`` [rad]; the beam), at the centres of the map's pixels; 0 beside it."""
+    from scipy.ndimage import map_coordinates
 
-    width = product.fwhm if fwhm is None else fwhm
-    scale = np.radians(np.sqrt(abs(np.linalg.det(image.wcs.pixel_scale_matrix))))
-    smooth = gaussian_filter(np.nan_to_num(image.values), width / FWHM_PER_SIGMA / scale)
-    rows, columns = np.indices(product.signal.shape)
-    lon, lat = np.radians(product.wcs.pixel_to_world_values(columns, rows))
-    directions = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
-    directions = directions @ wcs_frame_rotation(product.wcs) @ wcs_frame_rotation(image.wcs).T  # either may be galactic
-    lon, lat = np.arctan2(directions[..., 1], directions[..., 0]), np.arcsin(np.clip(directions[..., 2], -1, 1))
-    x, y = image.wcs.world_to_pixel_values(np.degrees(lon), np.degrees(lat))
-    return np.asarray(map_coordinates(smooth, [y, x], order=1), np.float64)
+    own = wcs_grid(image.wcs, (image.values.shape[0], image.values.shape[1]))
+    smooth, _ = own.smoothed(np.nan_to_num(image.values), product.fwhm if fwhm is None else fwhm)
+    grid = product.grid
+    x, y = own.coordinates(grid.directions() @ grid.turn @ own.turn.T)  # either may be galactic
+    at = np.where(np.isfinite(x) & np.isfinite(y), [y, x], -2.0)
+    return np.asarray(map_coordinates(np.nan_to_num(smooth), at, order=3), np.float64)
 
 
 def extreme(values: Floats, where: NDArray[np.bool_], metric: str) -> tuple[int, float]:
@@ -78,24 +74,21 @@ def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> floa
 
         (2 N)^(-1/2),   N = (sum w)^2 / sum_ij w_i w_j rho_ij^2,   rho = exp(-d^2 / 4 sigma^2)
 
-    sigma that of the smoothing. HEALPix and CAR: N is the area divided by 2 pi sigma^2. NaN without pixels.
+    sigma that of the smoothing, d the angle between pixels. HEALPix: N is the area divided by 2 pi sigma^2. NaN without pixels.
     """
-    from zonda.core.numerics.transforms import convolved, gaussian_taps
-
     w = np.where(where & np.isfinite(product.signal), product.weights, 0.0)
     if not w.any():
         return math.nan
-    sigma = product.smoothed_by / FWHM_PER_SIGMA / product.pixel
-    per_cell = 2 * math.pi * sigma**2
-    if product.projection != "TAN":
-        area = float(np.broadcast_to(product.areas(), w.shape)[w != 0].sum())
-        independent = min(area / product.pixel**2 / per_cell if per_cell else np.inf, float(np.count_nonzero(w)))
-    else:
-        rows, columns = np.flatnonzero(w.any(axis=1)), np.flatnonzero(w.any(axis=0))
-        w = w[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        pairs = per_cell * float((w * convolved(w, gaussian_taps(sigma))).sum()) if per_cell > 1 else float((w * w).sum())
-        independent = float(w.sum()) ** 2 / pairs
-    return 1 / math.sqrt(2 * independent)
+    cell, grid = 2 * math.pi * (product.smoothed_by / FWHM_PER_SIGMA) ** 2, product.grid
+    if not isinstance(grid, ImagePixels):
+        independent = min(grid.solid_angle(w != 0) / cell if cell else np.inf, float(np.count_nonzero(w)))
+        return 1 / math.sqrt(2 * independent)
+    rows, columns = (np.flatnonzero(w.any(axis=axis)) for axis in (1, 0))
+    window = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    w, grid = w[window], grid.window(*window)
+    smoothed = cell > float(np.nanmin(grid.areas))
+    pairs = float((w * grid.smoother(product.smoothed_by)(w) * cell / grid.areas).sum()) if smoothed else float((w * w).sum())
+    return 1 / math.sqrt(2 * float(w.sum()) ** 2 / pairs)
 
 
 def flat(product: MapProduct, metric: str) -> MapProduct:

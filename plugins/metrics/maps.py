@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -27,12 +28,13 @@ from zonda.core.configuration.units import Angle, Fraction
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
+from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
 
-from .common import SKY_ALONE, UNFILTERED, as_seen, at_beam, covered, extreme, flat, input_of, map_of, relative_error_of_rms
+from .common import SKY_ALONE, UNFILTERED, as_seen, at_beam, covered, extreme, input_of, map_of, relative_error_of_rms
 
 Smoothing = Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"]
 NAME = r"^[A-Za-z0-9_]+$"
@@ -133,14 +135,20 @@ class PeakRatio(_OfSmoothMap):
         if self.against == "unfiltered":
             before = self.smoothed(map_of(data, "peak_ratio", names[1], self.map)).signal
         else:
-            extra = seen.smoothed_by
-            before = as_seen(input_of(data, "peak_ratio"), flat(after, "peak_ratio"), math.hypot(after.fwhm, extra))
+            before = without_filters(input_of(data, "peak_ratio"), after, seen.smoothed_by)
         return peak_ratio(before, seen), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
         other = "the map without filters" if self.against == "unfiltered" else "the input convolved with the beam"
         return f"extreme value of the filtered sky / that of {other}, both {self.how()}, modes: {self.modes}"
+
+
+def without_filters(image: Image, product: MapProduct, smoothing: float) -> Floats:
+    """The input behind the beam in the pixels of a map, smoothed (FWHM [rad]) with the map's own weights, as the map is."""
+    plain = product if product.polarization is None else product.stokes("I")
+    seen = replace(plain, signal=as_seen(image, plain), half_difference=None, smoothed_by=0.0)
+    return (seen.smoothed(smoothing) if smoothing > 0 else seen).signal
 
 
 def peak_ratio(before: Floats, after: MapProduct) -> float:

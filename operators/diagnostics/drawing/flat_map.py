@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.maps.grid import image_grid
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.transforms import convolved, gaussian_taps
 from zonda.core.types import AnyFloats
@@ -128,5 +129,8 @@ class FlatMap:
         return math.sqrt((w * values[use].astype(np.float64) ** 2).sum() / w.sum()) if w.sum() > 0 else math.nan
 
     def _convolve(self, values: AnyFloats, fwhm: float) -> AnyFloats:
-        """Convolve with a Gaussian of ``fwhm`` [rad], in single precision."""
+        """Convolve with a Gaussian of ``fwhm`` [rad], in single precision; of a wide map each pixel with its own kernel."""
+        grid = image_grid(self.header, (values.shape[0], values.shape[1]), self.pixel)
+        if not grid.even:
+            return grid.smoother(fwhm)(values).astype(np.float32)
         return convolved(values, gaussian_taps(fwhm / FWHM_PER_SIGMA / self.pixel).astype(np.float32))
