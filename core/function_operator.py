@@ -16,8 +16,10 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from .block import Block
+from .changed import Changed, whole
 from .errors import PipelineError, ZondaError
 from .operator import Operator
+from .stream import Stream
 
 Function = Callable[[Block], Any]
 
@@ -32,11 +34,39 @@ class FunctionOperator(Operator):
 
     _call: Any = PrivateAttr(None)
 
+    def measure(self, stream: Stream, model: Any = None) -> Changed | None:
+        """``couples = "all"``: call the function with a block that is the whole scan. Each signal is acted on by itself.
+
+        Raises PipelineError as `exec` does.
+        """
+        observation, fixed = stream.observation, None
+        if stream.name == EMISSION:
+            fixed = observation.smooth.get(EMISSION)
+        name, (n_det, n_samp) = stream.name, stream.shape
+        values, every = whole(stream, fixed), (slice(0, n_det), slice(0, n_samp))
+        block = Block(observation, *every, {name: values}, dtype=np.float64, components=stream.components)
+        self._act(block)
+        if not self.provides:
+            return None
+        left = block.detdata.get(name)
+        if left is not values and (not isinstance(left, np.ndarray) or left.shape != block.shape or left.dtype.kind != "f"):
+            text = f"the function {self.function} left no stream {name} of shape {block.shape}"
+            raise PipelineError(text, place=self.label, cure=f'change block.detdata["{name}"] in place, or return it')
+        return Changed.of(np.asarray(left, np.float64), stream, fixed)
+
     def exec(self, block: Block, state: Any) -> None:
-        """Call the function; an array that it returns becomes the stream that it provides.
+        """Call the function; an array that it returns becomes the stream that it provides. With ``couples = "all"`` put what
+        `measure` found.
 
         Raises PipelineError from whatever the function raises, with the step, the function and its place.
         """
+        if self.couples != "all":
+            self._act(block)
+        elif state is not None:
+            state.put(block, next(iter(self.provides)))
+
+    def _act(self, block: Block) -> None:
+        """See `exec`."""
         try:
             made = self._call(block)
         except (ZondaError, MemoryError):
@@ -57,6 +87,10 @@ class FunctionOperator(Operator):
         block.new(next(iter(self.provides)), zero=False)[...] = values
 
 
+EMISSION = "atmosphere"
+"""The stream whose mean stands in ``observation.smooth`` (`core.run.whole`)."""
+
+
 @overload
 def operator(
     function: Function,
@@ -64,7 +98,7 @@ def operator(
     name: str | None = None,
     requires: Iterable[str] = ("signal",),
     provides: Iterable[str] = ("signal",),
-    couples: Literal["sample", "detectors", "time"] = "sample",
+    couples: Literal["sample", "detectors", "time", "all"] = "sample",
     linear: bool = False,
 ) -> FunctionOperator: ...
 @overload
@@ -74,7 +108,7 @@ def operator(
     name: str | None = None,
     requires: Iterable[str] = ("signal",),
     provides: Iterable[str] = ("signal",),
-    couples: Literal["sample", "detectors", "time"] = "sample",
+    couples: Literal["sample", "detectors", "time", "all"] = "sample",
     linear: bool = False,
 ) -> Callable[[Function], FunctionOperator]: ...
 def operator(
@@ -83,10 +117,14 @@ def operator(
     name: str | None = None,
     requires: Iterable[str] = ("signal",),
     provides: Iterable[str] = ("signal",),
-    couples: Literal["sample", "detectors", "time"] = "sample",
+    couples: Literal["sample", "detectors", "time", "all"] = "sample",
     linear: bool = False,
 ) -> FunctionOperator | Callable[[Function], FunctionOperator]:
     """A step that calls ``function(block)`` for every block; a plain call, or a decorator.
+
+    With ``couples="all"`` the block is the whole scan: all detectors (of a band) and all samples, in float64, once for each scan
+    and signal. Any other coupling sees parts: ``detectors`` all detectors at some of the samples, ``time`` all samples of some of
+    the detectors.
 
     The function returns the stream that it provides, (n_det_block, n_samp_block), or changes ``block.detdata`` and returns
     nothing. Streams have their mean in them, as for every step that does not say ``knows_means`` (`Operator`). It may be called
@@ -100,7 +138,7 @@ def operator(
     requires, provides
         Names of streams that it reads and writes. What adds to the data provides a `Component`.
     couples, linear
-        As of `Operator`.
+        As of `Operator`. With ``all`` it reads one stream, and provides that or nothing; it needs no `measure`.
 
     Raises
     ------
@@ -115,13 +153,17 @@ def operator(
     for what, names in (("requires", requires), ("provides", provides)):
         if isinstance(names, str) or not all(isinstance(one, str) for one in names):
             raise PipelineError(f"{what} is a list of names, not {names!r:.60}", place=place, cure=f"write {what}=['signal']")
-    if couples not in ("sample", "detectors", "time"):
-        cure = "choose from 'sample', 'detectors', 'time'; what measures the whole stream is a class (docs/plugins.md)"
+    if couples not in ("sample", "detectors", "time", "all"):
+        cure = "choose from 'sample', 'detectors', 'time', 'all'"
         raise PipelineError(f"a function cannot couple {couples!r:.40}", place=place, cure=cure)
+    if couples == "all" and (len(set(requires)) != 1 or not set(provides) <= set(requires)):
+        cure = "write requires=['signal'], and the same or nothing as provides"
+        raise PipelineError("a function of a whole scan reads one stream, and provides that or nothing", place=place, cure=cure)
     own = getattr(function, "__name__", type(function).__name__)
     label = name or ("function" if own == "<lambda>" else own)
     given = {
         "requires": frozenset(requires), "provides": frozenset(provides), "couples": couples, "linear": bool(linear),
+        "knows_means": couples == "all",
         "__doc__": getattr(function, "__doc__", None) or "A function.", "__module__": __name__,
     }  # fmt: skip
     made = cast(Any, type(FunctionOperator))(label if label.isidentifier() else "function", (FunctionOperator,), given)

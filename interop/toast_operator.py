@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any, ClassVar, Literal
 
@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, JsonValue, model_validator
 
 from zonda.core.block import Block
+from zonda.core.changed import Changed
 from zonda.core.configuration.diagnostics import nearest
 from zonda.core.configuration.values import refusal
 from zonda.core.data import Data
@@ -84,18 +85,7 @@ class ToastOperator(Operator):
 
     def exec(self, block: Block, state: Changed) -> None:
         """Replace the signal by what TOAST made of it."""
-        block.detdata["signal"][...] = state.values[block.detectors, block.samples]
-        block.means.pop("signal", None)
-        if state.mean is not None:
-            block.means["signal"] = state.mean
-
-
-@dataclass(frozen=True)
-class Changed:
-    """A signal that TOAST changed: values (n_det, n_samp), and the mean that stands beside them, if it is still there."""
-
-    values: AnyFloats
-    mean: SmoothField | None
+        state.put(block, "signal")
 
 
 WHAT = {"shared": "shared data", "intervals": "intervals", "detdata": "detector data", "meta": "metadata"}
@@ -155,12 +145,7 @@ def _changed(step: ToastOperator, stream: Stream) -> Changed:
         values = np.array(ob.detdata["signal"].data)
         values[spoilt] = np.nan
         values[_newly_flagged(step.label, stream, ob, before)] = np.nan
-    if mean is not None and not _is_left(values, mean, observation):
-        mean = None
-    if mean is not None:
-        for row, each in enumerate(values):
-            each -= mean.evaluate(slice(row, row + 1), slice(0, len(each)))[0]
-    return Changed(values.astype(stream.dtype), mean)
+    return Changed.of(values, stream)
 
 
 def made(name: str, traits: Mapping[str, Any]) -> Any:
@@ -260,13 +245,3 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
         tally.count(label, "instants that TOAST flagged", int(instants.sum()), observation.n_samples)
         tally.count(label, "further single samples that TOAST flagged", int((new & ~instants).sum()), new.size)
     return new & ~instants
-
-
-def _is_left(values: AnyFloats, mean: SmoothField, observation: Observation) -> bool:
-    """Whether the mean is still in the signal: its samples are nearer to the mean than to zero."""
-    with_it, without, good = 0.0, 0.0, observation.good_samples
-    for row in np.flatnonzero(observation.good_detectors):
-        part = values[row, good]
-        rest = part - mean.evaluate(slice(row, row + 1), slice(0, len(good)))[0, good]
-        with_it, without = with_it + float(np.nansum(rest * rest)), without + float(np.nansum(part * part))
-    return with_it < without

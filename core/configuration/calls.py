@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import FunctionType
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from ..errors import ZondaError
 from .diagnostics import ConfigurationError, Diagnostic
 from .explain import explain
 from .yaml_places import Document, Mark, Path, Source, Span
@@ -107,3 +109,25 @@ def written(name: str, given: Mapping[str, Any]) -> Document:
 def _short(value: Any) -> str:
     text = " ".join(repr(value).split())
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]} ..."
+
+
+def without_a_type(name: str, bases: tuple[type, ...], namespace: Mapping[str, Any], error: Exception) -> ZondaError:
+    """A class ``name`` of parameters, one of whose attributes pydantic cannot take."""
+    typed, kinds = namespace.get("__annotations__", {}), (FunctionType, property, classmethod, staticmethod, type)
+    plain = {k: v for k, v in namespace.items() if not k.startswith("_") and k not in typed and not isinstance(v, kinds)}
+    fields = {field for base in bases for field in getattr(base, "model_fields", {})}
+    methods = {k for k in plain if any(callable(getattr(base, k, None)) for base in bases)}
+    constants = {k for base in bases for k in getattr(base, "__class_vars__", ())}
+    for attribute, value in plain.items():
+        if attribute in constants:
+            continue
+        text = f"{attribute} = {value!r:.40}"
+        if attribute in methods:
+            return ZondaError(f"{text}: {attribute} is a method", place=name, cure=f"write def {attribute}(self, ...): ...")
+        if attribute == "name" and attribute in fields:
+            cure = f"leave it out, and give a step its label where it is made: {name}(name={value!r:.40})"
+            return ZondaError(f"{text}: the label of a step is no constant of its class", place=name, cure=cure)
+        kind = type(value).__name__ if value is not None else "Any"
+        cure = f"write {attribute}: {kind} = {value!r:.40} for a parameter, {attribute}: ClassVar[{kind}] = ... for a constant"
+        return ZondaError(f"{text} has no type", place=name, cure=cure)
+    return ZondaError(f"its parameters cannot be used: {str(error).splitlines()[0]}", place=name, cure="give each a type")

@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, PydanticUserError, ValidationError
 
 from ..errors import ZondaError
 from ..notebook import html_table
@@ -45,6 +45,15 @@ else:
 
         All is worked out when somebody asks.
         """
+
+        def __new__(mcls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **more: Any) -> Any:
+            """Raises ZondaError for what is neither a parameter nor a constant."""
+            try:
+                return super().__new__(mcls, name, bases, namespace, **more)
+            except PydanticUserError as err:
+                from .calls import without_a_type
+
+                raise without_a_type(name, bases, namespace, err) from None
 
         @property
         def __doc__(cls) -> str:

@@ -13,6 +13,7 @@ from ..errors import PipelineError
 from ..operator import Operator
 from ..scene import Scene
 from ..signal import Signal
+from .contract import broken
 
 PRECISIONS = ("float32", "float64")
 
@@ -31,6 +32,10 @@ def steps(operators: Any, name: str) -> list[Operator]:
         cures.append(_cure(operator, k))
     if wrong:
         raise PipelineError("; ".join(wrong), place=name, cure="\n".join(dict.fromkeys(cures)))
+    faults = [(k, operator, found) for k, operator in enumerate(made, 1) if (found := broken(operator))]
+    if faults:
+        text = "\n".join(f"step {k}, {type(operator).__name__}: {fault}" for k, operator, (fault, _) in faults)
+        raise PipelineError(text, place=name, cure="\n".join(dict.fromkeys(cure for *_, (_, cure) in faults)))
     return made
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..block import Block
 from ..compilation.jit import nb
+from ..errors import PipelineError
 from ..faults import PluginError, whose
 from ..mapmaker import MapMaker, filters, forms
 from ..numerics.tiles import TILE_SAMPLES
@@ -210,7 +211,9 @@ class BlockMaker:
 
         def work(block: Block) -> None:
             before = dict(block.detdata)
-            step.exec(block, state)
+            if (lost := step.exec(block, state)) is not None:  # type: ignore[func-returns-value]
+                text = f"exec returned {type(lost).__name__}, which nobody takes: a step changes block.detdata in place"
+                raise PipelineError(text, place=label, cure='write block.detdata["signal"][...] = ..., and return nothing')
             check_left(step, block, before, self._due[label])
 
         fields = {}

@@ -66,7 +66,7 @@ def test_white_noise_is_that_of_the_maps_own_covariances(tmp_path, angles, plate
     product = file.pipeline().run(file.scene(), threads=1).products["map"]
     for plane in "IQU":
         one = product.stokes(plane).smoothed(product.fwhm)
-        near = (one.distance() <= RADIUS) & (one.hits > 0)
+        near = (one.distance() <= RADIUS) & (one.known)
         expected = math.sqrt(np.average(one.noise[near] ** 2, weights=one.weights[near]))
         # the map rounds weights and terms to 2^-30; a pixel on the circle may be on its other side
         assert found.rms(stokes=plane) == pytest.approx(expected, rel=1e-5)
