@@ -55,7 +55,7 @@ NOT_READ = {
     "psi": "write polarization_angle, from eta towards xi", "theta": "write xi and eta", "phi": "write xi and eta",
     "quat": "write xi, eta and polarization_angle", "pol": "write polarization_angle, from eta towards xi",
     "pol_x": "write polarization_angle, from eta towards xi", "pol_y": "write polarization_angle, from eta towards xi",
-    "x": "write xi", "y": "write eta", "nep": "write net", "tau": "give TimeConstant a value",
+    "x": "write xi", "y": "write eta", "nep": "write net", "tau": "remove it, and give the step of the time constant a value",
 }  # fmt: skip
 """Columns that say where detectors look, or how well, in ways that are not read, with the cure."""
 OF_INSTRUMENT = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope", "pink_minimum_frequency")

@@ -108,6 +108,8 @@ class Observation:
         What the bands of a camera share of the scan; None: there is one band.
     output
         Folder (Path) for files that are written while the scan runs (see `Data.output`).
+    seen_of
+        Samples and sample rate [Hz] of the scan of which this is a look at fewer instants (`Operator.check`); None: of itself.
     """
 
     name: str
@@ -143,6 +145,7 @@ class Observation:
     pointed_radec: NDArray[np.float64] | None = None
     recorded_azimuth: NDArray[np.float64] | None = None
     shared: SharedScan | None = None
+    seen_of: tuple[int, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.flags.size:
@@ -189,6 +192,19 @@ class Observation:
     def duration(self) -> float:
         """n_samples / sample_rate, s."""
         return self.n_samples / self.sample_rate
+
+    @property
+    def sampling(self) -> tuple[int, float]:
+        """Samples and sample rate [Hz] with which a run takes the scan."""
+        return self.seen_of or (self.n_samples, self.sample_rate)
+
+    def of_each_band(self) -> list[Observation]:
+        """The scan as a camera with each of the instrument's bands alone sees it; itself where there is one."""
+        if not self.instrument.bands:
+            return [self]
+        cameras = enumerate(self.instrument.cameras.values())
+        none = np.zeros(0, np.uint8)
+        return [replace(self, instrument=c, focalplane=self.focalplane.of_band(k), detector_flags=none) for k, c in cameras]
 
     @property
     def departures(self) -> NDArray[np.float64]:

@@ -415,6 +415,46 @@ def test_numbers_in_a_map_that_no_sky_has(here, capsys, cards, value, words):
     assert all(w in message for w in words), message
 
 
+FILTERS = "  - BinMap\n"
+SIGNALS = "  - Efficiency\n"
+
+
+@pytest.mark.parametrize(
+    ("before", "step", "words"),
+    [
+        (FILTERS, "HighpassFilter: {frequency: 600 Hz}", "removes everything"),
+        (FILTERS, "HighpassFilter: {frequency: 600 Hz, response: bessel}", "removes everything"),
+        (FILTERS, "HighpassFilter: {frequency: 1 Hz, trim: 1 s}", "leaves nothing of a scan of 2 s"),
+        (FILTERS, "HighpassFilter: {frequency: 1 Hz, mask: {radius: 10 deg}}", "covers the whole scan"),
+        (FILTERS, "Detrend: {mask: {radius: 10 deg}}", "covers the whole scan"),
+        (FILTERS, "PolynomialFilter: {interval: throw}", "the scan has no interval 'throw'"),
+        (FILTERS, "PolynomialFilter: {mask: {radius: 10 deg}}", "covers the whole scan"),
+        (FILTERS, "Despline: {knots: 0.5 ms}", "more than 2000"),
+        (FILTERS, "HighpassFilter: {frequency: 1 Hz, mask: {file: map.fits}}", "covers the whole scan"),
+        (FILTERS, "HighpassFilter: {frequency: 1 Hz, mask: {file: nan.fits}}", "NaN"),
+        (FILTERS, "CommonModeFilter: {mask: {file: nan.fits}}", "NaN"),
+        (FILTERS, "ModeSpectrum: {delays: 60}", "more than 4096 rows"),
+        (SIGNALS, "PinkNoise: {minimum_frequency: 600 Hz}", "Nyquist frequency"),
+        (SIGNALS, "PinkNoise: {minimum_frequency: 1e-9 Hz, slope: 3, poles: 2}", "poles fit"),
+        (SIGNALS, "AtmosphereLayers: {pwv: 200 mm}", "precipitable water vapour"),
+        ("  - SaveMap\n", "CompareMaps: {file: nan.fits}", "no pixel has a value"),
+        ("  - SaveMap\n", "CompareMaps: {file: my.yaml}", "my.yaml"),
+    ],
+)
+def test_what_a_scan_does_not_allow_is_refused_by_check_as_by_run(here, capsys, before, step, words):
+    """At the step's place in the file, before anything is simulated."""
+    write_map(here / "nan.fits", np.full((11, 11), np.nan))
+    (here / "my.yaml").write_text(PIPELINE.replace(before, f"  - {step}\n{before}"))
+    assert before in PIPELINE
+    for command in ("check", "run"):
+        assert cli.main([command, "my.yaml", *(["--output", "out"] if command == "run" else [])]) == 2
+        message = capsys.readouterr().err
+        assert "Traceback" not in message
+        assert words in message, message
+        assert "my.yaml:" in message
+    assert not (here / "out").exists() or not list((here / "out").glob("*.fits"))
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     ("change", "words"),

@@ -57,6 +57,22 @@ class AtmosphereLayers(LayerParameters):
         """What an observation sees of the atmosphere, before any of it is drawn."""
         return self._models.of(self, observation)
 
+    def check(self, data: Data) -> list[str]:
+        """The weather and what the band sees of it. Raises InputError or PointingError where a run cannot be seen through it."""
+        models, lines = Models(data.scene.time, data.scene.weather, {}, self._models._bands), list[str]()
+        for observation in data.observations:
+            _check_pointing(observation)
+        for alone in data.observations[0].of_each_band() if data.observations else ():
+            model, band = models.of(self, alone), alone.instrument.band.name
+            _ = model.turbulence, model.ground  # what is wrong with layers is found as they are laid out
+            every = np.concatenate([o.elevation[[o.elevation.argmin(), o.elevation.argmax()]] for o in data.observations])
+            emission = np.asarray(model.band.emission(model.pwv, every))
+            if not lines:
+                lines.append(f"PWV {1e3 * model.pwv:.3g} mm at zenith")
+            through = float(np.mean(model.band.transmission(model.pwv, every)))
+            lines.append(f"{band}: emission {emission.min():.3g} to {emission.max():.3g} K_RJ, transmission {through:.3g}")
+        return lines
+
     def observe(self, data: Data) -> None:
         """Note the start of the run and its scans, which share one drifting atmosphere; announce the load to map makers."""
         self._models = self._models.of_run(data)  # one of its own: copies of this step may be at work in other threads

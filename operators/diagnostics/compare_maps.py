@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,7 @@ from pydantic import Field
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
-from zonda.core.errors import PipelineError
+from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_alone
@@ -26,6 +26,11 @@ from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
 from .comparison.stokes import on_meridians_of, planes_of, products_of
 from .series import about, key_of, plane_key
 from .transfer_function import window_of
+
+if TYPE_CHECKING:
+    from zonda.core.instrument import Band
+
+    from .comparison.files import ReadMap
 
 
 class CompareMaps(Output):
@@ -69,6 +74,20 @@ class CompareMaps(Output):
     (signal ``source_free``) or else of half the difference of the scans; of the latter alone; or as it is (`map`)."""
     bins: int = Field(24, ge=2, le=500)
     """Number of rings of the spectra, of equal width in the logarithm of the scale."""
+
+    def check(self, data: Data) -> list[str]:
+        """Read the `file`, and tell what it holds. Raises InputError where it cannot be read as a map."""
+        if self.file is None:
+            return []
+        read = _read(self)
+        if not np.isfinite(read.planes["I"].values).any():
+            cure = "give a map that is not NaN everywhere"
+            raise InputError("no pixel has a value", place=f"{self.label}, {self.file}", cure=cure)
+        for camera in data.scene.instrument.cameras.values():
+            for plane in read.planes.values():
+                _in_kelvin(plane, camera.band)
+        unit = read.planes["I"].unit or "K_RJ, as it states no unit"
+        return [f"{self.file.name}: {', '.join(read.planes)} in {unit}", *read.notes]
 
     def finalize(self, data: Data) -> None:
         """Raises PipelineError where a map is missing, InputError where the two cannot be compared."""
@@ -118,18 +137,24 @@ def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
     """The planes of the reference, K_RJ."""
     if step.file is None:
         return planes_of(_product(data, step.reference, step.label), step.reference)
-    plane = (step.plane,) if isinstance(step.plane, int) else None if step.plane is None else tuple(step.plane)
-    read = read_planes(step.file, wanted=Wanted(step.hdu, plane, step.coordsys))
+    read, band = _read(step), data.scene.instrument.band
     for what, _, note in (note.partition(": ") for note in read.notes):
         data.tally.state(step.label, what, note)
-    return {which: _in_kelvin(plane, data) for which, plane in read.planes.items()}
+    return {which: _in_kelvin(plane, band) for which, plane in read.planes.items()}
 
 
-def _in_kelvin(plane: Plane, data: Data) -> Plane:
+def _read(step: CompareMaps) -> ReadMap:
+    """The file. Raises InputError as `read_planes`."""
+    assert step.file is not None
+    plane = (step.plane,) if isinstance(step.plane, int) else None if step.plane is None else tuple(step.plane)
+    return read_planes(step.file, wanted=Wanted(step.hdu, plane, step.coordsys))
+
+
+def _in_kelvin(plane: Plane, band: Band) -> Plane:
     if plane.unit in ("K_RJ", ""):
         return replace(plane, unit="K_RJ")
     beam = math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2
-    factor: Any = to_kelvin_rj(plane.unit, data.scene.instrument.band, 1.0, 0.0, beam)
+    factor: Any = to_kelvin_rj(plane.unit, band, 1.0, 0.0, beam)
     if plane.unit == "Jy/pixel":
         factor = factor / np.broadcast_to(plane.grid.areas, plane.values.shape)
     return plane.scaled(factor, "K_RJ")

@@ -60,6 +60,13 @@ class ModeSpectrum(Operator):
     normalize: bool = False
     """Divide each detector's stream by its rms first, so that all count alike."""
 
+    def check(self, data: Data) -> list[str]:
+        """Refuse more than `MOST_ROWS` rows."""
+        for observation in data.observations[:1]:
+            for alone in observation.of_each_band():
+                self.prepare(alone)
+        return []
+
     def prepare(self, observation: Observation) -> Found:
         count = min(self.detectors, observation.n_detectors)
         if count * (self.delays + 1) > MOST_ROWS:

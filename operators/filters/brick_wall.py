@@ -177,14 +177,19 @@ class HighpassPlan:
         return np.asarray(fit + idct(spectrum, type=2))
 
 
+def first_kept(n: int, frequency: float) -> int:
+    """Number of the first cosine that a cut at ``frequency`` cycles per sample keeps of ``n``; 0: all but means and lines."""
+    cycles = n * frequency
+    return max(1, math.ceil(2 * cycles - 1e-9)) if cycles >= 1 else 0
+
+
 @lru_cache(maxsize=2)
 def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) -> HighpassPlan:
     """The plan for scans of ``n`` samples and a cut at ``frequency`` cycles per sample; the rest as in `HighpassFilter`.
 
     Kept for the next scan of that length: not to be changed.
     """
-    cycles = n * frequency
-    cut = max(1, math.ceil(2 * cycles - 1e-9)) if cycles >= 1 else 0
+    cut = first_kept(n, frequency)
     degree = min(degree if cut else min(degree, 1), n - 1)
     if cut:
         degree = min(degree, cut - 1)

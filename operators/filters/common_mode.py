@@ -30,7 +30,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from zonda.core.compilation.jit import nb
-from zonda.core.data import Block, Observation, Stream
+from zonda.core.data import Block, Data, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
 from zonda.core.signal import MAIN
@@ -72,6 +72,13 @@ class CommonModeFilter(CommonModeParameters):
         """The modes, for some of the detectors."""
         scale = None if measured.scale is None else measured.scale[rows]
         return Modes(measured.detectors[:, rows], measured.times, scale)
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse a mask whose file cannot be used."""
+        for observation in data.observations[:1] if self.mask is not None else ():
+            if self.mask is not None:
+                self.mask.of(observation)
+        return []
 
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
         """Find the modes; given those of the complete signal (``model``), their times in this one."""

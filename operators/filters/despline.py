@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
-from zonda.core.data import Block, Observation
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import has_a_signal
 from zonda.core.operator import Operator
@@ -34,16 +34,25 @@ class Despline(Operator):
     knots: Seconds = quantity("60 s", gt=0)
     """Time between two knots."""
 
-    def prepare(self, observation: Observation) -> Fit:
-        """The fit to this observation's good samples. Raises PipelineError for more than `MOST` knots."""
-        spacing = self.knots * observation.sample_rate
-        use = has_a_signal(observation.flags)
+    def check(self, data: Data) -> list[str]:
+        """Refuse more than `MOST` knots in a scan."""
+        for observation in data.observations:
+            self._check_number(observation)
+        return []
+
+    def _check_number(self, observation: Observation) -> None:
         if observation.duration > MOST * self.knots:
             raise PipelineError(
                 f"knots every {self.knots:g} s are more than {MOST} in a scan of {observation.duration:g} s",
                 place=f"{self.label}, {observation.name}",
                 cure="choose longer knots, or a HighpassFilter",
             )
+
+    def prepare(self, observation: Observation) -> Fit:
+        """The fit to this observation's good samples. Raises PipelineError for more than `MOST` knots."""
+        spacing = self.knots * observation.sample_rate
+        use = has_a_signal(observation.flags)
+        self._check_number(observation)
         basis = splines(observation.n_samples, spacing)
         observation.tally.state(self.label, f"{observation.name}: functions fitted to each detector", f"{basis.size}")
         return Fit.of(basis, use)

@@ -6,13 +6,13 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from zonda.core.data import Block, Observation
+from zonda.core.data import Block, Data, Observation
 from zonda.core.flags import has_a_signal
 from zonda.core.operator import Operator
 
 from .baseline import Fit, polynomials
 from .rows import by_rows
-from .source_mask import Inside, SourceMask, check_mask
+from .source_mask import Inside, SourceMask, check_mask, check_masks
 
 
 class Detrend(Operator):
@@ -31,6 +31,10 @@ class Detrend(Operator):
     """Order of the polynomial (0: the mean, 1: a line)."""
     mask: SourceMask | None = None
     """Source whose samples are not used for the fit; it is subtracted there too."""
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse a mask that cannot be used."""
+        return check_masks(self.mask, data, self.label)
 
     def prepare(self, observation: Observation) -> tuple[Fit, Inside | None]:
         """The fit to this observation's good samples."""

@@ -15,10 +15,10 @@ from zonda.core.types import AnyFloats, Floats
 
 from .baseline import Fit, polynomials
 from .bessel import BesselPlan, sections
-from .brick_wall import HighpassPlan, plan_highpass
+from .brick_wall import HighpassPlan, first_kept, plan_highpass
 from .parameters import HighpassParameters
 from .rows import SPOILT, in_double
-from .source_mask import Inside, check_mask, filter_outside
+from .source_mask import Inside, check_mask, check_masks, filter_outside
 
 ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
 
@@ -50,7 +50,12 @@ class HighpassFilter(HighpassParameters):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     def check(self, data: Data) -> list[str]:
-        """Scans that are shorter than one cycle of the cut."""
+        """Scans that are shorter than one cycle of the cut. Raises PipelineError where a run would find nothing left of one."""
+        for observation in data.observations:
+            place = f"{self.label}, {observation.name}"
+            _trimmed(self, *observation.sampling, place)
+            _check_cut(self, *observation.sampling, place)
+        check_masks(self.mask, data, self.label)
         short, every = sum(o.duration * self.frequency < 1 for o in data.observations), len(data.observations)
         text = f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {_short(self)}"
         return [text] if short else []
@@ -89,29 +94,38 @@ def _brick_wall(plan: HighpassPlan, rows: Floats, bad: NDArray[np.intp], masked:
     return sum(filter_outside(row, bad, None if masked is None else masked[d], act) for d, row in enumerate(rows))
 
 
+def _check_cut(step: HighpassFilter, n: int, rate: float, place: str) -> None:
+    """Raise PipelineError for a cut at which nothing is left of a scan of ``n`` samples."""
+    text = f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz contain no higher frequency"
+    if step.response == "bessel":
+        if step.frequency >= rate / 2:
+            raise PipelineError(text, place=place, cure=f"choose a frequency below {rate / 2:.6g} Hz")
+    elif first_kept(n, step.frequency / rate) >= n:
+        cure = f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan"
+        raise PipelineError(text, place=place, cure=cure)
+
+
 def _bessel(step: HighpassFilter, observation: Observation, fine: NDArray[np.bool_]) -> BesselPlan:
     """The causal filter of a scan. Raises PipelineError for a cutoff at the Nyquist frequency or above."""
     rate = observation.sample_rate
-    if step.frequency >= rate / 2:
-        raise PipelineError(
-            f"a cut at {step.frequency:g} Hz removes everything: samples at {rate:g} Hz contain no higher frequency",
-            place=f"{step.label}, {observation.name}",
-            cure=f"choose a frequency below {rate / 2:.6g} Hz",
-        )
+    _check_cut(step, observation.n_samples, rate, f"{step.label}, {observation.name}")
     trend = None if step.degree is None else Fit.of(polynomials(observation.n_samples, step.degree), fine)
     return BesselPlan(sections(step.frequency, rate), trend)
+
+
+def _trimmed(step: HighpassFilter, n: int, rate: float, place: str) -> int:
+    """Samples at either end that are trimmed of ``n``. Raises PipelineError where nothing is left."""
+    trimmed = min(round(step.trim * rate), n)
+    if 2 * trimmed >= n and trimmed:
+        text = f"trimming {step.trim:g} s at either end leaves nothing of a scan of {n / rate:g} s"
+        raise PipelineError(text, place=place, cure="shorten trim or lengthen the scan")
+    return trimmed
 
 
 def _trim(step: HighpassFilter, observation: Observation) -> None:
     """Flag the ends of a scan."""
     n = observation.n_samples
-    trimmed = min(round(step.trim * observation.sample_rate), n)
-    if 2 * trimmed >= n and trimmed:
-        raise PipelineError(
-            f"trimming {step.trim:g} s at either end leaves nothing of a scan of {observation.duration:g} s",
-            place=f"{step.label}, {observation.name}",
-            cure="shorten trim or lengthen the scan",
-        )
+    trimmed = _trimmed(step, n, observation.sample_rate, f"{step.label}, {observation.name}")
     observation.flags[:trimmed] |= TRIMMED
     observation.flags[n - trimmed :] |= TRIMMED
     observation.tally.count(step.label, "samples trimmed", 2 * trimmed, n)
@@ -120,17 +134,12 @@ def _trim(step: HighpassFilter, observation: Observation) -> None:
 def _planned(step: HighpassFilter, observation: Observation) -> HighpassPlan:
     """The plan for a scan's length; says, or refuses, where nothing or little is left."""
     n, rate = observation.n_samples, observation.sample_rate
+    _check_cut(step, n, rate, f"{step.label}, {observation.name}")
     degree = step.degree or 0
     plan = plan_highpass(n, step.frequency / rate, degree, step.oversampling)
     if plan.cut == 0:
         text = _short(step) if n > 1 + min(degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
         observation.tally.state(step.label, f"{observation.name} is shorter than 1/frequency", text)
-    elif plan.cut >= n:
-        raise PipelineError(
-            f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz contain no higher frequency",
-            place=f"{step.label}, {observation.name}",
-            cure=f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan",
-        )
     return plan
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.maps.header import with_known_frame
 from zonda.core.numerics import tangent
 from zonda.core.numerics.projection import pixel_matrix, ray_coefficients
 from zonda.core.observation import Observation
@@ -88,6 +89,7 @@ def _read(path: Path, changed: int) -> MaskImage:
         values, header = np.array(hdu.data), hdu.header.copy()
     if np.isnan(values).any():
         raise InputError("has pixels that are NaN", place=place, cure="write 1 where samples are masked and 0 elsewhere")
+    header, _ = with_known_frame(header, place)
     try:
         return MaskImage(values != 0, pixel_matrix(tangent.plain(header) or _astropy(header, place)))
     except InputError as err:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from zonda.core.data import Block, Observation
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import TRIMMED, has_a_signal
 from zonda.core.intervals import ranges
@@ -29,7 +29,7 @@ from zonda.core.types import Floats
 
 from .baseline import Basis, Fit, polynomials
 from .rows import Rows, by_rows
-from .source_mask import Inside, SourceMask, check_mask
+from .source_mask import Inside, SourceMask, check_mask, check_masks
 
 Part = Literal[
     "whole", "scanning", "throw", "throw_leftright", "throw_rightleft", "scan_leftright", "scan_rightleft"
@@ -57,6 +57,13 @@ class PolynomialFilter(Operator):
     every pass with half of the turnarounds on either side (`throw`)."""
     mask: SourceMask | None = None
     """Source whose samples are not used for the fit; it is subtracted there too."""
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse intervals that a scan does not have."""
+        for observation in data.observations if self.interval != "whole" else ():
+            if not observation.intervals.get(self.interval):
+                self._parts(observation)
+        return check_masks(self.mask, data, self.label)
 
     def prepare(self, observation: Observation) -> tuple[Pieces, Inside | None]:
         """The fits to this observation's good samples; flags what is in no interval."""

@@ -22,6 +22,7 @@ from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
+from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.projection import rotation_matrices
@@ -157,3 +158,16 @@ def check_mask(inside: Inside, observation: Observation, place: str) -> None:
     middle = int(np.argmin(np.hypot(observation.focalplane.xi, observation.focalplane.eta)))
     if inside.at(slice(middle, middle + 1), slice(0, observation.n_samples)).all():
         raise PipelineError("the source mask covers the whole scan", place=place, cure="choose a smaller one")
+
+
+ENOUGH = 256
+"""Instants of a look at a scan from which it is judged whether a mask covers it."""
+
+
+def check_masks(mask: SourceMask | None, data: Data, label: str) -> list[str]:
+    """What `Operator.check` finds of a mask: InputError for a file that cannot be used, PipelineError as `check_mask`."""
+    for observation in data.observations if mask is not None else ():
+        inside = mask.of(observation) if mask is not None else None
+        if inside is not None and observation.n_samples >= min(ENOUGH, observation.sampling[0]):
+            check_mask(inside, observation, f"{label}, {observation.name}")
+    return []

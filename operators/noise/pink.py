@@ -57,6 +57,14 @@ class PinkNoise(Operator):
             raise ValueError("reference says what net refers to: give net too, or neither")
         return self
 
+    def check(self, data: Data) -> list[str]:
+        """Fit the filter, as `prepare` does: InputError where it cannot be."""
+        for rate in {observation.sampling[1] for observation in data.observations}:
+            for observation in data.observations[0].of_each_band():
+                if spectrum := PinkSpectrum.of(self, observation):
+                    _fitted(self, replace(spectrum, rate=rate), observation)
+        return []
+
     def prepare(self, observation: Observation) -> _State | None:
         """Fit the filter; draw the common part. None: there is no pink noise."""
         if spectrum := PinkSpectrum.of(self, observation):
@@ -90,14 +98,22 @@ class _State(NamedTuple):
     """(n_samp,), or one for each slope (n_slopes, n_samp); without samples where nothing is shared."""
 
 
-def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
-    """Raises InputError where the number of poles cannot fit the spectrum (see `power_law_filter`)."""
-    each = spectrum.of_detectors(pink, observation)
+def _fitted(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> dict[float, PowerLawFilter]:
+    """The filter of the spectrum's own slope, and of each that a detector has.
+
+    Raises InputError where the number of poles cannot fit the spectrum (see `power_law_filter`).
+    """
+    slopes = [spectrum.slope, *spectrum.of_detectors(pink, observation).slopes]
     try:
-        law = spectrum.filter(pink.poles)
-        laws = {s: law if s == spectrum.slope else replace(spectrum, slope=s).filter(pink.poles) for s in each.slopes}
+        return {slope: replace(spectrum, slope=slope).filter(pink.poles) for slope in slopes}
     except InputError as err:
         raise InputError(err.message, place=pink.label, cure=err.cure) from None
+
+
+def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
+    """Raises InputError as `_fitted`."""
+    each, laws = spectrum.of_detectors(pink, observation), _fitted(pink, spectrum, observation)
+    law = laws[spectrum.slope]
     observation.tally.state(pink.label, "power over that of white noise", each.describe() + spectrum.describe(law))
     resolve(observation)
     level = level_of(pink, observation)

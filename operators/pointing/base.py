@@ -193,6 +193,8 @@ class Pointing(Operator):
         first = len(data.observations)
         self.model_copy(update={"jitter": 0.0})._observe(data, looked, coarse)
         made = data.observations[first:]
+        for observation in made:
+            observation.seen_of = max(round(self.scan_duration * rate), 1), rate
         elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
         part = "" if len(looked) == self.number else f" ({len(looked)} of them looked at)"
         several = f" of {len(self.targets)} targets" if self.targets else ""

@@ -83,6 +83,7 @@ class PointingRecorded(Operator):
         recording, found = self._read()
         for scan in found.scans:
             data.observations.append(_observation(self, data, _thinned(scan), recording))
+            data.observations[-1].seen_of = len(scan.seconds), scan.rate
         lines = [_summary(scan, recording.frame) for scan in found.scans]
         return lines + [f"{what}: {number}" for what, number in found.counts.items() if number]
 

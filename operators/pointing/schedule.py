@@ -52,6 +52,8 @@ class PointingSchedule(ScheduleParameters):
         total = sum(row.duration for row in rows)
         self._observe(data, min(rate, CHECKED / total))
         made = data.observations[first:]
+        for observation in made:
+            observation.seen_of = max(round(observation.duration * rate), 1), rate
         elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
         end = max(row.start.shifted(row.duration) for row in rows)
         lines = [f"{len(rows)} scan{'s' if len(rows) > 1 else ''} from {rows[0].start} to {end}, {total / 3600:.3g} h in all"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable
-from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -93,10 +92,9 @@ def looked_at(step: SkyParameters, data: Data) -> list[str]:
     if large:
         return [*lines, f"the values of {step.source} are looked at by the run alone: more than {LOOKED_WHOLE >> 20} MB"]
     for whole in data.observations[:SCANS_LOOKED_AT]:
-        for number, camera in enumerate(instrument.cameras.values()):
-            plane = whole.focalplane.of_band(number) if instrument.bands else whole.focalplane
-            grid = grid_of(step, replace(whole, instrument=camera, focalplane=plane))
-            found = conversion(grid, camera.band, step.spectral_index)
+        for observation in whole.of_each_band():
+            grid = grid_of(step, observation)
+            found = conversion(grid, observation.instrument.band, step.spectral_index)
             check_brightness(np.array([np.abs(source.values).max(initial=0.0)]) * found.typical * step.scale, step.place)
     return [*lines, *([f"pixels taken as zero: {source.zeroed}"] if source.zeroed else [])]
 
