@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +61,11 @@ class Image:
             return plain
         to = wcs_frame_rotation(self.wcs)[2] if pole is None else pole
         return replace(plain, values=_turned(self.polarization, (self.axis, to), self, "QU".index(which)))
+
+    @property
+    def fwhm(self) -> float:
+        """Its resolution [rad] by BMAJ; 0 without: pixels are points of the sky before any beam."""
+        return math.radians(float(self.header.get("BMAJ") or 0.0))
 
     @property
     def wcs(self) -> Any:

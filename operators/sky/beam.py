@@ -12,7 +12,9 @@ analytic transform of B,
 
 with J [rad per pixel] the linear map from pixels to the tangent plane, so rotated, skewed and oblong pixels are right. A single
 bright pixel comes out as an exact Gaussian of the FWHM, a uniform image ripples by 4 exp(-2 pi^2 (sigma / pixel)^2):
-3e-6 at 2 pixels per FWHM. Along an axis with fewer the image is taken as smooth instead (`Convolved.coarse`): the cubic spline
+3e-6 at 2 pixels per FWHM. J is constant here: images for which it is not are spread (`spread`).
+
+Along an axis with fewer the image is taken as smooth instead (`Convolved.coarse`): the cubic spline
 through its pixels, with the transform
 
     sinc^4(k) / sum_m sinc^4(k + m)   (k in cycles per pixel)                                                   (3)
@@ -113,6 +115,29 @@ def convolve(
         bounds=np.array([pad_x - qx / 2, pad_x + (columns - 0.5) * qx, pad_y - qy / 2, pad_y + (rows - 0.5) * qy]),
         steps=(qx, qy),
         coarse=bool((across < SMOOTH_BELOW).any()),
+    )
+
+
+def convolve_evenly(values: Floats, step: float, variance: float, outside: float, linear: bool = False) -> Convolved:
+    """``values`` (ny, nx) on a grid of ``step`` [rad], convolved with a Gaussian of ``variance`` [rad^2] of either axis.
+
+    They fade out towards the edges. What interpolation between points takes from a wave is divided out: sinc^4(k h) of cubic
+    B-splines and sinc^2(k h) of lines; what is left are its images, half of which are at the points and half between them.
+    """
+    rows, columns = values.shape
+    ny, nx = fast_length(rows), fast_length(columns)
+    kx, ky = np.fft.rfftfreq(nx), np.fft.fftfreq(ny)[:, None]  # cycles per step
+    transfer = np.exp(-2 * np.pi**2 * variance / step**2 * (kx**2 + ky**2))
+    transfer /= np.sinc(kx) ** (2 if linear else 4) * np.sinc(ky) ** (2 if linear else 4)
+    grid = np.fft.irfft2(np.fft.rfft2(values - outside, (ny, nx)) * transfer, (ny, nx))
+    size = np.abs(grid)
+    grid[size < TINY * size.max(initial=0.0)] = 0.0
+    return Convolved(
+        coefficients={"float64": grid, "float32": grid.astype(np.float32)},
+        to_grid=np.eye(3),
+        bounds=np.array([-0.5, columns - 0.5, -0.5, rows - 0.5]),
+        steps=(1, 1),
+        coarse=False,
     )
 
 

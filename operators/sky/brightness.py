@@ -18,7 +18,8 @@ from zonda.core.types import Floats
 from .grid import Grid
 from .inputs import HealpixMap, WcsMap
 from .limits import check_brightness
-from .resample import Progress, from_pixels, pixel_areas, resample_healpix, resample_image
+from .resample import ImageOnSky, Progress, resample_healpix, resample_image
+from .spread import Spread, spread_map
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
@@ -65,7 +66,8 @@ def conversion(grid: Grid, band: Band, spectral_index: float) -> Conversion:
         area = np.pi / (3 * source.nside**2)
         factor = total / area
     elif grid.resampled:
-        area, per_area = float(np.nanmedian(pixel_areas(source.wcs, *(_some(n) for n in source.values.shape)))), True
+        x, y = np.meshgrid(*(_some(n) for n in source.values.shape[::-1]))
+        area, per_area = float(np.nanmedian(ImageOnSky(source).areas(x, y))), True
     else:
         areas = tangent_areas(pixel_matrix(grid.wcs), grid.shape)
         area, factor = float(np.nanmedian(areas)), total / areas
@@ -113,6 +115,8 @@ class Brightness:
         What was chosen, and what was taken for something else, for the tally.
     polarization
         (2, ny, nx) Q and U from the meridians through `Grid.axis`; 0 where nothing is known. None: there are none.
+    resolution
+        FWHM [rad] of the Gaussians by which pixels were spread; 0: they were not.
     """
 
     key: tuple[Hashable, ...]
@@ -122,6 +126,7 @@ class Brightness:
     notes: dict[str, str]
     counts: dict[str, int]
     polarization: Floats | None = None
+    resolution: float = 0.0
 
     @property
     def nbytes(self) -> int:
@@ -131,6 +136,8 @@ class Brightness:
         """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's; ``axis``: the grid's."""
         header = self.wcs.to_header(relax=True)
         header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
+        if self.resolution:
+            header["BMAJ"] = header["BMIN"] = float(np.degrees(self.resolution))
         values = np.where(self.covered, self.values, np.nan) if self.covered.size else self.values
         return Image(values, header, "K_RJ", self.polarization, axis)
 
@@ -154,33 +161,42 @@ def on_own_pixels(grid: Grid, found: Conversion, scale: float, place: str) -> Br
     return Brightness(grid.key, values, np.zeros((0, 0), bool), grid.wcs, notes, {ZEROED: source.zeroed}, polarization)
 
 
-def interpolated(grid: Grid, found: Conversion, scale: float, outside: float, place: str, progress: Progress) -> Brightness:
-    """A map of another projection on a TAN grid; ``outside`` where it has no data. Raises as `on_own_pixels`."""
-    source, wcs = grid.source, grid.wcs
+def resampled(
+    grid: Grid, found: Conversion, scale: float, outside: float, place: str, progress: Progress, spread: Spread | None
+) -> Brightness:
+    """A map on a TAN grid, spread or interpolated; ``outside`` where it has no data. Raises as `on_own_pixels`."""
+    assert isinstance(found.factor, float)  # of own pixels alone there is one for each
+    source, wcs, factor = grid.source, grid.wcs, found.factor * scale
     least_and_largest = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
     check_brightness(least_and_largest * (found.typical * scale), place)
     counts, axis = {ZEROED: source.zeroed}, None if source.polarization is None else grid.axis
     if isinstance(source, HealpixMap):
         kind = f"HEALPix of nside {source.nside}"
-        values, covered, counts[POOR] = resample_healpix(source, wcs, grid.tiles, progress, axis)
     else:
-        kind = f"projection {', '.join(source.wcs.wcs.ctype)}"
-        values, covered = resample_image(source, wcs, grid.tiles, progress, found.per_area, axis)
-        counts[LOST] = _lost(source)
+        kind, counts[LOST] = f"projection {', '.join(source.wcs.wcs.ctype)}", _lost(source)
+    part = f", of which {grid.points / np.prod(grid.shape):.0%} is reached" if grid.tiles is not None else ""
+    where = (
+        f"TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of {np.degrees(grid.step) * 3600:.6g} arcsec about the observation"
+    )
+    if spread is not None:
+        how = f"its pixels spread, by their own solid angles, over a {where}{part}"
+        values, covered = spread_map(
+            source, wcs, spread, factor, per_area=found.per_area, outside=outside, tiles=grid.tiles, progress=progress, axis=axis
+        )  # fmt: skip
+    else:
+        how = f"interpolated (third order) onto a {where}{part}; its error falls with the third power of the input's pixel size"
+        if isinstance(source, HealpixMap):
+            values, covered, counts[POOR] = resample_healpix(source, wcs, grid.tiles, progress, axis)
+        else:
+            values, covered = resample_image(source, wcs, grid.tiles, progress, found.per_area, axis)
+        values *= factor
     progress(0, 0)
-    step = abs(float(wcs.wcs.cdelt[1])) * 3600
-    part = f", of which {grid.points / values.size:.0%} is reached" if grid.tiles is not None else ""
-    notes = {
-        **source.notes,
-        "input map": f"{kind}, interpolated (third order) onto a TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of "
-        f"{step:.6g} arcsec about the observation{part}; its error falls with the third power of the input's pixel size",
-        "conversion": found.text,
-    }
+    notes = {**source.notes, "input map": f"{kind}, {how}", "conversion": found.text}
     mask = np.zeros((0, 0), bool) if covered.all() else covered
-    polarization = None if axis is None else values[1:] * (found.factor * scale)
-    values = values if axis is None else values[0]
-    bright = np.where(covered, values * (found.factor * scale), outside)
-    return Brightness(grid.key, bright, mask, wcs, notes, counts, polarization)
+    intensity = values if axis is None else values[0]
+    bright = np.where(covered, intensity, outside) if spread is None else intensity + outside
+    resolution = 0.0 if spread is None else spread.resolution
+    return Brightness(grid.key, bright, mask, wcs, notes, counts, None if axis is None else values[1:], resolution)
 
 
 def _lost(image: WcsMap) -> int:
@@ -189,8 +205,8 @@ def _lost(image: WcsMap) -> int:
         return 0
     step = int(np.ceil(np.sqrt(image.values.size / CHECKED)))
     y, x = np.nonzero(image.values[::step, ::step])
-    lon, lat = from_pixels(image.wcs, x.astype(np.float64) * step, y.astype(np.float64) * step)
-    return int(np.count_nonzero(~(np.isfinite(lon) & np.isfinite(lat)))) * step * step
+    d = ImageOnSky(image).grid.at(x * step, y * step)
+    return int(np.count_nonzero(~np.isfinite(d).all(axis=-1))) * step * step
 
 
 def too_bright(peak: float, conversion: str) -> str:

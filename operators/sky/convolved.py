@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -14,15 +15,17 @@ from zonda.core.hooks import manager
 from zonda.core.numerics.angles import ARCSEC
 from zonda.core.types import Floats
 
-from .beam import REACH, SIGMA, convolve, distinct
-from .brightness import Brightness, conversion, interpolated, on_own_pixels, too_bright
+from .beam import REACH, SIGMA, Convolved, convolve, convolve_evenly, distinct
+from .brightness import Brightness, conversion, on_own_pixels, resampled, too_bright
 from .geometry import placed, turned
-from .grid import Grid, own_pixels, tangent_grid
+from .grid import Grid, is_flat, is_resolved, own_pixels, tangent_grid
 from .inputs import HealpixMap, WcsMap
 from .limits import check_brightness
 from .parameters import SkyParameters
 from .read import read_array, read_map
 from .resample import Progress, no_progress
+from .resolution import seen_twice
+from .spread import Spread
 from .state import Beam
 from .stokes import STOKES
 from .units import DOUBT
@@ -48,9 +51,9 @@ def beam_widths(step: SkyParameters, observation: Observation) -> tuple[Floats, 
 
 
 def grid_of(step: SkyParameters, observation: Observation) -> Grid:
-    """The grid on which the map will be convolved; nothing is convolved or interpolated yet."""
-    widths, _ = beam_widths(step, observation)
-    beam = REACH * SIGMA * float(widths.max(initial=0.0)), float(widths.min(initial=np.inf)) / step.pixels_per_fwhm
+    """The grid on which the map will be convolved; nothing is convolved, interpolated or spread yet."""
+    found, _ = beam_widths(step, observation)
+    widths = float(found.min(initial=np.inf)), float(found.max(initial=0.0))
     source, identity = source_of(step, observation.focalplane.polarized)
     band = observation.instrument.band
     key = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
@@ -58,14 +61,16 @@ def grid_of(step: SkyParameters, observation: Observation) -> Grid:
         centre = step.centre.icrs() if isinstance(step.centre, Target) else None
         if step.centre == "target" or (centre is None and source.wcs is None):
             centre = observation.centre
+        moved = source if centre is None or source.wcs is None else turned(source, centre, step.place)
         wcs = placed(source, centre)
         if wcs is not None:
-            moved = centre is not None and source.wcs is not None and source.polarization is not None
-            turn = turned(source, centre, step.place).turn if centre is not None and moved else None
-            return own_pixels(source, wcs, key, turn)
-        if centre is not None:
-            return tangent_grid(turned(source, centre, step.place), observation, beam, (*key, centre), step.place)
-    return tangent_grid(source, observation, beam, key, step.place)
+            placeless = replace(source, wcs=wcs)
+            reach = REACH * SIGMA * widths[1]
+            if not is_resolved(placeless, widths[0]) or is_flat(source, wcs, observation, reach):
+                return own_pixels(source, wcs, key, moved.turn)
+            moved = placeless if source.wcs is None else moved
+        source, key = moved, key if centre is None else (*key, centre)
+    return tangent_grid(source, observation, widths, step.pixels_per_fwhm, key, step.place)
 
 
 def source_of(step: SkyParameters, polarized: bool) -> tuple[WcsMap | HealpixMap, tuple[Hashable, ...]]:
@@ -88,6 +93,7 @@ def looked_at(step: SkyParameters, data: Data) -> list[str]:
         beam = instrument.beam_fwhm if step.fwhm is None else step.fwhm
         if text := odd_pixels(source, beam):
             warnings.warn(f"{step.label}: {step.file or step.source}: {text}", stacklevel=2)
+    warn_of_beams(step, source, np.array([camera.beam_fwhm for camera in instrument.cameras.values()]))
     lines = [f"{what}: {text}" for what, text in source.notes.items() if what != DOUBT]
     if large:
         return [*lines, f"the values of {step.source} are looked at by the run alone: more than {LOOKED_WHOLE >> 20} MB"]
@@ -97,6 +103,16 @@ def looked_at(step: SkyParameters, data: Data) -> list[str]:
             found = conversion(grid, observation.instrument.band, step.spectral_index)
             check_brightness(np.array([np.abs(source.values).max(initial=0.0)]) * found.typical * step.scale, step.place)
     return [*lines, *([f"pixels taken as zero: {source.zeroed}"] if source.zeroed else [])]
+
+
+def warn_of_beams(step: SkyParameters, source: WcsMap | HealpixMap, telescope: Floats) -> str:
+    """Warn where a map that was made with a beam is convolved with those of detectors, FWHM (n,) [rad]; what is stated of it."""
+    if step.beam == "none":
+        return ""
+    stated, text = seen_twice(source.beam, step.fwhm, telescope)
+    if text:
+        warnings.warn(f"{step.label}: {step.file or step.source}: {text}", stacklevel=2)
+    return stated
 
 
 def odd_pixels(source: WcsMap, beam: float) -> str:
@@ -113,31 +129,47 @@ def odd_pixels(source: WcsMap, beam: float) -> str:
 
 def brightness_on(grid: Grid, step: SkyParameters, band: Band) -> Brightness:
     """The map on the grid, in K_RJ."""
+    return _brightness(grid, step, band, grid.spread)
 
+
+def _brightness(grid: Grid, step: SkyParameters, band: Band, spread: Spread | None) -> Brightness:
     def make() -> Brightness:
         found = conversion(grid, band, step.spectral_index)
         if not grid.resampled:
             return on_own_pixels(grid, found, step.scale, step.place)
-        progress = _progress(step, f"interpolating {step.source}")
-        return interpolated(grid, found, step.scale, step.outside, step.place, progress)
+        progress = _progress(step, f"{'interpolating' if spread is None else 'spreading'} {step.source}")
+        return resampled(grid, found, step.scale, step.outside, step.place, progress, spread)
 
-    return cast(Brightness, step._cache.get(grid.key, make))
+    return cast(Brightness, step._cache.get((*grid.key, spread), make))
 
 
-def with_beam(sky: Brightness, step: SkyParameters, fwhm: float) -> Beam:
-    """The map convolved with one beam; the Jacobian is that at the tangent point."""
+def with_beam(grid: Grid, step: SkyParameters, band: Band, fwhm: float) -> Beam:
+    """The map convolved with one beam.
+
+    Where the map is spread over the grid the beam is right all over it; else it is that at the
+    tangent point.
+    """
+    linear = step.interpolation == "linear"
 
     def make() -> Beam:
-        jacobian = np.radians(np.asarray(sky.wcs.pixel_scale_matrix, np.float64))
-        linear = step.interpolation == "linear"
-        convolved = convolve(sky.values, jacobian, fwhm, step.outside, step.pixels_per_fwhm, linear)
-        if text := too_bright(float(np.abs(convolved.coefficients["float64"]).max(initial=0.0)), sky.notes["conversion"]):
+        sky, evenly = brightness_on(grid, step, band), grid.spread
+        if evenly is not None and fwhm != evenly.fwhm and not grid.is_flat:
+            evenly = Spread(fwhm, evenly.share)
+            sky = _brightness(grid, step, band, evenly)
+
+        def convolved(values: Floats, outside: float) -> Convolved:
+            if evenly is not None:
+                return convolve_evenly(values, grid.step, evenly.variance(fwhm), outside, linear)
+            jacobian = np.radians(np.asarray(sky.wcs.pixel_scale_matrix, np.float64))
+            return convolve(values, jacobian, fwhm, outside, step.pixels_per_fwhm, linear)
+
+        intensity = convolved(sky.values, step.outside)
+        if text := too_bright(float(np.abs(intensity.coefficients["float64"]).max(initial=0.0)), sky.notes["conversion"]):
             warnings.warn(f"{step.label}: {step.file or step.source}: {text}", stacklevel=2)
         more = () if sky.polarization is None else sky.polarization
-        others = [convolve(values, jacobian, fwhm, 0.0, step.pixels_per_fwhm, linear) for values in more]
-        return Beam.of(sky, fwhm, convolved, tuple(other.coefficients for other in others))
+        return Beam.of(sky, fwhm, intensity, tuple(convolved(values, 0.0).coefficients for values in more))
 
-    return cast(Beam, step._cache.get((*sky.key, "beam", step.pixels_per_fwhm, step.interpolation, fwhm), make))
+    return cast(Beam, step._cache.get((*grid.key, "beam", step.pixels_per_fwhm, step.interpolation, fwhm), make))
 
 
 def _identity(step: SkyParameters) -> tuple[Hashable, ...]:

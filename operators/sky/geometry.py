@@ -13,13 +13,13 @@ from zonda.core.errors import InputError
 from zonda.core.maps.header import number, with_known_frame
 from zonda.core.numerics import tangent
 from zonda.core.numerics.projection import wcs_frame_rotation
-from zonda.core.numerics.sphere import local_axes
+from zonda.core.numerics.sphere import angles, local_axes
 from zonda.core.storage.files import first_line
 from zonda.core.types import Floats
 
 from .inputs import WcsMap
 from .limits import check_geometry, check_sides
-from .resample import from_pixels
+from .resample import ImageOnSky
 
 _ANGLES = {
     **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
@@ -28,6 +28,8 @@ _ANGLES = {
     **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", "asec"), "arcsec"),
     "mas": "mas",
 }
+ROUNDED = 1e-12
+"""rad by which a map that is moved along is not turned."""
 _IN_RADIANS = {"deg": np.pi / 180, "rad": 1.0, "arcmin": np.pi / 10800, "arcsec": np.pi / 648000, "mas": np.pi / 648e6}
 
 
@@ -192,8 +194,9 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
     Parameters
     ----------
     centre
-        ICRS (ra, dec) [rad]: the image's centre, pixel ((nx + 1) / 2, (ny + 1) / 2) counted from 1, is put there and becomes
-        the tangent point; scale and orientation with respect to north are kept. None: where the header puts it.
+        ICRS (ra, dec) [rad]: the image's centre, pixel ((nx + 1) / 2, (ny + 1) / 2) counted from 1,
+        is put there. An image that has a place is moved as a whole (`turned`); one that has none
+        touches the sky there, its second axis north. None: where the header puts it.
 
     """
     if image.wcs is not None and not is_plain_tan(image.wcs):
@@ -203,31 +206,50 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
     from astropy.wcs import WCS
 
     rows, columns = image.values.shape
-    if image.wcs is not None:
-        matrix, swapped = np.asarray(image.wcs.pixel_scale_matrix), image.wcs.wcs.lng == 1
-    else:
-        assert image.scale is not None  # the reader gives one or the other
-        matrix, swapped = np.degrees(image.scale), False
+    middle = np.array([(columns + 1) / 2, (rows + 1) / 2])
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["DEC--TAN", "RA---TAN"] if swapped else ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.crval = np.degrees(centre)[::-1] if swapped else np.degrees(centre)
-    wcs.wcs.crpix = [(columns + 1) / 2, (rows + 1) / 2]
-    wcs.wcs.radesys = "ICRS"
+    wcs.wcs.radesys, wcs.wcs.lonpole = "ICRS", 180.0
+    if image.wcs is None:
+        assert image.scale is not None  # the reader gives one or the other
+        wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], np.degrees(centre), middle
+        return rescaled(wcs, np.degrees(image.scale))
+    lng, lat = image.wcs.wcs.lng, image.wcs.wcs.lat
+    wcs.wcs.ctype = ["DEC--TAN", "RA---TAN"] if lng == 1 else ["RA---TAN", "DEC--TAN"]
+    crpix = np.asarray(image.wcs.wcs.crpix[:2], np.float64)
+    turn = turned(image, centre).turn
+    assert turn is not None  # it was made
+    own = (
+        local_axes(*np.radians([image.wcs.wcs.crval[lng], image.wcs.wcs.crval[lat]])) @ turn
+    )  # of the tangent point, in ICRS there
+    ra, dec = centre if (crpix == middle).all() else (float(v) for v in angles(own[0]))
+    _, east, north = local_axes(ra, dec)
+    angle = float(np.arctan2(own[2] @ east, own[2] @ north)) + np.radians(float(image.wcs.wcs.lonpole) - 180.0)
+    matrix = np.asarray(image.wcs.pixel_scale_matrix, np.float64)
+    if abs(angle) > ROUNDED:  # east and north of the image's matrix are its own: each is turned from north to east
+        c, s = np.cos(angle), np.sin(angle)
+        matrix = np.array([[c, s], [-s, c]] if lng == 0 else [[c, -s], [s, c]]) @ matrix
+    wcs.wcs.crval = np.degrees([dec, ra] if lng == 1 else [ra, dec])
+    wcs.wcs.crpix = crpix
     return rescaled(wcs, matrix)
 
 
 def turned(image: WcsMap, centre: tuple[float, float], place: str = "") -> WcsMap:
-    """An image of any projection with its centre at ``centre``, ICRS (ra, dec) [rad], and its north (of its own coordinates)
-    north there: the sphere is turned, so that the image keeps its shape.
+    """An image of any projection moved over the sky with its centre to ``centre``, ICRS (ra, dec) [rad].
+
+    The sphere is turned, so that the image keeps its shape, and directions at its centre keep their angles from ICRS north: what
+    lies east stays east, whatever the frame of the image. Its Q and U turn with it.
 
     Raises InputError where the image's centre is beyond its projection.
     """
     rows, columns = image.values.shape
-    lon, lat = (float(c) for c in from_pixels(image.wcs, np.array((columns - 1) / 2), np.array((rows - 1) / 2)))
-    if not np.isfinite([lon, lat]).all():
+    sky = ImageOnSky(replace(image, turn=None))
+    middle = sky.directions(np.array((columns - 1) / 2), np.array((rows - 1) / 2))
+    if not np.isfinite(middle).all():
         raise InputError(
             f"the middle of the map is beyond its projection {', '.join(image.wcs.wcs.ctype)}",
             place=place,
             cure="remove centre, or cut the map",
         )
-    return replace(image, turn=local_axes(np.radians(lon), np.radians(lat)).T @ local_axes(*centre))
+    lon, lat = (float(v) for v in angles(middle))
+    back = local_axes(lon, lat).T @ local_axes(*centre)  # from ICRS directions there to those where the image was
+    return replace(image, turn=sky.to_own(lon, lat) @ back)

@@ -1,7 +1,18 @@
-"""The grid on which a map is convolved: its own pixels, or a TAN grid of what a scan reaches; laid out before it is filled."""
+"""The grid on which a map is convolved: its own pixels, or a TAN grid of what a scan reaches; laid out before it is filled.
+
+Which of the two, and how the second is filled:
+
+- A TAN image is convolved on its own pixels where they have one size (`FLAT`) as far as a scan
+  reaches, or are larger than half of the beam.
+- The pixels of any other map of 2 pixels per FWHM or more are spread over a grid (`spread`) whose
+  step resolves the beam.
+- A map without a beam, or with larger pixels, is smooth between its pixels: it is interpolated
+  (`resample`), in steps no longer than its shortest pixel side where the scan looks.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,14 +22,23 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights, frame_rotation, pixel_matrix, rotation_matrices, wcs_frame_rotation
+from zonda.core.numerics.projection import (
+    boresights,
+    directions,
+    frame_rotation,
+    pixel_matrix,
+    rotation_matrices,
+    wcs_frame_rotation,
+)
 from zonda.core.numerics.sphere import angle_between, local_axes
 from zonda.core.types import Floats
 
-from .beam import REACH, SIGMA
+from .beam import REACH, SIGMA, SMOOTH_BELOW
 from .footprint import extent
 from .inputs import HealpixMap, WcsMap
 from .region import Disc, region, tangent_wcs
+from .resample import ImageOnSky
+from .spread import Spread
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -29,6 +49,16 @@ LARGE = 2**22
 """Values of a file below which reading is no matter."""
 PER_POINT = {"image": 1.5e-6, "healpix": 2.5e-5}
 """Seconds for a point of a grid that is interpolated."""
+PER_PIXEL = {"image": 3e-6, "healpix": 1.5e-6}
+"""Seconds for a pixel that is spread over a grid."""
+FLAT = 1e-3
+"""Relative difference of solid angles up to which pixels of a TAN image count as equal (1.5 deg)."""
+FINER = 1.25
+"""Points of a grid over which pixels are spread, in those that are asked for: 5 per FWHM err by 6e-4 of a peak, 4 by 2e-3."""
+NARROWEST = 8
+"""Shortest side of pixels that are not skipped, as a part of their nominal one. (Near a pole those of CAR have none.)"""
+LOOKED_AT = 256, 37
+"""Instants of a scan and detectors of which it is looked up where they are on a map, at most."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +79,8 @@ class Grid:
         False: on the pixels of the file.
     points
         How many are filled.
+    spread
+        How pixels are spread over it; None: they are not.
     pole
         ICRS direction (3,) of the pole of the meridians from which the input's Q and U are counted; None: it has none.
     """
@@ -61,6 +93,7 @@ class Grid:
     resampled: bool
     points: int
     pole: Floats | None = None
+    spread: Spread | None = None
 
     @property
     def nbytes(self) -> int:
@@ -96,9 +129,28 @@ class Grid:
         return int((along @ np.array([-eta, -xi, np.ones(len(xi))]) <= 0).sum())
 
     @property
+    def step(self) -> float:
+        """Distance [rad] of points about the tangent point of a grid that is not the map's own."""
+        return float(np.radians(abs(self.wcs.wcs.cdelt[1])))
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether solid angles are the same all over it, to `FLAT`."""
+        ny, nx = self.shape
+        corners = np.array([[x, y, 1.0] for x in (-0.5, nx - 0.5) for y in (-0.5, ny - 0.5)])
+        matrix = pixel_matrix(self.wcs)
+        rays = corners @ np.linalg.inv(matrix).T
+        furthest = float(angle_between(rays / np.linalg.norm(rays, axis=1, keepdims=True), matrix[2]).max())
+        return bool(np.cos(furthest) ** 3 >= 1 - FLAT)
+
+    @property
     def interpolation(self) -> float:
         """Seconds on the reference machine to bring the map onto the grid."""
-        return self.points * PER_POINT["image" if isinstance(self.source, WcsMap) else "healpix"] if self.resampled else 0.0
+        kind = "image" if isinstance(self.source, WcsMap) else "healpix"
+        if self.spread is not None:
+            pixels = min(self.points * self.step**2 / nominal_sides(self.source).prod(), float(self.source.values.size))
+            return self.points * 5e-7 + float(pixels) * PER_PIXEL[kind]
+        return self.points * PER_POINT[kind] if self.resampled else 0.0
 
     @property
     def seconds(self) -> float:
@@ -114,22 +166,79 @@ def own_pixels(source: WcsMap, wcs: Any, key: tuple[Hashable, ...], turn: Floats
     return Grid((*key, "image", tuple(wcs.wcs.crval)), source, wcs, shape, None, False, source.values.size, pole)
 
 
+def is_flat(source: WcsMap, wcs: Any, observation: Observation, reach: float) -> bool:
+    """Whether a TAN image is flat (`FLAT`) as far as an observation and its beam's ``reach`` [rad] go from its tangent point."""
+    ny, nx = source.values.shape
+    matrix = pixel_matrix(wcs)
+    corners = np.array([[-0.5, -0.5, 1], [-0.5, ny - 0.5, 1], [nx - 0.5, -0.5, 1], [nx - 0.5, ny - 0.5, 1]])
+    rays = corners @ np.linalg.inv(matrix).T
+    end = float(angle_between(rays / np.linalg.norm(rays, axis=1, keepdims=True), matrix[2]).max())
+    if np.cos(end) ** 3 >= 1 - FLAT:
+        return True
+    boresight = observation.sky_boresight
+    cosine = min(float((matrix[2] @ boresights(boresight[chunk])).min()) for chunk in chunks(observation.n_samples))
+    far = float(np.arccos(np.clip(cosine, -1, 1))) + float(np.arctan(observation.focalplane.radius)) + reach
+    return bool(far < np.pi / 2 and np.cos(min(end, far)) ** 3 >= 1 - FLAT)
+
+
 def tangent_grid(
-    source: WcsMap | HealpixMap, observation: Observation, beam: tuple[float, float], key: tuple[Hashable, ...], place: str
+    source: WcsMap | HealpixMap,
+    observation: Observation,
+    widths: tuple[float, float],
+    points: float,
+    key: tuple[Hashable, ...],
+    place: str,
 ) -> Grid:
     """A grid about an observation, of the part of the map that its detectors reach.
 
-    ``beam``: its reach, and the step that it needs [rad]. Raises InputError as `region.region`.
+    ``widths``: of the narrowest and of the widest beam [rad], 0: none; ``points`` per FWHM. Raises InputError as `region.region`.
     """
-    reach, step = beam
-    pixel = pixel_side(source)
-    step = float(np.clip(step, pixel / 4, pixel if isinstance(source, WcsMap) else pixel / 1.5))
-    found = region(observation, step, reach, _disc(source), place)
+    narrow, wide = widths
+    spread = None
+    if is_resolved(source, narrow):
+        spread = Spread.of(narrow, float(nominal_sides(source).max()))
+        step = narrow / points / FINER
+    else:
+        side = shortest_side(source, observation)
+        step = float(np.clip(narrow / points, side / 4, side if isinstance(source, WcsMap) else side / 1.5))
+    found = region(observation, step, REACH * SIGMA * wide, _disc(source), place)
     ra, dec = observation.centre
     wcs = tangent_wcs(ra, dec, found.box, step)
     tiles = None if found.tiles is None else found.tiles.tobytes()
     pole = None if source.polarization is None else _frame(source, place)[2]
-    return Grid((*key, "grid", ra, dec, step, found.box, tiles), source, wcs, found.shape, found.tiles, True, found.points, pole)
+    made = *key, "grid", ra, dec, step, spread, found.box, tiles
+    return Grid(made, source, wcs, found.shape, found.tiles, True, found.points, pole, spread)
+
+
+def is_resolved(source: WcsMap | HealpixMap, fwhm: float) -> bool:
+    """Whether a beam of ``fwhm`` [rad] is at least 2 pixels of the map wide, by the header's scale."""
+    return bool(fwhm > 0 and fwhm >= SMOOTH_BELOW * nominal_sides(source).max())
+
+
+def nominal_sides(source: WcsMap | HealpixMap) -> Floats:
+    """Sides (2,) of a pixel [rad] by the header's scale; of a HEALPix map of the square of its area."""
+    if isinstance(source, HealpixMap):
+        return np.full(2, np.sqrt(np.pi / 3) / source.nside)
+    return np.asarray(np.radians(np.linalg.norm(np.asarray(source.wcs.pixel_scale_matrix), axis=0)))
+
+
+def shortest_side(source: WcsMap | HealpixMap, observation: Observation) -> float:
+    """The shortest side of a pixel [rad] where an observation looks, rounded down in steps of 2^(1/2); `NARROWEST` at least."""
+    nominal = float(nominal_sides(source).min())
+    if isinstance(source, HealpixMap):
+        return nominal
+    plane = observation.focalplane
+    at, of = (slice(None, None, -(-n // most)) for n, most in zip((observation.n_samples, len(plane)), LOOKED_AT, strict=True))
+    d = directions(observation.sky_boresight[at], plane.xi[of], plane.eta[of]).reshape(-1, 3)
+    sky = ImageOnSky(source)
+    x, y, inside = sky.at(d)
+    if not inside.any():
+        return nominal
+    xx, xy, yy = sky.grid.metric(x[inside], y[inside])
+    half, rest = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    found = np.sqrt(np.maximum(half - rest, 0.0))
+    ratio = float(np.nanmin(found, initial=nominal)) / nominal
+    return nominal * float(max(2.0 ** (math.floor(2 * math.log2(max(ratio, 1e-9)) + 1e-6) / 2), 1 / NARROWEST))
 
 
 def _frame(source: WcsMap | HealpixMap, place: str) -> Floats:
@@ -169,10 +278,3 @@ def _disc_of_pixels(source: HealpixMap) -> Disc | None:
         return None
     radius = float(np.arccos(np.clip((d @ middle).min() / length, -1, 1))) + float(healpy.max_pixrad(source.nside))
     return Disc(frame_rotation(source.frame).T @ (middle / length), radius)
-
-
-def pixel_side(source: WcsMap | HealpixMap) -> float:
-    """Side of a pixel, rad."""
-    if isinstance(source, HealpixMap):
-        return float(np.sqrt(np.pi / 3) / source.nside)
-    return float(np.radians(np.sqrt(abs(np.linalg.det(source.wcs.pixel_scale_matrix)))))

@@ -15,6 +15,7 @@ from zonda.core.types import Floats
 
 from . import stokes
 from .inputs import Frame, HealpixMap, Wanted
+from .resolution import made_with
 from .units import beam_solid_angle, check_beam, filled, unit_of
 
 _FRAMES: dict[str, Frame] = {
@@ -79,7 +80,9 @@ def read_healpix(hdu: Any, place: str, wanted: Wanted) -> HealpixMap:
         zeroed += filled(place, values[1:], wanted.missing, f"plane {{}} of Q and U, {where}")
     values *= factor
     q_and_u = values[1:] if len(columns) > 1 else None
-    return HealpixMap(values[0], pixels, nside, nested, frame, unit, beam, notes, zeroed, q_and_u)
+    return HealpixMap(
+        values[0], pixels, nside, nested, frame, unit, beam, notes, zeroed, q_and_u, made_with(header, wanted.input_beam)
+    )
 
 
 def _numbers(hdu: Any, k: int, place: str) -> Floats:

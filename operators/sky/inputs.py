@@ -72,6 +72,8 @@ class WcsMap:
         (3, 3) a direction on the sky (ICRS) to the one in the frame of `wcs` at which the image is looked up; None: the same one.
     polarization
         (2, ny, nx) Q and U in `unit`, COSMO, from the meridians of the frame of `wcs`; None: there are none, or none are wanted.
+    beam
+        FWHM (major, minor) [rad] of the beam that it was made with; None: the file names none.
     """
 
     values: Floats
@@ -83,6 +85,7 @@ class WcsMap:
     zeroed: int = 0
     turn: Floats | None = None
     polarization: Floats | None = None
+    beam: tuple[float, float] | None = None
 
     @property
     def nbytes(self) -> int:
@@ -106,6 +109,7 @@ class HealpixMap:
     notes: dict[str, str] = field(default_factory=dict)
     zeroed: int = 0
     polarization: Floats | None = None
+    beam: tuple[float, float] | None = None
 
     @property
     def nbytes(self) -> int:

@@ -39,7 +39,8 @@ class SkyParameters(Operator):
     pixel_size: Angle | None = Field(None, gt=0)
     """Side of a pixel; replaces the header's scale (its orientation is kept). Default: the header's."""
     centre: Target | Literal["target"] | None = None
-    """Put the map's centre here: a position fixed on the sky, or `target` for the scan's. Default: where its header says."""
+    """Put the map's centre here: a position fixed on the sky, or `target` for the scan's. Directions there keep their
+    angles from ICRS north. Default: where its header says."""
     input_beam: Angle | None = Field(None, gt=0)
     """Full width at half maximum of the beam that a map in Jy/beam was made with. Default: its header's BMAJ and BMIN."""
     coordsys: Literal["icrs", "galactic", "ecliptic"] | None = None

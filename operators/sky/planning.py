@@ -73,8 +73,11 @@ class SkyPlanning(Planning[SkyMap]):
             return Traits(peak=abs(sky.outside))
         if not grid.resampled:
             return Traits(peak=float(np.nanmax(np.abs(brightness_on(grid, sky, band).values - sky.outside), initial=0.0)))
-        factor = sky.scale * conversion(grid, band, sky.spectral_index).typical
-        return Traits(peak=max(abs(v * factor - sky.outside) for v in extremes(grid.source, grid.wcs, grid.tiles)))
+        found = conversion(grid, band, sky.spectral_index)
+        factor = sky.scale * float(np.asarray(found.factor).max())
+        return Traits(
+            peak=max(abs(v * factor - sky.outside) for v in extremes(grid.source, grid.wcs, grid.tiles, found.per_area))
+        )
 
     def _widest(self, observation: Observation) -> float:
         return float(beam_widths(self.operator, observation)[0].max(initial=0.0))
@@ -123,8 +126,7 @@ class SkyPlanning(Planning[SkyMap]):
         if operator.interpolation == "linear" or not fwhm:
             what = "linear" if operator.interpolation == "linear" else "cubic B-spline"
             return Effect("sampling order", (full(what),), cubic, "0.3 % of a point source's peak")
-        step = math.radians(math.sqrt(abs(float(np.linalg.det(grid.wcs.pixel_scale_matrix)))))
-        points = fwhm / step
+        points = fwhm / float(np.radians(np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0)).max())
         n = points * (math.ceil(operator.pixels_per_fwhm / points - 1e-9) if 2 <= points < operator.pixels_per_fwhm else 1)
         saved = FASTER * context.samples
         text = "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 / n^2 of its peak"

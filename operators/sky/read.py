@@ -26,6 +26,7 @@ from .geometry import geometry
 from .healpix import is_healpix, read_healpix
 from .inputs import HealpixMap, Wanted, WcsMap
 from .planes import chosen, plane_of_cube
+from .resolution import made_with
 from .units import beam_solid_angle, check_beam, filled, unit_of
 
 T = TypeVar("T", WcsMap, HealpixMap, WcsMap | HealpixMap)
@@ -144,4 +145,4 @@ def _image(place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Flo
         zeroed += filled(place, q_and_u, wanted.missing, "plane {} of Q and U, row {}, column {} (counted from 1)")
         q_and_u *= factor
         q_and_u[1] *= sign
-    return WcsMap(values, unit, wcs, scale, beam, notes, zeroed, polarization=q_and_u)
+    return WcsMap(values, unit, wcs, scale, beam, notes, zeroed, polarization=q_and_u, beam=made_with(header, wanted.input_beam))

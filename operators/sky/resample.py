@@ -6,6 +6,7 @@ The grid is worked on in blocks, and of each block the tiles that a scan reaches
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
+from zonda.core.maps.grid import wcs_grid
 from zonda.core.numerics.projection import frame_rotation, pixel_matrix, wcs_frame_rotation
-from zonda.core.numerics.sphere import angles, unit_vectors
+from zonda.core.numerics.sphere import local_axes
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
 
@@ -26,27 +28,27 @@ Progress = Callable[[int, int], None]
 
 NEIGHBOURS = 24
 """HEALPix pixels in each local fit: two rings and a few more."""
-ROWS = 64
 BLOCK = 8 * TILE
 AT_ONCE = 16384
 
 
 @dataclass(frozen=True)
-class _Block:
-    """Points of a grid: ``y``, ``x`` (n,) and their ICRS directions ``d`` (n, 3)."""
+class Block:
+    """Points of a grid of ``step`` [rad]: ``y``, ``x`` (n,) and their ICRS directions ``d`` (n, 3)."""
 
     y: NDArray[np.int64]
     x: NDArray[np.int64]
     d: Floats
+    step: float
 
 
-def _blocks(target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1) -> Iterator[_Block]:
+def blocks(target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1) -> Iterator[Block]:
     """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True, where given.
 
     ``thin``: only every ``thin``-th point along each axis.
     """
     nx, ny = target.pixel_shape
-    to_sky = np.linalg.inv(pixel_matrix(target)).T
+    to_sky, step = np.linalg.inv(pixel_matrix(target)).T, float(np.radians(abs(target.wcs.cdelt[1])))
     total, done = nx * ny if tiles is None else int(tiles.sum()) * TILE**2, 0
     progress(0, total)
     for first in range(0, ny, BLOCK):
@@ -58,7 +60,7 @@ def _blocks(target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, th
             if not y.size:
                 continue
             rays = np.stack([x, y, np.ones(y.size)], axis=1) @ to_sky
-            yield _Block(y, x, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+            yield Block(y, x, rays / np.linalg.norm(rays, axis=1, keepdims=True), step)
             done += y.size * thin * thin
             progress(min(done, total), total)
 
@@ -95,131 +97,142 @@ def resample_image(
     from scipy.ndimage import map_coordinates, spline_filter
 
     nx, ny = target.pixel_shape
-    planes, covered = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool)
-    coordinates = _coordinates(image)
-    for block in _blocks(target, tiles, progress):
-        x, y, inside = _on_image(image, coordinates, block.d)
+    found, covered, sky = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool), ImageOnSky(image)
+    for block in blocks(target, tiles, progress):
+        x, y, inside = sky.for_splines(block.d)
         if not inside.any():
             continue
         x, y = x[inside], y[inside]
-        rows, columns = _under(image, x, y)
-        sources = [image.values[np.ix_(rows, columns % image.values.shape[1])]]
-        if axis is not None:
-            sources += _turned(image, rows, columns, axis)
+        rows, columns = sky.around(x, y)
+        px, py = np.meshgrid(columns % image.values.shape[1], rows)
+        planes = sky.planes(px, py, axis)
         if per_area:
-            areas = pixel_areas(image.wcs, rows, columns)
+            areas = sky.areas(px, py)
             with np.errstate(divide="ignore", invalid="ignore"):
-                sources = [np.where(np.isfinite(areas) & (areas > 0), source / areas, 0.0) for source in sources]
+                planes = np.where(np.isfinite(areas) & (areas > 0), planes / areas, 0.0)
         at = np.array([y - rows[0], x - columns[0]])
-        for values, source in zip(planes, sources, strict=True):
-            found = map_coordinates(spline_filter(source, 3, mode="mirror"), at, order=3, prefilter=False, mode="mirror")
-            values[block.y[inside], block.x[inside]] = found
+        for values, plane in zip(found, planes, strict=True):
+            smooth = map_coordinates(spline_filter(plane, 3, mode="mirror"), at, order=3, prefilter=False, mode="mirror")
+            values[block.y[inside], block.x[inside]] = smooth
         covered[block.y[inside], block.x[inside]] = True
-    return planes if axis is not None else planes[0], covered
+    return found if axis is not None else found[0], covered
 
 
-def _turned(image: WcsMap, rows: NDArray[np.int64], columns: NDArray[np.int64], axis: Floats) -> list[Floats]:
-    """Q and U of some rows and columns of an image, from the meridians through the ICRS direction ``axis``; 0 beyond the sky."""
-    assert image.polarization is not None  # asked for only where there are Q and U
-    lon, lat = from_pixels(image.wcs, *np.meshgrid(columns.astype(np.float64), rows.astype(np.float64)))
-    d = unit_vectors(*np.radians((lon, lat)))
-    known = np.asarray(np.isfinite(d).all(axis=-1))
-    to = (wcs_frame_rotation(image.wcs) if image.turn is None else image.turn) @ axis
-    turn = between_meridians(np.where(known[..., None], d, 0.0), np.array([0.0, 0.0, 1.0]), to)
-    found = image.polarization[:, rows][:, :, columns % image.values.shape[1]]
-    return list(turned_by(np.where(known, found, 0.0), turn))
+class ImageOnSky:
+    """Pixels of an image by ICRS directions: their places, solid angles and values, in any projection."""
+
+    def __init__(self, image: WcsMap) -> None:
+        self.image = image
+        self.grid = wcs_grid(image.wcs, (image.values.shape[0], image.values.shape[1]))
+        self._turn = image.turn
+        if image.turn is None:
+            with suppress(InputError):  # FK4 is no rotation of ICRS
+                self._turn = wcs_frame_rotation(image.wcs)
+        cylinder = self.grid.cylinder
+        self._period = float(2 * np.pi / abs(self.grid.matrix[0, 0])) if cylinder else 0.0
+        self._areas = self.grid.areas[:, 0] if cylinder else None  # those of a row are equal
+
+    @property
+    def joined(self) -> bool:
+        """Whether it goes round the sky, so that its last column stands beside its first."""
+        return bool(self._period and abs(self.grid.shape[1] - self._period) < 0.5)
+
+    def directions(self, x: Any, y: Any) -> Floats:
+        """ICRS directions (..., 3) of 0-based pixels; NaN beyond the projection."""
+        own = self.grid.at(x, y)
+        return own @ self._turn if self._turn is not None else _between(own, self._frame, "icrs")
+
+    def areas(self, x: NDArray[np.int64], y: NDArray[np.int64]) -> Floats:
+        """Solid angles [sr] of 0-based pixels; NaN beyond the projection."""
+        if self._areas is not None:
+            return np.asarray(self._areas[y])
+        xx, xy, yy = self.grid.metric(x, y)
+        return np.asarray(np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)))
+
+    def planes(self, x: NDArray[np.int64], y: NDArray[np.int64], axis: Floats | None) -> Floats:
+        """(k, ...) I of pixels, or I, Q and U from the meridians through the ICRS direction ``axis``."""
+        intensity = self.image.values[None, y, x]
+        if axis is None or self.image.polarization is None:
+            return np.asarray(intensity)
+        own = self.grid.at(x, y)
+        known = np.asarray(np.isfinite(own).all(axis=-1))
+        to = (wcs_frame_rotation(self.image.wcs) if self._turn is None else self._turn) @ axis
+        turn = between_meridians(np.where(known[..., None], own, 0.0), np.array([0.0, 0.0, 1.0]), to)
+        return np.concatenate([intensity, turned_by(np.where(known, self.image.polarization[:, y, x], 0.0), turn)])
+
+    def at(self, d: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """0-based pixels (x, y) of ICRS directions (n, 3), NaN beyond the projection, and whether they are on the image."""
+        own = d @ self._turn.T if self._turn is not None else _between(d, "icrs", self._frame)
+        x, y = self.grid.coordinates(own)
+        ny, nx = self.grid.shape
+        with np.errstate(invalid="ignore"):
+            return x, y, (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+
+    def for_splines(self, d: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """As `at`; where the image goes round the sky, x is continuous about where most of the directions are."""
+        x, y, inside = self.at(d)
+        if self.joined and inside.any():
+            middle = np.median(x[inside])
+            x = (x - middle + self._period / 2) % self._period - self._period / 2 + middle
+        return x, y, inside
+
+    def around(self, x: Floats, y: Floats, margin: int = MARGIN) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns with a margin that splines at pixels (x, y) feel; columns beyond a seam go on counting."""
+        ny, nx = self.grid.shape
+        low, high = int(np.floor(x.min())) - margin, int(np.ceil(x.max())) + margin + 1
+        columns = np.arange(low, high) if self.joined else np.arange(max(low, 0), min(high, nx))
+        return np.arange(max(int(np.floor(y.min())) - margin, 0), min(int(np.ceil(y.max())) + margin + 1, ny)), columns
+
+    def under(self, block: Block, rim: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Rows and columns that hold all pixels nearest to points of a block, and which of these points are on the image.
+
+        ``rim``: ICRS directions (n, 3) around the block, a step beyond it. No column stands for the same sky as another one.
+        """
+        ny, nx = self.grid.shape
+        x, y, there = self.at(np.concatenate([block.d, rim]))
+        known = np.isfinite(x) & np.isfinite(y)
+        x, y, more = x[known], y[known], 2
+        if not x.size:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64), there[: len(block.d)]
+        columns = np.arange(nx)
+        if self._period:
+            columns = columns[columns < self._period - 0.5]
+            off = (x - x[0] + self._period / 2) % self._period - self._period / 2
+            if float(np.ptp(off)) > self._period / 2:  # a pole is near
+                more += int(np.ceil(block.step / abs(self.grid.matrix[1, 1])))
+            else:
+                first = x[0] + off.min() - more
+                columns = columns[(columns - first) % self._period <= np.ptp(off) + 2 * more]
+        else:
+            columns = columns[(columns >= x.min() - more) & (columns <= x.max() + more)]
+        rows = np.arange(max(int(np.floor(y.min())) - more, 0), min(int(np.ceil(y.max())) + more + 1, ny))
+        return rows, columns, there[: len(block.d)]
+
+    def to_own(self, ra: float, dec: float) -> Floats:
+        """(3, 3) from ICRS directions to those in the image's frame; of FK4 as it is at (ra, dec) [rad]."""
+        if self._turn is not None:
+            return self._turn
+        axes = local_axes(ra, dec)
+        centre, other = _between(np.stack([axes[0], axes[0] + 1e-5 * axes[2]]), "icrs", self._frame)
+        north = other - centre * (other @ centre)
+        north /= np.linalg.norm(north)
+        return np.stack([centre, np.cross(north, centre), north], axis=1) @ axes
+
+    @property
+    def _frame(self) -> Any:
+        from astropy.wcs.utils import wcs_to_celestial_frame
+
+        return wcs_to_celestial_frame(self.image.wcs)
 
 
-def _on_image(
-    image: WcsMap, coordinates: Callable[[Floats], tuple[Floats, Floats]], d: Floats
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """0-based pixels (x, y) of directions (n, 3), and whether they are on the image; x is continuous across a seam."""
-    rows, columns = image.values.shape
-    x, y = _to_pixels(image.wcs, *coordinates(d))
-    period = _period(image.wcs)
-    if period:
-        x = (x + 0.5) % period - 0.5
-    inside = (x >= -0.5) & (x < columns - 0.5) & (y >= -0.5) & (y < rows - 0.5)
-    if period and abs(columns - period) < 0.5 and inside.any():  # all round the sky: from where most of the points are
-        middle = np.median(x[inside])
-        x = (x - middle + period / 2) % period - period / 2 + middle
-    return x, y, inside
-
-
-def _under(image: WcsMap, x: Floats, y: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the image, with a margin, that splines at pixels (x, y) feel; columns beyond a seam go on counting."""
-    rows, columns = image.values.shape
-    period = _period(image.wcs)
-    joined = bool(period and abs(columns - period) < 0.5)
-    low, high = int(np.floor(x.min())) - MARGIN, int(np.ceil(x.max())) + MARGIN + 1
-    across = np.arange(low, high) if joined else np.arange(max(low, 0), min(high, columns))
-    return np.arange(max(int(np.floor(y.min())) - MARGIN, 0), min(int(np.ceil(y.max())) + MARGIN + 1, rows)), across
-
-
-def _coordinates(image: WcsMap) -> Callable[[Floats], tuple[Floats, Floats]]:
-    """From ICRS directions (..., 3) to the (lon, lat) [deg] in the frame of the image's WCS at which it is looked up."""
-    turn = image.turn
-    if turn is None:
-        try:
-            turn = wcs_frame_rotation(image.wcs)
-        except InputError:  # FK4 is no rotation of ICRS
-            return lambda d: _by_astropy(image.wcs, d)
-
-    def found(d: Floats) -> tuple[Floats, Floats]:
-        lon, lat = np.degrees(angles(d @ turn.T))
-        return lon % 360.0, lat
-
-    return found
-
-
-def _by_astropy(wcs: Any, d: Floats) -> tuple[Floats, Floats]:
+def _between(d: Floats, frame: Any, other: Any) -> Floats:
+    """Directions (..., 3) of one of astropy's frames in another one, by astropy."""
     from astropy.coordinates import SkyCoord
-    from astropy.wcs.utils import wcs_to_celestial_frame
 
-    frame = wcs_to_celestial_frame(wcs)
-    sky = SkyCoord(*np.moveaxis(d, -1, 0), representation_type="cartesian", frame="icrs").transform_to(frame).spherical
-    return np.asarray(sky.lon.deg), np.asarray(sky.lat.deg)
-
-
-def _to_pixels(wcs: Any, lon: Floats, lat: Floats) -> tuple[Floats, Floats]:
-    """0-based pixels of native (lon, lat) [deg]; NaN where the projection has none."""
-    pair = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
-    if wcs.has_distortion:
-        x, y = wcs.all_world2pix(*pair, 0, quiet=True)
-    else:
-        x, y = wcs.wcs_world2pix(*pair, 0)
-    return np.asarray(x), np.asarray(y)
-
-
-def _period(wcs: Any) -> float | None:
-    """Columns in a full turn of a cylindrical projection whose first axis is longitude; None for others."""
-    matrix = wcs.pixel_scale_matrix
-    if str(wcs.wcs.ctype[0])[-3:] not in ("CAR", "CEA", "MER", "CYP") or wcs.wcs.lng != 0 or matrix[0, 1] or matrix[1, 0]:
-        return None
-    return float(360.0 / abs(matrix[0, 0]))
-
-
-def pixel_areas(wcs: Any, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
-    """Solid angles (ny, nx) [sr] of an image's pixels of any projection, by the edges' midpoints; NaN beyond the projection."""
-    areas = np.empty((len(rows), len(columns)))
-    for first in range(0, len(rows), ROWS):
-        chunk = slice(first, first + ROWS)
-        x, y = np.meshgrid(columns.astype(np.float64), rows[chunk].astype(np.float64))
-
-        def ray(dx: float, dy: float, x: Floats = x, y: Floats = y) -> Floats:
-            return unit_vectors(*np.radians(from_pixels(wcs, x + dx, y + dy)))
-
-        h = 0.25
-        across, along = ray(h, 0.0) - ray(-h, 0.0), ray(0.0, h) - ray(0.0, -h)
-        areas[chunk] = np.linalg.norm(np.cross(across, along), axis=2) / (2 * h) ** 2
-    return areas
-
-
-def from_pixels(wcs: Any, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Native (lon, lat) [deg] of 0-based pixels; NaN beyond the projection."""
-    pair = wcs.all_pix2world(x, y, 0)
-    lon, lat = pair if wcs.wcs.lng == 0 else pair[::-1]
-    return np.asarray(lon), np.asarray(lat)
+    known = np.isfinite(d).all(axis=-1, keepdims=True)
+    sky = SkyCoord(*np.moveaxis(np.where(known, d, 1.0), -1, 0), representation_type="cartesian", frame=frame)
+    found = np.moveaxis(np.asarray(sky.transform_to(other).cartesian.xyz.value), 0, -1)
+    return np.where(known, found / np.linalg.norm(found, axis=-1, keepdims=True), np.nan)
 
 
 # ----------------------------------------------------------------------------------------------------------- HEALPix
@@ -249,9 +262,9 @@ def resample_healpix(
     values = planes if axis is not None else planes[0]
     if not len(sky.values):
         return values, covered, poor
-    for block in _blocks(target, tiles, progress):
+    for block in blocks(target, tiles, progress):
         own = healpy.vec2pix(sky.nside, *(block.d @ to_frame.T).T, nest=sky.nest)
-        seen = _slots(sky, own)[1]
+        seen = slots(sky, own)[1]
         near = _near(sky, block.d[seen] @ to_frame.T) if seen.any() else np.zeros(0, np.int64)
         if not len(near):
             continue
@@ -272,12 +285,12 @@ def resample_healpix(
     return values, covered, poor
 
 
-def _slots(sky: HealpixMap, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def slots(sky: HealpixMap, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Where pixels of these numbers stand in ``sky.values``, and whether they are there."""
     if sky.pixels is None:
         return numbers, np.ones(len(numbers), bool)
-    slots = np.minimum(np.searchsorted(sky.pixels, numbers), len(sky.pixels) - 1)
-    return slots, sky.pixels[slots] == numbers
+    found = np.minimum(np.searchsorted(sky.pixels, numbers), len(sky.pixels) - 1)
+    return found, sky.pixels[found] == numbers
 
 
 def _near(sky: HealpixMap, d: Floats) -> NDArray[np.int64]:
@@ -287,13 +300,13 @@ def _near(sky: HealpixMap, d: Floats) -> NDArray[np.int64]:
     middle = d.mean(axis=0)
     middle /= np.linalg.norm(middle)
     radius, pixel = float(np.arccos(np.clip((d @ middle).min(), -1, 1))), float(np.sqrt(healpy.nside2pixarea(sky.nside)))
-    slots = np.zeros(0, np.int64)
+    numbers = np.zeros(0, np.int64)
     for margin in (MARGIN * pixel, 8 * MARGIN * pixel, np.pi):
-        slots, there = _slots(sky, np.sort(healpy.query_disc(sky.nside, middle, min(radius + margin, np.pi), nest=sky.nest)))
-        slots = slots[there]
-        if len(slots) >= NEIGHBOURS:
+        numbers, there = slots(sky, np.sort(healpy.query_disc(sky.nside, middle, min(radius + margin, np.pi), nest=sky.nest)))
+        numbers = numbers[there]
+        if len(numbers) >= NEIGHBOURS:
             break
-    return slots
+    return numbers
 
 
 def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Floats, int]:
@@ -324,23 +337,30 @@ def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Flo
 # ----------------------------------------------------------------------------------------------------------- extremes
 
 
-def extremes(source: WcsMap | HealpixMap, target: Any, tiles: NDArray[np.bool_] | None) -> tuple[float, float]:
-    """Least and largest value of the map's pixels under a grid, from a thinned set of its points; (0, 0) where there are none."""
+def extremes(
+    source: WcsMap | HealpixMap, target: Any, tiles: NDArray[np.bool_] | None, per_area: bool = False
+) -> tuple[float, float]:
+    """Least and largest value of the map's pixels under a grid, from a thinned set of its points; (0, 0) where there are none.
+
+    ``per_area``: of values divided by the solid angles of their pixels [sr].
+    """
     import healpy
 
     found: list[Floats] = []
-    coordinates = _coordinates(source) if isinstance(source, WcsMap) else None
-    for block in _blocks(target, tiles, no_progress, thin=16):
+    sky = ImageOnSky(source) if isinstance(source, WcsMap) else None
+    for block in blocks(target, tiles, no_progress, thin=16):
         if isinstance(source, HealpixMap):
             d = block.d @ frame_rotation(source.frame).T
-            there = _slots(source, healpy.vec2pix(source.nside, *d.T, nest=source.nest))[1]
+            there = slots(source, healpy.vec2pix(source.nside, *d.T, nest=source.nest))[1]
             if there.any():
                 found.append(source.values[_near(source, d[there])])
-        elif coordinates:
-            x, y, inside = _on_image(source, coordinates, block.d)
+        elif sky:
+            x, y, inside = sky.for_splines(block.d)
             if inside.any():
-                rows, columns = _under(source, x[inside], y[inside])
-                found.append(source.values[np.ix_(rows, columns % source.values.shape[1])].ravel())
-    if not found:
+                rows, columns = sky.around(x[inside], y[inside])
+                px, py = np.meshgrid(columns % source.values.shape[1], rows)
+                values, areas = sky.planes(px, py, None)[0], sky.areas(px, py) if per_area else np.ones(1)
+                found.append((values / areas)[np.isfinite(values / areas)])
+    if not any(values.size for values in found):
         return 0.0, 0.0
-    return min(float(v.min()) for v in found), max(float(v.max()) for v in found)
+    return min(float(v.min()) for v in found if v.size), max(float(v.max()) for v in found if v.size)

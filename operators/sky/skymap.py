@@ -14,7 +14,7 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.core.product import Product
 from zonda.core.storage.fits_image import Cards
 
-from .convolved import beam_widths, brightness_on, grid_of, looked_at, with_beam
+from .convolved import beam_widths, brightness_on, grid_of, looked_at, warn_of_beams, with_beam
 from .inputs import HealpixMap
 from .parameters import SkyParameters
 from .state import SkyState
@@ -47,9 +47,11 @@ class InputImage(Product):
 class SkyMap(SkyParameters):
     """Signal of the sky above the atmosphere (K_RJ), from a FITS or HEALPix map: averaged over the band, convolved with the beam.
 
-    A TAN image is used on its own pixels; other projections and HEALPix maps are first interpolated (third order) onto a
-    TAN grid about the observation. The smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at
-    least `pixels_per_fwhm` points per FWHM: with 4 within 0.3 % of the peak of a point source; or linear (`interpolation`).
+    Pixels are points, each with its own solid angle: a detector sees their sum under its beam. A TAN image is convolved on its
+    own pixels as far as they have one size; the pixels of other projections, wider TAN images and HEALPix maps are spread over a
+    TAN grid about the observation (without a beam, and with fewer than 2 pixels per FWHM: interpolated, third order). The
+    smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at least `pixels_per_fwhm` points per FWHM:
+    with 4 within 0.3 % of the peak of a point source; or linear (`interpolation`).
 
     Polarized detectors see I + p (Q cos 2 psi + U sin 2 psi) of maps of I, Q and U (`core.polarization`), whose Q and U are
     turned to common axes before they are convolved and interpolated.
@@ -64,12 +66,15 @@ class SkyMap(SkyParameters):
 
     def prepare(self, observation: Observation) -> SkyState:
         grid, (widths, index) = grid_of(self, observation), beam_widths(self, observation)
+        if stated := warn_of_beams(self, grid.source, observation.focalplane.fwhm):
+            observation.tally.state(self.label, "resolution", stated)
         sky = brightness_on(grid, self, observation.instrument.band)
         if not grid.reached(observation, float(widths.max(initial=0.0))):
             observation.tally.state(self.label, f"{observation.name}: not convolved", "no detector reaches the input map")
             return SkyState(grid, sky, [], index)
         angles = None if sky.polarization is None else PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
-        state = SkyState(grid, sky, [with_beam(sky, self, float(fwhm)) for fwhm in widths], index, angles)
+        band = observation.instrument.band
+        state = SkyState(grid, sky, [with_beam(grid, self, band, float(fwhm)) for fwhm in widths], index, angles)
         state.tell(observation.tally, self.label)
         return state
 

@@ -44,7 +44,6 @@ def beam_solid_angle(place: str, header: Any, unit: str, given: float | None, no
                 f"input_beam is for maps in Jy/beam, and this one is in {unit}", place=place, cure="remove input_beam"
             )
         return None
-    notes["resolution"] = "the map is in Jy/beam, so convolved already; it is convolved with the detector's beam once more"
     degrees = "set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam"
     if given is not None:
         if "BMAJ" in header:

@@ -53,7 +53,8 @@ def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Flo
     from scipy.ndimage import map_coordinates
 
     own = wcs_grid(image.wcs, (image.values.shape[0], image.values.shape[1]))
-    smooth, _ = own.smoothed(np.nan_to_num(image.values), product.fwhm if fwhm is None else fwhm)
+    width = product.fwhm if fwhm is None else fwhm
+    smooth, _ = own.smoothed(np.nan_to_num(image.values), math.sqrt(max(width**2 - image.fwhm**2, 0.0)))
     grid = product.grid
     x, y = own.coordinates(grid.directions() @ grid.turn @ own.turn.T)  # either may be galactic
     at = np.where(np.isfinite(x) & np.isfinite(y), [y, x], -2.0)

@@ -333,13 +333,13 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
 
 
 def plane_of(product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None) -> Plane:
-    """A product of a run, with its noise. The input image has a resolution of 0: no beam.
+    """A product of a run, with its noise. The input image has no beam, but where its pixels were spread (BMAJ).
 
     ``alone``: a map of the noise alone, and what it is in words.
     Where the noise is not known and there is a map of it, it has the shape of 1 / sqrt(samples).
     """
     if isinstance(product, Image):
-        return Plane(name, np.asarray(product.values, np.float64), product.header, product.unit, 0.0)
+        return Plane(name, np.asarray(product.values, np.float64), product.header, product.unit, product.fwhm)
     noise: Floats | None = product.noise
     if not np.isfinite(product.noise).any():
         with np.errstate(divide="ignore"):

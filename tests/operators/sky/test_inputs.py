@@ -191,8 +191,8 @@ CODES = ["AZP", "SZP", "STG", "SIN", "ARC", "ZPN", "ZEA", "AIR", "CYP", "CEA", "
 @pytest.mark.parametrize("axes", ["RA", "GLON"])
 @pytest.mark.parametrize("code", CODES)
 def test_centre_moves_every_projection(made, save, code, axes):
-    """A smooth blob beside the map's centre is found at the same distance and position angle from the target: by astropy's
-    spherical trigonometry, of which the operator knows nothing."""
+    """A smooth blob beside the map's centre is found at the same distance and position angle (of ICRS) from the target: by
+    astropy's spherical trigonometry, of which the operator knows nothing."""
     shape, blob, width = (61, 51), (38, 21), np.radians(0.4)  # 4 pixels of 0.1 deg
     header = made.tan_header(shape, ra=40.0, dec=30.0, crpix=(20.3, 33.2), cdelt=(-360.0, 360.0))
     names = ("RA--", "DEC-") if axes == "RA" else ("GLON", "GLAT")
@@ -202,7 +202,7 @@ def test_centre_moves_every_projection(made, save, code, axes):
     header.update(PARAMETERS.get(code, {}))
     wcs = WCS(header)
     rows, columns = np.mgrid[: shape[0], : shape[1]]
-    where = SkyCoord(*wcs.wcs_pix2world(columns, rows, 0), unit="deg")  # in the map's own coordinates
+    where = SkyCoord(*wcs.wcs_pix2world(columns, rows, 0), unit="deg", frame="icrs" if axes == "RA" else "galactic").icrs
     source = where[blob]
     path = save(np.exp(-4 * np.log(2) * (where.separation(source).rad / width) ** 2), header)
     middle, target = where[shape[0] // 2, shape[1] // 2], SkyCoord(260.0, -10.0, unit="deg")

@@ -135,6 +135,31 @@ def test_a_moved_map_keeps_its_pattern(made, save):
     np.testing.assert_allclose(found, seen(o, turn=turn), rtol=0, atol=1e-7)  # its middle lies between pixels, 1e-9 deg
 
 
+@pytest.mark.parametrize("kind", ["TAN", "CAR"])
+@pytest.mark.parametrize("frame", ["icrs", "galactic"])
+def test_a_map_moved_onto_its_own_centre_stays_as_it_is(made, save, kind, frame):
+    """Galactic north is 57.6 deg from that of ICRS there; the image's reference point is far from its middle."""
+    middle = SkyCoord(83.6, 22.0, unit="deg").transform_to(frame).spherical
+    header = stokes_header(made, (96, 96), ra=middle.lon.deg, dec=middle.lat.deg, cdelt=(-20.0, 20.0), crpix=(-3000.0, 48.5))
+    header.update({f"CTYPE{k}": f"{name}{kind}" for k, name in ((1, "RA---"), (2, "DEC--"))})
+    if frame == "galactic":
+        header.update({f"CTYPE{k}": f"{name}{kind}" for k, name in ((1, "GLON-"), (2, "GLAT-"))})
+        del header["RADESYS"]
+    header["CRVAL2"] = 0.0 if kind == "CAR" else header["CRVAL2"]
+    wcs = WCS(header).celestial
+    own = wcs.pixel_to_world(47.5, 47.5).icrs
+    y, x = np.random.default_rng(5).uniform(30, 65, (2, 200))
+    at = wcs.pixel_to_world(x, y).icrs
+    o = made.observation(at.ra.rad, at.dec.rad, psi=np.linspace(0, 6, 200), centre=(own.ra.rad, own.dec.rad), fwhm=60.0)
+    o.focalplane.polarization_efficiency[:] = 0.9
+    path = save(np.random.default_rng(6).standard_normal((3, 96, 96)), header)
+    stays = made.look(SkyMap(file=path), o)
+    moved = made.look(SkyMap(file=path, centre=f"{own.ra.deg:.12f} deg {own.dec.deg:.12f} deg"), o)
+    # directions are rounded to 1e-12 deg; the tangent point of the grid is the same
+    np.testing.assert_allclose(moved, stays, atol=1e-8)
+    assert stays.std() > 0.1
+
+
 def test_iau_is_cosmo_with_the_other_sign_of_u(made, save):
     values = np.random.default_rng(3).normal(size=(3, 9, 9))
     read = {}

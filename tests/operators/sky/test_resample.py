@@ -10,9 +10,10 @@ from astropy.wcs import WCS
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.operators.sky.brightness import tangent_areas
+from zonda.operators.sky.inputs import WcsMap
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.region import tangent_wcs
-from zonda.operators.sky.resample import pixel_areas, resample_healpix
+from zonda.operators.sky.resample import ImageOnSky, resample_healpix
 from zonda.operators.sky.skymap import SkyMap
 
 ARCMIN = np.pi / 10800
@@ -107,7 +108,7 @@ def test_outside_a_resampled_map(made, save):
 def test_pixel_areas(made, kind):
     header = made.tan_header((60, 70), cdelt=(-600.0, 600.0))
     header["CTYPE1"], header["CTYPE2"] = f"RA---{kind}", f"DEC--{kind}"
-    areas = pixel_areas(WCS(header), np.arange(60), np.arange(70))
+    areas = ImageOnSky(WcsMap(np.zeros((60, 70)), "K_RJ", WCS(header), None)).areas(*np.meshgrid(np.arange(70), np.arange(60)))
     if kind == "ZEA":  # equal-area by name
         np.testing.assert_allclose(areas, (600 * ARCMIN / 60) ** 2, rtol=1e-5)
     if kind == "TAN":
