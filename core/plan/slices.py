@@ -59,8 +59,8 @@ def _taken(values: Any, index: NDArray[np.intp]) -> Any:
 
 
 def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, every: int = 1) -> PipelineFile:
-    """The same pipeline over a slice, without what writes or draws, with a run of the sky as it is in the complete map, and one of
-    the sky with modes of its own where the pipeline has such a signal."""
+    """The same pipeline over a slice, without what writes or draws, with a run of the sky as it is in the
+    complete map, and one of the sky with modes of its own where the pipeline has such a signal."""
     steps: list[Step] = []
     for step in file.steps:
         o = step.operator

@@ -10,6 +10,7 @@ from ..data import Data
 from ..errors import ZondaError
 from ..mapmaker import makes_products
 from ..operator import Operator
+from ..output import may_write
 from ..pipeline import Pipeline
 from ..signal import is_stream
 
@@ -59,6 +60,6 @@ def looks(operators: Sequence[Operator | None], scene: Scene) -> tuple[list[list
 def writes(operators: Iterable[Operator]) -> bool:
     """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its products in memory."""
     return any(
-        not (makes_products(o) or "boresight" in o.provides or (o.provides and all(map(is_stream, o.provides))))
+        may_write(o) or (o.provides and not (makes_products(o) or "boresight" in o.provides or all(map(is_stream, o.provides))))
         for o in operators
     )

@@ -27,8 +27,8 @@ FUNCTION = 0.55e-9
 """Seconds per sample of one function of time that is fitted and removed."""
 
 STANDS_OUT = 0.3
-"""Ratio of the noise's singular values to that of the common mode up to which the second is far from `gap`, were the scan's common mode
-half of the ensemble's."""
+"""Ratio of the noise's singular values to the common mode's up to which the second is far from `gap`,
+were the scan's common mode half of the ensemble's."""
 
 START = 1e-3
 """Residual of the first vector, the detectors' mean."""
@@ -85,8 +85,8 @@ DECIMATION = (
 
 
 def images(q: float) -> tuple[float, float]:
-    """rms and sum of the amplitudes of the two images that a coarse series of ``q`` knots per cycle of the cut makes of a cosine at
-    the cut: sinc(k / 2M)^4 at 2M -+ k over that at k is (k / (2M -+ k))^4 = (q -+ 1)^-4."""
+    """rms and sum of the amplitudes of the two images that a coarse series of ``q`` knots per cycle of the
+    cut makes of a cosine at the cut: sinc(k / 2M)^4 at 2M -+ k over that at k is (k / (2M -+ k))^4 = (q -+ 1)^-4."""
     below, above = (q - 1) ** -4, (q + 1) ** -4
     return math.hypot(below, above), below + above
 

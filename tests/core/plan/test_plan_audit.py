@@ -54,7 +54,7 @@ def test_the_errors_are_there(everything_coarse):
 
 def test_layers_are_bounded_by_what_is_there():
     """Behind the detectors' mean they do not come out a hundred times smaller than they are bounded."""
-    file = zonda.load("mustang2_cluster", overrides=[*SHORT, "CommonModeFilter={method: mean}"])
+    file = zonda.load("mustang2_cluster", overrides=[*SHORT, "CommonModeFilter.method=mean"])
     layers = ["layer 0", "layer 5", "layer 9"]
     found = audit(file, zonda.plan(file, drop=layers, threads=1), threads=1, seconds=40.0)
     assert not found.violated, str(found)
