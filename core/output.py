@@ -58,7 +58,7 @@ class Output(Operator):
 
 
 class StreamOutput(Operator):
-    """A step that writes what its blocks hold, scan by scan: an output that acts before the end (`SaveTOD`)."""
+    """A step that writes what its blocks hold, scan by scan: an output that acts before the end."""
 
 
 def is_output(operator: Operator) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ..mapmaker import MapMaker, filters, forms, makes_products
+from ..mapmaker import MapMaker, filters, forms, made_by, makes_products
 from ..operator import Operator
 from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
@@ -86,6 +86,8 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
         rows += [Row("", o.label, reason) for o in pipeline.signals.steps if o.label not in needed[instead]]
         needed[""] = needed.pop(instead)
     acting = {o.label for o in pipeline.operators if isinstance(o, Output) or "boresight" in o.provides}.union(*needed.values())
+    named = {part for name in needed if name for part in pipeline.runs[name].without or ()}
+    acting |= {o.label for o in pipeline.operators if made_by(o) & named}  # a signal is not without what is not there
     rows = [r for r in rows if not r.operator or (r.operator in acting) == bool(r.run)]
     rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     runs = tuple(name for name in pipeline.runs if name in needed)

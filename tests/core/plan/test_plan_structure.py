@@ -17,7 +17,10 @@ from zonda.core.signal import Component, Signal
 
 def kind(name, requires=(), provides=(), optional=(), base=Operator, **attributes):
     sets = {"requires": frozenset(requires), "provides": frozenset(provides), "optional": frozenset(optional)}
-    return type(name, (base,), {"__doc__": name, "__module__": __name__, **sets, **attributes})()
+    step = "finalize" if issubclass(base, Output) else "observe" if "boresight" in provides else "exec"
+    acts = {} if "configure" in attributes else {step: lambda self, *given: None}
+    acts |= {"measure": lambda self, stream, model=None: None} if attributes.get("couples") == "all" else {}
+    return type(name, (base,), {"__doc__": name, "__module__": __name__, **sets, **acts, **attributes})()
 
 
 POINT = kind("Point", provides={"boresight"})
