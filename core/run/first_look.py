@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from ..data import Data
@@ -40,16 +40,20 @@ def warn_of_nothing_saved(pipeline: Pipeline) -> None:
         warnings.warn(f"{text}; add a step that saves or shows it (`zonda plugins` lists the operators)", stacklevel=3)
 
 
-def looks(operators: Sequence[Operator | None], scene: Scene) -> tuple[list[list[str]], list[tuple[int, ZondaError]]]:
+def looks(
+    operators: Sequence[Operator | None], scene: Scene, say: Callable[[str], None] | None = None
+) -> tuple[list[list[str]], list[tuple[int, ZondaError]]]:
     """What each operator's `check` finds, and every error, with the number of its step.
 
-    None stands for a step that could not be made.
+    None stands for a step that could not be made. ``say`` is told each step before it is looked at.
     """
     data, found = Data(scene=scene), list[list[str]]()
     refused: list[tuple[int, ZondaError]] = []
     for number, operator in enumerate(operators):
         if operator is None:
             continue
+        if say is not None:
+            say(operator.label)
         try:
             found.append(operator.check(data))
         except ZondaError as err:
