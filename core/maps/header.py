@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ _SAME = {
     **dict.fromkeys(("ICRF", "ICRF2", "ICRF3", "GCRS"), ("ICRS", None)),
 }  # fmt: skip
 """What CASA, AIPS and others write: RADESYS and equinox."""
+_NUMBERS = re.compile(r"(CRPIX|CRVAL|CDELT|CROTA)[12]|(CD|PC)[12]_[12]|LONPOLE|LATPOLE|PV[12]_\d+|EQUINOX|EPOCH")
+"""Cards of world coordinates that are numbers: astropy takes a default for one that is none."""
 _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
 
@@ -71,9 +74,17 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
     Raises
     ------
     InputError
-        RADESYS is none that is known, or no text; EQUINOX is no number.
+        RADESYS is none that is known, or no text; cards of the world coordinates are no numbers, units no texts.
     """
     made = header.copy()
+    for key in list(made):
+        if _NUMBERS.fullmatch(key) and number(made, key, place) is None and key in made:
+            del made[key]
+        elif key in ("CUNIT1", "CUNIT2"):
+            text(made, key, place)
+    for key in ("CRVAL1", "CRVAL2"):
+        if abs(number(made, key, place) or 0.0) > 720.0:
+            raise InputError(f"{key} = {made[key]:g} is no longitude or latitude in degrees", place=place, cure=f"correct {key}")
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in _EQUATORIAL:
@@ -81,7 +92,7 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
                 del made[key]
         return made, ""
     for key in ("EQUINOX", "EPOCH"):
-        if key in made and number(made, key, place) is None:
+        if key in made and not number(made, key, place):  # 0: not known
             del made[key]
     key = "RADESYS" if "RADESYS" in made else "RADECSYS"
     written = text(made, key, place)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..errors import InputError
+from .header import number
 
 _NAMES = {1: "I", 2: "Q", 3: "U", 4: "V"}
 """Values of a FITS axis STOKES (Greisen & Calabretta 2002); those below zero are correlations."""
@@ -80,10 +81,24 @@ def columns_of_q_and_u(names: Sequence[str]) -> list[int] | None:
     return [letters.index("Q"), letters.index("U")] if {"Q", "U"} <= set(letters) else None
 
 
-def along_axis(header: Any, axis: int, length: int) -> list[str]:
-    """What each plane along the FITS axis STOKES is."""
-    first, step, pixel = (float(header.get(f"{key}{axis}", 1.0)) for key in ("CRVAL", "CDELT", "CRPIX"))
-    return [_NAMES.get(round(first + (n + 1 - pixel) * step), "a correlation") for n in range(length)]
+def along_axis(header: Any, axis: int, length: int, place: str = "") -> list[str]:
+    """What each plane along the FITS axis STOKES is: I, Q and U where no card says anything.
+
+    Raises
+    ------
+    InputError
+        Its cards are no numbers, or not all there; they give no whole numbers, or one for several planes.
+    """
+    cure = f"correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}: 1, 1, 1 for I, Q, U"
+    given = [number(header, f"{key}{axis}", place, cure) for key in ("CRVAL", "CDELT", "CRPIX")]
+    if (given[0] is None) != (given[2] is None):
+        raise InputError(f"of CRVAL{axis} and CRPIX{axis} one is missing", place=place, cure=cure)
+    first, step, pixel = (1.0 if value is None else value for value in given)
+    values = [first + (n + 1 - pixel) * step for n in range(length)]
+    if any(abs(value - round(value)) > 1e-3 for value in values) or len({round(value) for value in values}) < length:
+        told = ", ".join(f"{value:g}" for value in values[:4])
+        raise InputError(f"the planes of its axis STOKES have the values {told}", place=place, cure=cure)
+    return [_NAMES.get(round(value), "a correlation") for value in values]
 
 
 def _letter(name: str) -> str:

@@ -34,12 +34,11 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
             have.add("signal")
         name = type(operator).__name__
         later = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides}
-        made = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides - o.requires}
         for what in sorted(operator.requires - have):
-            if what in made:
+            if what in later:
                 problems.append(
                     OrderProblem(
-                        index, f"{name} needs {what}, which {made[what]} provides only later", f"move it below {made[what]}"
+                        index, f"{name} needs {what}, which {later[what]} provides only later", f"move it below {later[what]}"
                     )
                 )
             else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,21 +17,48 @@ from zonda.core.configuration.units import read_unit
 from zonda.core.errors import InputError
 from zonda.core.intervals import Intervals
 from zonda.core.storage import fits_files, hdf5_files
+from zonda.core.storage.files import reading
 from zonda.core.types import Floats
 
 from .antenna_log import BEGINS, read_log
 from .recording import Recording, longest_rising
 
 ALIASES = {
-    "time": ("time", "times", "t", "ctime", "timestamp", "mjd"),
+    "time": (
+        "time",
+        "times",
+        "t",
+        "ctime",
+        "timestamp",
+        "mjd",
+        "utc",
+        "datetime",
+        "date",
+        "date_time",
+        "iso",
+        "iso_time",
+        "time_utc",
+        "utc_time",
+        "unix",
+        "unixtime",
+        "unix_time",
+        "posix",
+    ),
     "seconds": ("seconds",),
-    "az": ("az", "azimuth"),
-    "el": ("el", "elevation", "alt", "altitude"),
-    "ra": ("ra",),
-    "dec": ("dec",),
+    "az": ("az", "azimuth", "azim", "azi"),
+    "el": ("el", "elevation", "elev", "alt", "altitude"),
+    "ra": ("ra", "right_ascension", "raj2000"),
+    "dec": ("dec", "declination", "decj2000", "dej2000"),
     "flags": ("flags", "flag"),
 }
 """Our name of a column, and names that files have for it, in small letters."""
+
+UNITS = {
+    **dict.fromkeys(("deg", "degs", "degree", "degrees", "°"), "deg"), **dict.fromkeys(("rad", "radian", "radians"), "rad"),
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"), "ms": "ms", "arcmin": "arcmin", "arcsec": "arcsec",
+}  # fmt: skip
+"""Units as headings write them, in small letters, and as we do."""
+ISO = re.compile(r"\d{4}-\d{2}-\d{2}([T ]\d{2}:\d{2}(:\d{2}(\.\d{1,9})?)?)?")
 
 Clock = Literal["unix", "mjd", "scene"]
 
@@ -96,12 +124,18 @@ def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recordi
 
 
 def _csv(path: Path, place: str) -> RecordedTable:
+    """Text: columns with commas, semicolons, tabs or blanks between them, under a line of their names and units."""
+    with reading(place, "CSV", "write rows of equally many numbers, under a line such as: time [s], az [deg], el [deg]"):
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte order mark
+    header, _, rest = text.partition("\n")
+    header = header.lstrip("# ").strip()
+    mark = max(",;\t", key=header.count)
+    comma = mark if mark in header else None
+    words = header.split(comma) if comma else re.findall(r"\S+(?:\s*[\[(][^\])]*[\])])?", header)
+    names = [_heading(word) for word in words]
     try:
-        with path.open(encoding="utf-8-sig") as file:  # spreadsheets begin with a byte order mark
-            header = file.readline().lstrip("# ").strip()
-            names = [name.strip() for name in header.split(",")]
-            table = np.genfromtxt(file, delimiter=",", ndmin=2)
-    except (UnicodeDecodeError, ValueError) as err:
+        table = np.genfromtxt(rest.splitlines(), delimiter=comma, ndmin=2)
+    except ValueError as err:
         raise InputError(f"cannot be read as CSV: {err}", place=place, cure="write rows of equally many numbers") from None
     if table.size == 0 or table.shape[1] != len(names):
         raise InputError(
@@ -109,11 +143,40 @@ def _csv(path: Path, place: str) -> RecordedTable:
             place=place,
             cure="begin with a line such as: time [s], az [deg], el [deg]",
         )
-    columns = {}
-    for k, name in enumerate(names):
-        word, _, unit = name.partition("[")
-        columns[word.strip().lower()] = (table[:, k], unit.rstrip("] ") or None)
-    return RecordedTable(columns)
+    found = RecordedTable({name: (table[:, k], unit) for k, (name, unit) in enumerate(names)})
+    for k, (name, _) in enumerate(names):
+        if name in ALIASES["time"] and np.isnan(table[:, k]).all():
+            texts = [line.split(comma)[k].strip().strip("\"'") for line in rest.splitlines() if line.strip()]
+            found.start, seconds = _dates(texts, place)
+            found.columns = {**found.columns, name: (seconds, "s"), "seconds": (seconds, "s")}
+            break
+    return found
+
+
+def _heading(text: str) -> tuple[str, str | None]:
+    """Name in small letters and unit of ``az [deg]``, ``Azimuth(deg)``, ``az_deg`` or ``az``."""
+    match = re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]", text.strip())
+    known = {name for names in ALIASES.values() for name in names}
+    if match is None:
+        behind = re.fullmatch(r"(.*?)[_ .](\w+)", text.strip())
+        match = behind if behind and behind[1].lower() in known and behind[2].lower() in UNITS else None
+    name, unit = (match[1], match[2].strip()) if match else (text, "")
+    plain = name.strip().strip("\"'").lower().replace(" ", "_")
+    return plain, UNITS.get(unit.lower(), unit) or None
+
+
+def _dates(texts: list[str], place: str) -> tuple[Instant, Floats]:
+    """A whole second next to the first of dates (ISO 8601, UTC), and seconds since then; NaN for an empty text."""
+    plain = [re.sub(r"(Z|[+-]00:?00)$", "", text) for text in texts]
+    wrong = next((text for text, p in zip(texts, plain, strict=True) if p and not ISO.fullmatch(p)), None)
+    if wrong is not None or not any(plain):
+        what = f"time is {wrong!r}, no date" if wrong is not None else "has no time that is a number or a date"
+        raise InputError(what, place=place, cure="write dates as 2024-11-25T07:00:00.5 (UTC), or seconds since 1970")
+    with reading(place, "CSV", "write dates as 2024-11-25T07:00:00.5 (UTC)"):
+        instants = np.array([p.replace(" ", "T") or "NaT" for p in plain], "datetime64[ns]")
+    first = instants[~np.isnat(instants)][0].astype("datetime64[s]")
+    seconds = (instants - first) / np.timedelta64(1, "s")
+    return Instant(int(first.astype(np.int64)) * SECOND), np.asarray(seconds, np.float64)
 
 
 def _fits(path: Path, place: str) -> RecordedTable:

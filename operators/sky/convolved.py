@@ -38,6 +38,8 @@ LARGE = 1 << 26
 """Bytes of a file above which the progress bar shows that it is read."""
 LOOKED_WHOLE = 1 << 28
 """Bytes of a file up to which `zonda check` reads its values."""
+OBLONG = 20.0
+"""Ratio of a pixel's sides beyond which an image's scale is doubted."""
 COARSE = 100.0
 """Beams in a pixel beyond which an image's scale is doubted."""
 SCANS_LOOKED_AT = 8
@@ -124,6 +126,8 @@ def odd_pixels(source: WcsMap, beam: float) -> str:
     cure = "are CDELT1 and CDELT2 in degrees?"
     if across < fwhm:
         return f"{text} and all of it {across:.4g} arcsec, less than the beam of {fwhm:.4g} arcsec; {cure}"
+    if max(x, y) > OBLONG * min(x, y):
+        return f"{text}: is one of CDELT1 and CDELT2 wrong?"
     return f"{text}, and the beam {fwhm:.4g} arcsec; {cure}" if min(x, y) > COARSE * fwhm else ""
 
 

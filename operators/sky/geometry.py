@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.errors import InputError
-from zonda.core.maps.header import number, with_known_frame
+from zonda.core.maps.header import number, text, with_known_frame
 from zonda.core.numerics import tangent
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.numerics.sphere import angles, local_axes
@@ -82,11 +82,11 @@ def _with_known_units(header: Any, place: str) -> Any:
     """A copy of the header whose celestial axes have units that FITS knows."""
     header = header.copy()
     for key in ("CUNIT1", "CUNIT2"):
-        text = str(header.get(key, "") or "").strip()
-        if text and text.lower() in _ANGLES:
-            header[key] = _ANGLES[text.lower()]
-        elif text and _celestial(header, key[-1]):
-            raise InputError(f"{key} = '{text}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'")
+        written = text(header, key, place)
+        if written and written.lower() in _ANGLES:
+            header[key] = _ANGLES[written.lower()]
+        elif written and _celestial(header, key[-1]):
+            raise InputError(f"{key} = '{written}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'")
     return header
 
 

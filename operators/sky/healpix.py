@@ -42,7 +42,10 @@ def read_healpix(hdu: Any, place: str, wanted: Wanted) -> HealpixMap:
     frame = _frame(place, header, wanted, notes)
     names = hdu.columns.names
     numbered, first = pixel_column(names), intensity_column(names, wanted.column, place)
-    if numbered is None and text(header, "INDXSCHM", place).upper() == "EXPLICIT":
+    scheme = text(header, "INDXSCHM", place).upper()
+    if scheme not in ("", "IMPLICIT", "EXPLICIT"):
+        raise InputError(f"INDXSCHM = '{scheme}' is not known", place=place, cure="set it to IMPLICIT or EXPLICIT")
+    if numbered is None and scheme == "EXPLICIT":
         cure = "name the column of pixel numbers PIXEL"
         raise InputError(f"INDXSCHM is EXPLICIT, and no column numbers the pixels: {', '.join(names)}", place=place, cure=cure)
     notes |= stokes.of_columns(names, first)

@@ -42,7 +42,7 @@ def plane(header: Any, axis: int, length: int, wanted: int | None, place: str) -
     InputError
         There is no I on the axis.
     """
-    found = along_axis(header, axis, length)
+    found = along_axis(header, axis, length, place)
     if "I" not in found and wanted is None:
         message = f"its axis STOKES has {', '.join(found)} and no I"
         raise InputError(message, place=place, cure=f"give a map of I, or correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}")

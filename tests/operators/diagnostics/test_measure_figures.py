@@ -111,14 +111,3 @@ def test_every_metric_is_a_figure_or_is_refused():
     for name in metrics:
         found = get(name)
         assert isinstance(found, zonda.FigureMetric | OfFunction) == (found.instead is None), name
-
-
-def test_figures_of_one_signal_alone_keep_what_it_is_without(tmp_path):
-    """The plan leaves out what no output depends on; the sky, which the signal is without, is named by it and stays."""
-    runs = "runs: {free: {without: [sky], modes: full}}\n"
-    file = loaded(tmp_path, "  - MeasureFigures: {metrics: [{central_rms: {signal: free}}]}\n", runs)
-    planned = zonda.plan(file, threads=1).apply(file)
-    data = planned.pipeline().run(planned.scene(), output=tmp_path / "planned", threads=1)
-    whole = file.pipeline().run(file.scene(), output=tmp_path / "whole", threads=1)
-    (name,) = [figure.name for figure in whole["figures"]]
-    assert data["figures"][name].value == whole["figures"][name].value

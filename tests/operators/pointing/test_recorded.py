@@ -518,3 +518,46 @@ def test_odd_items_in_toasts_layout(saved: Any, observe: Callable[..., Data]) ->
         f["shared/boresight_radec"] = np.zeros((7, 4))
     with pytest.raises(InputError, match="boresight_radec is 7 x 4, not 2150 x 4"):
         observe(PointingRecorded(file=path))
+
+
+@pytest.mark.parametrize(
+    ("header", "comma", "time"),
+    [
+        ("time [s], az [deg], el [deg]", ",", "unix"),
+        ("time, az [deg], el [deg]", ",", "iso"),
+        ("UTC; Azimuth(deg); Elevation(deg)", ";", "iso"),
+        ("time [s]\taz [deg]\tel [deg]", "\t", "unix"),
+        ("timestamp\tAzimuth (degrees)\tElevation (degrees)", "\t", "unix"),
+        ("# ctime az_deg el_deg", " ", "unix"),
+        ("time [s] az [deg] el [deg]", "  ", "unix"),
+        ("datetime,az_deg,el_deg,remark", ",", "z"),
+    ],
+)
+def test_logs_as_people_have_them(tmp_path: Path, header: str, comma: str, time: str) -> None:
+    """Dates (ISO 8601), commas, semicolons, tabs and blanks, units in brackets or behind the name: the same pointing."""
+    t = np.arange(30) / 10
+    dates = {
+        "unix": [f"{UNIX + s:.1f}" for s in t],
+        "iso": [f"2024-11-25T07:00:{s:04.1f}" for s in t],
+        "z": [f"2024-11-25 07:00:{s:04.1f}Z" for s in t],
+    }[time]
+    rows = [
+        comma.join([d, f"{180 + s:.4f}", "50", *(["ok"] if "remark" in header else [])]) for d, s in zip(dates, t, strict=True)
+    ]
+    path = tmp_path / "log.txt"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    found = read_recording(path, "unix")
+    assert found.start is not None
+    seconds = np.array([(found.start.seconds_since(Instant.parse("2024-11-25T07:00Z"))) + s for s in found.seconds])
+    np.testing.assert_allclose(seconds, t, rtol=0, atol=3e-7 if time == "unix" else 1e-12)  # doubles since 1970
+    np.testing.assert_allclose(np.degrees(found.longitude), 180 + t, rtol=1e-12)
+    np.testing.assert_allclose(np.degrees(found.latitude), 50, rtol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["yesterday", "2024-13-25T07:00:00", "2024-11-25T07:00:00+02:00", "25/11/2024 07:00"])
+def test_what_is_no_date_in_utc_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("time, az [deg], el [deg]\n" + "".join(f"{text},180,50\n" for _ in range(3)))
+    with pytest.raises(InputError, match=r"log\.csv") as caught:
+        read_recording(path, "unix")
+    assert "2024-11-25T07:00:00.5" in str(caught.value)
