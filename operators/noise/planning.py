@@ -138,7 +138,10 @@ def calibrated(level: WhiteLevel, observation: Observation) -> Floats:
 
 
 def pole_cost(poles: int, passes: float = 1.0) -> Cost:
-    """The kernel takes poles four at a time. ``passes``: filters in a tile of detectors (`filters_in_a_tile`)."""
+    """The kernel takes poles four at a time; complex pairs are not counted.
+
+    ``passes``: filters in a tile of detectors (`filters_in_a_tile`).
+    """
     return Cost(fixed=0.01 * passes, per_sample=(1.7e-9 + 0.75e-9 * math.ceil(poles / 4)) * passes, kernel="random")
 
 
@@ -172,8 +175,11 @@ def psd_error(a: PowerLawFilter, b: PowerLawFilter, level: float) -> float:
 def _response(law: PowerLawFilter, f: Any) -> Any:
     """sqrt(g) H, complex, of equation (1) of `one_over_f`."""
     back = np.exp(-2j * np.pi * f)
-    top = np.prod(1 - (1 - law.zeros[:, None]) * back, axis=0)
-    return math.sqrt(law.gain) * top / np.prod(1 - (1 - law.poles[:, None]) * back, axis=0)
+    zeros, poles = (
+        np.r_[single, pair, pair.conj()] for single, pair in ((law.zeros, law.pair_zeros), (law.poles, law.pair_poles))
+    )
+    top = np.prod(1 - (1 - zeros[:, None]) * back, axis=0)
+    return math.sqrt(law.gain) * top / np.prod(1 - (1 - poles[:, None]) * back, axis=0)
 
 
 def _correlated(law: PowerLawFilter, context: Context) -> float:

@@ -56,6 +56,7 @@ class Streams:
         padding = -law.poles.size % 4  # the kernel takes sections four at a time; a section with z = q passes its input on
         self._rate = np.append(law.poles, np.ones(padding)).astype(np.float32)
         self._tap = np.append(law.zeros - law.poles, np.zeros(padding)).astype(np.float32)
+        self._pairs = np.ascontiguousarray(law.pairs, np.float32)
         self._tiles: dict[int, _Tile] = {}
         self._lock = threading.Lock()
 
@@ -109,7 +110,7 @@ class Streams:
         with tile.lock:
             nearest = max(k for k in tile.kept if k <= sample)
             state = tile.kept[nearest].copy()
-            law = self._rate, self._tap
+            law = self._rate, self._tap, self._pairs
             for start, stop in _pieces(nearest, sample):
                 _filter(self.key, number, start, stop - start, state, *law, 0, *level, common[:0], shares, over, out[:0])
                 self._keep(tile, stop, state)
@@ -125,10 +126,11 @@ class Streams:
         tile.kept[sample], tile.last = state.copy(), sample
 
     def _first_state(self, number: int) -> NDArray[np.float32]:
-        n = self.law.poles.size
+        n, sections = len(self.law.start), self.law.poles.size
         deviates = normals(self.start_key, 0, n * TILE_DETECTORS, stream=number).reshape(n, TILE_DETECTORS)
-        state = np.zeros((self._rate.size, TILE_DETECTORS), np.float32)
-        state[:n] = self.law.start @ deviates
+        begun = self.law.start @ deviates
+        state = np.zeros((self._rate.size + n - sections, TILE_DETECTORS), np.float32)
+        state[:sections], state[self._rate.size :] = begun[:sections], begun[sections:]
         return state
 
 
@@ -173,11 +175,12 @@ def _pieces(start: int, stop: int) -> list[tuple[int, int]]:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, inside, common, shares, over, out):  # type: ignore[no-untyped-def]
-    """Equation (2) of `one_over_f` for 16 detectors x n samples; adds level * y of those from ``lane`` on to ``out`` (``over``:
-    puts it there).
+def _filter(key, tile, start, n, state, rate, tap, pairs, lane, lines, cell, inside, common, shares, over, out):  # type: ignore[no-untyped-def]
+    """Equations (2), (3) of `one_over_f` for 16 detectors x n samples; adds level * y of those from ``lane`` on to ``out``
+    (``over``: puts it there).
 
-    ``state`` (K, 16), K a multiple of 4, is moved on by n samples. Deviate 16 t + lane of stream ``tile`` drives sample t.
+    ``state`` (K + 2 M, 16), K a multiple of 4, M the number of ``pairs`` (M, 4), is moved on by n samples. Deviate 16 t + lane
+    of stream ``tile`` drives sample t.
     ``lines, cell, inside``: the `Series` of the level. shares[0] y + shares[1] common takes the place of y; an empty ``common``
     stream is 0.
     """
@@ -194,6 +197,8 @@ def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, inside, co
             fill_normals(key, tile, origin, x[: 16 * m])
         for k in range(0, rate.size, 4):
             _four_sections(x[: 16 * m], state[k : k + 4].ravel(), rate[k : k + 4], tap[k : k + 4])
+        for k in range(pairs.shape[0]):
+            _pair(x[: 16 * m], state[rate.size + 2 * k : rate.size + 2 * k + 2].ravel(), pairs[k])
         for d in range(uint64(out.shape[0])):
             row, size = out[d, done : done + m], level[:m]
             series_into(lines[d], cell, inside, start + done, size)
@@ -204,6 +209,19 @@ def _filter(key, tile, start, n, state, rate, tap, lane, lines, cell, inside, co
                 mixed[t] = shares[0] * x[uint64(16) * t + uint64(lane) + d] + shares[1] * shared[t]
             for t in range(uint64(m)):
                 row[t] += size[t] * mixed[t]
+
+
+@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+def _pair(x, s, pair):  # type: ignore[no-untyped-def]
+    """Equation (3) in place on x (m, 16) and the pair's state s (2, 16), both flat."""
+    a, b, to_real, to_imaginary = pair[0], pair[1], pair[2], pair[3]
+    for t in range(uint64(x.size // 16)):
+        now = uint64(16) * t
+        for d in range(uint64(16)):
+            y, r, i = x[now + d], s[d], s[d + uint64(16)]
+            s[d] = r + (y - a * r + b * i)
+            s[d + uint64(16)] = i - (a * i + b * r)
+            x[now + d] = y + (to_real * r + to_imaginary * i)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})

@@ -135,9 +135,16 @@ def test_float32_states_are_enough(f_min, slope):
     out = np.zeros((16, n), np.float32)
     streams.add(0, 0, out)
     exact = normals(stream_key(7, "a"), 0, 16 * n).reshape(n, 16).T.astype(np.float64)
-    first = law.start @ normals(stream_key(7, "b"), 0, 8 * 16).reshape(8, 16)
-    for q, z, s in zip(law.poles, law.zeros, first, strict=True):
+    n_states = len(law.start)
+    first = law.start @ normals(stream_key(7, "b"), 0, n_states * 16).reshape(n_states, 16)
+    for q, z, s in zip(law.poles, law.zeros, first[:8], strict=True):
         exact, _ = lfilter([1, z - 1], [1, q - 1], exact, axis=1, zi=((z - q) * s)[:, None])
+    for (a, b, real, imaginary), (r, i) in zip(law.pairs, first[8:].reshape(-1, 2, 16), strict=True):
+        y = exact.copy()
+        for t in range(n):  # equation (3)
+            y[:, t] += real * r + imaginary * i
+            r, i = r + (exact[:, t] - a * r + b * i), i - (a * i + b * r)
+        exact = y
     assert abs(out - exact).std() < 1e-3 * exact.std()
     # At every frequency, not only where the power is; differences, lest the lowest frequencies leak over all others.
     noise, signal = (abs(np.fft.rfft(np.diff(x, axis=1) * np.hanning(n - 1), axis=1)) ** 2 for x in (out - exact, exact))
