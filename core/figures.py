@@ -83,6 +83,9 @@ class FigureMetric(Metric, Parameters):
         """Names of the signals of the pipeline of which it reads products; empty text: the complete one."""
         return ("",)
 
+    def look(self, kinds: Mapping[str, str]) -> None:
+        """Raise `ZondaError` before a run whose maps are of these kinds, by product: its projection, HEALPix, or hits."""
+
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """(value, standard error or NaN), in `unit`. ``names``: those of the signals in `needs`, in their order.
 

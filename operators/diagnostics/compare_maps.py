@@ -195,3 +195,6 @@ def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
     data.tally.state(label, f"{of}gain of the map", f"{f['gain']:.4g} +- {f['gain error']:.2g}")
     data.tally.state(label, f"{of}correlation", f"{f['correlation']:.4f}")
     data.tally.state(label, f"{of}rms of the difference", f"{f['rms difference']:.3e} {found.unit}")
+    if f.get("chi2 values"):
+        ratio, error = f["chi2"] / f["chi2 pixels"], math.sqrt(2 / f["chi2 values"])
+        data.tally.state(label, f"{of}chi2 of the difference / pixels", f"{ratio:.4g} +- {error:.2g}")

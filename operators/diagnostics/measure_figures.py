@@ -15,7 +15,7 @@ from zonda.core.output import Output
 from zonda.core.signal import Signal
 from zonda.core.storage.files import product_path
 
-from .series import about, key_of
+from .series import about, key_of, kinds_of_maps
 
 
 class ProductsRead:
@@ -62,6 +62,12 @@ class MeasureFigures(Output):
         """Whether a metric reads products of that signal."""
         plain = len(_metrics(self)) < len(self.metrics) and not signal.startswith("_")
         return plain or signal in self.shown or signal in self.named_signals()
+
+    def check(self, data: Data) -> list[str]:
+        """Raises `ZondaError` where a metric cannot be measured on the kind of map that will be made."""
+        for metric in _metrics(self):
+            metric.look(kinds_of_maps(data))
+        return []
 
     def finalize(self, data: Data) -> None:
         """Measure, in the order of the list."""

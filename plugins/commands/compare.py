@@ -218,8 +218,9 @@ def _in_one_unit(reference: Plane, other: Plane, unit: str | None, frequency: fl
             f"has no unit, and the other map is in {known}", place=bare.name, cure="set its header key BUNIT to what it is in"
         )
     wanted = unit or ("MJy/sr" if reference.unit == "Jy/pixel" else reference.unit)
-    if wanted == "Jy/beam" and unit is None and reference.unit == other.unit and not (reference.fwhm and other.fwhm):
-        return reference, other  # nothing is known of the beams, so that nothing is smoothed
+    per_beam = unit is None and wanted == reference.unit == other.unit == "Jy/beam" and not (reference.fwhm and other.fwhm)
+    if per_beam and beam <= max(reference.fwhm or 0.0, other.fwhm or 0.0):
+        return reference, other  # a beam is not known, so that nothing is smoothed
     return (
         (in_unit(reference, wanted, frequency, beam), in_unit(other, wanted, frequency, beam)) if wanted else (reference, other)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +31,14 @@ def map_of(data: Data, metric: str, signal: str = "", name: str = "map") -> MapP
         there = ", ".join(sorted(key for key, p in data.products.items() if isinstance(p, MapProduct))) or "none"
         wanted = product_name(stream_of(signal), name)
         raise InputError(f"there is no map {wanted!r}", place=metric, cure=f"the maps of this run: {there}")
-    if product.contents == "hits":
-        raise InputError(f"the map {name!r} counts samples and has no signal", place=metric, cure="leave contents: hits out")
+    needs_signal({name: product.contents}, metric, name)
     return product
+
+
+def needs_signal(kinds: Mapping[str, str], metric: str, name: str) -> None:
+    """InputError about ``metric`` where the map ``name`` will count samples alone. ``kinds``: as in `FigureMetric.look`."""
+    if kinds.get(name) == "hits":
+        raise InputError(f"the map {name!r} counts samples and has no signal", place=metric, cure="leave contents: hits out")
 
 
 def at_beam(product: MapProduct, fwhm: float | None = None) -> MapProduct:
@@ -94,9 +100,14 @@ def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> floa
 
 def flat(product: MapProduct, metric: str) -> MapProduct:
     """A TAN map; PipelineError about ``metric`` for another."""
-    if product.projection != "TAN":
-        raise PipelineError(f"{metric} needs a TAN map", place=metric, cure="leave BinMap.nside and projection out")
+    needs_tan(product.projection, metric)
     return product
+
+
+def needs_tan(kind: str, metric: str) -> None:
+    """PipelineError about ``metric`` for a map that is not TAN."""
+    if kind != "TAN":
+        raise PipelineError(f"{metric} needs a TAN map", place=metric, cure="leave BinMap.nside and projection out")
 
 
 def input_of(data: Data, metric: str) -> Image:

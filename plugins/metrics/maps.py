@@ -16,7 +16,7 @@ samples; a noise map with the factor f takes what 1/f noise and the atmosphere a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -34,7 +34,18 @@ from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
 
-from .common import SKY_ALONE, UNFILTERED, as_seen, at_beam, covered, extreme, input_of, map_of, relative_error_of_rms
+from .common import (
+    SKY_ALONE,
+    UNFILTERED,
+    as_seen,
+    at_beam,
+    covered,
+    extreme,
+    input_of,
+    map_of,
+    needs_signal,
+    relative_error_of_rms,
+)
 
 Smoothing = Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"]
 NAME = r"^[A-Za-z0-9_]+$"
@@ -52,6 +63,10 @@ class _OfSmoothMap(_OfMap):
 
     smooth: Smoothing = "beam"
     """Smooth a map that is not smoothed yet: with the beam, with a Gaussian of this FWHM, or not."""
+
+    def look(self, kinds: Mapping[str, str]) -> None:
+        """A map of the signal."""
+        needs_signal(kinds, self.own_name(), self.map)
 
     def smoothed(self, product: MapProduct) -> MapProduct:
         """The map as it is judged."""

@@ -9,7 +9,7 @@ With a the map of the sky alone without filters, b the same behind them, and the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -24,7 +24,7 @@ from zonda.core.numerics.angles import angle_text
 from zonda.core.signal import Signal
 from zonda.operators.diagnostics.transfer_function import compare, window_of
 
-from .common import SKY_ALONE, UNFILTERED, flat, map_of
+from .common import SKY_ALONE, UNFILTERED, flat, map_of, needs_signal, needs_tan
 
 
 class TransferAt(FigureMetric):
@@ -56,6 +56,11 @@ class TransferAt(FigureMetric):
     def named_signals(self) -> tuple[str, ...]:
         """None but those of `needs`."""
         return ()
+
+    def look(self, kinds: Mapping[str, str]) -> None:
+        """A TAN map of the signal."""
+        needs_signal(kinds, "transfer_at", self.map)
+        needs_tan(kinds.get(self.map, "TAN"), "transfer_at")
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """Equation (1); the standard error is that from the scatter of the ring's modes, for T alone."""

@@ -132,7 +132,9 @@ def compare(reference: Plane, other: Plane, settings: Settings | None = None, la
     cell, known = cell_of(flat), np.isfinite(planes["map"])
     spectra = radial_spectra(maps, tapered(known, cell), cell, ring_edges(known.shape, cell, settings.bins))
     if (uneven := _unevenness(flat, known)) > UNEVEN:
-        notes.append(f"solid angles of the pixels differ by {100 * uneven:.2g} %: scales of the spectra are those of the middle")
+        notes.append(
+            f"solid angles of the pixels: they differ by a factor of {1 + uneven:.3g}; scales of spectra are the middle's"
+        )
     return Comparison(
         names, planes, header, a.unit, fwhm, pixel, figures, spectra, found, notes, centre, label,
         {name: (plane.noise_in_words, plane.factor) for name, plane in noise.items()},

@@ -10,6 +10,7 @@ from zonda.core.accuracy.metrics import OfFunction, get
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.plan.structure import prune
 from zonda.core.registry import metrics
+from zonda.core.run.first_look import first_look
 from zonda.plugins.checks import scenes
 
 STEPS = """\
@@ -111,3 +112,25 @@ def test_every_metric_is_a_figure_or_is_refused():
     for name in metrics:
         found = get(name)
         assert isinstance(found, zonda.FigureMetric | OfFunction) == (found.instead is None), name
+
+
+@pytest.mark.parametrize(
+    ("given", "metric", "message"),
+    [
+        ("projection: CAR, pixel: 3 arcsec", "{transfer_at: {scale: 20 arcsec}}", "transfer_at needs a TAN map"),
+        ("nside: 8192", "{transfer_at: {scale: 20 arcsec}}", "transfer_at needs a TAN map"),
+        ("contents: hits, pixel: 3 arcsec", "central_rms", "counts samples and has no signal"),
+        ("contents: hits, pixel: 3 arcsec", "peak_snr", "counts samples and has no signal"),
+        ("contents: hits, pixel: 3 arcsec", "coverage", ""),
+        ("projection: CAR, pixel: 3 arcsec", "{peak_ratio: {against: input}}", ""),
+    ],
+)
+def test_maps_of_which_there_is_no_figure_are_refused_before_the_run(tmp_path, given, metric, message):
+    file = loaded(tmp_path, f"  - MeasureFigures: {{metrics: [{metric}]}}\n")
+    (tmp_path / "p.yaml").write_text((tmp_path / "p.yaml").read_text().replace("pixel: 3 arcsec", given))
+    file = zonda.load(tmp_path / "p.yaml")
+    if not message:
+        first_look(file.pipeline(), file.scene(), saved=False)
+        return
+    with pytest.raises(ZondaError, match=message):
+        first_look(file.pipeline(), file.scene(), saved=False)
