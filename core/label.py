@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from pydantic import PrivateAttr
 
 from .configuration.parameters import Parameters
+
+
+def labels(steps: Iterable[Labelled]) -> list[str]:
+    """Their labels in a pipeline, which numbers namesakes: ``WhiteNoise``, ``WhiteNoise.2``."""
+    seen: dict[str, int] = {}
+    found = []
+    for step in steps:
+        base = step.name or type(step).__name__
+        seen[base] = seen.get(base, 0) + 1
+        found.append(base if seen[base] == 1 else f"{base}.{seen[base]}")
+    return found
 
 
 class Labelled(Parameters):

@@ -57,6 +57,29 @@ class Output(Operator):
         with what `finalize` will do, as far as it depends on products that will not change."""
 
 
+class StreamOutput(Operator):
+    """A step that writes what its blocks hold, scan by scan: an output that acts before the end."""
+
+
+def is_output(operator: Operator) -> bool:
+    """Whether a step says that it is an output: what it reads is what a run is for."""
+    return isinstance(operator, (Output, StreamOutput))
+
+
+def changes_observations(operator: Operator) -> bool:
+    """Whether all that a step does is to change observations (a plate's angles): it provides nothing, and neither works on their
+    data nor writes."""
+    works = any(
+        getattr(type(operator), step) is not getattr(Operator, step) for step in ("exec", "measure", "collect", "finalize")
+    )
+    return not operator.provides and not works and not is_output(operator)
+
+
+def may_write(operator: Operator) -> bool:
+    """Whether a step may leave a file: an output, or one that works on the data and provides nothing of it."""
+    return is_output(operator) or not (operator.provides or changes_observations(operator))
+
+
 def output_folder(of: Data | Observation, place: str) -> Path:
     """The output folder of a run, which is there and can be written to; raises `OutputError` where it is not."""
     if of.output is None:

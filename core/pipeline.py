@@ -14,6 +14,7 @@ from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
 from .hooks import manager
+from .label import labels
 from .machine import available_memory, available_threads
 from .notebook import html_table
 from .observation import Observation
@@ -94,7 +95,8 @@ class Pipeline:
         self.operators = arguments.steps(operators, name)  # copies: labels are this pipeline's own
         self.name, self.description, self.precision = name, description, arguments.precision(precision, name)
         self.only = tuple(arguments.components(only, name))
-        self._name_steps()
+        for operator, label in zip(self.operators, labels(self.operators), strict=True):
+            operator._label = label
         if problems := check_order(self.operators):
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             cures = dict.fromkeys(p.cure for p in problems if p.cure)
@@ -112,13 +114,6 @@ class Pipeline:
     def chain(self) -> Chain:
         """The steps that act on every observation, with the signals that they make."""
         return Chain(self.signals.steps, self.signals.formed, self.signals.components)
-
-    def _name_steps(self) -> None:
-        seen: dict[str, int] = {}
-        for operator in self.operators:
-            base = operator.name or type(operator).__name__
-            seen[base] = seen.get(base, 0) + 1
-            operator._label = base if seen[base] == 1 else f"{base}.{seen[base]}"
 
     @faults_named(exceptions=False)
     def run(

@@ -40,6 +40,7 @@ _WHERE = {
     "product_name": "zonda.core.signal",
     "MapMaker": "zonda.core.mapmaker",
     "Output": "zonda.core.output",
+    "StreamOutput": "zonda.core.output",
     "Planning": "zonda.core.plan.planning",
     "Figure": "zonda.core.figures",
     "FigureMetric": "zonda.core.figures",
@@ -95,6 +96,7 @@ if TYPE_CHECKING:
     from zonda.core.numerics.random import uniforms as uniforms
     from zonda.core.operator import Operator as Operator
     from zonda.core.output import Output as Output
+    from zonda.core.output import StreamOutput as StreamOutput
     from zonda.core.pipeline import Pipeline as Pipeline
     from zonda.core.plan.bands import plan as plan
     from zonda.core.plan.planning import Planning as Planning

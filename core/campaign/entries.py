@@ -72,7 +72,7 @@ def entries(campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], 
                 if campaign.realizations > 1:
                     place["realization"] = realization
                 combination = tuple((k, v) for k, v in place.items() if not _combined(campaign, k, values))
-                alike = _plain(tuple(item for item in combination if item[0] != "realization")), base  # never share them
+                alike = _plain(tuple(item for item in combination if item[0] not in _drawn_anew(campaign, values))), base
                 same = used.get(alike, 0)
                 used[alike] = same + 1
                 found.append(Entry(place, settings, separate(base, same), moment, combination))
@@ -133,6 +133,15 @@ def _combined(campaign: Campaign, axis: str, values: dict[str, Any]) -> bool:
         return True
     listed = {"observation", *(k for entry in campaign.observations for k in entry)}
     return bool(listed & set(campaign.combine)) if axis in listed else axis in campaign.combine
+
+
+def _drawn_anew(campaign: Campaign, values: dict[str, Any]) -> set[str]:
+    """The axes along which random numbers are others whether or not it is co-added over them: other observations, made at another
+    time or of another target. A seed that is given stays as it is; `observation` counts what its keys say."""
+    found = {"realization", "observation"}
+    if not campaign.paired:
+        found |= {"night"} if "seed" in values else {"night", "time", "target"}
+    return found
 
 
 def _plain(combination: tuple[tuple[str, Any], ...]) -> Any:

@@ -23,7 +23,7 @@ from ..configuration.parameters import Parameters
 from ..configuration.pipeline_file import parse
 from ..errors import PipelineError, ZondaError
 from ..operator import Operator
-from ..output import Output
+from ..output import Output, may_write
 from ..pipeline import Pipeline
 from ..registry import instruments, operators, operators_that, sites
 from ..run import arguments
@@ -122,7 +122,7 @@ def _keys(pipeline: Any) -> list[str]:
         cure = "write zonda.campaign(zonda.Pipeline([...]), scene, output=...); a pipeline file: zonda.load(file).pipeline()"
         raise PipelineError(f"a campaign is made of a Pipeline, not of {pipeline!r:.60}", place=PLACE, cure=cure)
     keys = [_key(step) for step in pipeline.operators]
-    if not any(isinstance(o, Output) or (not o.provides and o.requires | o.optional) for o in pipeline.operators):
+    if not any(map(may_write, pipeline.operators)):
         writers = ", ".join(operators_that(lambda step: issubclass(step, Output)))
         raise PipelineError("no step writes anything", place=PLACE, cure=f"add one that does: {writers}")
     return keys

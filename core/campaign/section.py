@@ -92,7 +92,11 @@ class SweepSection(Section):
             )
         elif mistakes.validate(Sweep, value, ("sweep",), "sweep") is not None:
             called = {key: Sweep.CALLED.get(key, key) for key in value}
-            document.value["campaign"] = {called[key]: value[key] for key in value} | {"combine": [], "figures": True}
+            document.value["campaign"] = {called[key]: value[key] for key in value} | {
+                "combine": [],
+                "paired": True,
+                "figures": True,
+            }
             for path, mark in list(document.marks.items()):
                 if path[0:1] == ("sweep",):
                     document.marks[("campaign", *(called.get(k, k) for k in path[1:2]), *path[2:])] = mark

@@ -72,6 +72,9 @@ class Campaign(Parameters):
     combine: Literal["all"] | list[str] = "all"
     """What is co-added: all, or these axes (keys of grid and observations, `observation`, `night`, `realization`): one set of
     products for each combination of the others."""
+    paired: bool = False
+    """Entries that are not co-added see the same noise and atmosphere on other nights, at other times and of other
+    targets too. Otherwise those of the same night, time and target alone do, which differ in a parameter."""
     task: Literal["scan", "entry"] = "scan"
     """A task is one scan, or all scans of one entry (fewer and longer tasks; the products are the same bits)."""
     engine: Engine = "processes"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import click
 
 from . import complete
@@ -23,7 +25,9 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
 
     if note := elsewhere(file.scene()):
         click.echo(f"warning: {note}", err=True)
-    found = file.look()
+    found = file.look(say=_say if sys.stderr.isatty() else None)
+    if sys.stderr.isatty():
+        _say("")
     click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
     for what, text in file.scene().instrument.notes.items():
         click.echo(f"  {what}: {text}")
@@ -36,3 +40,8 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
         from ..campaign.prepare import outline
 
         click.echo(outline(source(pipeline, settings, False))[0])
+
+
+def _say(step: str) -> None:
+    """Name the step that is looked at, on one line of the terminal."""
+    click.echo(f"\r\033[K{f'checking {step}' if step else ''}", nl=False, err=True)

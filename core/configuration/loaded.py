@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -91,12 +92,17 @@ class PipelineFile:
             precision=header.precision,
         )
 
-    def look(self, *, saved: bool = True, scene: Scene | None = None) -> list[list[str]]:
-        """As `first_look`; raises `ConfigurationError` with all mistakes of the steps, each at its place in the file."""
+    def look(
+        self, *, saved: bool = True, scene: Scene | None = None, say: Callable[[str], None] | None = None
+    ) -> list[list[str]]:
+        """As `first_look`; raises `ConfigurationError` with all mistakes of the steps, each at its place in the file.
+
+        ``say`` is told each step before it is looked at.
+        """
         pipeline, scene = self.pipeline(), scene or self.scene()
         if self.document is None:
             return first_look(pipeline, scene, saved=saved)
-        found, refused = looks(pipeline.operators, scene)
+        found, refused = looks(pipeline.operators, scene, say)
         if refused:
             mistakes = [refusal(self.document, self.steps[number], err) for number, err in refused]
             raise ConfigurationError(mistakes, self.place)

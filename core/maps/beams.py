@@ -36,6 +36,13 @@ def effective_fwhm(weights: Mapping[float, float]) -> float:
     return math.sqrt(total / math.fsum(weight / fwhm**2 for fwhm, weight in used))
 
 
+def expected_fwhm(fwhm: Floats, net: Floats) -> float:
+    """Equation (1) [rad] of detectors (n_det,) that see the same of a map, with the weights of their ``net``; equal ones where
+    one is 0."""
+    weight = net**-2.0 if (net > 0).all() else np.ones(len(net))
+    return effective_fwhm({float(width): float(weight[fwhm == width].sum()) for width in np.unique(fwhm)})
+
+
 @dataclass
 class Beams:
     """Weights in a map by the detectors' FWHM [rad], in whole numbers of `UNIT` times a sample of weight 1."""

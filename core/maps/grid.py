@@ -35,7 +35,7 @@ Smoother = Callable[..., Floats]
 """f(values, power=1.0): values, shape of the grid, convolved with the power-th power of equation (2). Nothing lies outside."""
 
 EVEN = 2e-3
-"""Relative differences of steps across an image, and skewness of its pixels, below which one kernel serves all pixels."""
+"""Relative differences of steps across an image below which one kernel serves all pixels."""
 GENTLE = 1e-2
 """sigma tan(latitude) of a CAR image up to which each row has its own kernel: the kernel's width varies by half of it within."""
 CUT = 5.0
@@ -46,6 +46,11 @@ MOST_PAIRS = 3e6
 """Pairs of HEALPix pixels under a kernel up to which each is looked at: harmonics of a whole sphere take as long."""
 LARGEST_NSIDE = 2048
 """Of HEALPix maps that are smoothed by harmonics: beyond, a whole sphere takes gigabytes."""
+DIRECT = 1e9
+"""Pairs of pixels under a kernel up to which each is looked at: some 3 s."""
+TILE = 64
+SKEW = 1e-2
+"""Skewness of pixels below which the kernel is that of pixels at right angles: right to half of it, of the kernel's peak."""
 CYLINDERS = ("CAR", "CEA", "MER", "CYP")
 ROWS = 256
 """Of an image that are worked on at a time."""
@@ -339,9 +344,44 @@ class ImagePixels(MapGrid):
             return self._by_rows(sigma)
         steps = self._even()
         if steps is None:
-            return self._directly(sigma)
+            reach = self.reach(CUT * sigma)
+            few = 4.0 * math.prod(self.shape) * math.prod(reach) < DIRECT
+            return self._directly(sigma) if few or self.kind in CYLINDERS else self._by_tiles(sigma, reach)
         along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
         return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
+
+    def _by_tiles(self, sigma: float, reach: tuple[int, int]) -> Smoother:
+        """Of a large image: tile by tile, each so small that one kernel serves it where that can be."""
+        ny, nx = self.shape
+        more = tuple(math.ceil(1.2 * n) + 2 for n in reach)
+        tiles = self._tiles(slice(0, ny), slice(0, nx))
+
+        def found(values: AnyFloats, power: float = 1.0) -> Floats:
+            out = np.empty((ny, nx))
+            for y, x in tiles:
+                low = max(y.start - more[0], 0), max(x.start - more[1], 0)
+                around = slice(low[0], min(y.stop + more[0], ny)), slice(low[1], min(x.stop + more[1], nx))
+                steps, part = self.window(y, x)._even(), np.asarray(values[around], np.float64)
+                if steps is None:
+                    whole = self.window(*around)._directly(sigma)(part, power)
+                else:
+                    along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
+                    whole = np.asarray(convolved(part, along_y**power, along_x**power), np.float64)
+                out[y, x] = whole[y.start - low[0] : y.stop - low[0], x.start - low[1] : x.stop - low[1]]
+            return out
+
+        return found
+
+    def _tiles(self, y: slice, x: slice) -> list[tuple[slice, slice]]:
+        """Halves of halves of the image, until each is even or of no more than `TILE` pixels a side."""
+        rows, columns = y.stop - y.start, x.stop - x.start
+        if max(rows, columns) <= TILE or self.window(y, x).even:
+            return [(y, x)]
+        if rows >= columns:
+            middle = y.start + rows // 2
+            return self._tiles(slice(y.start, middle), x) + self._tiles(slice(middle, y.stop), x)
+        middle = x.start + columns // 2
+        return self._tiles(y, slice(x.start, middle)) + self._tiles(y, slice(middle, x.stop))
 
     def _by_rows(self, sigma: float) -> Smoother:
         """Of a CAR image: along each row with its own width, then along the columns; right to sigma tan(latitude) / 2."""
@@ -387,7 +427,7 @@ class ImagePixels(MapGrid):
         reference = tuple(float(v) for v in np.sqrt((self.matrix**2).sum(axis=0))[::-1])
         for dy, dx in (reference, self.sides):
             with np.errstate(invalid="ignore"):
-                same = (abs(np.sqrt(xx) / dx - 1) < EVEN) & (abs(np.sqrt(yy) / dy - 1) < EVEN) & (abs(xy) < EVEN * dx * dy)
+                same = (abs(np.sqrt(xx) / dx - 1) < EVEN) & (abs(np.sqrt(yy) / dy - 1) < EVEN) & (abs(xy) < SKEW / 2 * dx * dy)
             if same.all():
                 return dy, dy if abs(dx / dy - 1) < 1e-9 else dx
         return None

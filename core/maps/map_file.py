@@ -17,7 +17,8 @@ from ..storage.files import atomic_path
 from ..storage.fits_image import BLOCK, Cards, image_pieces
 from ..types import AnyFloats
 from .map_arrays import MapArrays
-from .stokes import CONVENTION, MEANINGS, file_planes
+from .noise_figures import noise_stated
+from .stokes import CONVENTION, MEANINGS, file_planes, planes_of
 from .units import scale_of
 
 PLANES = ("signal", "hits", "weights", "noise", "half_difference")
@@ -87,15 +88,18 @@ class MapFile:
         ``signal``, ``hits`` ...: (ny, nx) each on a WCS grid, (n_pix,) on HEALPix; NaN where nothing is known.
     cards
         More of the header of the first image, or of the table.
+    noise
+        `noise_figures.noise_stated`.
     """
 
     name: str
     product: MapArrays
     planes: dict[str, AnyFloats]
     cards: Cards = field(default_factory=Cards)
+    noise: Mapping[str, tuple[float | None, str]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, name: str, product: MapArrays) -> MapFile:
+    def of(cls, name: str, product: MapArrays, noise: Mapping[str, tuple[float | None, str]] | None = None) -> MapFile:
         """With the planes that a product has."""
         found: dict[str, Any]
         if product.polarization is not None:
@@ -104,7 +108,7 @@ class MapFile:
             found = {plane: getattr(product, plane) for plane in (PLANES if product.contents == "all" else ("hits",))}
         if product.directions is not None:
             found = found | dict(zip(CROSSING, (product.crosslinking, *product.directions), strict=True))
-        return cls(name, product, {plane: values for plane, values in found.items() if values is not None})
+        return cls(name, product, {plane: values for plane, values in found.items() if values is not None}, noise=noise or {})
 
     def unit(self, plane: str) -> str:
         """FITS unit; none for counts."""
@@ -139,6 +143,18 @@ class MapFile:
     def halves(self) -> Cards:
         """What `half_difference` is the difference of."""
         return Cards([("JACKKNIF", ascii_text(self.product.difference), "halves that were subtracted")])
+
+    def noise_cards(self, plane: str = "") -> Cards:
+        """What stands behind the noise, for the header of a ``plane`` of it; of a table, for all its columns together."""
+        cards = Cards()
+        for key, (factor, words) in self.noise.items():
+            if plane and plane not in {"I": ("noise", "cov_ii"), "Q": ("cov_qq",), "U": ("cov_uu",)}[key]:
+                continue
+            if factor is not None:
+                cards["NOISEFAC" if plane else f"NOISFAC{key}"] = factor, "measured noise / this white noise"
+            if plane or key == "I":
+                cards["NOISEOF"] = ascii_text(words), "what the noise was measured in"
+        return cards
 
     def first(self, about: Provenance) -> Cards:
         """Cards of the first header: the name, where it comes from, and its own cards."""
@@ -183,7 +199,7 @@ class MapFile:
                 header.add(self.beam)
             if name.startswith("half_difference"):
                 header.add(self.halves)
-            header.add(self.convention)
+            header.add(self.noise_cards(name) if name == "noise" or name.startswith("cov_") else Cards()).add(self.convention)
             if k == 0:
                 header.add(self.first(about)).add(self.cards)
             yield from image_pieces(header, plane, extension=k > 0, dtype=_type(name, plane))
@@ -212,7 +228,7 @@ class MapFile:
         if scale := scale_of(product.unit)[1]:
             made["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
         made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards()).add(self.convention)
-        made.add(self.first(about)).add(self.cards)
+        made.add(self.noise_cards()).add(self.first(about)).add(self.cards)
         hdus = [fits.PrimaryHDU(), table]
         for hdu, more in zip(hdus, (self.first(about), made), strict=True):
             for key, value in more.items():
@@ -227,7 +243,8 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
     path = Path(path).expanduser()
     if path.exists() and not overwrite:
         raise OutputError("exists already", place=str(path), cure="choose another name, or write overwrite=True")
-    return MapFile.of("map", product).write(path, Provenance.of_a_map(product))
+    whole: Any = product
+    return MapFile.of("map", product, noise_stated(planes_of(whole, "map"), "map")).write(path, Provenance.of_a_map(product))
 
 
 def _type(name: str, plane: Any) -> np.dtype[Any]:

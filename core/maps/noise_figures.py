@@ -63,6 +63,8 @@ def noise_figures(maps: Mapping[str, MapProduct], given: float | None = None) ->
 
 LEAST = 0.1
 """Share of the 99th percentile of the weight (1 / noise^2) that a pixel needs for its noise to be measured."""
+WHITE = "white noise only"
+"""Said of noise that is the standard error of independent pixels, where no map of the noise alone is known."""
 FREE = "the map of all but the sky"
 """How the source-free map is called."""
 
@@ -94,6 +96,21 @@ def noise_factor(noise: Floats, alone: Floats) -> float | None:
     well = known & (weight >= LEAST * np.percentile(weight[known], 99))
     factor = float(np.sqrt(np.mean(ratio[well] ** 2)))
     return factor if factor > 0 else None
+
+
+def noise_stated(maps: Mapping[str, MapProduct], name: str) -> dict[str, tuple[float | None, str]]:
+    """What is known of the noise of I, and of Q and U where they are there, of a map among ``maps`` (`maps_of`).
+
+    The factor on its white noise, and what it was measured in; None and `WHITE` where there is no map of the noise
+    alone. Nothing where no noise is known.
+    """
+    found: dict[str, tuple[float | None, str]] = {}
+    for key, own in (("I", name), ("Q", f"{name}_Q"), ("U", f"{name}_U")):
+        if own in maps and np.isfinite(maps[own].noise).any():
+            alone = noise_alone(maps, own)
+            factor = None if alone is None else noise_factor(maps[own].noise, alone[0])
+            found[key] = (None, WHITE) if alone is None or factor is None else (factor, alone[1])
+    return found
 
 
 def noise_sources(

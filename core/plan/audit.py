@@ -213,7 +213,7 @@ def audit(
         rows += _compare(d.name, d.choice, reference, _run(decided(d), threads), whole_plan.context)
     if fewer != whole.operators and reference.map is not None:
         bare = decided(structure=dataclasses.replace(whole, operators=fewer))
-        result = dataclasses.replace(_run(bare, threads), signal=[], sky=None)
+        result = dataclasses.replace(_run(bare, threads), signal=[], sky=None, own=None)
         nothing = Choice("dropped", "what no output depends on", bound={"map_rms": 0.0})
         rows += _compare("structure", nothing, reference, result, whole_plan.context)
     if len(same) > 1:
@@ -275,6 +275,8 @@ class _Result:
     sky: Any
     given: Any = None
     """The sky alone as it comes in, not filtered, which a transfer function is relative to."""
+    own: Any = None
+    """The sky alone with modes of its own, where the pipeline asks for that."""
 
 
 def _run(file: PipelineFile, threads: int | None) -> _Result:
@@ -282,10 +284,11 @@ def _run(file: PipelineFile, threads: int | None) -> _Result:
     data = file.pipeline().run(file.scene(), threads=threads, keep=["signal"] if made else ())
     maps = [k for k, v in data.products.items() if hasattr(v, "hits") and hasattr(v, "signal")]
     main = next((data.products[k] for k in maps if "/" not in k), None)
-    sky, given = (next((data.products[k] for k in maps if k.startswith(f"{run}/")), None) for run in ("sky_alone", GIVEN))
+    runs = ("sky_alone", GIVEN, "sky_with_own_modes")
+    sky, given, own = (next((data.products[k] for k in maps if k.startswith(f"{run}/")), None) for run in runs)
     kept = [o for o in data.observations if "signal" in o.detdata]
     signal = [np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64) for o in kept]
-    return _Result(signal, main, sky, given)
+    return _Result(signal, main, sky, given, own)
 
 
 def _with_sky_given(file: PipelineFile) -> PipelineFile:
@@ -324,13 +327,18 @@ def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: 
                 scaled = difference[deep] ** 2 * hits[deep] / context.coverage.hits
                 squares = [float(p.mean()) for p in np.array_split(scaled, PARTS) if p.size]
                 add("map_rms", _rms(squares), _rms_error(squares), scale, plane)
-    if full.sky is not None and other.sky is not None:
-        strongest = float(np.nanmax(np.abs((full.sky if full.given is None else full.given).signal), initial=0.0))
-        for plane, share, one, two in _planes(full.sky, other.sky):
-            largest = float(np.nanmax(np.abs(one.signal - two.signal) * share, initial=0.0))
-            add("peak", largest, 0.0, ROUNDING * strongest, plane)
+    skies = [(one, two) for one, two in ((full.sky, other.sky), (full.own, other.own)) if one is not None and two is not None]
+    if skies:
+        strongest = float(np.nanmax(np.abs((skies[0][0] if full.given is None else full.given).signal), initial=0.0))
+        largest: dict[str, float] = {}
+        for one, two in skies:
+            for plane, share, a, b in _planes(one, two):
+                found = float(np.nanmax(np.abs(a.signal - b.signal) * share, initial=0.0))
+                largest[plane] = max(largest.get(plane, 0.0), found)
+        for plane, value in largest.items():
+            add("peak", value, 0.0, ROUNDING * strongest, plane)
             if strongest > 0:
-                add("transfer", largest / strongest, 0.0, ROUNDING, plane)
+                add("transfer", value / strongest, 0.0, ROUNDING, plane)
     return rows
 
 

@@ -17,7 +17,10 @@ from ..operator import Operator
 from ..run.in_step import joins
 from ..scene import Scene
 from ..signal import MAIN, Component, Formed
-from .estimate import Traits
+from .estimate import Traits, add
+
+OTHER_MODES = "; + 2 x rms of all of the stream, where other modes are removed"
+"""What `Context.behind_modes` adds to a formula."""
 
 INSTANTS = 64
 """Nodes of a smooth field that are looked at, at most."""
@@ -164,7 +167,7 @@ class Context:
             return self.fluctuation
         top = min(high, 0.5 * self.first.sample_rate)
         grid = np.geomspace(max(low, 1e-4 * top), top, 40)
-        if high < math.inf:
+        if low <= 0:
             grid = np.r_[0.0, grid]
         total = 0.0
         for t in self.traits.values():
@@ -196,6 +199,12 @@ class Context:
     def removes_common(self) -> bool:
         """Whether what all detectors have in common is removed."""
         return any(t.removes_common for t in self.traits.values())
+
+    @property
+    def turns(self) -> bool:
+        """Whether a filter removes modes that it finds in the data, which turn where a part of the data is left out; or one
+        without a planning class may."""
+        return any(t.turns for t in self.traits.values())
 
     @cached_property
     def before_filters(self) -> bool:
@@ -251,11 +260,23 @@ class Context:
         """Bound on map and stream from an error of rms ``tod`` in the stream."""
         return {"tod": tod, "map_rms": self.in_map(tod, correlated, common)}
 
-    def other_modes(self, label: str) -> dict[str, float]:
-        """Bound on what changes where other singular modes are removed, because what ``label`` makes is no longer the largest
-        of what the detectors have in common: all that the others make, and all of the sky."""
+    def other_modes(self, label: str = "") -> dict[str, float]:
+        """Bound on what changes beside a part E of the data, where that is left out and other modes are removed for it; of what
+        all other steps but ``label`` make, B, and all of the sky.
+
+        With P, P' the projectors on the modes of E + B and of B, Q on the detectors' mean, |.| the rms,
+
+            |(1 - P) (E + B) - (1 - P') B| <= |(1 - Q) (E + B)| + |(1 - Q) B| <= |(1 - Q) E| + 2 |B|,
+
+        because nothing of the modes' rank leaves less than they do.
+        """
         others = replace(self, traits={k: t for k, t in self.traits.items() if k != label or t.removes_common or t.response})
-        return {**self.bound(others.passed, self.first.duration, common=True), **self.sky_error(1.0), "psd": 0.0}
+        return {**self.bound(2 * others.passed, self.first.duration, common=True), **self.sky_error(1.0), "psd": 0.0}
+
+    def behind_modes(self, bound: Mapping[str, float]) -> dict[str, float]:
+        """The bound on an error of a part of the data, behind all filters: where one finds its modes in the data, with
+        `other_modes`."""
+        return add(bound, self.other_modes()) if self.turns else dict(bound)
 
     def affords(self, bound: Mapping[str, float]) -> bool:
         """Whether a bound alone is within the budget."""

@@ -133,6 +133,8 @@ class Traits:
         Amplitude that passes at a frequency [Hz]; None: all.
     removes_common
         Removes what all detectors have in common.
+    turns
+        Removes modes that it finds in the data: without a part of them it finds others.
     weighs
         Makes a map in which samples are weighed by the inverse variance of their white noise.
     gain_error
@@ -147,6 +149,7 @@ class Traits:
     pixel: float = 0.0
     response: Callable[[float], float] | None = None
     removes_common: bool = False
+    turns: bool = False
     weighs: bool = False
     gain_error: float = 0.0
 

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from ..configuration.pipeline_file import PipelineFile
+from ..maps.beams import expected_fwhm
 from .context import Context
 from .decide import Decided
 from .estimate import Cost
@@ -148,7 +147,8 @@ def _noise(plan: Plan) -> str:
     if not pixel:
         return f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none"
     words = f"noise: {kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part), {kelvin(sample)} per sample"
-    coverage, fwhm = plan.context.coverage, float(np.mean(plan.context.first.focalplane.fwhm))
+    coverage, plane = plan.context.coverage, plan.context.first.focalplane
+    fwhm = expected_fwhm(plane.fwhm, plane.net)
     smoothing = (coverage.pixel if coverage else math.inf) / fwhm * math.sqrt(2 * math.log(2) / math.pi)
     if smoothing < 0.5:  # sqrt(pixel area / (4 pi sigma^2)), where pixels are small
         beam, both = (f"{math.degrees(f) * 3600:.3g} arcsec" for f in (fwhm, math.sqrt(2) * fwhm))

@@ -59,7 +59,8 @@ def _taken(values: Any, index: NDArray[np.intp]) -> Any:
 
 
 def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, every: int = 1) -> PipelineFile:
-    """The same pipeline over a slice, without what writes or draws, with a run of the sky alone."""
+    """The same pipeline over a slice, without what writes or draws, with a run of the sky as it is in the
+    complete map, and one of the sky with modes of its own where the pipeline has such a signal."""
     steps: list[Step] = []
     for step in file.steps:
         o = step.operator
@@ -70,8 +71,20 @@ def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, 
         steps.append(step)
     made = frozenset[str]().union(*(made_by(s.operator) for s in steps))
     sky = "sky" in made and made & {"atmosphere", "white", "pink"}
-    runs = {"sky_alone": Signal(only=["sky"])} if sky else {}
+    runs = {"sky_alone": Signal(only=["sky"], modes="full")} if sky else {}
+    if sky and _has_own_modes(file):
+        runs["sky_with_own_modes"] = Signal(only=["sky"])
     return dataclasses.replace(file, steps=tuple(steps), header=file.header.model_copy(update={"runs": runs}))
+
+
+def _has_own_modes(file: PipelineFile) -> bool:
+    """Whether a signal of the sky is filtered by itself, not as a part of the complete one."""
+    signals = file.pipeline().signals
+    return any(
+        signal.filtered and not signal.model and signals.makers(name) and signals.all[name].components <= {"sky"}
+        for name, signal in signals.all.items()
+        if name
+    )
 
 
 def measured(file: PipelineFile, labels: Sequence[str], seconds: float = 5.0) -> dict[str, Cost]:

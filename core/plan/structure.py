@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ..mapmaker import MapMaker, filters, forms, makes_products
+from ..mapmaker import MapMaker, filters, forms, made_by, makes_products
 from ..operator import Operator
-from ..output import Output
+from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
 from ..run.signals import acting_steps, remainder
 from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
@@ -62,7 +62,7 @@ class Structure:
 def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     """What the pipeline's outputs depend on. ``keep``: labels of operators that stay whatever depends on them."""
     rows: list[Row] = []
-    in_memory = not any(isinstance(o, Output) or (not o.provides and o.requires | o.optional) for o in pipeline.operators)
+    in_memory = not any(map(is_output, pipeline.operators))
     every = set().union(*(o.provides for o in pipeline.operators))
     needed: dict[str, dict[str, str]] = {}  # by signal: label -> reason
     for name in [*pipeline.runs, ""]:  # the complete signal last: the others may need its modes
@@ -86,6 +86,8 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
         rows += [Row("", o.label, reason) for o in pipeline.signals.steps if o.label not in needed[instead]]
         needed[""] = needed.pop(instead)
     acting = {o.label for o in pipeline.operators if isinstance(o, Output) or "boresight" in o.provides}.union(*needed.values())
+    named = {part for name in needed if name for part in pipeline.runs[name].without or ()}
+    acting |= {o.label for o in pipeline.operators if made_by(o) & named}  # a signal is not without what is not there
     rows = [r for r in rows if not r.operator or (r.operator in acting) == bool(r.run)]
     rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     runs = tuple(name for name in pipeline.runs if name in needed)
@@ -159,6 +161,8 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
         elif made and all(map(is_stream, made)) and (MAIN not in made or type(operator).finalize is Operator.finalize):
             left_out[operator.label] = f"no step that is needed reads {' or '.join(sorted(made))}"
             continue
+        elif changes_observations(operator):
+            reason = "changes the observations"
         elif makes_products(operator) and not made & wanted:
             left_out[operator.label] = f"no step writes or draws its {' or '.join(sorted(made))}"
             continue
@@ -189,7 +193,8 @@ def _products(operator: Operator) -> set[str]:
 
 def _makes_something(operator: Operator, wanted: set[str]) -> bool:
     made = _products(operator)
-    return bool(made & wanted) or bool(made and not makes_products(operator)) or (not operator.provides)
+    unknown = not operator.provides and not changes_observations(operator)
+    return bool(made & wanted) or bool(made and not makes_products(operator)) or unknown
 
 
 def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
@@ -206,6 +211,7 @@ def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
         or forms(o)
         or (filters(o) and signal.filtered)
         or isinstance(o, MapMaker)
+        or changes_observations(o)
     ]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile, Step
-from ..pipeline import Pipeline
+from ..label import labels
 from .figures import duration
 
 
@@ -63,9 +63,8 @@ class PlanSummary:
 
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators omitted."""
-        labels = [o.label for o in file.pipeline().operators]
         steps, kept = [], []
-        for label, step in zip(labels, file.steps, strict=True):
+        for label, step in zip((o.label for o in file.pipeline().operators), file.steps, strict=True):
             if label in self.operators:
                 update = self.settings.get(label, {})
                 steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
@@ -82,10 +81,10 @@ class PlanSummary:
         return words + (f", not counting {', '.join(p.unknown)}" if p.unknown else "")
 
 
-def same_labels(steps: list[Step], labels: list[str]) -> list[Step]:
+def same_labels(steps: list[Step], wanted: list[str]) -> list[Step]:
     """The steps, named where need be: each keeps its label, which its random numbers depend on, though a namesake is left out."""
     named = []
-    for step, label, new in zip(steps, labels, Pipeline([s.operator for s in steps]).operators, strict=True):
-        same = new.label == label
+    for step, label, new in zip(steps, wanted, labels(s.operator for s in steps), strict=True):
+        same = new == label
         named.append(step if same else Step(step.key, step.operator.model_copy(update={"name": label})))
     return named

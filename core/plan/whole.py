@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import ZondaError
-from .context import Context
+from .context import OTHER_MODES, Context
 from .estimate import Bound, Choice, Effect, Estimate, add, full
 from .look import look
 from .planning import planning_of
@@ -54,6 +54,9 @@ def everything_of(label: str, estimates: Mapping[str, Estimate], context: Contex
             one, two = (_contributes(other.label, e, c) for e, c in ((there, context), (here, left)))
             bound = add(bound, {m: max(one.get(m, 0.0), two.get(m, 0.0)) for m in {*one, *two}})
     text = "sum of what its effects contribute, and of what others make at another level without it"
+    if any(t.turns for other, t in context.traits.items() if other != label):
+        bound = add(bound, context.other_modes(label))
+        text += OTHER_MODES
     return Effect(NAME, (full("in full"), Choice("dropped", "left out", leave_out=True, bound=bound, formula=text)), bound, text)
 
 

@@ -48,6 +48,8 @@ def runs(given: Any, name: str) -> dict[str, Signal]:
     for key, value in (given or {}).items():
         if not isinstance(value, Signal | Mapping):
             raise PipelineError(f"signal {key} is a dict, not {_what(value)}", place=name, cure=cure)
+        if isinstance(value, Signal) and str(key).startswith("_"):
+            continue  # of `Pipeline.runs`: its output asks for it again
         made[str(key)] = value if isinstance(value, Signal) else Signal(**value)
     return made
 

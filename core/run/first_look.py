@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from ..data import Data
 from ..errors import ZondaError
 from ..mapmaker import makes_products
 from ..operator import Operator
+from ..output import may_write
 from ..pipeline import Pipeline
 from ..signal import is_stream
 
@@ -39,16 +40,20 @@ def warn_of_nothing_saved(pipeline: Pipeline) -> None:
         warnings.warn(f"{text}; add a step that saves or shows it (`zonda plugins` lists the operators)", stacklevel=3)
 
 
-def looks(operators: Sequence[Operator | None], scene: Scene) -> tuple[list[list[str]], list[tuple[int, ZondaError]]]:
+def looks(
+    operators: Sequence[Operator | None], scene: Scene, say: Callable[[str], None] | None = None
+) -> tuple[list[list[str]], list[tuple[int, ZondaError]]]:
     """What each operator's `check` finds, and every error, with the number of its step.
 
-    None stands for a step that could not be made.
+    None stands for a step that could not be made. ``say`` is told each step before it is looked at.
     """
     data, found = Data(scene=scene), list[list[str]]()
     refused: list[tuple[int, ZondaError]] = []
     for number, operator in enumerate(operators):
         if operator is None:
             continue
+        if say is not None:
+            say(operator.label)
         try:
             found.append(operator.check(data))
         except ZondaError as err:
@@ -59,6 +64,6 @@ def looks(operators: Sequence[Operator | None], scene: Scene) -> tuple[list[list
 def writes(operators: Iterable[Operator]) -> bool:
     """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its products in memory."""
     return any(
-        not (makes_products(o) or "boresight" in o.provides or (o.provides and all(map(is_stream, o.provides))))
+        may_write(o) or (o.provides and not (makes_products(o) or "boresight" in o.provides or all(map(is_stream, o.provides))))
         for o in operators
     )

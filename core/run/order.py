@@ -34,11 +34,12 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
             have.add("signal")
         name = type(operator).__name__
         later = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides}
+        made = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides - o.requires}
         for what in sorted(operator.requires - have):
-            if what in later:
+            if what in made:
                 problems.append(
                     OrderProblem(
-                        index, f"{name} needs {what}, which {later[what]} provides only later", f"move it below {later[what]}"
+                        index, f"{name} needs {what}, which {made[what]} provides only later", f"move it below {made[what]}"
                     )
                 )
             else:

@@ -21,7 +21,7 @@ import numpy as np
 from zonda.core.instrument import Band
 from zonda.core.knobs import Knob
 from zonda.core.observation import Observation
-from zonda.core.plan.context import Context
+from zonda.core.plan.context import OTHER_MODES, Context
 from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, add, full
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
@@ -42,6 +42,9 @@ INSTANTS = 200
 
 SAFETY = 1.25
 """Factor on the ensemble rms: the rms of one scan scatters about it, the more the slower the drift over the telescope."""
+
+PASSAGES = 3.0
+"""Factor on the rms of a layer's transmission: a source is seen through what it is in a few passages."""
 
 POINT, TRANSFER, LATTICE = 1.2e-8, 1.2e-7, 2.7e-8
 """Seconds per point (node x time) of one layer and of the radiative transfer and splines; per lattice point: a band alone takes
@@ -111,7 +114,7 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         once = 0.05 + (CHOICE[0] + CHOICE[1] * context.first.n_detectors) * len(context.observations)
         shared = 0.0 if first.resolution().nodes.shape else SHARED
         cost = Cost(fixed + LATTICE * _cells(first), per_sample=0.6e-9, once=once, shared=shared)
-        return Estimate(tuple(effects), cost, _without(self.operator.label, context, effects))
+        return Estimate(tuple(effects), cost, _without(context, a, left))
 
 
 @dataclass(eq=False)
@@ -197,12 +200,12 @@ def _velocities(o: Observation, plane: ScanPlane, layers: list[Layer]) -> list[F
     return [layer.height * velocity - (plane.drift @ layer.wind)[:, None] for layer in layers]
 
 
-def _without(label: str, context: Context, effects: list[Effect]) -> dict[str, float]:
-    """All layers; the mean emission, where no filter takes it out; and what other modes would then be removed."""
-    found = add(*(e.size for e in effects if e.name.startswith("layer ")))
+def _without(context: Context, a: Calibrated, left: Sequence[float]) -> dict[str, float]:
+    """All layers; the mean emission, where no filter takes it out."""
+    found = add(*_layer_bounds(context, a, left))
     if not any(t.response for t in context.traits.values()):
         found = add(found, {"tod": context.mean_emission, "map_rms": context.mean_emission})
-    return add(found, context.other_modes(label)) if context.removes_common else found
+    return found
 
 
 def left_of_layer(context: Context, a: Calibrated, k: int) -> float:
@@ -235,17 +238,11 @@ def _layer_effects(context: Context, a: Calibrated, left: Sequence[float], point
     text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) a_l x " + (
         "rms left of the layer after subtraction of the detectors' mean" if context.removes_common else "rms behind the beam"
     )
+    bounds, p = _layer_bounds(context, a, left), a.model.parameters
+    text += OTHER_MODES if context.turns else ""
     effects = []
-    averages, spectra, p = a.averages[str(context.coverage)], _spectral_shares(context, a), a.model.parameters
     for k, layer in enumerate(a.layers):
-        rms = SAFETY * left[k]
-        bound = context.bound(rms, _correlated(context, layer), common=True)
-        bound["map_rms"] = min(bound["map_rms"], averages[k] * rms)
-        if context.before_filters:
-            bound["tod"] = SAFETY * a.of_layer(k)
-        opacity = _opacity_share(a) * p.pwv_rms * layer.amplitude * math.sqrt(a.variances[k])
-        bound |= context.sky_error(opacity)
-        bound["psd"] = min(SAFETY**2 * spectra[k], 1.0)
+        bound = context.behind_modes(bounds[k])
         choices = [full(f"at {layer.height:.0f} m")]
         if k in p.omit:
             choices = [full(f"at {layer.height:.0f} m: left out by the pipeline")]
@@ -253,6 +250,23 @@ def _layer_effects(context: Context, a: Calibrated, left: Sequence[float], point
             choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound, formula=text, seconds=POINT * points))
         effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
     return effects
+
+
+def _layer_bounds(context: Context, a: Calibrated, left: Sequence[float]) -> list[dict[str, float]]:
+    """Bound on what each layer adds to the products."""
+    averages, spectra, p = a.averages[str(context.coverage)], _spectral_shares(context, a), a.model.parameters
+    bounds = []
+    for k, layer in enumerate(a.layers):
+        rms = SAFETY * left[k]
+        bound = context.bound(rms, _correlated(context, layer), common=True)
+        bound["map_rms"] = min(bound["map_rms"], averages[k] * rms)
+        if context.before_filters:
+            bound["tod"] = SAFETY * a.of_layer(k)
+        opacity = _opacity_share(a) * p.pwv_rms * layer.amplitude * math.sqrt(a.variances[k])
+        bound |= context.sky_error(PASSAGES * opacity)
+        bound["psd"] = min(SAFETY**2 * spectra[k], 1.0)
+        bounds.append(bound)
+    return bounds
 
 
 def _spectral_shares(context: Context, a: Calibrated) -> list[float]:

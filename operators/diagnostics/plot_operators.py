@@ -298,11 +298,17 @@ def _flat(
 
 def _map(name: str, product: MapProduct, style: Style, maps: Mapping[str, MapProduct]) -> tuple[Any, ...]:
     run, _, key = name.rpartition("/")
-    flat = _flat(product, "signal")
+    flat = _flat(_smoothed(product, style), "signal")
     snr = None
     if style.contours and not run:
         snr = _snr(product, style, noise_alone(maps, name) if name in maps else _of_q_and_u(maps, name.removesuffix("_P")))
     return product_path("", name).name, run, key, flat, style, snr
+
+
+def _smoothed(product: MapProduct, style: Style) -> MapProduct:
+    """A CAR map as it is shown: smoothed on its own pixels, before it is brought to a plane. Others as they are."""
+    smoothing = product.fwhm if style.smooth is None else style.smooth
+    return product if product.projection != "CAR" or product.smoothed_by or not smoothing else product.smoothed(smoothing)
 
 
 def _of_q_and_u(maps: Mapping[str, MapProduct], name: str) -> tuple[Floats, str] | None:
@@ -315,8 +321,8 @@ def _snr(product: MapProduct, style: Style, alone: tuple[Floats, str] | None) ->
     """The SNR of a map as it is shown, and what its noise is, in words; None where it is not known. ``alone``: `noise_alone`."""
     flat = product.projection == "TAN"
     smoothing = product.fwhm if style.smooth is None else style.smooth
-    plane = replace(plane_of(product, "map", alone), fwhm=0.0)
-    plane = plane.smoothed(smoothing if flat and not product.smoothed_by else 0.0).measured()
+    as_it_is = product.smoothed_by or product.projection == "HEALPix"
+    plane = replace(plane_of(product, "map", alone), fwhm=0.0).smoothed(0.0 if as_it_is else smoothing).measured()
     if plane.noise is None or not np.isfinite(plane.noise).any():
         return None
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -325,7 +331,7 @@ def _snr(product: MapProduct, style: Style, alone: tuple[Floats, str] | None) ->
 
 
 def _noise(name: str, sources: dict[Noise, tuple[MapProduct, Any]], style: Style) -> tuple[Any, ...]:
-    flat = {of: _flat(product, plane, style=style) for of, (product, plane) in sources.items()}
+    flat = {of: _flat(_smoothed(product, style), plane, style=style) for of, (product, plane) in sources.items()}
     return product_path("", f"noise_{name}").name, flat, style
 
 

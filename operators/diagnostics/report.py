@@ -18,6 +18,7 @@ from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.figures import Figures
+from zonda.core.maps.beams import expected_fwhm
 from zonda.core.numerics.angles import angle_text
 from zonda.core.output import Output, Progress, output_folder
 from zonda.core.storage.files import write_text
@@ -187,7 +188,7 @@ def _band(camera: Instrument, data: Data, *, several: bool) -> list[tuple[str, A
         plane = scans[0].focalplane
         rows += [
             (f"Beam (FWHM){tell}", spread(plane.fwhm * 648000 / np.pi, "″")),
-            (f"1 K_RJ at a point source's peak{tell}", flux_density(1.0, float(np.mean(plane.fwhm)), band)),
+            (f"1 K_RJ at a point source's peak{tell}", flux_density(1.0, expected_fwhm(plane.fwhm, plane.net), band)),
             (f"Main-beam efficiency ζ{tell}", spread(plane.main_beam_efficiency)),
             (f"Illumination efficiency ε{tell}", spread(plane.illumination_efficiency)),
             (f"NET on the sky{tell}", _net(scans, data)),

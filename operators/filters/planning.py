@@ -26,6 +26,10 @@ LANCZOS = 0.5e-9
 FUNCTION = 0.55e-9
 """Seconds per sample of one function of time that is fitted and removed."""
 
+STANDS_OUT = 0.3
+"""Ratio of the noise's singular values to the common mode's up to which the second is far from `gap`,
+were the scan's common mode half of the ensemble's."""
+
 START = 1e-3
 """Residual of the first vector, the detectors' mean."""
 
@@ -59,11 +63,11 @@ class HighpassPlanning(Planning[HighpassFilter]):
         knots = full_q * cut * o.duration
         cost = Cost(fixed=0.01, per_time=5e-8, per_sample=2e-9 + 2e-8 * knots / o.n_samples)
         choices = [full(f"{full_q:g} knots per cycle of the cut")]
-        near = LEAKS * context.weighted(lambda f: min((f / cut) ** 4, 1.0), 0.0, cut)
-        text = "1.5 sqrt(int_0^f_cut S (f / f_cut)^8 df) x (q^-4 + q_full^-4), q knots per cycle of the cut"
+        low, text = low_part(context, cut), DECIMATION
         for q in self.coarser("oversampling"):
-            share = q**-4 + full_q**-4
-            bound = context.bound(near * share, 1 / cut, common=True)
+            error = sum(LEAKS * math.hypot(low * images(x)[0], aliased(context, cut, x)) for x in (q, full_q))
+            share = sum(images(x)[1] for x in (q, full_q))
+            bound = context.bound(error, 1 / cut, common=True)
             bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
             saved = 2e-8 * (knots - q * cut * o.duration) * o.n_detectors * len(context.observations)
             settings = {"oversampling": q}
@@ -73,6 +77,47 @@ class HighpassPlanning(Planning[HighpassFilter]):
             "high-pass decimation", tuple(choices), size, "rms of the stream: its low part removed wrongly altogether"
         )
         return Estimate((effect,), cost, _left_in(context))
+
+
+DECIMATION = (
+    "1.5 x rms of images of the cosines a_k below the cut, sqrt(sum a_k^2 (k / K)^8) / q^4, and of what lies at their places"
+)
+
+
+def images(q: float) -> tuple[float, float]:
+    """rms and sum of the amplitudes of the two images that a coarse series of ``q`` knots per cycle of the
+    cut makes of a cosine at the cut: sinc(k / 2M)^4 at 2M -+ k over that at k is (k / (2M -+ k))^4 = (q -+ 1)^-4."""
+    below, above = (q - 1) ** -4, (q + 1) ** -4
+    return math.hypot(below, above), below + above
+
+
+def aliased(context: Context, cut: float, q: float) -> float:
+    """rms of what the coarse series takes for the low part, K: what lies at the places of the images, weighed as they are; the
+    mean of (k / K)^8 over the cosines is 1 / 9."""
+    top = 0.5 * context.first.sample_rate
+    if (q - 1) * cut >= top:
+        return 0.0
+    return context.weighted(lambda f: 1.0, (q - 1) * cut, min((q + 1) * cut, top)) * (q - 1) ** -4 / 3
+
+
+def low_part(context: Context, cut: float) -> float:
+    """sqrt(<sum_{k < K} a_k^2 (k / K)^8>), K: cosines below the cut of a scan of T, by their part in the error of the low part.
+
+    A wave exp(i w t) has its own cosine, k = w T / pi, and in the others, as a scan has ends,
+
+        a_k^2 <= (8 / pi^2) kappa^2 / (kappa^2 - k^2)^2,   kappa = w T / pi.
+    """
+    duration = context.first.duration
+    last = max(math.ceil(2 * cut * duration), 1)
+    k = np.arange(1, last)
+
+    def in_others(f: float) -> float:
+        kappa = 2 * f * duration
+        apart = np.maximum(np.abs(k - kappa), 0.5) * (k + kappa)
+        return math.sqrt(8 / math.pi**2 * float(((kappa / apart) ** 2 * (k / last) ** 8).sum()))
+
+    own = context.weighted(lambda f: min((f / cut) ** 4, 1.0), 0.0, cut)
+    return math.hypot(own, context.weighted(in_others, 0.0, 0.5 * context.first.sample_rate))
 
 
 class DetrendPlanning(Planning[Any]):
@@ -178,7 +223,8 @@ class CommonModePlanning(Planning[CommonModeFilter]):
 
     def traits(self, observation: Observation) -> Traits:
         """Traits of a filter that removes the common mode."""
-        return Traits(removes_common=observation.n_detectors > 1)
+        several = observation.n_detectors > 1
+        return Traits(removes_common=several, turns=several and self.operator.method == "svd")
 
     def memory(self, observation: Observation) -> int:
         """Series over the scan: one for each step of the iteration, or the sums of `focal_plane_mean`; the copy of one tile."""
@@ -204,8 +250,8 @@ class CommonModePlanning(Planning[CommonModeFilter]):
             return Estimate((), cost, without)
         choices = [full(f"residual {tightest:g}")]
         text = "rms of the stream behind the high-pass filter x residual / (1 - gap^2)"
-        for residual in self.coarser("residual"):
-            share = math.sqrt(modes) * (residual + tightest) / (1 - self.operator.gap**2)
+        for residual in self.coarser("residual") if self._stands_out(context) else ():
+            share = (residual + tightest) / (1 - self.operator.gap**2)
             bound = context.bound(share * context.passed, slow, common=True) | {"psd": 2 * share + share**2}
             bound |= context.sky_error(share)
             saved = LANCZOS * (count - steps(residual, modes, context)) * context.samples
@@ -214,10 +260,20 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         effect = Effect("common-mode residual", tuple(choices), size, "rms of the stream: no common mode removed at all")
         return Estimate((effect,), cost, without)
 
+    def _stands_out(self, context: Context) -> bool:
+        """Whether one mode alone is removed, which stands far above the noise, of the complete signal alone. Else the second
+        singular value is near the first, which a large residual does not show: another number of modes is then removed."""
+        own = any(s.filtered and not s.takes_model(self.operator.label) for s in context.work.signals[1:])
+        return self.operator.modes == 1 and not own and shrinkage(context) <= STANDS_OUT**2
+
 
 def steps(residual: float, modes: int, context: Context) -> int:
     """Steps that a residual takes: each lessens it by the square of the ratio of the noise's singular values to the mode's."""
+    return modes + max(1, math.ceil(math.log(residual / START) / math.log(min(shrinkage(context), 0.5))))
+
+
+def shrinkage(context: Context) -> float:
+    """Square of the ratio of the noise's singular values to that of what all detectors see alike."""
     n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
     common = max((context.passed / LEAKS) ** 2 - noise**2, 0.0) if context.cut > 0 else context.fluctuation**2
-    shrink = min(noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30), 0.5)
-    return modes + max(1, math.ceil(math.log(residual / START) / math.log(shrink)))
+    return noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30)

@@ -12,7 +12,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import OutputError, PipelineError
 from zonda.core.maps.map_file import MapFile, Provenance
-from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures, noise_sources
+from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures, noise_sources, noise_stated
 from zonda.core.output import Output, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, product_path
 from zonda.core.storage.fits_image import Cards
@@ -25,7 +25,9 @@ class SaveMap(Output):
     ``map.fits``, ``noiseless_map.fits`` ...: the signal in the primary HDU (K_RJ), then HITS, WEIGHTS, NOISE and, where it was
     made, HALF_DIFFERENCE, all with the same world coordinates; HEALPix maps are explicit-index (partial) tables that healpy
     reads. Of polarized maps I, Q, U (POLCCONV = COSMO), HITS, WEIGHTS, the covariance COV_II ... COV_UU and CONDITION.
-    CROSSLINKING and the table SCAN_HITS where `BinMap` kept them.
+    CROSSLINKING and the table SCAN_HITS where `BinMap` kept them. NOISE is that of independent samples; where a map of the noise
+    alone is there (source-free, half-difference), NOISEFAC in its header is what it is to be multiplied by for noise that is
+    correlated between pixels, and NOISEOF says what that was measured in, else "white noise only".
     ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the middle
     (`central_diameter`). Every file carries beam, seed, versions, the resolved YAML and the log of the run.
 
@@ -50,13 +52,17 @@ class SaveMap(Output):
         maps = maps_of(data.products, split=False)
         if not maps:
             raise PipelineError("there is no map to write", place=self.label, cure="add a step that makes one, e.g. BinMap")
-        files = {product_path(folder, name, ".fits"): MapFile.of(name, product) for name, product in maps.items()}
+        planes = maps_of(data.products)
+        files = {
+            product_path(folder, name, ".fits"): MapFile.of(name, product, noise_stated(planes, name))
+            for name, product in maps.items()
+        }
         figures = noise_figures(maps, self.central_diameter)
         for name, product in maps.items():
             if sources := noise_sources(maps, name):
-                planes: dict[str, AnyFloats] = {of: getattr(found, plane) for of, (found, plane) in sources.items()}
+                alone: dict[str, AnyFloats] = {of: getattr(found, plane) for of, (found, plane) in sources.items()}
                 cards = noise_cards([f for f in figures if f.product == name])
-                files[product_path(folder, f"noise_{name}", ".fits")] = MapFile(f"noise_{name}", product, planes, cards)
+                files[product_path(folder, f"noise_{name}", ".fits")] = MapFile(f"noise_{name}", product, alone, cards)
         if not self.overwrite:
             for path in files:
                 if path.exists():

@@ -14,8 +14,7 @@ from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, OutputError
-from zonda.core.operator import Operator
-from zonda.core.output import output_folder
+from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
 from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
@@ -75,7 +74,7 @@ class _State:
         publish(self.temporary, self.path)
 
 
-class SaveTOD(Operator):
+class SaveTOD(StreamOutput):
     """Files of the streams at this step, one per scan: ``tod_<observation>.h5`` or ``.fits``.
 
     The smooth mean emission is added in float64, so `signal` is the whole T_scan (or what the filters left of it). HDF5

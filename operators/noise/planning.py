@@ -12,8 +12,8 @@ from zonda.core.errors import ZondaError
 from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.observation import Observation, WhiteLevel
-from zonda.core.plan.context import LEAKS, Context
-from zonda.core.plan.estimate import Bound, Choice, Cost, Effect, Estimate, Traits, add, full
+from zonda.core.plan.context import LEAKS, OTHER_MODES, Context
+from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
@@ -77,7 +77,7 @@ class PinkPlanning(Planning[PinkNoise]):
         return Traits(rms=rms, faster=faster)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size and cost; the saving and error of fewer poles, or of no pink noise."""
+        """Its size and cost; the saving and error of fewer poles (whose first states are drawn anew), or of no pink noise."""
         pink, o = self.operator, context.lowest
         spectrum = PinkSpectrum.of(pink, o)
         if spectrum is None:
@@ -93,15 +93,14 @@ class PinkPlanning(Planning[PinkNoise]):
         size["psd"] = level * float(law.response(np.array([0.1 / (o.duration * o.sample_rate)]))[0])
         text = "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R: high-pass filter"
         cost = pole_cost(pink.poles, filters_in_a_tile(spectrum.of_detectors(pink, o).slope))
+        left_out = context.behind_modes(size)
+        text += OTHER_MODES if context.turns else ""
         choices = [full(f"{pink.poles} poles"), *self._coarser(context, spectrum, level)]
         if pink.shared == 0 and not context.kept_streams & pink.provides:
             # a common part would be what a singular mode consists of: it is not dropped
             saved = cost.seconds(context.times, o.n_detectors) + 0.5e-9 * context.samples
-            choices.append(Choice("dropped", "none", leave_out=True, bound=size, formula=text, seconds=saved))
-        without: Bound = size
-        if pink.shared > 0 and context.removes_common:
-            without = add(size, context.other_modes(pink.label))
-        return Estimate((Effect("poles", tuple(choices), size, text),), cost, without)
+            choices.append(Choice("dropped", "none", leave_out=True, bound=left_out, formula=text, seconds=saved))
+        return Estimate((Effect("poles", tuple(choices), left_out, text),), cost, size)
 
     def _coarser(self, context: Context, spectrum: PinkSpectrum, level: float) -> list[Choice]:
         """Filters of fewer poles; ``level``: of the white noise that they filter, over that of all white noise."""
@@ -109,6 +108,7 @@ class PinkPlanning(Planning[PinkNoise]):
         law, amplitude = spectrum.filter(pink.poles), self._amplitude(spectrum, o)
         correlated, common = _correlated(law, context), pink.shared > 0 and not context.removes_common
         text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
+        text += OTHER_MODES if context.turns else ""
         passes = filters_in_a_tile(spectrum.of_detectors(pink, o).slope)
         seconds = pole_cost(pink.poles, passes).seconds(context.times, o.n_detectors)
         for poles in self.coarser("poles"):
@@ -122,6 +122,7 @@ class PinkPlanning(Planning[PinkNoise]):
                 free = difference(law, coarse, replace(context, traits={}), o.sample_rate, o.duration)
                 bound["tod"] = amplitude * math.sqrt(free)
             bound["psd"] = psd_error(law, coarse, level)
+            bound = context.behind_modes(bound)
             saved = seconds - pole_cost(poles, passes).seconds(context.times, o.n_detectors)
             choices.append(Choice("coarse", f"{poles} poles", {"poles": poles}, bound=bound, formula=text, seconds=saved))
         return choices

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from zonda.core.numerics.sphere import separation
 from .limits import LargestMotion
 from .observed import report
 from .samples_per_beam import SamplesPerBeam
-from .schedule_files import read_schedule, read_site
+from .schedule_files import Row, read_schedule, read_site
 from .scheduled import ScheduleParameters, scan_of
 from .sun_and_moon import distances
 
@@ -28,6 +29,25 @@ CHECKED = 1 << 14
 
 ANOTHER_DAY = 86400.0
 """s between the schedule and the scene's time from which a run warns: the weather is the scene's."""
+
+
+MOST_LOOKED_AT = 64
+"""Rows of a schedule that `zonda check` looks at."""
+
+
+def _some(rows: Sequence[Row]) -> list[Row]:
+    """Rows evenly over a schedule, with the lowest and the highest (where the mount turns fastest), the widest and the narrowest
+    throw, and the longest and the shortest scan: a limit of the telescope that any row exceeds, one of these does."""
+    if len(rows) <= MOST_LOOKED_AT:
+        return list(rows)
+    found = {round(k) for k in np.linspace(0, len(rows) - 1, MOST_LOOKED_AT - 6)}
+    for values in (
+        [row.elevation for row in rows],
+        [row.azimuth[1] - row.azimuth[0] for row in rows],
+        [row.duration for row in rows],
+    ):
+        found |= {int(np.argmin(values)), int(np.argmax(values))}
+    return [rows[k] for k in sorted(found)]
 
 
 class PointingSchedule(ScheduleParameters):
@@ -49,14 +69,16 @@ class PointingSchedule(ScheduleParameters):
         """How many scans there are, where they look, how fast, and how near to Sun and Moon."""
         first, rate = len(data.observations), self.sample_rate or data.scene.instrument.sample_rate
         rows = read_schedule(self.schedule, self.nod.duration)
-        total = sum(row.duration for row in rows)
-        self._observe(data, min(rate, CHECKED / total))
+        looked = _some(rows)
+        self._observe(data, min(rate, CHECKED / sum(row.duration for row in looked)), looked)
         made = data.observations[first:]
         for observation in made:
             observation.seen_of = max(round(observation.duration * rate), 1), rate
         elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
         end = max(row.start.shifted(row.duration) for row in rows)
-        lines = [f"{len(rows)} scan{'s' if len(rows) > 1 else ''} from {rows[0].start} to {end}, {total / 3600:.3g} h in all"]
+        total = sum(row.duration for row in rows) / 3600
+        part = "" if len(looked) == len(rows) else f" ({len(looked)} of them looked at)"
+        lines = [f"{len(rows)} scan{'s' if len(rows) > 1 else ''} from {rows[0].start} to {end}, {total:.3g} h in all{part}"]
         lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
         lines += distances(made)
         topics = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
@@ -79,9 +101,10 @@ class PointingSchedule(ScheduleParameters):
                 )
             warnings.warn(f"{self.label}: {text}: {cure}", stacklevel=4)
 
-    def _observe(self, data: Data, rate: float) -> None:
+    def _observe(self, data: Data, rate: float, some: Sequence[Row] = ()) -> None:
+        """Append the scans of all rows, or of ``some``, sampled at ``rate`` [Hz]."""
         scene, before = data.scene, len(data.observations)
-        rows = read_schedule(self.schedule, self.nod.duration)
+        rows = some or read_schedule(self.schedule, self.nod.duration)
         self._compare_sites(data)
         if abs(scene.time.seconds_since(rows[0].start)) > ANOTHER_DAY:
             text = f"the schedule begins {rows[0].start}, the weather is that of {scene.time}: set the scene's time"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from zonda.core.errors import PipelineError
 from zonda.core.mapmaker import makes_products
 from zonda.core.operator import Operator
-from zonda.core.output import Output
+from zonda.core.output import is_output
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.common_mode import CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
@@ -83,9 +83,9 @@ def steps_of(file: PipelineFile) -> Steps:
     kept: list[Operator] = []
     for step in file.steps:
         operator = step.operator
-        if isinstance(operator, Output) or (makes_products(operator) and not isinstance(operator, BinMap)):
+        if is_output(operator) or (makes_products(operator) and not isinstance(operator, BinMap)):
             continue
-        if _only_writes(operator) or type(operator) is SkyMap:
+        if type(operator) is SkyMap:
             continue
         if "boresight" not in operator.provides:
             _check(operator, step.key)
@@ -95,10 +95,6 @@ def steps_of(file: PipelineFile) -> Steps:
     found = Steps.among(kept)
     _check_together(found, file.header.name)
     return found
-
-
-def _only_writes(operator: Operator) -> bool:
-    return not operator.provides and type(operator) is not HalfWavePlate
 
 
 def _check(operator: Operator, name: str) -> None:

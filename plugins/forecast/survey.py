@@ -16,7 +16,7 @@ from scipy.fft import dct, idct
 
 from zonda.core.errors import PipelineError
 from zonda.core.focalplane import Focalplane
-from zonda.core.maps.beams import effective_fwhm
+from zonda.core.maps.beams import expected_fwhm
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.projection import boresights, frame_rotation, homographies
 from zonda.core.observation import Observation
@@ -156,10 +156,8 @@ class Survey:
         """Of the map's beam [rad], `core.maps.beams`: by the weights of the detectors of the first scan."""
         good = self.observations[0].good_detectors
         fwhm, net = self.focalplane.fwhm[good], self.focalplane.net[good]
-        inverse = self.steps.binning.weights == "inverse_variance" and bool((net > 0).all())
-        weight = net**-2.0 if inverse else np.ones(len(net))
-        shares = {float(width): float(weight[fwhm == width].sum()) for width in np.unique(fwhm)}
-        return effective_fwhm(shares) or self.scene.instrument.beam_fwhm
+        net = net if self.steps.binning.weights == "inverse_variance" else np.ones(len(net))
+        return expected_fwhm(fwhm, net) or self.scene.instrument.beam_fwhm
 
     @property
     def sigma(self) -> float:

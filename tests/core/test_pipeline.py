@@ -17,7 +17,7 @@ from zonda.core.output import Output
 from zonda.core.pipeline import Pipeline
 from zonda.core.registry import operators
 from zonda.core.run.order import check_order, makers
-from zonda.core.signal import product_name
+from zonda.core.signal import Signal, product_name
 
 
 class Point(Operator):
@@ -82,6 +82,16 @@ class Sum(Operator):
         for name in ("sky", "white"):
             if name in block.detdata:
                 block.new("signal")[...] += block.detdata[name]
+
+
+class Filter(Operator):
+    """Changes the signal, which others make."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+
+    def exec(self, block, state):
+        block.detdata["signal"] *= 1
 
 
 class Total(MapMaker):
@@ -234,6 +244,7 @@ def test_a_component_enters_at_a_place_that_there_is():
         ([Sky()], "Sky needs boresight, which no step provides"),
         ([White(), Point()], "White needs boresight, which Point provides only later"),
         ([Point(), Total()], "Total needs signal, which no step provides"),
+        ([Point(), White(), Filter(), Filter()], "Filter needs signal, which no step provides"),
         ([Point(), Sum(), Sky()], "Sky provides sky only after Sum has used it"),
         ([Point(), Sky(), Sum(), Glitches()], "Glitches provides glitches only after Sum has used it"),
         ([Sum()], "no step points the telescope"),
@@ -281,3 +292,27 @@ def test_unknown_component_of_a_run():
 def test_no_observation(scene):
     with pytest.raises(PipelineError, match="made no observation"):
         Pipeline([Point(scans=0), Sky(), Sum()]).run(scene)
+
+
+def test_the_signals_of_a_pipeline_make_another():
+    """Those that its outputs ask for among them: they ask again."""
+    steps = [Point(), Sky(), White(), Sum(), Total(), Asks()]
+    pipeline = Pipeline(steps, runs={"noiseless": {"only": ["sky"]}})
+    assert len(pipeline.runs) == 2
+    again = Pipeline(pipeline.operators, runs=pipeline.runs)
+    assert again.runs == pipeline.runs
+    assert [o.shown for o in again.operators if isinstance(o, Asks)] == [
+        o.shown for o in pipeline.operators if isinstance(o, Asks)
+    ]
+
+
+class Asks(Output):
+    """Asks for a signal."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"total"})
+
+    def signals(self):
+        return (Signal(without=["sky"]),)
+
+    def finalize(self, data):
+        assert data.products["total"]

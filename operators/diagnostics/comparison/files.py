@@ -136,7 +136,10 @@ def read_planes(path: Path, name: str = "", wanted: Wanted | None = None) -> Rea
     for key, plane in read.planes.items():
         found = free.planes.get(key)
         alike = found is not None and free.own and found.unit == plane.unit and _on_one_grid(found, plane)
-        made[key] = replace(plane, alone=found.values, alone_of=FREE, factor=None) if alike and found is not None else plane
+        if alike and found is not None and plane.noise is not None:
+            white = plane.noise / (plane.factor or 1.0)
+            plane = replace(plane, noise=white, alone=found.values, alone_of=FREE, factor=None)
+        made[key] = plane
     return replace(read, planes=made)
 
 
@@ -193,6 +196,7 @@ class Found:
     unit: Any
     stated: dict[str, tuple[float, str]]
     notes: list[str] = field(default_factory=list)
+    halves: str = "of two halves"
 
 
 def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadMap:
@@ -216,7 +220,7 @@ def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadM
             noise, alone = values.get(f"noise {key}"), values.get(f"half {key}")
             own, words = found.stated.get(key, (None, ""))
             if alone is not None:
-                own, words = None, f"half the difference, {about.get('JACKKNIF', 'of two halves')}"
+                own, words = None, f"half the difference, {found.halves}"
             elif own is not None and noise is not None:
                 noise = noise * own
             plane = Plane(
@@ -245,6 +249,7 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     if "I" not in found:
         raise InputError(f"its axis STOKES has {', '.join(names)} and no I", place=place, cure="give a map of I, Q and U")
     stated: dict[str, tuple[float, str]] = {}
+    halves = "of two halves"
     first = wanted.hdu is None and len(names) == 1  # the extensions beside it are of it
     alike = [other for other in hdus if other.is_image and other.shape == shape] if first else []
     letters = columns_of_q_and_u([str(other.name) for other in alike])
@@ -255,10 +260,11 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
             noise = np.asarray(other.data[index], np.float64).reshape(shape[-2:])
             found[of] = np.sqrt(noise) if other.name.upper().startswith("COV") else noise
             stated |= _stated(other.header, of, place)
+            halves = text(other.header, "JACKKNIF", place) or halves
     both = found.keys() >= {"Q", "U"}
     kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
-    notes = [f"{what}: {text}" for what, text in (("plane", note), ("frame", frame)) if text]
-    return Found(wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated, notes)
+    notes = [f"{what}: {said}" for what, said in (("plane", note), ("frame", frame)) if said]
+    return Found(wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated, notes, halves)
 
 
 def _plane_of(header: Any, shape: Sequence[int], choice: Wanted, place: str) -> tuple[int, tuple[int | slice, ...], str]:
@@ -329,7 +335,13 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     stated: dict[str, tuple[float, str]] = {}
     for of in ("I", *(("Q", "U") if "Q" in columns else ())):
         stated |= _stated({"NOISEFAC": header.get(f"NOISFAC{of}"), "NOISEOF": header.get("NOISEOF")}, f"noise {of}", place)
-    return Found(where, {key: v[order] for key, v in planes.items()}, header.get(f"TUNIT{1 + first}"), stated)
+    return Found(
+        where,
+        {key: v[order] for key, v in planes.items()},
+        header.get(f"TUNIT{1 + first}"),
+        stated,
+        halves=text(header, "JACKKNIF", place) or "of two halves",
+    )
 
 
 def plane_of(product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None) -> Plane:

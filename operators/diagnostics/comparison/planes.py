@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import noise_factor
+from zonda.core.maps.noise_figures import WHITE, noise_factor
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.numerics import tangent
 from zonda.core.numerics.angles import FWHM_PER_SIGMA, angle_text
@@ -40,8 +40,6 @@ SAME = 1e-4
 """Pixels: offsets of grids that differ from whole ones by less count as whole."""
 EQUAL_BEAMS = 1e-3
 """Relative difference of beams that count as one."""
-WHITE = "white noise only"
-"""Said of noise that is the standard error of independent pixels, where no map of the noise alone is known."""
 MOST = 2000
 """Points along each side of the plane onto which a HEALPix map is brought."""
 NEIGHBOURS = 12

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from zonda.core.numerics.sphere import unit_vectors
+
 from .canvas import BOTTOM, CHARACTER, LINE, PALE, TOP, new_figure
 from .graticule import AstropyAxes, Graticule, graticule
 from .sky_axes import SkyAxes, Ticks, names_of
@@ -19,6 +21,8 @@ STRIP = 2.2
 """Width over height from which an image is a strip."""
 BAR, GAP, UNDER = 1.12, 0.2, 0.62
 """Room for a colour bar with its labels beside an image, before the next image, and for a colour bar below, in."""
+NEARLY = 0.01
+"""Relative difference of steps on the sky that no picture shows."""
 TITLE = 4.4
 """Least room for a title, in."""
 
@@ -58,21 +62,24 @@ def located(wcs: Any) -> SkyAxes | AstropyAxes:
 def map_axes(shape: tuple[int, ...], wcs: Any, count: int = 1, scales: int = 1) -> list[Any]:
     """Axes of a new figure for ``count`` images (ny, nx), each with one for its colour bar as ``bar_axes``.
 
-    They have the image's pixel coordinates, with tick marks in longitude and latitude, or lines of them where these do not follow
-    the edges. Images of strips are wide, with the colour bar below and one below the other; a strip too thin to be seen is
-    stretched, and its axis says so. ``scales``: of a colour bar, 1 or 2. Latitudes are written at the first of images side by
-    side only, since they are the same for all.
+    They have the image's pixel coordinates, with tick marks in longitude and latitude, or lines of them where these do
+    not follow the edges. Pixels have the shape that they have on the sky in the middle of the image. Images of strips
+    are wide, with the colour bar below and one below the other; a strip too thin to be seen is stretched, and its axis
+    says so. ``scales``: of a colour bar, 1 or 2. Latitudes are written at the first of images side by side only, since
+    they are the same for all.
     """
     axes = located(wcs)
     ny, nx = shape
-    strip = nx > STRIP * ny
-    scale = min((LONG if strip else IMAGE[0]) / nx, IMAGE[1] / ny)
-    width, height = max(nx * scale, min(THIN, IMAGE[0])), max(ny * scale, THIN)
+    step_x, step_y = sky_steps(axes, shape)
+    across = nx * step_x / step_y  # in the pixels' height
+    strip = across > STRIP * ny
+    scale = min((LONG if strip else IMAGE[0]) / across, IMAGE[1] / ny)
+    width, height = max(across * scale, min(THIN, IMAGE[0])), max(ny * scale, THIN)
     marks = _marks(axes, shape, width, height)
     places, size = _places((width, height), marks, count, strip, scales)
     found = new_figure(size, places)
     made = found[::2]
-    stretched = width / nx / (height / ny)
+    stretched = width / across / (height / ny)
     for k, ax in enumerate(made):
         ax.bar_axes, ax.names_latitude = found[2 * k + 1], strip or k == 0
         ax.bar_below, ax.sky = strip, axes
@@ -81,6 +88,17 @@ def map_axes(shape: tuple[int, ...], wcs: Any, count: int = 1, scales: int = 1) 
         ax.sky_names = _stretched(marks.names, axes.names, stretched)
         _mark(ax, marks, shape)
     return made
+
+
+def sky_steps(axes: SkyAxes | AstropyAxes, shape: tuple[int, ...]) -> tuple[float, float]:
+    """Steps on the sky [deg] of the middle pixel of an image (ny, nx), by one in x and in y; those of the header to 1 %."""
+    y, x = ((n - 1) / 2 for n in shape)
+    lon, lat = axes.world(x + np.array([0.5, -0.5, 0.0, 0.0]), y + np.array([0.0, 0.0, 0.5, -0.5]))
+    ends = unit_vectors(np.radians(lon), np.radians(lat))
+    steps = np.degrees(np.linalg.norm(ends[::2] - ends[1::2], axis=1))
+    if np.isfinite(steps).all() and (abs(steps / axes.scales - 1) > NEARLY).any():
+        return float(steps[0]), float(steps[1])
+    return axes.scales
 
 
 def _stretched(names: tuple[str, str], sky: tuple[str, str, str], ratio: float) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from zonda.core.types import AnyFloats
 
 from .canvas import PALE, log_labels, unit_of, write_title
 from .graticule import AstropyAxes
-from .map_layout import located, map_axes
+from .map_layout import located, map_axes, sky_steps
 from .sky_axes import SkyAxes
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def plot_map(
     style = {"vmin": bottom * factor, "vmax": top * factor, "cmap": mpl.colormaps[name].with_extremes(bad="0.85")}
     _show(ax, axes, shown, label if unit else "brightness", **style)
     if fwhm:
-        _draw_beam(ax, _scales(ax, axes), fwhm)
+        _draw_beam(ax, _scales(ax, axes, values.shape), fwhm)
     _head(ax, title)
     return ax  # type: ignore[no-any-return]
 
@@ -81,7 +81,7 @@ def plot_circle(ax: Any, wcs: Any, shape: tuple[int, ...], diameter: float) -> N
     from matplotlib.patches import Ellipse
 
     axes = located(wcs)
-    width, height = (diameter / scale for scale in _scales(ax, axes))
+    width, height = (diameter / scale for scale in _scales(ax, axes, shape))
     ax.add_patch(Ellipse(_centre(ax, axes, shape), width, height, fill=False, edgecolor="black", linestyle=":", linewidth=1.2))
 
 
@@ -232,7 +232,7 @@ def _show(ax: Any, axes: SkyAxes | AstropyAxes, values: Any, label: str, **style
         for coordinate in ax.coords:
             coordinate.set_ticklabel(size=9)
     else:
-        dx, dy = (60 * scale for scale in axes.scales)
+        dx, dy = (60 * step for step in sky_steps(axes, values.shape))
         half_x, half_y = nx * dx / 2 * flip, ny * dy / 2
         extent = (-half_x, half_x, -half_y, half_y)
         picture = ax.imshow(values, origin="lower", extent=extent, interpolation="nearest", aspect="equal", **style)
@@ -258,9 +258,9 @@ def _centre(ax: Any, axes: SkyAxes | AstropyAxes, shape: tuple[int, ...]) -> tup
     return axes.reference if isinstance(axes, SkyAxes) and axes.projection != "CAR" else middle
 
 
-def _scales(ax: Any, axes: SkyAxes | AstropyAxes) -> Any:
+def _scales(ax: Any, axes: SkyAxes | AstropyAxes, shape: tuple[int, ...]) -> Any:
     """rad per unit of the axes, along x and y."""
-    return np.radians(axes.scales) if _is_world(ax) else (ARCMIN, ARCMIN)
+    return np.radians(sky_steps(axes, shape)) if _is_world(ax) else (ARCMIN, ARCMIN)
 
 
 def _draw_beam(ax: Any, scales: Any, fwhm: float) -> None:

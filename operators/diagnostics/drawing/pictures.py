@@ -224,9 +224,7 @@ def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
 
 def _shown(product: FlatMap, style: Style) -> tuple[FlatMap, str]:
     """The map as its picture shows it, and what was done to it."""
-    if not product.smooth:
-        return product, "not smoothed"
-    if style.smooth == 0 or product.smoothed_by:
+    if not product.smooth or style.smooth == 0 or product.smoothed_by:
         return product, f"smoothed by {angle_text(product.smoothed_by)}" if product.smoothed_by else "not smoothed"
     fwhm = product.fwhm if style.smooth is None else style.smooth
     return (product.smoothed(fwhm), f"smoothed by {angle_text(fwhm)} for this picture") if fwhm > 0 else (product, "not smoothed")

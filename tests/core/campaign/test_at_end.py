@@ -6,6 +6,7 @@ from pathlib import Path
 
 import h5py
 import pytest
+from astropy.io import fits
 
 from zonda.core.campaign.job import Job
 from zonda.core.campaign.log import read
@@ -74,6 +75,10 @@ def test_products_of_operators_at_the_end_are_those_of_one_run(bench, files):
     assert names == sorted(p.name for p in split.glob("*.fits"))
     for name in names:
         assert bench.planes(plain, name) == bench.planes(split, name)
+    noise, joined_noise = (fits.getheader(folder / "map.fits", "NOISE") for folder in (plain, split))
+    assert noise["NOISEFAC"] > 1  # pink noise
+    assert joined_noise["NOISEFAC"] == pytest.approx(noise["NOISEFAC"])
+    assert joined_noise["NOISEOF"] == noise["NOISEOF"] == "the map of all but the sky"
     scans = sorted(plain.glob("tod_*.h5"))
     assert len(scans) == 3
     for path in scans:

@@ -61,6 +61,34 @@ def test_realizations_never_share_random_numbers(combine):
     assert shared == (combine != "all")
 
 
+@pytest.mark.parametrize(
+    ("axes", "shared"),
+    [
+        ({"nights": 3}, False),
+        ({"realizations": 3}, False),
+        ({"grid": {"time": ["2024-11-25T07:00", "2024-11-26T07:00", "2024-11-27T07:00"]}}, False),
+        ({"observations": [{"target": "05h +20d"}, {"target": "06h +20d"}, {"target": "07h +20d"}]}, False),
+        ({"observations": [{"seed": 7, "time": "2024-11-25T07:00"}, {"seed": 7, "time": "2024-11-26T07:00"}]}, True),
+        ({"grid": {"PointingDaisy.radius": ["1 arcmin", "2 arcmin", "3 arcmin"]}}, True),
+        ({"observations": [{"PointingDaisy.radius": "1 arcmin"}, {"PointingDaisy.radius": "2 arcmin"}]}, True),
+        ({"nights": 3, "paired": True}, True),
+        ({"grid": {"time": ["2024-11-25T07:00", "2024-11-26T07:00"]}, "paired": True}, True),
+        ({"realizations": 3, "paired": True}, False),
+    ],
+)
+def test_what_is_not_combined_is_independent_where_it_is_another_observation(axes, shared):
+    """Other nights, times and targets have noise of their own; parameters are compared with the same noise."""
+    seeds = [e.seed for e in expand(combine=[], **axes)]
+    assert seeds[0] == 7
+    assert len(set(seeds)) == (1 if shared else len(seeds))
+
+
+def test_every_night_of_a_comparison_is_independent_and_each_is_paired():
+    found = expand(grid={"PointingDaisy.radius": ["1 arcmin", "2 arcmin"]}, nights=2, combine=[])
+    assert [e.seed for e in found[:2]] == [e.seed for e in found[2:]]
+    assert found[0].seed != found[1].seed
+
+
 def test_seeds_do_not_collide_with_neighbours():
     seeds = [separate(s, k) for s in range(50) for k in range(200)]
     assert len(set(seeds)) == len(seeds)

@@ -96,6 +96,21 @@ def test_a_wide_tangent_plane_is_smoothed_by_its_own_pixels():
     assert found.noise[at] == pytest.approx(math.sqrt(areas[at] / (4 * math.pi * sigma**2)), rel=0.005)
 
 
+def test_large_images_are_smoothed_by_tiles(monkeypatch):
+    """A single pixel 20 deg from the tangent point, as in small images, where each pixel has its own kernel."""
+    one = product("TAN", 0.0, side=45.0, pixel=6 * ARCMIN)
+    fwhm, sigma = 30 * ARCMIN, 30 * ARCMIN / FWHM_PER_SIGMA
+    values = np.zeros(one.signal.shape)
+    for at in ((225, 225 + 190), (225 + 130, 225 - 130), (64, 128)):
+        values[at] = 1.0
+    found, noise = one.grid.smoothed(values, fwhm, noise=np.ones(values.shape))
+    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 0.0)
+    tiled, other = one.grid.smoothed(values, fwhm, noise=np.ones(values.shape))
+    peak = one.areas().max() / (2 * math.pi * sigma**2)
+    assert abs(tiled - found).max() < 0.005 * peak
+    np.testing.assert_allclose(other[20:-20, 20:-20], noise[20:-20, 20:-20], rtol=0.005)
+
+
 def test_the_beam_of_a_picture_is_round_on_the_sky():
     import matplotlib as mpl
 

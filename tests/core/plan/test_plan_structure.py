@@ -7,7 +7,7 @@ import pytest
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.mapmaker import MapMaker
 from zonda.core.operator import Operator
-from zonda.core.output import Output
+from zonda.core.output import Output, StreamOutput
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan import structure as shares
 from zonda.core.plan.planner import plan_band
@@ -17,7 +17,10 @@ from zonda.core.signal import Component, Signal
 
 def kind(name, requires=(), provides=(), optional=(), base=Operator, **attributes):
     sets = {"requires": frozenset(requires), "provides": frozenset(provides), "optional": frozenset(optional)}
-    return type(name, (base,), {"__doc__": name, "__module__": __name__, **sets, **attributes})()
+    step = "finalize" if issubclass(base, Output) else "observe" if "boresight" in provides else "exec"
+    acts = {} if "configure" in attributes else {step: lambda self, *given: None}
+    acts |= {"measure": lambda self, stream, model=None: None} if attributes.get("couples") == "all" else {}
+    return type(name, (base,), {"__doc__": name, "__module__": __name__, **sets, **acts, **attributes})()
 
 
 POINT = kind("Point", provides={"boresight"})
@@ -29,7 +32,7 @@ FILTER = kind("Filter", {"signal"}, {"signal"}, couples="all", linear=True)
 MAP = kind("Map", {"signal", "boresight"}, {"map"}, base=MapMaker, linear=True)
 HITS = kind("Hits", {"boresight"}, {"map"}, base=MapMaker, linear=True)
 SPECTRUM = kind("Spectrum", {"signal"}, {"spectrum"})
-TOD = kind("Tod", {"signal"})
+TOD = kind("Tod", {"signal"}, base=StreamOutput)
 SAVE = kind("Save", {"map"}, {"map_file"}, base=Output)
 FREEZES = kind("Freezes", {"signal"}, {"signal"}, couples="all", linear=True)
 TRANSFER = kind("Transfer", {"map"}, {"table"}, base=Output, signals=lambda self: (Signal(only=["sky"]),))
@@ -213,3 +216,29 @@ def test_what_runs_of_a_file(end, without, tmp_path):
     assert {s.key for s in file.steps} - {s.key for s in planned.steps} == without
     data = planned.pipeline().run(planned.scene(), output=tmp_path, threads=1)
     assert {label for label, _, _ in data.provenance["timings"]} == {s.key for s in file.steps} - without
+
+
+PLATE = kind("Plate", {"boresight"}, configure=lambda self, observation: None)
+OWN_FILE = kind("OwnFile", {"signal"}, exec=lambda self, block, state: None)
+
+
+@pytest.mark.parametrize("step", [PLATE, OWN_FILE])
+def test_a_step_that_provides_nothing_is_no_output_but_where_it_says_so(step):
+    """It changes observations, or may do anything: the products are the output, as where nothing is saved at all."""
+    found, runs, _ = acting(POINT, SKY, AIR, NOISE, SUM, step, FILTER, MAP, runs=RUNS)
+    assert found == {"Point", step.label, "Sky", "Air", "Noise", "Sum", "Filter", "Map"}
+    assert runs == set(RUNS)
+
+
+def test_a_step_that_writes_streams_says_so():
+    """Nobody saves the map: it is left out, and with it the signals that are mapped alone."""
+    found, runs, _ = acting(POINT, PLATE, SKY, NOISE, SUM, TOD, MAP, runs=RUNS)
+    assert found == {"Point", "Plate", "Sky", "Noise", "Sum", "Tod"}
+    assert runs == set()
+
+
+def test_what_changes_observations_stays_where_the_sky_alone_takes_the_place_of_everything():
+    """A plate turns the polarization of the sky alone, too; it is not a reason to simulate the noise."""
+    found, _, structure = acting(POINT, PLATE, SKY, NOISE, SUM, MAP, TRANSFER)
+    assert structure.instead
+    assert found == {"Point", "Plate", "Sky", "Sum", "Map", "Transfer"}

@@ -134,3 +134,14 @@ def test_maps_of_which_there_is_no_figure_are_refused_before_the_run(tmp_path, g
         return
     with pytest.raises(ZondaError, match=message):
         first_look(file.pipeline(), file.scene(), saved=False)
+
+
+def test_figures_of_one_signal_alone_keep_what_it_is_without(tmp_path):
+    """The plan leaves out what no output depends on; the sky, which the signal is without, is named by it and stays."""
+    runs = "runs: {free: {without: [sky], modes: full}}\n"
+    file = loaded(tmp_path, "  - MeasureFigures: {metrics: [{central_rms: {signal: free}}]}\n", runs)
+    planned = zonda.plan(file, threads=1).apply(file)
+    data = planned.pipeline().run(planned.scene(), output=tmp_path / "planned", threads=1)
+    whole = file.pipeline().run(file.scene(), output=tmp_path / "whole", threads=1)
+    (name,) = [figure.name for figure in whole["figures"]]
+    assert data["figures"][name].value == whole["figures"][name].value

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
+
 import numpy as np
 import pytest
 
@@ -433,3 +435,42 @@ def test_check_says_where_sun_and_moon_are(tmp_path):
             assert low - 0.06 <= apart.min()
             assert apart.max() <= high + 0.06
     assert "below the horizon" in found["Sun"]
+
+
+def long_schedule(path, number, **odd):
+    """Rows of 2 min, one after the other; ``odd``: azmax or el of one row in the middle."""
+    begin = datetime(2025, 3, 1, tzinfo=UTC)
+    rows = []
+    for k in range(number):
+        start = begin + timedelta(minutes=3 * k)
+        mine = odd if k == 977 else {}
+        end = start + timedelta(minutes=2)
+        rows.append(
+            (start.isoformat(), end.isoformat(), 0.0, "patch", 120.0, mine.get("azmax", 150.0), mine.get("el", 50.0), k, 0)
+        )
+    return version_5(path, rows)
+
+
+def check(path, **more):
+    data = Data(scene=Scene(site=SITE, instrument="so_lat_mf", time="2025-03-01T06:00"))
+    return PointingSchedule(schedule=path, **FAST | more).check(data), data
+
+
+def test_a_check_looks_at_some_rows_of_a_long_schedule(tmp_path):
+    """Half an hour for the 26 000 rows of a survey, once. All rows are read, and counted."""
+    lines, data = check(long_schedule(tmp_path / "a.ecsv", 2000, el=61.0))
+    assert "2000 scans" in lines[0]
+    assert f"({len(data.observations)} of them looked at)" in lines[0]
+    assert len(data.observations) <= 64
+    assert "50.00 to 61.00 deg" in lines[1], "the highest row is one of them"
+    short, data = check(long_schedule(tmp_path / "b.ecsv", 20))
+    assert len(data.observations) == 20
+    assert "looked at" not in short[0]
+
+
+def test_a_row_that_the_telescope_cannot_do_is_found_among_many(tmp_path):
+    """The lowest, and the highest, where the mount turns fastest, are always looked at."""
+    with pytest.raises(PointingError, match="patch-977-0"):
+        check(long_schedule(tmp_path / "low.ecsv", 2000, el=1.0))
+    with pytest.raises(PointingError, match="patch-977-0"):
+        check(long_schedule(tmp_path / "fast.ecsv", 2000, el=80.0), check_limits="error")

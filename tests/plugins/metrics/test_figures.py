@@ -18,6 +18,7 @@ from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.numerics.sphere import separation
 from zonda.operators.diagnostics.power_spectrum import Spectrum, Welch
 from zonda.plugins.checks import scenes
 from zonda.plugins.metrics.common import as_seen
@@ -183,6 +184,41 @@ def test_peak_ratio_against_an_input_of_any_pixels_in_a_map_of_uneven_depth(step
     image = Image(np.exp(-(away**2) / 2 / (20 / FWHM_PER_SIGMA) ** 2), cards)
     found = measure(data({"sky": {"only": ["sky"]}}, sky__map=seen, input=image), "peak_ratio", against="input")
     assert found.value == pytest.approx(1, abs=0.005)
+
+
+def on_the_sky(world, shape, fwhm, peak=1.0):
+    """A Gaussian about `CENTRE` at the pixels of an image, by angles on the sky."""
+    y, x = np.indices(shape)
+    lon, lat = np.radians(world.all_pix2world(x, y, 0))
+    return peak * np.exp(-4 * np.log(2) * (separation(lon, lat, CENTRE) / ARCSEC / fwhm) ** 2)
+
+
+def car(pixel, shape):
+    """A CAR image about `CENTRE`, square on the sky at declination 20 to 6 %."""
+    world = WCS(naxis=2)
+    world.wcs.ctype, world.wcs.crval, world.wcs.cdelt = ["RA---CAR", "DEC--CAR"], [75, 0], [-pixel / 3600, pixel / 3600]
+    world.wcs.crpix = [(shape[1] + 1) / 2, (shape[0] + 1) / 2 - 20 * 3600 / pixel]
+    return world
+
+
+def test_peak_ratio_of_a_car_map():
+    world = car(2.0, (161, 161))
+    seen = replace(product(on_the_sky(world, (161, 161), np.sqrt(544), 400 / 544)), header=world.to_header())
+    image = Image(blob(20), header(SIDE, PIXEL))
+    found = measure(data({"sky": {"only": ["sky"]}}, sky__map=seen, input=image), "peak_ratio", against="input")
+    assert found.value == pytest.approx(1, abs=3e-3)
+
+
+def test_the_error_of_an_rms_on_a_car_map():
+    """The scatter of the rms of 200 maps of white noise, smoothed: known to 1 / sqrt(400) = 5 %, tested at 3.5 sigma."""
+    world = car(2.0, (121, 121))
+    noise = replace(product(np.zeros((121, 121)), pixel=2.0), header=world.to_header())
+    rng, values = np.random.default_rng(3), []
+    for _ in range(200):
+        one = replace(noise, signal=rng.standard_normal((121, 121))).smoothed(FWHM * ARCSEC)
+        values.append(central_rms(one, 100 * ARCSEC))
+    value, error = np.array(values).T
+    assert np.std(value) == pytest.approx(error.mean(), rel=0.18)
 
 
 def test_peak_snr():

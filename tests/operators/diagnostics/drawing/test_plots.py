@@ -54,6 +54,28 @@ def values():
     return made
 
 
+@pytest.mark.parametrize(
+    ("kind", "steps", "dec"),
+    [("TAN", (8.0, 4.0), 20.0), ("SIN", (3.0, 6.0), 0.0), ("CAR", (4.0, 4.0), 60.0), ("TAN", (4.0, 4.0), 20.0)],
+)
+def test_pictures_have_the_proportions_of_the_sky(kind, steps, dec):
+    """A field as wide as it is high is drawn so, and the beam is a circle on the paper, whatever the pixels' shape."""
+    dx, dy = steps
+    across = dx * (np.cos(np.radians(dec)) if kind == "CAR" else 1.0)
+    shape = round(400 / dy), round(400 / across)
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval = [f"RA---{kind}", f"DEC--{kind}"], [75.0, 0.0 if kind == "CAR" else dec]
+    wcs.wcs.cdelt = [-dx / 3600, dy / 3600]
+    wcs.wcs.crpix = [shape[1] / 2 + 0.5, shape[0] / 2 + 0.5 - (dec * 3600 / dy if kind == "CAR" else 0)]
+    ax = plot_map(np.random.default_rng(1).standard_normal(shape), wcs, fwhm=40 * ARCSEC)
+    box = ax.get_window_extent()
+    assert box.width / box.height == pytest.approx(1.0, rel=0.02)
+    [beam] = [p for p in ax.patches if type(p).__name__ == "Ellipse"]
+    wide, high = beam.width / shape[1] * box.width, beam.height / shape[0] * box.height
+    assert wide == pytest.approx(high, rel=0.02)
+    assert wide / box.width == pytest.approx(0.1, rel=0.02)
+
+
 @pytest.fixture
 def spectrum():
     f = np.linspace(0.01, 50, 2000)
