@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from zonda.core.instrument import Band
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.picture import Shown, draw
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
@@ -79,6 +80,18 @@ def test_a_single_pixel_keeps_its_flux(kind, dec):
     sigma = FWHM / FWHM_PER_SIGMA
     assert found.signal[at] * 2 * math.pi * sigma**2 == pytest.approx(1.0, rel=0.005)
     assert (found.signal * areas).sum() == pytest.approx(1.0, rel=0.005)
+
+
+def test_units_per_pixel_there_and_back():
+    """At 60 deg a pixel of 1 arcmin is half as wide: its Jy/pixel are half of those on the equator."""
+    one = product("CAR", 60.0)
+    one.band = Band(name="b", low="80 GHz", high="100 GHz")
+    one.signal = np.ones(one.signal.shape)
+    there = one.to("Jy/pixel")
+    np.testing.assert_allclose(there.signal, 1e6 * one.to("MJy/sr").signal * one.areas(), rtol=1e-12)
+    middle = there.signal[there.signal.shape[0] // 2, 0]
+    assert middle == pytest.approx(1e6 * one.to("MJy/sr").signal[0, 0] * ARCMIN**2 / 2, rel=1e-3)
+    np.testing.assert_allclose(there.to("K_RJ").signal, 1.0, rtol=1e-12)
 
 
 def test_a_wide_tangent_plane_is_smoothed_by_its_own_pixels():
