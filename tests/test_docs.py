@@ -5,18 +5,54 @@ import importlib.util
 import json
 import re
 import runpy
+import textwrap
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def blocks(language):
+CODE = ("yaml", "yml", "python", "py", "pycon", "json", "toml")
+"""Languages of blocks that say what a user writes; others are shells' commands and what they print."""
+
+ELSEWHERE = {
+    ("CONTRIBUTING.md", 1): "test_the_operator_that_contributing_shows_keeps_the_contract",
+    ("CONTRIBUTING.md", 2): "needs the operator above; test_the_operator_that_contributing_shows_keeps_the_contract",
+    ("coming_from_toast.md", 1): "needs TOAST: tests/interop/test_toast.py",
+    **{("interop.md", k): "needs TOAST or sotodlib: tests/interop, in the environments of .ci" for k in (1, 2, 3, 5, 6, 7, 8)},
+    ("sky.md", 3): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
+    ("sky.md", 4): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
+}
+"""Blocks that are not executed here, by page and number, with where they are."""
+
+
+def fenced():
+    """(page, number, language, text) of every block."""
     for page in PAGES:
-        for number, text in enumerate(re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)):
+        found = re.findall(r"^ *```([\w.-]*)[^\n]*\n(.*?)^ *```", page.read_text(), re.S | re.M)
+        for number, (language, text) in enumerate(found):
+            yield page, number, language, textwrap.dedent(text)
+
+
+def blocks(*languages):
+    """The blocks of a language that are executed here."""
+    for page, number, language, text in fenced():
+        if language in languages and (page.name, number) not in ELSEWHERE:
             yield pytest.param(text, id=f"{page.name}-{number}")
+
+
+def test_every_block_is_executed_or_said_to_be_elsewhere():
+    """A block of a language without a test, or an exception without a block, is a mistake."""
+    every = {(page.name, number): language for page, number, language, _ in fenced()}
+    code = {place for place, language in every.items() if language in CODE}
+    assert ELSEWHERE.keys() <= code
+    executed = {p.id.rpartition("-")[::2] for p in [*blocks("python", "py"), *blocks("yaml", "yml"), *blocks("toml")]}
+    assert {(page, int(number)) for page, number in executed} == code - ELSEWHERE.keys()
+    assert set(every.values()) - set(CODE) <= {"sh", "text", "csv", ""}, "another language: add it to CODE, or here"
 
 
 def in_a_folder_with_a_map(folder, monkeypatch):
@@ -36,7 +72,7 @@ def with_recorded_data(folder, text):
         return
     import zonda
 
-    camera = {"like": "mustang2", "detectors": 19}
+    camera = {"like": "mustang2", "detectors": 20}
     scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1)
     scan = zonda.PointingDaisy(radius="1 arcmin", scan_duration="30 s", sample_rate="25 Hz")
     steps = [scan, zonda.WhiteNoise(), zonda.PinkNoise(), zonda.Efficiency(), zonda.SaveTOD()]
@@ -77,7 +113,7 @@ def defined_before(text):
     return names
 
 
-@pytest.mark.parametrize("text", list(blocks("python")))
+@pytest.mark.parametrize("text", list(blocks("python", "py")))
 def test_python(text, tmp_path, monkeypatch):
     in_a_folder_with_a_map(tmp_path, monkeypatch)
     with_recorded_data(tmp_path, text)
@@ -86,26 +122,112 @@ def test_python(text, tmp_path, monkeypatch):
     assert names
 
 
+@pytest.mark.parametrize("text", list(blocks("toml")))
+def test_toml(text):
+    """Entry points of groups that there are."""
+    from zonda.core import registry
+
+    known = {group for r in vars(registry).values() if isinstance(r, registry.Registry) for group in r.groups}
+    assert tomllib.loads(text)["project"]["entry-points"].keys() <= known
+
+
 def gallery():
     for path in sorted((ROOT / "docs" / "gallery").glob("*.yaml")):
         yield pytest.param(path.read_text(), id=path.stem)
 
 
-@pytest.mark.parametrize("text", [*(b for b in blocks("yaml") if "operators:" in b.values[0]), *gallery()])
+LONG = {"psd_slope": "80 s", "PointingRaster": "3 min"}
+"""What a pipeline may hold that needs longer scans than those of `small`: a spectrum at 16 mHz, a field that is covered once."""
+
+
+def small(text):
+    """A pipeline with few detectors and short scans: all else as it is written."""
+    tree = yaml.safe_load(text)
+    if isinstance(camera := tree.get("instrument"), str):
+        tree["instrument"] = {"like": camera, "detectors": 20}
+    elif camera and "detectors" in camera:
+        camera["detectors"] = min(camera["detectors"], 20)
+    duration = next((long for what, long in LONG.items() if what in text), "20 s")
+    for step in tree["operators"]:
+        for name, parameters in step.items() if isinstance(step, dict) else ():
+            if name.startswith("Pointing") and "schedule" not in parameters:
+                parameters["scan_duration"] = duration
+            elif name == "PointingSchedule":
+                parameters["sample_rate"] = "20 Hz"
+    campaign, sweep = tree.get("campaign"), tree.get("sweep")
+    for many in (many for many in (campaign, sweep) if many):
+        many |= {"engine": "serial"} | {key: min(many[key], 2) for key in ("nights", "realizations", "seeds") if key in many}
+    return yaml.safe_dump(tree, sort_keys=False)
+
+
+CAMERA = """\
+instrument: {name: camera, telescope: {name: dish, diameter: 12 m}, band: {name: b150, low: 140 GHz, high: 160 GHz},
+  detectors: 38, field_of_view: 10 arcmin, main_beam_efficiency: 0.6, illumination_efficiency: 0.9, net: 500 uK s(1/2),
+  knee: 0.2 Hz, sample_rate: 25 Hz, polarization: pairs}
+"""
+PLACE = "site: {name: here, latitude: 40.3 deg, longitude: 10.1 deg, altitude: 600 m, climatology: green_bank}\n"
+SCENE = "time: 2024-03-01T02:00\ntarget: az 100 deg el 60 deg\nseed: 3\n"
+SCAN = "- PointingDaisy: {radius: 10 arcmin, speed: 1 arcmin/s, scan_duration: 20 s}\n"
+MAPPED = "- AtmosphereLayers\n- WhiteNoise\n- Efficiency\n- BinMap: {pixel: 30 arcsec}\n- SaveMap\n"
+
+
+def in_a_scene(text):
+    """The pipelines that a fragment is part of: of each line of a choice, one."""
+    if text.startswith("accuracy:"):
+        return [PLACE + CAMERA + SCENE + text + "operators:\n" + SCAN + MAPPED]
+    if text.startswith("weather:"):
+        return [PLACE + CAMERA + SCENE + line + "\noperators:\n" + SCAN + MAPPED for line in text.splitlines()]
+    if text.startswith("site:"):
+        return [text + CAMERA + SCENE + "weather: {pwv: 2 mm}\noperators:\n" + SCAN + MAPPED]
+    if "LoadTOD" in text:
+        return ["operators:\n" + text + "- HighpassFilter: {frequency: 0.1 Hz}\n- BinMap: {pixel: 5 arcsec}\n- SaveMap\n"]
+    plate, *others = text.splitlines(keepends=True)
+    steps = plate + others[0] + "- WhiteNoise\n- Efficiency\n" + "".join(others[1:]) + "- SaveMap\n"
+    return [PLACE + CAMERA + SCENE + "operators:\n" + SCAN + steps]
+
+
+def with_what_fragments_read(folder, text):
+    """Files that fragments name: a polarized map, the weather, the noise that `zonda noise` finds."""
+    from zonda.core import cli
+
+    if "iqu.fits" in text:
+        text = text.replace("iqu.fits", "filament.fits")
+        with_a_filament(text)
+        (folder / "filament.fits").rename(folder / "iqu.fits")
+    if "era5.nc" in text:
+        files = runpy.run_path(str(ROOT / "tests" / "operators" / "atmosphere" / "weather" / "era5_files.py"))
+        files["new_layout"](folder / "era5.nc")
+        rows = ["height [km], pressure [hPa], temperature [degC], relative humidity [%], wind east [m/s], wind north [m/s]"]
+        rows += ["0.5, 955, 10, 50, 3, 1", "1.5, 845, 4, 40, 5, 1", "3.0, 700, -5, 30, 9, 2", "5.0, 540, -18, 20, 14, 3"]
+        (folder / "profile.csv").write_text("\n".join([*rows, "9.0, 308, -44, 10, 25, 0"]) + "\n")
+    if "night.noise.ecsv" in text:
+        assert cli.main(["noise", "night.h5", "--segment", "4 s", "--output", "night.noise.ecsv"]) == 0
+
+
+@pytest.mark.parametrize("text", [*blocks("yaml", "yml"), *gallery()])
 def test_yaml(text, tmp_path, monkeypatch, capsys):
-    """As `zonda check` sees it: its targets are up, its scans within the telescope's limits."""
+    """A pipeline as `zonda check` sees it in full, and run with few detectors and short scans; a fragment in a small scene."""
     from zonda.core import cli
 
     in_a_folder_with_a_map(tmp_path, monkeypatch)
     with_recorded_data(tmp_path, text)
     with_files_of_the_page(tmp_path, text)
     with_survey_data(tmp_path, text)
-    with_a_filament(text)
-    (tmp_path / "page.yaml").write_text(text)
-    status = cli.main(["check", "page.yaml"])
-    out, err = capsys.readouterr()
-    assert status == 0, err
-    assert "no mistakes" in out
+    whole = "operators:" in text
+    if whole:
+        with_a_filament(text)
+    else:
+        with_what_fragments_read(tmp_path, text)
+    for number, page in enumerate([text] if whole else in_a_scene(text)):
+        (tmp_path / "page.yaml").write_text(page)
+        status = cli.main(["check", "page.yaml"])
+        out, err = capsys.readouterr()
+        assert status == 0, err
+        assert "no mistakes" in out
+        (tmp_path / "small.yaml").write_text(small(page) if whole else page)
+        status = cli.main(["run", "small.yaml", "--output", f"out{number}", "--threads", "1"])
+        assert status == 0, capsys.readouterr().err
+        capsys.readouterr()
 
 
 def test_the_readme_shows_one_pipeline_twice(tmp_path, monkeypatch):
@@ -139,8 +261,6 @@ def test_links():
 
 
 def test_every_page_is_in_the_navigation_of_the_site_once():
-    import yaml
-
     def pages(entry):
         if isinstance(entry, str):
             return [entry]
