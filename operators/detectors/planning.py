@@ -42,7 +42,7 @@ class GainPlanning(Planning[GainDrift]):
 
 
 class TimeConstantPlanning(Planning[TimeConstant]):
-    """It has no coarser form. Where the signal is not straight between samples, it errs by 1 - sinc^2(f / f_s)."""
+    """It has no coarser form."""
 
     of = TimeConstant
 
@@ -53,15 +53,10 @@ class TimeConstantPlanning(Planning[TimeConstant]):
         # a Gaussian of FWHM passes to 1 % of its power below 0.71 v / FWHM
         frequency = min(0.71 * speed / float(o.focalplane.fwhm.min()), o.sample_rate / 2)
         loss = 1 - 1 / math.hypot(1, 2 * math.pi * frequency * tau)
-        straight = 1 - float(np.sinc(frequency / o.sample_rate)) ** 2
         text = "1 - |1 / (1 + 2 pi i f tau)| at f = 0.71 v / FWHM"
-        effects = (
-            Effect("time constant", (full("exact between samples in straight lines"),), context.sky_error(loss), text),
-            Effect("time constant: straight lines between samples", (full("exact at samples"),),
-                   context.sky_error(straight), "1 - sinc^2(f / f_s) at f = 0.71 v / FWHM"),
-        )  # fmt: skip
+        effects = (Effect("time constant", (full("exact below 0.46 of the sample rate"),), context.sky_error(loss), text),)
         remembered = REMEMBERED * tau * o.sample_rate
-        return Estimate(effects, Cost(fixed=0.001, per_sample=4e-9 * (1 + remembered / 2048)))
+        return Estimate(effects, Cost(fixed=0.001, per_sample=3e-8 * (1 + remembered / 2048)))
 
 
 class CrosstalkPlanning(Planning[Crosstalk]):
