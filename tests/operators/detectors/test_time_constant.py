@@ -52,7 +52,7 @@ def test_a_source_of_some_samples(bench, tau, width, shift):
 
 
 def test_the_peak_of_a_fast_detector(bench):
-    """2.1 samples FWHM, and a time constant of a twentieth of a sample: 1 - (tau / sigma)^2 of the peak; straight lines left 0.92."""
+    """2.1 samples FWHM, a time constant of a twentieth of a sample: 1 - (tau / sigma)^2 of the peak; straight lines left 0.92."""
     sigma = 2.1 / np.sqrt(8 * np.log(2))
     found = act(bench, np.exp(-((np.arange(N) - N // 2) ** 2) / 2 / sigma**2)[None], tau=0.05 / RATE)[0]
     assert found.max() == pytest.approx(1 - (0.05 / sigma) ** 2, abs=1e-3)
