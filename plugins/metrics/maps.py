@@ -30,6 +30,7 @@ from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.noise_figures import WHITE
 from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
@@ -219,7 +220,7 @@ class PeakSnr(_OfSmoothMap):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
-        return f"largest |map| / noise ({self.noise}), {self.how()}"
+        return f"largest |map| / noise ({WHITE if self.noise == 'white' else self.noise}), {self.how()}"
 
 
 class Coverage(_OfMap):

@@ -258,7 +258,7 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     for other in alike:
         if (of := NOISES.get(str(other.name).upper())) is not None:
             noise = np.asarray(other.data[index], np.float64).reshape(shape[-2:])
-            found[of] = np.sqrt(noise) if other.name.upper().startswith("COV") else noise
+            found[of] = _root(noise) if other.name.upper().startswith("COV") else noise
             stated |= _stated(other.header, of, place)
             halves = text(other.header, "JACKKNIF", place) or halves
     both = found.keys() >= {"Q", "U"}
@@ -298,6 +298,11 @@ def _plane_of(header: Any, shape: Sequence[int], choice: Wanted, place: str) -> 
     return stokes, tuple(slice(None) if axis == stokes else numbers.get(axis, 1) - 1 for axis in axes), note
 
 
+def _root(variance: Floats) -> Floats:
+    """Standard errors; NaN where a variance is negative."""
+    return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+
 def _stated(header: Any, of: str, place: str) -> dict[str, tuple[float, str]]:
     """The factor on white noise that the header of a plane of noise states, and what it was measured in."""
     factor = number(header, "NOISEFAC", place) if of.startswith("noise") else None
@@ -320,7 +325,7 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     columns |= {key: names.index(name) for name, key in NOISES.items() if name in names and key[-1] in columns}
     planes = {key: np.asarray(hdu.data.field(k), np.float64).ravel() for key, k in columns.items()}
     planes = {key: np.where(marked_bad(plane, header, place), np.nan, plane) for key, plane in planes.items()}
-    planes = {key: np.sqrt(plane) if names[columns[key]].startswith("COV") else plane for key, plane in planes.items()}
+    planes = {key: _root(plane) if names[columns[key]].startswith("COV") else plane for key, plane in planes.items()}
     pixels = np.arange(planes["I"].size) if place_of is None else np.asarray(hdu.data.field(place_of), np.int64).ravel()
     seen = np.isfinite(planes["I"])
     if not seen.any():
