@@ -49,7 +49,7 @@ LARGE = 2**22
 """Values of a file below which reading is no matter."""
 PER_POINT = {"image": 1.5e-6, "healpix": 2.5e-5}
 """Seconds for a point of a grid that is interpolated."""
-PER_PIXEL = {"image": 3e-6, "healpix": 1.5e-6}
+PER_PIXEL = {"image": 1.7e-6, "healpix": 1.5e-6}
 """Seconds for a pixel that is spread over a grid."""
 FLAT = 1e-3
 """Relative difference of solid angles up to which pixels of a TAN image count as equal (1.5 deg)."""

@@ -64,7 +64,8 @@ class SkyPlanning(Planning[SkyMap]):
         widths, _ = beam_widths(self.operator, observation)
         grid = grid_of(self.operator, observation)
         angles = 0 if grid.pole is None else 40 * observation.n_samples
-        return (5 + 2 * len(widths)) * grid.nbytes + (grid.source.nbytes if grid.resampled else 0) + angles
+        each = 2 if grid.spread is None or grid.is_flat else 3  # of a wide field pixels are spread for each beam
+        return (5 + each * len(widths)) * grid.nbytes + (grid.source.nbytes if grid.resampled else 0) + angles
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""

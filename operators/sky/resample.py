@@ -28,6 +28,10 @@ Progress = Callable[[int, int], None]
 
 NEIGHBOURS = 24
 """HEALPix pixels in each local fit: two rings and a few more."""
+CUTS = 8
+"""Pieces along each side into which a pixel at the edge of a projection is cut."""
+ZENITHAL = ("TAN", "SIN", "ARC", "STG", "ZEA")
+"""Projections in which no two points stand for the same sky."""
 BLOCK = 8 * TILE
 AT_ONCE = 16384
 
@@ -147,7 +151,25 @@ class ImageOnSky:
         if self._areas is not None:
             return np.asarray(self._areas[y])
         xx, xy, yy = self.grid.metric(x, y)
-        return np.asarray(np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)))
+        found = np.asarray(np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)))
+        if (edge := ~np.isfinite(found)).any():  # a part is beyond the projection: the mean of the rest
+            cuts = np.linspace(-0.5, 0.5, CUTS + 1)
+            corner = self.grid.at(x[edge, None, None] + cuts, y[edge, None, None] + cuts[:, None])
+            a, b = corner[:, 1:, 1:] - corner[:, :-1, :-1], corner[:, 1:, :-1] - corner[:, :-1, 1:]
+            parts = np.linalg.norm(np.cross(a, b), axis=-1) / 2
+            there = np.isfinite(parts)
+            with np.errstate(invalid="ignore"):
+                total = np.where(there, parts, 0.0).sum(axis=(1, 2))
+                found[edge] = total * CUTS**2 / there.sum(axis=(1, 2))
+        return found
+
+    def is_own(self, x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether pixels are those that hold their centres: of several that stand for the same sky, one."""
+        if self._period or self.grid.kind in ZENITHAL:
+            return np.ones(x.shape, bool)
+        u, v = self.grid.coordinates(self.grid.at(x, y))
+        with np.errstate(invalid="ignore"):
+            return np.asarray((np.abs(u - x) < 0.5) & (np.abs(v - y) < 0.5))
 
     def planes(self, x: NDArray[np.int64], y: NDArray[np.int64], axis: Floats | None) -> Floats:
         """(k, ...) I of pixels, or I, Q and U from the meridians through the ICRS direction ``axis``."""

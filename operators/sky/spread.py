@@ -49,7 +49,7 @@ CUT = 5.0
 """Standard deviations at which the narrower Gaussians end."""
 STRAIGHT = 1e-5
 """sigma |x_j| below which the skewness is left out."""
-AT_ONCE = 2**20
+AT_ONCE = 2**18
 """Pixels of a map that are placed together."""
 NORTH = np.array([0.0, 0.0, 1.0])
 
@@ -162,7 +162,7 @@ def _of_image(image: WcsMap, target: Any, axis: Floats | None) -> Under:
             if wanted.any():
                 x, y, d = x[wanted], y[wanted], d[wanted]
                 areas = sky.areas(x, y)
-                known = np.isfinite(areas)
+                known = np.isfinite(areas) & sky.is_own(x, y)
                 yield d[known], areas[known], sky.planes(x[known], y[known], axis)
 
     def under(block: Block, chosen: Chosen) -> tuple[NDArray[np.bool_], Iterator[Part]]:

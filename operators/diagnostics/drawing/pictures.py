@@ -80,7 +80,11 @@ def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, A
         ax = plot_plain(values * factor, where, (-top * factor, top * factor), "RdBu_r", label, title=title)
     else:
         ax = plot_map(values, where, title=title)
-    return [Sketch(file, what, "The input map, before beam, opacity and filters.", ax)]
+    text = "The input map, before beam, opacity and filters."
+    if header.get("BMAJ"):
+        width = angle_text(math.radians(float(header["BMAJ"])))
+        text += f" Its pixels are spread over a grid with Gaussians of {width} (FWHM)."
+    return [Sketch(file, what, text, ax)]
 
 
 def draw_map(

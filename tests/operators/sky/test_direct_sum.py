@@ -7,6 +7,7 @@ import healpy
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.numerics.radiation import to_kelvin_rj
@@ -264,3 +265,46 @@ def test_q_and_u_are_summed_likewise(made, save, tmp_path, kind):
     expected = weights @ values[0] + q_and_u.real * angles[0, 0] + q_and_u.imag * angles[1, 0]
     np.testing.assert_allclose(made.look(SkyMap(file=path), scan)[0], expected, atol=8e-3)
     assert expected.std() > 0.1
+
+
+@pytest.mark.parametrize("kind", ["CAR", "CYP", "HPX", "TSC"])
+def test_seams_and_repeated_sky_leave_a_uniform_sky_uniform(made, kind):
+    """450 deg of columns, a fifth of which repeat the sky of others; faces of a cube; where a projection closes."""
+    header = made.tan_header((500, 900), ra=40.0, dec=0.0, cdelt=(-1800.0, 1800.0))
+    header["CTYPE1"], header["CTYPE2"] = f"RA---{kind}", f"DEC--{kind}"
+    if kind == "CYP":
+        header["PV2_1"], header["PV2_2"] = 1.0, 0.8  # a full turn has 576 columns
+    operator = SkyMap(map=fits.ImageHDU(np.ones((500, 900)), header))
+    for ra, dec in ((40.0, 0.0), (85.0, 0.0), (220.0, 10.0), (310.0, -60.0)):
+        d = around(np.array(healpy.ang2vec(ra, dec, lonlat=True)), np.radians(3.0))
+        # 8/3 sigma^2 = 6e-4 of the fourth power of angles on a plane; creases between faces
+        np.testing.assert_allclose(seen(made, operator, d, np.radians(2.0)), 1.0, atol=1.5e-3)
+
+
+def test_pixels_at_the_edge_of_a_projection_count(made, save):
+    """Half of this pixel is beyond the ellipse of AIT; it was taken for none."""
+    header = made.tan_header((320, 640), ra=0.0, dec=0.0, cdelt=(-1800.0, 1800.0), unit="Jy/pixel")
+    header["CTYPE1"], header["CTYPE2"] = "RA---AIT", "DEC--AIT"
+    wcs = WCS(header)
+    row = 160
+    column = int(np.flatnonzero(np.isfinite(wcs.wcs_pix2world(np.arange(640), np.full(640, row), 0)[0]))[0])
+    values = np.zeros((320, 640))
+    values[row, column] = 1.0
+    pixel = directions(wcs, np.array([column]), np.array([row]))
+    got = seen(made, SkyMap(file=save(values, header)), np.repeat(pixel, 3, axis=0), np.radians(1.5))
+    expected = to_kelvin_rj("Jy/beam", made.BAND, None, 0.0, 1.0) * beam(pixel, pixel, np.radians(1.5))[0, 0]
+    np.testing.assert_allclose(got, expected, rtol=1e-3)
+
+
+def test_linear_interpolation_of_spread_pixels(made, save):
+    """Within its bound, 1.02 / n^2 of the peak on n points per FWHM, and of the right flux."""
+    header, fwhm = header_of(made, "CAR", -60.0), 3.0 * ARCMIN
+    values = np.zeros((90, 90))
+    values[44, 47] = 1.0
+    pixel = directions(WCS(header), np.array([47]), np.array([44]))
+    d = np.concatenate([pixel, around(pixel[0], fwhm, 4000)])
+    got = seen(made, SkyMap(file=save(values, header), interpolation="linear", pixels_per_fwhm=8), d, fwhm)
+    expected = to_kelvin_rj("Jy/beam", made.BAND, None, 0.0, 1.0) * beam(d, pixel, fwhm)[:, 0]
+    error = (got - expected) / expected[0]
+    assert 1e-3 < np.abs(error).max() < 1.02 / 10**2
+    assert abs((got @ expected) / (expected @ expected) - 1) < 1e-3
